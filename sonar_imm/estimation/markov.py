@@ -78,11 +78,23 @@ class RateChain:
             raise ValueError(f'the reference step must be positive, got {step}')
         self.matrix = check_transition_matrix(matrix)
         self.step = float(step)
-        self.generator = _generator(self.matrix, self.step)
-        self._fastest = float(np.abs(self.generator).max())
-        self._powers = _powers(self.generator, self._fastest)
-        self._cache: OrderedDict[float, FloatArray] = OrderedDict()
+        self._settle(_generator(self.matrix, self.step))
         self.residual = float(np.abs(self._exponential(self.step) - self.matrix).max())
+
+    @classmethod
+    def of_generator(cls, generator: FloatArray, step: float) -> RateChain:
+        """The chain of rates (M, M), per second, whose rows sum to zero."""
+        chain = cls.__new__(cls)
+        chain.step, chain.residual = float(step), 0.0
+        chain._settle(generator)
+        chain.matrix = chain._exponential(step)
+        return chain
+
+    def _settle(self, generator: FloatArray) -> None:
+        self.generator = generator
+        self._fastest = float(np.abs(generator).max())
+        self._powers = _powers(generator, self._fastest)
+        self._cache: OrderedDict[float, FloatArray] = OrderedDict()
 
     def transition(self, dt: float) -> FloatArray:
         """P(dt), (M, M), read-only. The matrix as given when dt is the reference step and it is
@@ -107,7 +119,7 @@ class RateChain:
         events = self._fastest * dt
         halvings = max(0, math.ceil(math.log2(events))) if events > 1.0 else 0
         mixture = _poisson(events / 2.0**halvings) @ self._powers
-        P = _stochastic(mixture.reshape(self.matrix.shape))
+        P = _stochastic(mixture.reshape(self.generator.shape))
         for _ in range(halvings):
             P = _stochastic(P @ P)
         return P

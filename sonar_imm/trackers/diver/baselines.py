@@ -90,7 +90,7 @@ def relative_headings(config: DiverConfig) -> ModelSet:
     rate = config.velocity_noise**2 / T
 
     def motion(dt: float) -> Motion:
-        F, Q = np.tile(np.eye(4), (M, 1, 1)), _white_acceleration(rate, 0.0, dt)
+        F, Q = np.tile(np.eye(4), (M, 1, 1)), white_acceleration(rate, 0.0, dt)
         F[:, :2, 2:], F[:, 2:, 2:] = dt * R, R
         return Motion(F, np.tile(Q, (M, 1, 1)), np.zeros((M, 4)))
 
@@ -105,7 +105,7 @@ def relative_headings(config: DiverConfig) -> ModelSet:
     )
 
 
-def _white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:
+def white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:
     """Process noise of a velocity that walks at random, `rate` (m/s)^2 a second, while it turns by
     `turn` rad/s: the exact integral, so steps compose."""
     angle = turn * dt
@@ -134,7 +134,7 @@ def single_direction(config: DiverConfig) -> ModelSet:
     def motion(dt: float) -> Motion:
         return Motion(
             np.stack([_turning(turn, dt) for turn in turns]),
-            np.stack([_white_acceleration(*both, dt) for both in zip(rates, turns)]),
+            np.stack([white_acceleration(*both, dt) for both in zip(rates, turns)]),
             np.zeros((M, 4)),
         )
 

@@ -238,7 +238,14 @@ def _new_track(
     known = np.isfinite(first[2]).any()
     share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
     mu = mu * np.repeat(share / share.sum() * len(share), M)
-    return np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None], mu
+    at, covariance = np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None]
+    if models.mixing is not None:
+        # But for how it moves, of which a ping says nothing.
+        moves = slice(2, 4)
+        at[..., moves] = x[..., moves]
+        covariance[..., moves, :] = P[..., moves, :]
+        covariance[..., :, moves] = P[..., :, moves]
+    return at, covariance, mu
 
 
 # -- starts --------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from ..model_checks import chain_problems
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
 
 MODEL_SETS = (
+    'families',
     'heading_speed',
     'heading_speed_lateral',
     'world_headings',
@@ -60,7 +61,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'motion models run side by side', choices=MODEL_SETS)
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))
-    hover: bool = parameter(True, '', 'add a model for standing still (heading_speed sets)')
+    hover: bool = parameter(True, '',
+        'add a model for standing still (heading_speed sets, families)')
     reference_step: float = parameter(1.0, 's',
         'time step for which the probabilities and noises of the models are stated; values for '
         'other steps are derived from them', range=(1e-3, 3600.0))
@@ -82,6 +84,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'baseline_stay_probability', range=(0.0, 1.0), kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
+    family_switch_rate: float = parameter(0.001, '1/s',
+        'families: rate of going from one family of models to the others', range=(0.0, 10.0))
+    covariance_scales: tuple[float, ...] = parameter((1.0, 3.0, 10.0), '',
+        'families: the filter runs in copies, each of which multiplies the covariances of all '
+        'measurements by one of these; with dimensions 3: one copy, times 1',
+        range=(1.0, 1e4), kind='float[]')
     adaptation: str = parameter('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
         'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',
@@ -94,17 +102,22 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     # -- how divers move -------------------------------------------------------------------------
     speed_mean: float = parameter(0.75, 'm/s',
-        'speed expected of a new track (heading_speed sets)', range=(0.0, 20.0))
+        'speed expected of a new track (heading_speed sets, families)', range=(0.0, 20.0))
     speed_std: float = parameter(0.4, 'm/s',
-        'standard deviation of the speed of a new track around speed_mean (heading_speed sets)',
-        range=(1e-3, 20.0))
+        'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
+        'families)', range=(1e-3, 20.0))
     velocity_std: float = parameter(0.7, 'm/s',
         'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
         'velocity state)', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
-        'random walk of the speed over a reference step (heading_speed sets)', range=(0.0, 10.0))
+        'random walk of the speed over a reference step (heading_speed sets, families)',
+        range=(0.0, 10.0))
+    brisk_speed_noise: float = parameter(0.07, 'm/s',
+        'families: random walk of the speed over a reference step in the brisk family, in place '
+        'of speed_noise', range=(0.0, 10.0))
     lateral_noise: float = parameter(0.24, 'm',
-        'random walk sideways over a reference step (heading_speed sets)', range=(0.0, 10.0))
+        'random walk sideways over a reference step (heading_speed sets, families)',
+        range=(0.0, 10.0))
     lateral_speed_std: float = parameter(0.2, 'm/s',
         'heading_speed_lateral: standard deviation of the lateral velocity', range=(0.0, 10.0))
     lateral_speed_time: float = parameter(10.0, 's',
@@ -283,6 +296,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     def check(self) -> list[str]:
         problems = super().check() + self._place_problems() + self._sensor_problems()
+        if not self.covariance_scales:
+            problems.append('covariance_scales needs one value at least')
         if self.depth_min > self.depth_max:
             problems.append(
                 f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'
@@ -345,6 +360,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         """Number of models in the set these parameters describe."""
         if self.model_set in BASELINES:
             return BASELINES[self.model_set]
-        return self.directions + (
-            1 if self.hover and self.model_set.startswith('heading_speed') else 0
-        )
+        hovering = self.model_set.startswith(('heading_speed', 'families'))
+        count = self.directions + int(self.hover and hovering)
+        return 2 * count + 3 if self.model_set == 'families' else count

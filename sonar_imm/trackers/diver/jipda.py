@@ -30,9 +30,11 @@ from ...estimation import jipda as joint_association
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
+from . import families
 from .config import DiverConfig
 from .scan import Positions
 from .state import DiverState
+from .state_space import Layout
 
 CONFIRMS = 0.9
 """Existence above which a track may be confirmed."""
@@ -76,12 +78,29 @@ class JointWeights(NamedTuple):
 
 
 def joint_weights(
-    now: DiverState, fixes: Positions, h: FloatArray, H: FloatArray, excluded: BoolArray
+    now: DiverState,
+    fixes: Positions,
+    h: FloatArray,
+    H: FloatArray,
+    excluded: BoolArray,
+    densities: families.Densities | None,
 ) -> JointWeights:
-    """Weigh all pairings of tracks and `fixes`; h (T, M, 2) expected by H (1, M, 2, n)."""
+    """Weigh all pairings of tracks and `fixes`; h (T, M, 2) expected by H (1, M, 2, n); densities:
+    of the pairs, where these and no chi-square gate them."""
     config = fixes.config
-    threshold = gate_threshold(config.gate_probability, 2)
-    mixture, nis = joint_association.likelihoods(h, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+    if densities is None:
+        threshold = gate_threshold(config.gate_probability, 2)
+        mixture, nis = joint_association.likelihoods(
+            h, H, now.P, now.mu, fixes.z, fixes.R, threshold
+        )
+    else:
+        mixture = np.exp(densities.whole)
+        # What a crowded cluster leaves out first is what is least probable.
+        apart = 2.0 * (
+            densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole
+        )
+        nis = np.where(densities.whole > families.bound(config), apart, np.inf)
+        threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
     seen = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
     beta, missed, existence = joint_association.associate(
@@ -100,17 +119,33 @@ def update_jointly(
     weights: JointWeights,
     hit: IndexArray,
     h: FloatArray,
-    H: FloatArray,
+    layout: Layout,
     considered: BoolArray,
+    densities: families.Densities | None,
 ) -> DiverState:
     """Update the tracks by all fixes they may have caused; hit (t,): those whose whitened
-    innovation is new; considered (n,): what an update does not move."""
+    innovation is new; considered (n,): what an update does not move; densities: of the pairs,
+    where the models run in copies."""
     nis, nis_dof = now.nis.copy(), now.nis_dof.copy()
     nis[hit] += np.square(now.white[hit]).sum(axis=1)
     nis_dof[hit] += np.uint16(2)
-    x, P, mu, repairs = joint_association.update(
-        now.x, now.P, now.mu, h, H, fixes.z, fixes.R, weights.beta, weights.missed, considered
-    )
+    if densities is None:
+        x, P, mu, repairs = joint_association.update(
+            now.x,
+            now.P,
+            now.mu,
+            h,
+            layout.H,
+            fixes.z,
+            fixes.R,
+            weights.beta,
+            weights.missed,
+            considered,
+        )
+    else:
+        x, P, mu, repairs = families.update_jointly(
+            now, fixes, h, layout, considered, weights.beta, weights.missed, densities
+        )
     # The life of a named track hangs on its own fixes.
     named = now.target_id != NOBODY
     return now._replace(

@@ -25,6 +25,9 @@ heading_speed
 heading_speed_lateral
     State (x, y, s, l): as above, with a lateral speed l that fades (Ornstein-Uhlenbeck), for
     headings between the models.
+families
+    State (x, y, s, unused) or (x, y, vx, vy): two heading_speed sets and three constant velocities
+    in one filter, in copies for covariances that are too small; see `families`.
 others
     To compare with, see `baselines`.
 
@@ -34,12 +37,14 @@ these are reconstructions.
 
 from __future__ import annotations
 
+from attrs import evolve
 import numpy as np
 
 from ...estimation import markov
 from ...estimation.arrays import FloatArray
 from .baselines import relative_headings, single_direction, world_headings
 from .config import DiverConfig
+from .families import families
 from .state_space import (
     headings,
     initial_probabilities,
@@ -56,6 +61,7 @@ __all__ = ['build_models']
 def build_models(config: DiverConfig) -> ModelSet:
     """The model set that `config` names, with the depth and the bias of fixes that it asks for."""
     models = {
+        'families': _families,
         'heading_speed': _heading_speed,
         'heading_speed_lateral': _heading_speed_lateral,
         'world_headings': world_headings,
@@ -109,6 +115,17 @@ def _heading_speed(config: DiverConfig) -> ModelSet:
         np.array([config.speed_std**2]),
         initial_probabilities(config, M),
         motion,
+    )
+
+
+def _families(config: DiverConfig) -> ModelSet:
+    plain = evolve(
+        config, model_set='heading_speed', transition_matrix=(), initial_probabilities=()
+    )
+    return families(
+        config,
+        _heading_speed(plain),
+        _heading_speed(evolve(plain, speed_noise=config.brisk_speed_noise)),
     )
 
 

@@ -27,6 +27,7 @@ one step here: an `Explanation` says what each track that takes part becomes, an
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import math
 from typing import NamedTuple
 
@@ -399,21 +400,25 @@ def update_by_ping(
         good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
         good[keep] = after.good
         return after._replace(good=good)
-    n, measured, mask = x.shape[-1], ping.measured, layout.mask
+    n, mask = x.shape[-1], layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
     if ping.passive or ping.pairs > MOST_SUBSETS:
         starts = optima(ping, config)
-        x, P, evidence, weights = student_t_ping(
-            x, P, mask, config.target_z, measured, starts, DEGREES
-        )
-        squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
-        good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
+        found = []
+        for x_k, P_k, measured, least in _copies(x, P, ping, layout):
+            heavy = measured, starts, DEGREES
+            x_k, P_k, evidence, weights = student_t_ping(x_k, P_k, mask, config.target_z, *heavy)
+            squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
+            good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
+            found.append((x_k, P_k, evidence + least, good))
     else:
-        eps = config.outlier_probability
-        x, P, evidence, good = subset_ping(
-            x, P, mask, config.target_z, measured, eps, MOST_EXPLANATIONS
-        )
+        subsets = config.outlier_probability, MOST_EXPLANATIONS
+        found = [
+            subset_ping(x_k, P_k, mask, config.target_z, measured, *subsets)
+            for x_k, P_k, measured, _ in _copies(x, P, ping, layout)
+        ]
+    x, P, evidence, good = found[0] if len(found) == 1 else map(np.concatenate, zip(*found))
     with np.errstate(divide='ignore'):
         weight = np.log(mu) + evidence
     best = weight.max(initial=-np.inf)
@@ -431,6 +436,20 @@ def update_by_ping(
         float(best + np.log(share.sum())),
         repairs,
     )
+
+
+def _copies(
+    x: FloatArray, P: FloatArray, ping: Ping, layout: Layout
+) -> Iterator[tuple[FloatArray, FloatArray, PingMeasurements, float]]:
+    """x (M, n) and P (M, n, n) of each copy of the models, the measurements with the variances
+    that it takes them to have, and the logarithm of what their densities are divided by for
+    that."""
+    M = len(x) // len(layout.scales)
+    for k, factor in enumerate(layout.scales.tolist()):
+        own, measured = slice(k * M, (k + 1) * M), ping.measured
+        if factor != 1.0:
+            measured = measured._replace(variance=measured.variance * factor)
+        yield x[own], P[own], measured, -0.5 * len(measured.value) * math.log(factor)
 
 
 def begin_from_ping(

@@ -54,6 +54,25 @@ class _Pass:
             column.append(value)
 
 
+def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
+    """What each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and the
+    transitions (K, M, M) into each step; of all models together what they weigh at the end."""
+    filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)
+    if len(blocks) == 1:
+        return np.broadcast_to(filtered[-1], filtered.shape)
+    rows = [transition[:, block].mean(axis=1) for block in blocks]
+    between = np.stack(
+        [np.stack([row[:, block].sum(axis=1) for block in blocks], axis=1) for row in rows], axis=1
+    )
+    smoothed, total = filtered.copy(), filtered[-1].sum()
+    for k in range(len(mu) - 2, -1, -1):
+        predicted = filtered[k] @ between[k + 1]
+        ratio = smoothed[k + 1] / np.where(predicted > 0.0, predicted, 1.0)
+        weight = filtered[k] * (between[k + 1] @ ratio)
+        smoothed[k] = weight * (total / weight.sum()) if weight.sum() > 0.0 else smoothed[k + 1]
+    return smoothed
+
+
 class SmoothingDiverTracker(DiverTracker):
     """A `DiverTracker` that remembers everything, so that `smoothed` can look back at the end.
 
@@ -103,23 +122,33 @@ class SmoothingDiverTracker(DiverTracker):
 
     def _smooth(self, forward: _Pass) -> tuple[FloatArray, FloatArray, FloatArray]:
         """x (K, M, n), P (K, M, n, n), mu (K, M) of a pass, smoothed copy by copy: copies do not
-        switch, so that what each weighs at the end it weighs all along."""
+        switch, so that what each weighs at the end it weighs all along. Families, whose states are
+        unequal, are smoothed each by itself, and then what they weigh (`_family_weights`)."""
         x, P, mu = np.stack(forward.x), np.stack(forward.P), np.stack(forward.mu)
         M = len(self.models.names)
         moves = self._moves(forward, x.shape[-1])
+        transition = np.stack(forward.transition)
+        parts = self.models.copies * len(self.models.blocks)
         for copy in range(self.models.copies):
-            own = slice(copy * M, (copy + 1) * M)
-            total = mu[:, own].sum(axis=1, keepdims=True)
-            if not (total > 0.0).all():
-                mu[:, own] = 0.0
-                continue
-            weight = mu[:, own] / total if self.models.copies > 1 else mu
-            transition = np.stack(forward.transition)
-            result = imm_smooth(x[:, own], P[:, own], weight, transition, *moves)
-            self._smoothed_repairs += int(result.repaired.sum())
-            x[:, own], P[:, own] = result.x, result.P
-            mu[:, own] = result.mu * total[-1] if self.models.copies > 1 else result.mu
-        if self.models.copies > 1:
+            whole = slice(copy * M, (copy + 1) * M)
+            weights = _family_weights(mu[:, whole], transition, self.models.blocks)
+            for block, weight in zip(self.models.blocks, weights.T):
+                own = slice(copy * M + block.start, copy * M + block.stop)
+                total = mu[:, own].sum(axis=1, keepdims=True)
+                if not (total > 0.0).all():
+                    mu[:, own] = 0.0
+                    continue
+                inside = mu[:, own] / total if parts > 1 else mu
+                steps = transition[:, block, block]
+                if len(weights.T) > 1:
+                    steps = steps / steps.sum(axis=2, keepdims=True)
+                result = imm_smooth(
+                    x[:, own], P[:, own], inside, steps, *(part[:, block] for part in moves)
+                )
+                self._smoothed_repairs += int(result.repaired.sum())
+                x[:, own], P[:, own] = result.x, result.P
+                mu[:, own] = result.mu * weight[:, None] if parts > 1 else result.mu
+        if parts > 1:
             mu /= mu.sum(axis=1, keepdims=True)
         return x, P, mu
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 import math
 from typing import Any, NamedTuple
 
@@ -27,6 +28,8 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
+from . import family_kernels
+from .family_kernels import Mixing
 from .state_space import Instruments, ModelSet, Motion
 
 FIXES, ARRIVALS = 0, 1
@@ -47,6 +50,9 @@ covariance is not what it says. Of `MEMORY` fixes with true covariances the mean
 deviation of 0.14, so that the first is five sigmas away: motion takes up a part of errors that are
 larger than stated, and leaves a mean of about 2 however much larger they are."""
 
+TOO_SMALL = 2.0
+"""Scale of the covariances of fixes above which they are too small to be left as they are."""
+
 MOST_STEPS = 300
 """A gap is crossed in no more steps than this, however long it is."""
 
@@ -64,6 +70,7 @@ ROWS = (
     'target_id',
     'near_to',
     'near_for',
+    'refused',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -73,7 +80,8 @@ class FixConsistency(NamedTuple):
     over the last fixes of confirmed tracks.
 
     number of fixes; nis, for each coordinate; pairs of successive fixes, their cross product and
-    mean square of whitened innovations.
+    mean square of whitened innovations; of `families` the scale of the covariances that the copies
+    of the filter tell, and how many fixes in a row it was above `TOO_SMALL`.
 
     Innovations of a filter with true covariances have a mean NIS of their number of coordinates
     (2) and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as
@@ -90,11 +98,23 @@ class FixConsistency(NamedTuple):
     pairs: float = 0.0
     cross: float = 0.0
     square: float = 0.0
+    scale: float = 1.0
+    above: int = 0
 
     @property
     def sums(self) -> tuple[float, float, float, float, float]:
         """All of them, as `fix_kernels.watch` takes and gives them."""
         return self.number, self.nis, self.pairs, self.cross, self.square
+
+    def after(
+        self, sums: tuple[float, ...], scale: FloatArray, tentative: BoolArray
+    ) -> FixConsistency:
+        """With new sums, after fixes whose covariances were taken `scale` (k,) times, by tracks of
+        which some are `tentative` (k,)."""
+        firm = scale[~tentative]
+        mean = float(firm.mean()) if len(firm) else self.scale
+        above = self.above + len(firm) if mean > TOO_SMALL else 0
+        return self._replace(**dict(zip(self._fields, sums)), scale=mean, above=above)
 
     @property
     def mean_nis(self) -> float:
@@ -110,10 +130,17 @@ class FixConsistency(NamedTuple):
         """Sentences on covariances that cannot be true, once `MEMORY` fixes were seen."""
         if self.number < 0.99 * MEMORY:
             return []
+        if self.above >= MEMORY:
+            times = self.scale * max(self.mean_nis, 1.0)
+            return [
+                f'fixes miss by {math.sqrt(times):.2g} times what they state: their covariances '
+                f'are {times:.2g} times too small; multiply covariance_scale by that'
+            ]
         if self.mean_nis > OPTIMISTIC:
             return [
                 f'fixes miss by more than they state: mean NIS {self.mean_nis:.2g} for each '
-                'coordinate, 1 is due; raise covariance_scale or the noise of the motion'
+                'coordinate, 1 is due; raise covariance_scale (model_set families finds out by '
+                'how much) or the noise of the motion'
             ]
         if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
             return [
@@ -134,7 +161,9 @@ class DiverState(NamedTuple):
     innovation of the last fix, NaN for none; existence (T,): probability that there is a diver,
     NaN where hits are counted instead; evidence (T,): sum of the probabilities of its detections;
     target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
-    track it is near, 0 for none, and for how many scans (`jipda`, `names`); scale (2, 2): for
+    track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
+    position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
+    believed, NaN since it took another (`families`); scale (2, 2): for
     fixes and for arrivals the sum of squared residuals in units of their stated variance, and
     their number; fixes, arrivals: what innovations say of the stated covariances of either;
     last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
@@ -157,6 +186,7 @@ class DiverState(NamedTuple):
     target_id: IntArray
     near_to: IntArray
     near_for: IntArray
+    refused: FloatArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
@@ -186,6 +216,7 @@ class DiverState(NamedTuple):
             target_id=np.empty(0, np.int64),
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
+            refused=np.empty((0, 6)),
             scale=np.zeros((2, 2)),
         )
 
@@ -268,17 +299,18 @@ def cross(
     transition, motion = chain.transition(before.learnt, dt / count), models.motion(dt / count)
     x, P, mu = before.x, before.P, before.mu
     for _ in range(count):
-        x, P, mu = _mix(x, P, mu, transition, models.copies)
+        x, P, mu = _mix(x, P, mu, transition, models)
         x, P, repairs = _predict(x, P, motion, models.copies)
         yield Step(x, P, mu, transition, dt / count, repairs)
 
 
 def _mix(
-    x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, copies: int
+    x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, models: ModelSet
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mix the models of each copy among each other."""
+    mix, copies = partial(_mix_models, mixing=models.mixing), models.copies
     if copies == 1:
-        return imm_kernels.mix(x, P, mu, transition)
+        return mix(x, P, mu, transition)
     T, n = len(mu), x.shape[-1]
     M = mu.shape[1] // copies
     weight = mu.reshape(T * copies, M)
@@ -286,11 +318,21 @@ def _mix(
     weight = np.where(total > 0.0, weight / np.where(total > 0.0, total, 1.0), 1.0 / M)
     if len(transition) > 1:
         transition = np.repeat(transition, copies, axis=0)
-    x, P, c = imm_kernels.mix(
-        x.reshape(T * copies, M, n), P.reshape(T * copies, M, n, n), weight, transition
-    )
+    x, P, c = mix(x.reshape(T * copies, M, n), P.reshape(T * copies, M, n, n), weight, transition)
     whole = T, copies * M, n
     return x.reshape(whole), P.reshape(*whole, n), (c * total).reshape(T, copies * M)
+
+
+def _mix_models(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    mixing: Mixing | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    if mixing is None:
+        return imm_kernels.mix(x, P, mu, transition)
+    return family_kernels.mix(x, P, mu, transition, mixing)
 
 
 def _predict(

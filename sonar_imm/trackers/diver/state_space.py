@@ -51,6 +51,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.gauss_markov import gauss_markov
 from ...measurements import Arrivals
 from .config import DiverConfig
+from .family_kernels import Mixing
 
 OUTPUTS = ('px', 'py', 'vx', 'vy')
 _CACHED_STEPS = 64
@@ -82,11 +83,12 @@ class ModelSet:
     """M models over a common state of n components, x and y first.
 
     names: of the models; E: (M, q, n) outputs; chain: the law of switching; start: state
-    components after the position for a new track, mean and variance, (n - 2,) each; initial: (M,)
-    model probabilities of a new track. What `with_depth` and `with_fix_bias` add: outputs, names
-    of the q outputs; height and bias, places of z and of the bias of fixes in the state, -1 for
-    none; heights (K,): where K copies of the models begin in z, which do not switch between each
-    other.
+    components after the position for a new track, mean and variance, (n - 2,) each or (M, n - 2);
+    initial: (M,) model probabilities of a new track. What `with_depth` and `with_fix_bias` add:
+    outputs, names of the q outputs; height and bias, places of z and of the bias of fixes in the
+    state, -1 for none; heights (K,): where K copies of the models begin in z, which do not switch
+    between each other. What `families` adds: mixing, the kinds of unequal states; scales (K,): by
+    what K copies multiply the covariances of measurements.
     """
 
     names: tuple[str, ...]
@@ -100,6 +102,8 @@ class ModelSet:
     height: int = -1
     bias: int = -1
     heights: tuple[float, ...] = (0.0,)
+    mixing: Mixing | None = None
+    scales: tuple[float, ...] = (1.0,)
     _cache: OrderedDict[float, Motion] = field(factory=OrderedDict, init=False)
 
     @property
@@ -108,7 +112,16 @@ class ModelSet:
 
     @property
     def copies(self) -> int:
-        return len(self.heights)
+        return max(len(self.heights), len(self.scales))
+
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """The places of models with states of the same components that switch between each
+        other."""
+        if self.mixing is None:
+            return (slice(0, len(self.names)),)
+        ends = np.cumsum(np.bincount(self.mixing.family)).tolist()
+        return tuple(slice(first, last) for first, last in zip([0, *ends], ends))
 
     def by_model(self, mu: FloatArray) -> FloatArray:
         """Model probabilities (T, M) of mu (T, K M), whatever the copy."""
@@ -142,20 +155,26 @@ class ModelSet:
         M, n, K = len(self.names), self.n, self.copies
         shape = len(position), K * M
         x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
-        x[..., :2], x[..., 2:] = position[:, None], self.start_mean
+        x[..., :2], x[..., 2:] = position[:, None], self._for_copies(self.start_mean)
         P[..., :2, :2] = covariance[:, None]
-        P[..., range(2, n), range(2, n)] = self.start_variance
+        if from_fix and len(self.scales) > 1:
+            P[..., :2, :2] *= np.repeat(self.scales, M)[:, None, None]
+        P[..., range(2, n), range(2, n)] = self._for_copies(self.start_variance)
         if self.height >= 0:
             x[..., self.height] = np.repeat(self.heights, M)
         if self.bias >= 0 and from_fix:
             # A fix is position and bias: as much as one is larger the other is smaller.
-            shared = np.diag(self.start_variance[self.bias - 2 : self.bias])
+            shared = np.diag(np.atleast_2d(self.start_variance)[0, self.bias - 2 : self.bias])
             there = slice(self.bias, self.bias + 2)
             P[..., :2, :2] += shared
             P[..., :2, there] = P[..., there, :2] = -shared
         mu = np.empty(shape)
         mu[:] = np.tile(self.initial / K, K) if K > 1 else self.initial
         return x, P, mu
+
+    def _for_copies(self, start: FloatArray) -> FloatArray:
+        """What all models begin with, or each one of each copy."""
+        return start if start.ndim == 1 else np.tile(start, (self.copies, 1))
 
 
 def headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
@@ -213,8 +232,8 @@ def with_depth(base: ModelSet, config: DiverConfig) -> ModelSet:
     return evolve(
         base,
         E=np.tile(E, (copies, 1, 1)),
-        start_mean=np.append(base.start_mean, [heights[0], 0.0]),
-        start_variance=np.append(
+        start_mean=_appended(base.start_mean, [heights[0], 0.0]),
+        start_variance=_appended(
             base.start_variance, [max(COPY_SPREAD * width**2 / 12.0, 1e-4), rate]
         ),
         motion=motion,
@@ -236,11 +255,17 @@ def with_fix_bias(base: ModelSet, config: DiverConfig) -> ModelSet:
     return evolve(
         base,
         E=E,
-        start_mean=np.append(base.start_mean, [0.0, 0.0]),
-        start_variance=np.append(base.start_variance, [std**2, std**2]),
+        start_mean=_appended(base.start_mean, [0.0, 0.0]),
+        start_variance=_appended(base.start_variance, [std**2, std**2]),
         motion=motion,
         bias=n,
     )
+
+
+def _appended(start: FloatArray, more: list[float]) -> FloatArray:
+    """`start` (n,) or (M, n) with the same further components for all models."""
+    there = np.broadcast_to(more, (*start.shape[:-1], len(more)))
+    return np.concatenate([start, there], axis=-1)
 
 
 def _joined(base: Motion, F: FloatArray, Q: FloatArray) -> Motion:
@@ -301,7 +326,8 @@ class Instruments:
         H = np.zeros((1, len(models.E), 2, n + len(variances)))
         H[0, :, :, :n] = models.fix
         mask = np.array([True] * n + estimated)
-        return Layout(n, np.array(variances), mask, H, sound, offsets, clocks)
+        scales = np.array(models.scales)
+        return Layout(n, np.array(variances), mask, H, scales, sound, offsets, clocks)
 
 
 @frozen(eq=False)
@@ -309,14 +335,15 @@ class Layout:
     """n states of motion, then q constants with prior `variances` (q,).
 
     mask (n + q,): True for what an update may move, False for what is only considered; H
-    (1, M, 2, n + q): what a fix measures of the whole state; sound, offsets, clocks: places in the
-    whole state, -1 or absent for none.
+    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`; sound,
+    offsets, clocks: places in the whole state, -1 or absent for none.
     """
 
     n: int
     variances: FloatArray
     mask: BoolArray
     H: FloatArray
+    scales: FloatArray
     sound: int
     offsets: dict[int, int]
     clocks: dict[int, int]

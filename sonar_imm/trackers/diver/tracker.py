@@ -30,7 +30,7 @@ Source: docs/diver.md, after 'multi-directional motion fusion model for diver tr
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 from operator import itemgetter
 from typing import cast, NamedTuple
@@ -51,13 +51,13 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, fix_kernels, jipda, names, pings
+from . import births, families, fix_kernels, jipda, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .models import build_models
 from .scan import Positions, Scan
-from .state import cross, DiverState, FixConsistency, FIXES, learnt_scale, MEMORY, Step
+from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments, Layout
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
@@ -70,7 +70,7 @@ class Association(NamedTuple):
     """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
     (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
     may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
-    where these and not the pairs update the tracks."""
+    where these and not the pairs update the tracks; densities: of all pairs, of `families`."""
 
     tracks: IndexArray
     detection: IntArray
@@ -79,6 +79,7 @@ class Association(NamedTuple):
     free: BoolArray
     existence: FloatArray | None = None
     weights: jipda.JointWeights | None = None
+    densities: families.Densities | None = None
 
 
 class DiverTracker:
@@ -90,7 +91,9 @@ class DiverTracker:
     def __init__(self, config: DiverConfig):
         self.models = build_models(config)
         self._position = np.ascontiguousarray(self.models.E[:, :2])
-        self._chain = AdaptiveChain(
+        mixing = self.models.mixing
+        kind = partial(families.FamilyChain, mixing.family) if mixing else AdaptiveChain
+        self._chain = kind(
             self.models.chain,
             cast(Form, config.adaptation),
             weight=config.adaptation_prior,
@@ -232,6 +235,9 @@ class DiverTracker:
         found: list[Birth] = []
         for fixes in scan.fixes:
             association = self._associate(now, fixes)
+            now, again = self._reacquire(now, fixes, association)
+            if again:
+                association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
@@ -266,7 +272,7 @@ class DiverTracker:
             stamp_ns=stamp_ns,
             x=x,
             P=P,
-            mu=last.mu,
+            mu=families.shared(last.mu, len(self.models.scales)),
             nis=np.zeros(count),
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
@@ -278,24 +284,35 @@ class DiverTracker:
     def _associate(self, now: DiverState, fixes: Positions) -> Association:
         """Which fixes are of which tracks; of several tracks the confirmed ones choose first. A
         fix that says whose it is goes to the track of that name."""
-        config, H = fixes.config, self._layout(now.instruments).H
+        config, layout = fixes.config, self._layout(now.instruments)
+        H, densities = layout.H, None
         expected = fix_kernels.expected(now.x, H)
+        if self.models.mixing is not None:
+            densities = families.densities(now, expected, layout, fixes.z, fixes.R)
         if fixes.target_id is not None:
             tracks, row = np.nonzero(now.target_id[:, None] == fixes.target_id[None])
             free = ~np.isin(np.arange(len(fixes.z)), row)
-            return Association(tracks, row, expected, now.score, free)
+            if densities is not None:
+                believed = densities.whole[tracks, row] > families.bound(config)
+                tracks, row = tracks[believed], row[believed]
+            return Association(tracks, row, expected, now.score, free, densities=densities)
         excluded = now.target_id != NOBODY
         if config.named_tracks == 'share':
             excluded = np.zeros(len(excluded), bool)
         if config.association == 'jipda':
-            weights = jipda.joint_weights(now, fixes, expected, H, excluded)
+            weights = jipda.joint_weights(now, fixes, expected, H, excluded, densities)
             claimed = weights.beta.sum(axis=0)
             existence = jipda.birth_existence(config, claimed)
             tracks, likeliest = weights.likeliest()
             free = claimed < 0.5
-            return Association(tracks, likeliest, expected, now.score, free, existence, weights)
-        threshold = gate_threshold(config.gate_probability, 2)
-        fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+            return Association(
+                tracks, likeliest, expected, now.score, free, existence, weights, densities
+            )
+        if densities is None:
+            threshold = gate_threshold(config.gate_probability, 2)
+            fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+        else:
+            fit = densities.whole.copy()
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
@@ -304,7 +321,21 @@ class DiverTracker:
         tracks = np.flatnonzero(chosen >= 0)
         free = np.ones(len(fixes.z), bool)
         free[chosen[tracks]] = False
-        return Association(tracks, chosen[tracks], expected, score, free)
+        return Association(tracks, chosen[tracks], expected, score, free, densities=densities)
+
+    def _reacquire(
+        self, now: DiverState, fixes: Positions, association: Association
+    ) -> tuple[DiverState, bool]:
+        """The tracks, those that were lost where two fixes say that they are, and whether there
+        was one."""
+        if association.densities is None or association.weights is not None or not len(now.x):
+            return now, False
+        hit, left = np.zeros(len(now.x), bool), np.ones(len(fixes.z), bool)
+        hit[association.tracks] = True
+        firm = now.life.status[association.tracks] != TENTATIVE
+        left[association.detection[firm]] = False
+        layout, whole = self._layout(now.instruments), association.densities.whole
+        return families.reacquired(now, fixes, hit, left, whole, self.models, self._chain, layout)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
         """The tracks after the fixes that are theirs."""
@@ -313,17 +344,27 @@ class DiverTracker:
         white, consistency = now.white, now.fixes
         if len(tracks):
             mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
-            innovations = mean, covariance, fixes.z, fixes.R, tracks, detection
+            z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
+            scale = np.ones(len(tracks))
+            if self.models.mixing is not None:
+                scale = families.scale(now.mu[tracks], self.models)
+                z, R, row = z[row], R[row] * scale[:, None, None], np.arange(len(tracks))
+            innovations = mean, covariance, z, R, tracks, row
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
-            consistency = FixConsistency(*sums)
+            consistency = now.fixes.after(sums, scale, tentative[tracks])
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask
-            return jipda.update_jointly(now, fixes, weights, tracks, h, layout.H, considered)
+            return jipda.update_jointly(
+                now, fixes, weights, tracks, h, layout, considered, association.densities
+            )
         if not len(tracks):
             return now
-        if layout.mask.all():
+        if association.densities is not None:
+            of_copies = association.densities.copies
+            after = families.update(now, fixes, tracks, detection, h, layout, of_copies)
+        elif layout.mask.all():
             predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
             after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
         else:
@@ -373,8 +414,14 @@ class DiverTracker:
         if not alive.all():
             now = now._replace(broken=now.broken + int((~alive).sum()))
         hit, looked = now.nis_dof > 0, scan.complete & (now.target_id == NOBODY)
+        # Nobody coasts while there are fixes that may be his own.
+        looked = looked | (now.refused[:, 0] == now.stamp_ns)
         by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked & ~by_existence)
+        if self.models.mixing is not None and any(group.whole for group in scan.fixes):
+            doubtful, over = families.doubtful(now, config)
+            status = np.where(doubtful[kept], TENTATIVE, life.status).astype(np.uint8)
+            life, alive = evolve(life, status=status), alive & ~over
         if by_existence.any():
             judged = jipda.judge(now, hit, looked, self._position)
             status = np.where(by_existence[kept], judged.status[kept], life.status)
@@ -433,6 +480,7 @@ class DiverTracker:
                 'target_id': np.array([birth.target_id for birth in found]),
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
+                'refused': np.full((count, 6), np.nan),
             },
         )
 
@@ -451,6 +499,7 @@ class DiverTracker:
             'nis_dof': state.nis_dof,
             'existence': state.existence,
             'target_id': state.target_id.astype(np.int32),
+            **families.columns(state.mu, self.models),
         }
         if self.origin is not None:
             place = self.origin.geodetic(xyz)

@@ -33,7 +33,7 @@ def test_every_set_is_consistent(model_set):
     models = build_models(config)
     M, n = len(models.names), models.n
     assert M == config.model_count() and len(set(models.names)) == M
-    assert models.E.shape == (M, 4, n) and models.initial.shape == (M,)
+    assert models.E.shape == (models.copies * M, 4, n) and models.initial.shape == (M,)
     np.testing.assert_allclose(models.initial.sum(), 1.0)
     for dt in (0.0, 1e-3, 0.3, 1.0, 29.0, 600.0):
         F, Q, B = models.motion(dt)
@@ -44,12 +44,14 @@ def test_every_set_is_consistent(model_set):
     x, P, mu = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     mean, covariance = imm.combine(x[None], P[None], mu[None], models.E)
     np.testing.assert_allclose(mean[0, :2], CENTRE)
-    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD)
+    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD * np.mean(models.scales))
 
 
 @pytest.mark.parametrize('model_set', COMPOSE)
 def test_ten_short_steps_are_one_long_step(model_set):
-    models = build_models(DiverConfig(model_set=model_set, speed_noise=0.2))
+    models = build_models(
+        DiverConfig(model_set=model_set, speed_noise=0.2, covariance_scales=(1.0,))
+    )
     x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     short_x, short_P = x[None], P[None]

@@ -1,0 +1,450 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The diver tracker over 33 paths against every single family of motion, told the truth.
+
+    SONAR_IMM_DATA=../shared/data python -m benchmarks.diver_families \
+        --out docs/results/diver_families.json
+
+*paths*: boats, scooters, swimmers in legs, circles and zigzags, divers who stand, loiter or drift;
+three paths were recorded (an AUV's dead reckoning, two boats), their fixes are simulated. Some
+fixes state a sixth of their variance. The best in hindsight is the least RMSE of the raw fixes,
+two heading sets and five constant velocities, each alone, told the true covariance and without a
+gate. `ratio` is the RMSE of `model_set: families`, told what the fixes state, over that. NEES is
+of the position, 2 is due; fixes before the tenth do not count.
+
+*tag*: the fixes of a towed tag as they are, against GPS 3.4 s later (`real_recordings`).
+
+*usbl*: a swimmer heard every 2 s to .9 m, of whose fixes one in twenty misses by 40 m on each
+axis, with and without a name in them. `coverage` is the share inside the 95 % ellipse.
+
+*wild*: fixes every second, of which 3 % are wild by 20 to 60 m. *stated*: fixes stated at .3 m
+that are 1.5 m, before and after the advice of the warning is followed. *cost*: a step of a single
+diver, processor time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+import re
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.real_recordings import DATA, load, TAG, tag_scores
+from benchmarks.study import final_estimates, Parts, rms, study
+from sonar_imm.measurements import Fix, NOBODY
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SINGLES: dict[str, dict[str, Any]] = {
+    'heading .005': {'model_set': 'heading_speed'},
+    'heading .07': {'model_set': 'heading_speed', 'speed_noise': 0.07},
+    **{
+        f'CV {noise:g}': {'model_set': 'cv', 'acceleration_noise': (noise,)}
+        for noise in (0.03, 0.1, 0.25, 0.6, 1.5)
+    },
+}
+ALONE: dict[str, Any] = {
+    'max_tracks': 1,
+    'confirm_hits': 1,
+    'delete_misses': 10000,
+    'max_coast': 600.0,
+}
+FIRST = 10
+"""Fixes at the beginning that are not scored."""
+
+INSIDE = -2.0 * np.log(0.05)
+"""Squared distance within which 95 % of two normal coordinates lie."""
+
+
+class Path(NamedTuple):
+    """Fixes z (k, 2) at t (k,) of a diver at truth (k, 2), with covariances R (k, 2, 2), stated
+    too small by a factor."""
+
+    t: np.ndarray
+    truth: np.ndarray
+    z: np.ndarray
+    R: np.ndarray
+    too_small: float = 1.0
+
+
+def integrated(speed: np.ndarray, heading: np.ndarray, step: float = 0.1) -> np.ndarray:
+    """Positions (k, 2) of a diver with a speed (k,) and heading (k,) at each step."""
+    velocity = np.column_stack([speed * np.cos(heading), speed * np.sin(heading)])
+    return np.cumsum(velocity * step, axis=0)
+
+
+def legs(
+    rng: np.random.Generator, seconds: float, speed: float, dwell: float, turn: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed and heading each .1 s: legs of about `dwell` seconds, turns of about `turn` degrees
+    at 30 degrees a second."""
+    k = int(seconds * 10)
+    due = np.empty(k)
+    heading, left = rng.uniform(-np.pi, np.pi), 0
+    for row in range(k):
+        if left <= 0:
+            heading += np.deg2rad(turn) * rng.normal()
+            left = int(10 * rng.exponential(dwell)) + 10
+        due[row], left = heading, left - 1
+    made = due.copy()
+    for row in range(1, k):
+        made[row] = made[row - 1] + np.clip(due[row] - made[row - 1], -0.0524, 0.0524)
+    return np.full(k, speed), made
+
+
+def smooth_turns(
+    rng: np.random.Generator, seconds: float, rate: float, dwell: float
+) -> np.ndarray:
+    """Heading (k,) each .1 s of a vessel whose rate of turn, of `rate` degrees a second, is drawn
+    anew now and then."""
+    k = int(seconds * 10)
+    rates, left, now = np.empty(k), 0, 0.0
+    for row in range(k):
+        if left <= 0:
+            now = np.deg2rad(rate) * rng.choice([-1.0, 0.0, 1.0])
+            left = int(10 * rng.exponential(dwell)) + 20
+        rates[row], left = now, left - 1
+    return rng.uniform(-np.pi, np.pi) + np.cumsum(rates) * 0.1
+
+
+def course(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Positions (k, 2) each .1 s."""
+    seconds = 300.0
+    k = int(10 * seconds)
+    t = 0.1 * np.arange(k)
+    if kind == 'boat':
+        return integrated(np.full(k, 3.0), smooth_turns(rng, seconds, 8.0, 15.0))
+    if kind == 'scooter':
+        return integrated(np.full(k, 2.0), smooth_turns(rng, seconds, 10.0, 10.0))
+    if kind == 'changes':
+        speed, heading = legs(rng, seconds, 0.6, 20.0, 70.0)
+        heading[:1000] = smooth_turns(rng, 100.0, 10.0, 10.0)
+        speed[:1000], speed[1000:1600] = 2.0, 0.0
+        return integrated(speed, heading)
+    if kind == 'circle':
+        return integrated(np.full(k, 0.6), 0.6 / 15.0 * t)
+    if kind == 'wander':
+        return integrated(np.full(k, 0.7), np.cumsum(0.05 * rng.normal(size=k)))
+    if kind == 'zigzag':
+        aside = np.where(t // 15.0 % 2 == 0.0, 0.6, -0.6)
+        return integrated(np.full(k, 0.8), rng.uniform(-3.0, 3.0) + aside)
+    if kind == 'pace':
+        slow = np.exp(-0.1 / 60.0)
+        speed = np.empty(k)
+        speed[0] = 0.7
+        for row in range(1, k):
+            push = 0.25 * np.sqrt(1.0 - slow**2) * rng.normal()
+            speed[row] = 0.7 + slow * (speed[row - 1] - 0.7) + push
+        return integrated(np.abs(speed), legs(rng, seconds, 1.0, 20.0, 60.0)[1])
+    if kind == 'straight':
+        return integrated(np.full(k, 0.75), np.full(k, rng.uniform(-np.pi, np.pi)))
+    speeds = {'still': 0.0, 'loiter': 0.15, 'drift': 0.08, 'legs': 0.75}
+    return integrated(*legs(rng, seconds, speeds[kind], 20.0, 5.0 if kind == 'drift' else 70.0))
+
+
+KINDS: dict[str, tuple[str, float, float, float]] = {
+    'boat turning, .3 m, 2 s': ('boat', 0.3, 2.0, 1.0),
+    'scooter 2 m/s, .2 m': ('scooter', 0.2, 1.0, 1.0),
+    'scooter 2 m/s, .2 m, R / 6': ('scooter', 0.2, 1.0, 6.0),
+    'scooter, still, legs, .3 m': ('changes', 0.3, 1.0, 1.0),
+    'legs, 1 m': ('legs', 1.0, 1.0, 1.0),
+    'legs, 1 m, R / 6': ('legs', 1.0, 1.0, 6.0),
+    'still, 1 m': ('still', 1.0, 1.0, 1.0),
+    'still, 1 m, R / 6': ('still', 1.0, 1.0, 6.0),
+    'loiter .15 m/s, 1.5 m': ('loiter', 1.5, 1.0, 1.0),
+    'straight, polar': ('straight', 0.0, 1.0, 1.0),
+    'gaps 10 s, 1 m': ('legs', 1.0, 10.0, 1.0),
+    'circle, .5 m': ('circle', 0.5, 1.0, 1.0),
+    'wandering heading, .5 m': ('wander', 0.5, 1.0, 1.0),
+    'zigzag, .5 m': ('zigzag', 0.5, 1.0, 1.0),
+    'pace kept a minute, .5 m': ('pace', 0.5, 1.0, 1.0),
+}
+"""Course, standard deviation of a fix on each axis (0: polar), seconds between fixes, by how many
+times the stated variance is too small."""
+
+
+def made(kind: str, seed: int) -> Path:
+    """One path of a kind."""
+    name, std, every, too_small = KINDS[kind]
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    rows = np.arange(0, 3000 if std else 1000, round(10 * every))
+    truth = course(name, rng)[rows]
+    if std:
+        R = np.tile(np.eye(2) * std**2, (len(rows), 1, 1))
+    else:
+        truth = truth + [-40.0, 40.0]
+        angle, distance = np.arctan2(truth[:, 1], truth[:, 0]), np.hypot(*truth.T)
+        along = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        wide = (np.deg2rad(2.0) * distance)[:, None, None] ** 2
+        R = 0.01 * along[:, :, None] * along[:, None] + wide * across[:, :, None] * across[:, None]
+    noise = np.einsum('kab,kb->ka', np.linalg.cholesky(R), rng.normal(size=truth.shape))
+    return Path(0.1 * rows, truth, truth + noise, R, too_small)
+
+
+def recorded(seed: int = 0) -> dict[str, Path]:
+    """Paths that were sailed, with simulated fixes: an AUV's dead reckoning and two boats."""
+    found: dict[str, Path] = {}
+    if not DATA.is_dir():
+        return found
+    rng = np.random.default_rng([seed, 99])
+    dvl = np.genfromtxt(DATA / 'stpere_nav/dvl.csv', delimiter=',', names=True)
+    turned = np.genfromtxt(DATA / 'stpere_nav/attitude.csv', delimiter=',', names=True)
+    courses = {'AUV, recorded, .3 m': (*_reckoned(dvl, turned), 0.3)}
+    truth = json.loads((DATA / 'autoferry/scenario13_groundTruth.json').read_text())
+    for number, (t, place) in enumerate(_boats(truth), start=1):
+        courses[f'boat {number}, recorded, 1 m'] = t, place, 1.0
+    for name, (t, place, std) in courses.items():
+        grid = np.arange(t[0], min(t[-1], t[0] + 400.0), 1.0)
+        there = np.column_stack([np.interp(grid, t, column) for column in place.T])
+        R = np.tile(np.eye(2) * std**2, (len(grid), 1, 1))
+        z = there + std * rng.normal(size=there.shape)
+        found[name] = Path(grid - grid[0], there, z, R)
+    return found
+
+
+def _reckoned(dvl: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time and dead-reckoned place of the AUV, from its own velocity and yaw."""
+    good = dvl['bottom_velocity_valid'] == 1
+    t = dvl['stamp_s'][good]
+    yaw = np.interp(t, turned['stamp_s'], np.unwrap(np.deg2rad(turned['yaw_deg'])))
+    forward, right = (0.01 * dvl[f'bottom_velocity_{axis}_cm_s'][good] for axis in 'xy')
+    # North east from a yaw clockwise of north; the velocity is smoothed over some 5 s.
+    smooth = np.ones(7) / 7.0
+    north = np.convolve(forward * np.cos(yaw) - right * np.sin(yaw), smooth, 'same')
+    east = np.convolve(forward * np.sin(yaw) + right * np.cos(yaw), smooth, 'same')
+    step = np.diff(t, prepend=t[0])
+    return t, np.column_stack([np.cumsum(east * step), np.cumsum(north * step)])
+
+
+def _boats(rows: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Time and place (east, north) of each boat of the Autoferry recording."""
+    rows = [row for scan in rows for row in scan]
+    boats = []
+    for number in sorted({row['targetID'] for row in rows}):
+        own = sorted(
+            (row['time'], *row['position'][:2]) for row in rows if row['targetID'] == number
+        )
+        table = np.array(own)
+        boats.append((table[:, 0], np.ascontiguousarray(table[:, [2, 1]])))
+    return boats
+
+
+def paths(seeds: int) -> dict[str, Path]:
+    """All paths by name."""
+    found = {f'{kind}, {seed + 1}': made(kind, seed) for kind in KINDS for seed in range(seeds)}
+    return {**found, **recorded()}
+
+
+def fixes_of(path: Path, factor: float, name: int | None = None) -> list[Fix]:
+    """The fixes with their covariances times `factor`, with a name if one is given."""
+    target = NOBODY if name is None else name
+    return [
+        Fix(
+            stamp_ns=round((100.0 + t) * 1e9),
+            position=np.array([*z, 0.0]),
+            covariance=R * factor,
+            frame_id='map',
+            target_id=target,
+        )
+        for t, z, R in zip(path.t, path.z, path.R)
+    ]
+
+
+def followed(
+    path: Path, config: DiverConfig, factor: float = 1.0, name: int | None = None
+) -> tuple[np.ndarray, np.ndarray, DiverTracker]:
+    """Errors (k, 2) of the first track after each fix, NaN without one, their NEES (k,), and the
+    tracker."""
+    tracker = DiverTracker(config)
+    final = final_estimates(tracker, fixes_of(path, factor, name))
+    error, squared = np.full((len(path.t), 2), np.nan), np.full(len(path.t), np.nan)
+    for row, stamp in enumerate(sorted(final)):
+        each = final[stamp]
+        firm = np.flatnonzero(each.extras['track_state'] > 0)
+        if len(firm):
+            error[row] = each.state[firm[0], :2] - path.truth[row]
+            P = each.covariance[firm[0], :2, :2]
+            squared[row] = error[row] @ np.linalg.solve(P, error[row])
+    return error, squared, tracker
+
+
+def scores(path: Path) -> dict[str, Any]:
+    """RMSE of all programs on a path."""
+    rmse = {'raw': rms(np.hypot(*(path.z - path.truth)[FIRST:].T))}
+    for name, values in SINGLES.items():
+        config = DiverConfig(**ALONE, gate_probability=0.9999999, **values)
+        rmse[name] = rms(np.hypot(*followed(path, config)[0][FIRST:].T))
+    best = min(rmse, key=lambda name: rmse[name])
+    error, squared, tracker = followed(
+        path, DiverConfig(model_set='families', max_tracks=1), 1.0 / path.too_small
+    )
+    ours = rms(np.hypot(*error[FIRST:].T))
+    return {
+        'raw': rmse['raw'],
+        'cv_25': rmse['CV 0.25'],
+        'heading_speed': rmse['heading .005'],
+        'best': rmse[best],
+        'best_is': best,
+        'families': ours,
+        'ratio': ours / rmse[best],
+        'nees': float(np.mean(squared[FIRST:])),
+        'tracks': int(tracker._stream.state.life.next_id - 1),
+    }
+
+
+def tag() -> dict[str, dict[str, float]]:
+    """The towed tag: its fixes, with what a user knows and with nothing."""
+    from pathlib import Path as FilePath
+    import tempfile
+
+    from sonar_imm_tools.recordings.convert import convert_fixes
+
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        bag = FilePath(folder) / 'fixes'
+        source = DATA / 'yaps_ssu1'
+        convert_fixes(source / 'fixes.csv', bag, truth=source / 'gps_truth.csv')
+        items, truth = load(bag)
+    known = DiverConfig(model_set='families', **TAG)
+    for name, config in {
+        'told nothing': DiverConfig(model_set='families'),
+        'what a user knows': known,
+        'heading_speed, told nothing': DiverConfig(model_set='heading_speed'),
+    }.items():
+        tracker = DiverTracker(config)
+        final = final_estimates(tracker, items)
+        plain, lagged, median, nees, compared = tag_scores(
+            [final[k] for k in sorted(final)], truth
+        )
+        found[name] = {
+            'rmse_m': plain,
+            'rmse_lag_m': lagged,
+            'median_m': median,
+            'nees': nees,
+            'compared': float(compared),
+            'tracks': float(tracker._stream.state.life.next_id - 1),
+        }
+    return found
+
+
+def swimmer(rng: np.random.Generator, every: float, std: float) -> Path:
+    """A swimmer in legs at .7 m/s for ten minutes."""
+    truth = integrated(*legs(rng, 600.0, 0.7, 25.0, 60.0))[:: round(10 * every)]
+    R = np.tile(np.eye(2) * std**2, (len(truth), 1, 1))
+    return Path(
+        every * np.arange(len(truth)), truth, truth + std * rng.normal(size=truth.shape), R
+    )
+
+
+def usbl(seed: int) -> Path:
+    """A transponder heard every 2 s, one fix in twenty wild."""
+    rng = np.random.default_rng([seed, 5])
+    path = swimmer(rng, 2.0, 0.9)
+    wild = rng.uniform(size=len(path.t)) < 0.05
+    path.z[wild] += 40.0 * rng.normal(size=(int(wild.sum()), 2))
+    return path
+
+
+def wild(seed: int) -> Path:
+    """Fixes every second, 3 % wild by 20 to 60 m."""
+    rng = np.random.default_rng([seed, 6])
+    path = swimmer(rng, 1.0, 1.0)
+    rows = np.flatnonzero(rng.uniform(size=len(path.t)) < 0.03)
+    angle, far = rng.uniform(-np.pi, np.pi, len(rows)), rng.uniform(20.0, 60.0, len(rows))
+    path.z[rows] += np.column_stack([far * np.cos(angle), far * np.sin(angle)])
+    return path
+
+
+def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: Any) -> dict:
+    """RMSE, coverage and NEES of a tracker that is told nothing but `values`."""
+    error, squared, tracker = followed(path, DiverConfig(**values), factor, name)
+    error, squared = error[FIRST:], squared[FIRST:]
+    there = np.isfinite(squared)
+    said = ' '.join(tracker.warnings())
+    return {
+        'rmse_m': rms(np.hypot(*error[there].T)),
+        'coverage': float(np.mean(squared[there] <= INSIDE)),
+        'nees': float(np.mean(squared[there])),
+        'followed': float(np.mean(there)),
+        'tracks': float(tracker._stream.state.life.next_id - 1),
+        'warns': float('times what they state' in said),
+        'advice': float((re.findall(r'are ([\d.e+]+) times too small', said) or ['nan'])[0]),
+    }
+
+
+def mean_over(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means of all numbers; the advice of those runs that gave one."""
+    out = {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
+    told = [run['advice'] for run in runs if np.isfinite(run['advice'])]
+    return {**out, 'advice': float(np.mean(told)) if told else None}
+
+
+def cost() -> dict[str, float]:
+    """Processor time of a step in microseconds, the least of three runs."""
+    items = fixes_of(swimmer(np.random.default_rng(0), 1.0, 1.0), 1.0)
+    found: dict[str, float] = {}
+    for model_set in ('heading_speed', 'families'):
+        times = []
+        for _ in range(3):
+            tracker = DiverTracker(DiverConfig(model_set=model_set, max_tracks=1))
+            tracker.warm()
+            start = process_time()
+            for item in items:
+                tracker.process(item)
+            times.append((process_time() - start) / len(items) * 1e6)
+        found[f'{model_set}_us'] = min(times)
+    return {**found, 'ratio': found['families_us'] / found['heading_speed_us']}
+
+
+def main(seeds: int = 2, runs: int = 20) -> Parts:
+    yield {'seeds': seeds, 'runs': runs}
+    rows = []
+    for name, path in paths(seeds).items():
+        rows.append(scores(path))
+        yield {'paths': {name: rows[-1]}}
+    ratios = [row['ratio'] for row in rows]
+    due = [row['nees'] for row in rows]
+    yield {
+        'summary': {
+            'paths': len(rows),
+            'mean_ratio': float(np.mean(ratios)),
+            'worst_ratio': float(np.max(ratios)),
+            'least_nees': float(np.min(due)),
+            'most_nees': float(np.max(due)),
+        }
+    }
+    if DATA.is_dir():
+        yield {'tag': tag()}
+    for number, label in ((None, 'without a name'), (7, 'with a name')):
+        for model_set in ('families', 'heading_speed'):
+            found = [robust(usbl(seed), name=number, model_set=model_set) for seed in range(runs)]
+            yield {'usbl': {f'{model_set}, {label}': mean_over(found)}}
+    found = [robust(wild(seed), model_set='families') for seed in range(runs)]
+    yield {'wild': {'families': mean_over(found)}}
+    told, advised = [], []
+    for seed in range(runs):
+        path = swimmer(np.random.default_rng([seed, 7]), 1.0, 1.5)
+        told.append(robust(path, 0.04, model_set='families'))
+        scale = told[-1]['advice'] if np.isfinite(told[-1]['advice']) else 1.0
+        advised.append(robust(path, 0.04, model_set='families', covariance_scale=scale))
+    yield {'cost': cost()}
+    yield {'stated': {'as stated': mean_over(told), 'advice followed': mean_over(advised)}}
+
+
+if __name__ == '__main__':
+    study(main)

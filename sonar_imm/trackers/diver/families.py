@@ -1,0 +1,446 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One filter for divers that swim steadily, briskly, turn about or drift, whatever their fixes
+state: `model_set: families`.
+
+Four families of models run in one interacting multiple model filter: `steady` and `brisk` (each
+the `heading_speed` set, with a speed that is kept or changes within a minute), `lively` (two
+constant-velocity models) and `quiet` (one). Inside a family the chain is as ever and learns. From
+one family to another it goes rarely (`family_switch_rate`), or the families never separate; a
+family that has become improbable is overwritten by the images of the others
+(`family_kernels.mix`), and so is there when the diver changes.
+
+The whole filter runs in copies that take the covariances of measurements so many times
+(`covariance_scales`). They do not mix: what they say of the measurements weighs them.
+
+Which fix may be a track's is not asked of a chi-square, but of the predictive density of the whole
+mixture: it has to be more probable that the diver was seen there than that he was missed and the
+fix is false. A name settles whose a fix is, never whether it is good. Two refused fixes in a row
+that agree with each other begin the track anew, under its own identity (`reacquired`).
+
+Source: docs/diver.md, 'Families'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+from typing import NamedTuple
+
+from attrs import evolve
+import numpy as np
+
+from ...estimation import imm_kernels, jipda, markov
+from ...estimation.adaptation import AdaptiveChain, Chain, Form
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.association import TENTATIVE
+from ...estimation.consider import consider_models
+from ...estimation.small_matrices import add_jitter_all
+from ...measurements import NOBODY
+from . import family_kernels
+from .baselines import white_acceleration
+from .config import DiverConfig
+from .family_kernels import HEADING, HOVER, Mixing, VELOCITY
+from .fix_kernels import expected
+from .scan import Positions
+from .state import cross, DiverState
+from .state_space import headings, initial_probabilities, Layout, ModelSet, Motion, rate_chain
+
+FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
+
+LIVELY, QUIET = (0.05, 0.6), (0.03,)
+"""Acceleration noise of the constant velocities, m/s^2 over a reference step."""
+
+SHARE = 5e-4
+"""Share of the weight of the copies that is spread evenly over them with each scan, so that a
+sensor which becomes worse is noticed."""
+
+LEAST_WEIGHT = 1e-150
+"""Weight that a copy keeps."""
+
+LOST = 0.02
+"""A track whose misses in a row were less probable than this may be lost."""
+
+MISTAKEN = 0.02
+"""A false fix is expected beside another this often, at most, where two refused fixes that agree
+begin a track anew."""
+
+CONFIRMS, ENDS = 0.9, 0.002
+"""Probability that a track is a diver above which hits confirm it, and below which it ends."""
+
+REACH = 13.8
+"""Mahalanobis distance squared within which a fix is beside another."""
+
+
+# -- the models ----------------------------------------------------------------------------------
+
+
+def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet:
+    """The four families, of which two are `heading_speed` sets with two noises of the speed."""
+    noises = (*LIVELY, *QUIET)
+    count, moving = len(steady.names), len(noises)
+    family = np.repeat(np.arange(4), [count, count, len(LIVELY), len(QUIET)])
+    M, T = len(family), config.reference_step
+    units, _, _ = headings(config)
+    place = np.arange(count)
+    own = np.where(place < config.directions, HEADING, HOVER)
+    kind = np.concatenate([own, own, np.full(moving, VELOCITY)])
+    direction = np.where(place < config.directions, place, 0)
+    direction = np.concatenate([direction, direction, np.zeros(moving, np.int64)])
+    sector = (2.0 * np.pi / config.directions) ** 2 / 12.0
+    speed = config.speed_mean, config.speed_std**2
+    E = np.zeros((M, 4, 4))
+    E[: 2 * count, :, :3] = np.concatenate([steady.E, brisk.E])
+    E[2 * count :] = np.eye(4)
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.zeros((M, 4, 4)), np.zeros((M, 4, 4))
+        F[:] = np.eye(4)
+        for first, models in ((0, steady), (count, brisk)):
+            rows = slice(first, first + count)
+            F[rows, :3, :3], Q[rows, :3, :3], _ = models.motion(dt)
+        F[2 * count :, :2, 2:] = dt * np.eye(2)
+        for row, noise in enumerate(noises, start=2 * count):
+            Q[row] = white_acceleration(noise**2 * T, 0.0, dt)
+        return Motion(F, Q, np.zeros((M, 4)))
+
+    start_mean, start_variance = np.zeros((M, 2)), np.full((M, 2), config.velocity_std**2)
+    start_mean[: 2 * count, 0] = speed[0]
+    start_variance[: 2 * count] = speed[1], 1.0
+    if config.transition_matrix:
+        chain = rate_chain(config, np.eye(M))
+    else:
+        both, plain = (steady, brisk), evolve(config, transition_matrix=())
+        rates = markov.persistent(len(LIVELY), config.baseline_stay_probability)
+        generators = [rate_chain(plain, models.chain.matrix).generator for models in both]
+        generators += [markov.RateChain(rates, T).generator, np.zeros((len(QUIET), len(QUIET)))]
+        generator = _between(family, generators, config.family_switch_rate)
+        chain = markov.RateChain.of_generator(generator, T)
+    if config.initial_probabilities:
+        initial = initial_probabilities(config, M)
+    else:
+        initial = 0.25 / np.bincount(family)[family]
+    # Copies of the models begin at heights where depth is a state; one thing at a time.
+    scales = (1.0,) if config.dimensions == 3 else config.covariance_scales
+    names = [f'{name}_{each}' for name in FAMILIES[:2] for each in steady.names]
+    return ModelSet(
+        (*names, 'lively_calm', 'lively_sharp', 'quiet'),
+        np.tile(E, (len(scales), 1, 1)),
+        chain,
+        start_mean,
+        start_variance,
+        initial,
+        motion,
+        mixing=Mixing(family, kind, direction, units, *speed, sector),
+        scales=scales,
+    )
+
+
+def _between(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
+    """The generator (M, M) of chains that go from each family to each other one at `rate` / 3,
+    evenly to its models; between the first two the place in the family is kept."""
+    size = np.bincount(family)
+    out = np.asarray(rate / 3.0 / size[family][None] * (family[:, None] != family[None]))
+    count = int(size[0])
+    for a, b in ((0, 1), (1, 0)):
+        kept = slice(a * count, (a + 1) * count), slice(b * count, (b + 1) * count)
+        out[kept] = rate / 3.0 * np.eye(count)
+    first = 0
+    for block in blocks:
+        own = slice(first, first + len(block))
+        out[own, own] = block
+        first += len(block)
+    np.fill_diagonal(out, 0.0)
+    np.fill_diagonal(out, -out.sum(axis=1))
+    return out
+
+
+class FamilyChain(AdaptiveChain):
+    """An `AdaptiveChain` that learns inside each family, never between them."""
+
+    def __init__(self, family: IntArray, chain: Chain, form: Form, **settings: float):
+        super().__init__(chain, form, **settings)
+        self.family = family
+
+    def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
+        found = super().transition(learnt, dt)
+        if self.form == 'fixed':
+            return found
+        return family_kernels.inside_families(found, self.chain.transition(dt), self.family)
+
+
+# -- copies --------------------------------------------------------------------------------------
+
+
+def shared(mu: FloatArray, copies: int) -> FloatArray:
+    """mu (T, K M) after a little of the weight of the copies is spread over them."""
+    if copies == 1 or not len(mu):
+        return mu
+    each, weight = _each_copy(mu, copies)
+    weight = (1.0 - SHARE) * weight + SHARE / copies
+    return np.asarray((each * weight[..., None]).reshape(mu.shape))
+
+
+def _each_copy(mu: FloatArray, copies: int) -> tuple[FloatArray, FloatArray]:
+    """The probabilities (T, K, M) of the models in each copy, and the weights (T, K) of those."""
+    mu = mu.reshape(len(mu), copies, mu.shape[1] // copies)
+    weight = mu.sum(axis=2)
+    return mu / weight[..., None], weight
+
+
+def scale(mu: FloatArray, models: ModelSet) -> FloatArray:
+    """How many times what they state the covariances of measurements are, (T,), as the copies
+    tell."""
+    return np.asarray(_each_copy(mu, len(models.scales))[1] @ models.scales)
+
+
+class Densities(NamedTuple):
+    """Logarithms of what D fixes are to T tracks: copies (T, K, D) in each copy, whole (T, D) in
+    the mixture."""
+
+    copies: FloatArray
+    whole: FloatArray
+
+
+def densities(
+    now: DiverState, h: FloatArray, layout: Layout, z: FloatArray, R: FloatArray
+) -> Densities:
+    """The densities of fixes z (D, 2), R (D, 2, 2); h (T, K M, 2) expected."""
+    copies = family_kernels.log_densities(h, layout.H, now.P, now.mu, z, R, layout.scales)
+    _, weight = _each_copy(now.mu, len(layout.scales))
+    whole = np.logaddexp.reduce(copies + np.log(weight)[..., None], axis=1)
+    return Densities(copies, whole)
+
+
+def bound(config: DiverConfig) -> float:
+    """The logarithm of the density from which it is more probable that a diver was seen than that
+    he was missed and the fix is false."""
+    p = config.detection_probability
+    return math.log(config.clutter_density) + math.log1p(-p) - math.log(p)
+
+
+def update(
+    now: DiverState,
+    fixes: Positions,
+    tracks: IndexArray,
+    detection: IntArray,
+    h: FloatArray,
+    layout: Layout,
+    of_copies: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
+    """As `fix_kernels.update`, copy by copy; of_copies (T, K, D) as in `Densities`. The nis is
+    that of the whole mixture, and stands in `now.white`."""
+    K, t = len(layout.scales), len(tracks)
+    M, n = now.x.shape[1] // K, now.x.shape[2]
+    each, weight = _each_copy(now.mu[tracks], K)
+    innovation = (fixes.z[detection][:, None] - h[tracks]).reshape(t * K, M, 2)
+    R = (fixes.R[detection][:, None] * layout.scales[:, None, None]).reshape(t * K, 2, 2)
+    x, P = now.x[tracks].reshape(t * K, M, n), now.P[tracks].reshape(t * K, M, n, n)
+    mu, H = each.reshape(t * K, M), np.ascontiguousarray(layout.H[:, :M])
+    if layout.mask.all():
+        x, P, mu, _, _, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
+        repairs = int(repaired.sum())
+    else:
+        x, P, mu, _, ok = consider_models(x, P, mu, innovation, H[0], R, layout.mask)
+        repairs = sum(add_jitter_all(covariance) for covariance in P)
+    weight = reweighed(weight, of_copies[tracks, :, detection])
+    whole = now.x.copy(), now.P.copy(), now.mu.copy()
+    for part, new in zip(whole, (x, P, mu.reshape(t, K, M) * weight[..., None])):
+        part[tracks] = new.reshape(part[tracks].shape)
+    hit = tracks[ok.reshape(t, K).all(axis=1)]
+    nis, nis_dof = now.nis.copy(), now.nis_dof.copy()
+    nis[hit] += np.square(now.white[hit]).sum(axis=1)
+    nis_dof[hit] += np.uint16(2)
+    return *whole, nis, nis_dof, repairs
+
+
+def update_jointly(
+    now: DiverState,
+    fixes: Positions,
+    h: FloatArray,
+    layout: Layout,
+    considered: BoolArray,
+    beta: FloatArray,
+    missed: FloatArray,
+    found: Densities,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """x, P, mu of all tracks and the covariances repaired, after fixes that are theirs with
+    probabilities beta (T, D), or none with `missed` (T,): what each copy says of a fix shares that
+    between the copies."""
+    K = len(layout.scales)
+    M = now.x.shape[1] // K
+    each, weight = _each_copy(now.mu, K)
+    x, P, mu, repairs = now.x.copy(), now.P.copy(), now.mu.copy(), 0
+    shared_out = weight[..., None] * np.exp(found.copies - found.whole[:, None])
+    for k, factor in enumerate(layout.scales):
+        own = slice(k * M, (k + 1) * M)
+        of_fixes = np.where(beta > 0.0, beta * shared_out[:, k], 0.0)
+        of_none = missed * weight[:, k]
+        x[:, own], P[:, own], mu[:, own], repaired = jipda.update(
+            np.ascontiguousarray(now.x[:, own]),
+            np.ascontiguousarray(now.P[:, own]),
+            np.ascontiguousarray(each[:, k]),
+            np.ascontiguousarray(h[:, own]),
+            np.ascontiguousarray(layout.H[:, own]),
+            fixes.z,
+            fixes.R * factor,
+            of_fixes,
+            of_none,
+            considered,
+        )
+        after = np.maximum(of_fixes.sum(axis=1) + of_none, LEAST_WEIGHT)
+        mu[:, own] *= after[:, None]
+        repairs += repaired
+    return x, P, mu / mu.sum(axis=1, keepdims=True), repairs
+
+
+def reweighed(weight: FloatArray, log_density: FloatArray) -> FloatArray:
+    """The weights (t, K) of copies after measurements of `log_density` (t, K) in each."""
+    log = np.log(weight) + np.where(np.isfinite(log_density), log_density, -1e300)
+    new = np.maximum(np.exp(log - log.max(axis=1, keepdims=True)), LEAST_WEIGHT)
+    return np.asarray(new / new.sum(axis=1, keepdims=True))
+
+
+# -- lost tracks ---------------------------------------------------------------------------------
+
+
+def reacquired(
+    now: DiverState,
+    fixes: Positions,
+    hit: BoolArray,
+    left: BoolArray,
+    whole: FloatArray,
+    models: ModelSet,
+    chain: AdaptiveChain,
+    layout: Layout,
+) -> tuple[DiverState, bool]:
+    """What becomes of tracks that were not `hit` (T,) by a group of fixes of which some are `left`
+    (D,), and whether one began anew; whole (T, D) as in `Densities`.
+
+    A fix that may have been a track's own and was not believed is remembered. One that agrees with
+    it, as the next fix of a track that began at the first would, begins the track anew.
+    """
+    refused = now.refused
+    if hit.any():
+        refused = refused.copy()
+        refused[hit] = np.nan
+    begun: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}
+    for track, row in _refusals(now, fixes, hit, left, whole):
+        z, R = fixes.z[row], fixes.R[row]
+        parts = None
+        if np.isfinite(refused[track, 0]) and _may_be_lost(now, track, fixes):
+            parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
+        refused = refused.copy()
+        if parts is None:
+            refused[track] = now.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
+        else:
+            begun[track], refused[track] = parts, np.nan
+    if begun:
+        x, P, mu = now.x.copy(), now.P.copy(), now.mu.copy()
+        for track, parts in begun.items():
+            x[track], P[track], mu[track] = parts
+        now = now._replace(x=x, P=P, mu=mu)
+    return now._replace(refused=refused), bool(begun)
+
+
+def _refusals(
+    now: DiverState, fixes: Positions, hit: BoolArray, left: BoolArray, whole: FloatArray
+) -> Iterator[tuple[int, int]]:
+    """Tracks, each with the fix that may have been its own: by the name, or the nearest of what
+    confirmed tracks `left`, each to the track it is nearest to."""
+    if fixes.target_id is not None:
+        own = now.target_id[:, None] == fixes.target_id[None]
+        for track, row in zip(*np.nonzero(own)):
+            if not hit[track]:
+                yield int(track), int(row)
+        return
+    waiting = np.flatnonzero(~hit & (now.life.status != TENTATIVE))
+    rows = np.flatnonzero(left)
+    if not len(waiting) or not len(rows):
+        return
+    near = whole[np.ix_(waiting, rows)]
+    nearest = near.argmax(axis=0)
+    for place, track in enumerate(waiting.tolist()):
+        own = np.flatnonzero(nearest == place)
+        if len(own):
+            yield track, int(rows[own[near[place, own].argmax()]])
+
+
+def _may_be_lost(now: DiverState, track: int, fixes: Positions) -> bool:
+    """Whether so many misses in a row are improbable of a track that is where it should be."""
+    if fixes.target_id is not None or not fixes.whole:
+        return True
+    missed = 1.0 - fixes.config.detection_probability
+    return bool(missed ** (now.life.misses[track] + 1) <= LOST)
+
+
+def _anew(
+    now: DiverState,
+    track: int,
+    refused: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    fixes: Positions,
+    models: ModelSet,
+    chain: AdaptiveChain,
+    layout: Layout,
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """x, P and mu now of the track, had it begun at the fix that it `refused` (6,); None where the
+    fix z (2,), R (2, 2) does not agree, or two false fixes may well do."""
+    stamp, px, py, xx, xy, yy = refused.tolist()
+    x, P, mu = models.new_tracks(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
+    x, P = layout.widened(x, P)
+    row = np.arange(len(now.x)) == track
+    alone = now.only(row)._replace(x=x, P=P, mu=mu)
+    dt = max((now.stamp_ns - stamp) * 1e-9, 0.0)
+    *_, last = cross(models, chain, alone, dt, fixes.config.longest_step)
+    alone = alone._replace(x=last.x, P=last.P, mu=last.mu)
+    h = expected(alone.x, layout.H)
+    if densities(alone, h, layout, z[None], R[None]).whole[0, 0] <= bound(fixes.config):
+        return None
+    if fixes.target_id is None and fixes.config.max_tracks > 1:
+        _, covariance = imm_kernels.combine(alone.x, alone.P, alone.mu, layout.H[0])
+        area = math.pi * REACH * math.sqrt(np.linalg.det(covariance[0] + R))
+        if fixes.config.clutter_density * area > MISTAKEN:
+            return None
+    return last.x[0], last.P[0], last.mu[0]
+
+
+def doubtful(now: DiverState, config: DiverConfig) -> tuple[BoolArray, BoolArray]:
+    """Which tentative tracks (T,) explain their fixes no better than clutter does, so that their
+    hits do not confirm them, and which so badly that they end.
+
+    A copy with large covariances takes what lies far away, so that hits alone mean little. The
+    odds of a track are those of a new diver against a false fix, and what its fixes made of them.
+    """
+    odds = now.score + math.log(config.birth_density / config.clutter_density)
+    open_ = (now.life.status == TENTATIVE) & (now.target_id == NOBODY) & np.isnan(now.existence)
+    return open_ & (odds < _log_odds(CONFIRMS)), open_ & (odds < _log_odds(ENDS))
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability) - math.log1p(-probability)
+
+
+def columns(mu: FloatArray, models: ModelSet) -> dict[str, FloatArray]:
+    """What is published of families beside the probabilities of their models."""
+    if models.mixing is None:
+        return {}
+    each = models.by_model(mu)
+    family = np.eye(len(FAMILIES))[models.mixing.family]
+    out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
+    out['hover'] = each @ (models.mixing.kind == HOVER)
+    out['covariance_scale'] = scale(mu, models)
+    return out

@@ -1,0 +1,357 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Families: the vectors of an independent prototype, and what the set promises its users."""
+
+from pathlib import Path
+
+from helpers.diver_runs import fix, SECOND
+from helpers.estimates import same
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.diver import family_kernels
+from sonar_imm.trackers.diver.families import FAMILIES
+from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+VECTORS = Path(__file__).parents[2] / 'vectors/regret_free'
+COLUMNS = [f'family_{name}' for name in FAMILIES] + ['hover', 'covariance_scale']
+
+
+def config(**values):
+    return DiverConfig(**{'model_set': 'families', 'max_tracks': 1, **values})
+
+
+@pytest.fixture(scope='module')
+def models():
+    return build_models(config())
+
+
+def used(kind):
+    """The components that a model has."""
+    return range(4) if kind == 1 else range(3)
+
+
+def test_chain_and_models_are_those_of_the_prototype(models):
+    with np.load(VECTORS / 'mixing.npz') as vectors:
+        np.testing.assert_allclose(models.chain.generator, vectors['generator'], atol=1e-12)
+        for name, dt in (('transition_1s', 1.0), ('transition_07s', 0.7)):
+            np.testing.assert_allclose(models.chain.transition(dt), vectors[name], atol=1e-12)
+        np.testing.assert_array_equal(models.mixing.kind, vectors['kind'])
+        assert models.mixing.sector_variance == pytest.approx(vectors['sector_variance'])
+
+
+def mixed(models, x, P, mu, transition):
+    speed = models.mixing._replace(speed=0.75, speed_variance=0.16)
+    return (part[0] for part in family_kernels.mix(x[None], P[None], mu[None], transition, speed))
+
+
+def test_mixing_is_that_of_the_prototype(models):
+    with np.load(VECTORS / 'mixing.npz') as vectors:
+        assert vectors['speed_mean'] == 0.75 and vectors['speed_variance'] == pytest.approx(0.16)
+        parts = (vectors[name] for name in ('x', 'P', 'mu'))
+        x, P, c = mixed(models, *parts, vectors['transition_1s'][None])
+        for ours, name in ((x, 'out_x'), (P, 'out_P'), (c, 'out_c')):
+            np.testing.assert_allclose(ours, vectors[name], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    'pair',
+    ['heading_to_cv', 'cv_to_heading', 'cv_to_hover', 'hover_to_cv', 'heading_to_heading'],
+)
+def test_image_of_one_model_in_the_components_of_another(models, pair):
+    with np.load(VECTORS / 'mixing.npz') as vectors:
+        source, target = int(vectors[f'{pair}/in_model']), int(vectors[f'{pair}/out_model'])
+        only = np.zeros(37)
+        only[source] = 1.0
+        everywhere = np.full((1, 37, 37), 1.0 / 37.0)
+        x, P, _ = mixed(models, vectors['x'], vectors['P'], only, everywhere)
+        own = used(models.mixing.kind[target])
+        np.testing.assert_allclose(x[target][own], vectors[f'{pair}/x'][own], atol=1e-12)
+        covariance = vectors[f'{pair}/P'][np.ix_(own, own)]
+        np.testing.assert_allclose(P[target][np.ix_(own, own)], covariance, atol=1e-12)
+
+
+def test_a_velocity_goes_to_the_headings_it_may_have(models):
+    """The probability is shared by the direction of the velocity, not by the chain."""
+    with np.load(VECTORS / 'mixing.npz') as vectors:
+        source = int(vectors['cv_to_heading/in_model'])
+        only = np.zeros(37)
+        only[source] = 1.0
+        transition = vectors['transition_1s'][None]
+        _, _, c = mixed(models, vectors['x'], 0.01 * vectors['P'], only, transition)
+        velocity = vectors['x'][source, 2:]
+        headings = models.mixing.kind == 0
+        likeliest = models.mixing.units[models.mixing.direction[headings][c[headings].argmax()]]
+        assert likeliest @ velocity > 0.9 * np.hypot(*velocity)
+        np.testing.assert_allclose(c[headings].sum(), transition[0, source, headings].sum())
+        np.testing.assert_allclose(c[~headings], transition[0, source, ~headings], atol=1e-15)
+
+
+def test_a_run_is_that_of_the_prototype():
+    """Its transitions are taken at a step rounded to a microsecond, and are not learnt."""
+    tracker = DiverTracker(config(adaptation='fixed', confirm_hits=1))
+    exact = tracker.models.chain.transition
+    tracker._chain.transition = lambda learnt, dt: np.array(exact(round(dt, 6))[None])
+    with np.load(VECTORS / 'run.npz') as run:
+        np.testing.assert_allclose(tracker.models.initial, run['start_mu'], atol=1e-15)
+        assert tuple(run['scales']) == tracker.config.covariance_scales
+        for k, t in enumerate(run['t']):
+            place = Fix(
+                stamp_ns=round((1.0 + t) * 1e9),
+                position=np.array([*run['z'][k], 0.0]),
+                covariance=run['R'][k],
+            )
+            estimate = tracker.process(place)[-1]
+            mu = tracker._stream.state.mu.reshape(3, 37)
+            weight = mu.sum(axis=1)
+            np.testing.assert_allclose(estimate.state[0], run['out_x'][k], atol=TOLERANCE)
+            np.testing.assert_allclose(estimate.covariance[0], run['out_P'][k], atol=TOLERANCE)
+            np.testing.assert_allclose(weight, run['out_scale_probability'][k], atol=TOLERANCE)
+            for copy in range(3):
+                np.testing.assert_allclose(
+                    mu[copy] / weight[copy], run[f'copy{copy}/mu'][k], atol=TOLERANCE
+                )
+
+
+TOLERANCE = 1e-9
+
+
+def path(count, speed=0.7, std=0.5, seed=1, every=1.0, scale=1.0, **more):
+    """Fixes of a diver who swims east, their covariances `scale` times what is true."""
+    rng = np.random.default_rng(seed)
+    return [
+        Fix(
+            stamp_ns=round((100.0 + every * k) * 1e9),
+            position=np.array([speed * every * k, 0.0, 0.0]) + [*(std * rng.normal(size=2)), 0.0],
+            covariance=np.eye(2) * std**2 * scale,
+            **more,
+        )
+        for k in range(count)
+    ]
+
+
+def moved(item, x, y):
+    """The same fix elsewhere."""
+    from attrs import evolve
+
+    return evolve(item, position=item.position + [x, y, 0.0])
+
+
+def ids(estimates):
+    """The identities of confirmed tracks."""
+    return [e.extras['track_id'][e.extras['track_state'] > 0].tolist() for e in estimates]
+
+
+def run(tracker, items):
+    return [tracker.process(item)[-1] for item in items]
+
+
+def test_columns_of_the_contract():
+    estimate = run(DiverTracker(config()), path(20))[-1]
+    columns = estimate.columns()
+    assert list(columns)[-6:] == COLUMNS
+    assert all(columns[name].dtype == np.float64 for name in COLUMNS)
+    assert sum(columns[f'family_{name}'][0] for name in FAMILIES) == pytest.approx(1.0)
+    assert len(estimate.model_names) == 37 and estimate.probabilities.sum() == pytest.approx(1.0)
+    other = DiverTracker(DiverConfig(model_set='heading_speed')).process(fix(1, 0.0, 0.0))[-1]
+    assert not set(COLUMNS) & set(other.columns())
+
+
+@pytest.mark.parametrize('stated', [1.0, 1.0 / 6.0, 6.0])
+def test_scale_of_the_stated_covariances(stated):
+    """Copies find out what is stated too small, and never take a covariance for too large."""
+    tracker = DiverTracker(config())
+    estimates = run(tracker, path(300, std=1.0, scale=stated))
+    scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
+    said = ' '.join(tracker.warnings())
+    if stated < 1.0:
+        assert 3.0 < scale < 10.0 and 'times what they state' in said
+    else:
+        assert 1.0 <= scale < 1.6 and 'times what they state' not in said
+
+
+def test_a_name_does_not_make_a_fix_good():
+    """The same fixes with and without a name give the same diver."""
+    plain, named = path(200, std=0.9), path(200, std=0.9, target_id=7)
+    rng = np.random.default_rng(3)
+    for k in np.flatnonzero(rng.uniform(size=200) < 0.05)[1:]:
+        far = 40.0 * rng.normal(size=2)
+        plain[k], named[k] = moved(plain[k], *far), moved(named[k], *far)
+    error = []
+    for items in (plain, named):
+        estimates = run(DiverTracker(config(max_tracks=20)), items)
+        rows = [np.flatnonzero(e.extras['track_id'] == 1)[0] for e in estimates]
+        at = np.array([e.state[row, :2] for e, row in zip(estimates, rows)])
+        error.append(at - np.column_stack([0.7 * np.arange(200), np.zeros(200)]))
+    np.testing.assert_allclose(error[0], error[1], atol=1e-9)
+    assert np.sqrt(np.mean(np.sum(error[1][10:] ** 2, axis=1))) < 0.9
+
+
+@pytest.mark.parametrize('named', [{}, {'target_id': 7}])
+def test_two_fixes_that_agree_bring_a_lost_track_back(named):
+    """Under its own identity; a single one is refused."""
+    items = path(60, **named)
+    jumped = [*items[:30], *(moved(item, 80.0, -60.0) for item in items[30:])]
+    estimates = run(DiverTracker(config(max_tracks=5)), jumped)
+    first = estimates[30]
+    assert np.abs(first.state[0, :2] - [21.0, 0.0]).max() < 3.0
+    row = np.flatnonzero(estimates[31].extras['track_id'] == 1)[0]
+    assert np.abs(estimates[31].state[row, :2] - jumped[31].position[:2]).max() < 2.0
+    assert ids(estimates)[-1] == [1]
+
+
+def test_wild_fixes_that_disagree_do_not():
+    items = path(60, target_id=7)
+    items[30], items[31] = moved(items[30], 80.0, -60.0), moved(items[31], -70.0, 20.0)
+    estimates = run(DiverTracker(config(max_tracks=5)), items)
+    assert np.abs(estimates[31].state[0, :2] - [21.7, 0.0]).max() < 3.0
+    assert set(np.concatenate(ids(estimates)).tolist()) == {1}
+
+
+def test_two_false_fixes_in_clutter_do_not_move_a_track():
+    """Where so many are false that two may well agree, tracks begin by their hits."""
+    from attrs import evolve
+
+    items = path(40)
+    for k in (30, 31):
+        items[k] = moved(items[k], 50.0, 50.0)
+    tracker = DiverTracker(config(max_tracks=5, clutter_density=1e-2))
+    estimates = run(tracker, [evolve(item, sensor='') for item in items])
+    row = np.flatnonzero(estimates[31].extras['track_id'] == 1)[0]
+    assert np.abs(estimates[31].state[row, :2] - [21.7, 0.0]).max() < 5.0
+
+
+def test_nobody_coasts_while_his_fixes_are_refused():
+    """Fixes of a name that agree with nothing end its track, however long it may coast."""
+    rng = np.random.default_rng(0)
+    items = path(60, target_id=7)
+    wild = [moved(item, *(3000.0 * rng.normal(size=2))) for item in items[30:45]]
+    tracker = DiverTracker(config(max_tracks=5, max_coast=600.0))
+    before = run(tracker, items[:30])[-1]
+    after = run(tracker, wild)
+    assert before.extras['target_id'].tolist() == [7]
+    assert any(1 not in e.extras['track_id'] for e in after)
+
+
+def test_transitions_are_learnt_inside_families_only():
+    tracker = DiverTracker(config())
+    run(tracker, path(200))
+    state, family = tracker._stream.state, tracker.models.mixing.family
+    nominal = tracker.models.chain.transition(1.0)
+    learnt = tracker._chain.transition(state.learnt, 1.0)[0]
+    inside = family[:, None] == family[None]
+    np.testing.assert_allclose(learnt[~inside], nominal[~inside], atol=1e-15)
+    np.testing.assert_allclose(learnt.sum(axis=1), 1.0)
+    assert np.abs(learnt - nominal)[inside].max() > 0.01
+
+
+def test_several_divers_in_clutter():
+    """Two divers and false fixes: two tracks, by either association."""
+    for association in ('gnn', 'jipda'):
+        rng, extra = np.random.default_rng(5), []
+        settings = {'association': association, 'clutter_density': 2e-4, 'max_tracks': 5}
+        tracker = DiverTracker(config(**settings))
+        for k in range(40):
+            there = np.array([[0.7 * k, 0.0], [0.7 * k, 25.0]])
+            seen = (there + 0.5 * rng.normal(size=(2, 2)))[rng.uniform(size=2) < 0.9]
+            places = np.concatenate([seen, rng.uniform(-60.0, 60.0, (rng.poisson(3.0), 2))])
+            scan = Fixes(
+                stamp_ns=(k + 1) * SECOND,
+                position=np.column_stack([places, np.zeros(len(places))]),
+                covariance=np.tile(0.25 * np.eye(2), (len(places), 1, 1)),
+            )
+            estimate = tracker.process(scan)[-1]
+            firm = estimate.state[estimate.extras['track_state'] > 0, :2]
+            near = np.hypot(*(firm[:, None] - there).transpose(2, 0, 1)) < 3.0
+            assert k < 6 or near.any(axis=0).all(), association
+            extra.append((~near.any(axis=1)).sum())
+        assert np.mean(extra) < 0.15, association
+        assert np.isfinite(estimate.covariance).all()
+
+
+def test_smoothing_is_better_than_the_filter():
+    rng = np.random.default_rng(2)
+    heading = np.cumsum(np.where(rng.uniform(size=80) < 0.06, rng.normal(size=80), 0.0))
+    truth = np.cumsum(0.7 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    tracker = SmoothingDiverTracker(config(confirm_hits=1))
+    filtered = [
+        tracker.process(fix(k + 1, *(z + rng.normal(size=2)), np.eye(2)))[-1]
+        for k, z in enumerate(truth)
+    ]
+    smoothed = tracker.smoothed()
+    errors = [np.array([e.state[0, :2] for e in each]) - truth for each in (filtered, smoothed)]
+    plain, smooth = (np.sqrt(np.mean(np.sum(e**2, axis=1))) for e in errors)
+    assert smooth < 0.85 * plain
+    for estimate in smoothed:
+        assert np.linalg.eigvalsh(estimate.covariance[0]).min() > 0.0
+        assert estimate.probabilities.sum() == pytest.approx(1.0)
+
+
+def test_smoothing_knows_when_behaviour_changed():
+    """A scooter that stops: what the families weigh is smoothed too."""
+    rng = np.random.default_rng(4)
+    x = np.concatenate([2.0 * np.arange(40), np.full(40, 78.0)])
+    tracker = SmoothingDiverTracker(config(confirm_hits=1))
+    for k, place in enumerate(x):
+        tracker.process(fix(k + 1, *([place, 0.0] + 0.3 * rng.normal(size=2)), 0.09 * np.eye(2)))
+    smoothed = tracker.smoothed()
+    assert np.mean([e.extras['hover'][0] for e in smoothed[52:]]) > 0.7
+    speed = [np.hypot(*e.state[0, 2:]) for e in smoothed]
+    np.testing.assert_allclose(speed[10:34], 2.0, atol=0.4)
+
+
+def test_a_late_fix_is_put_in_its_place():
+    items = path(40)
+    expected = run(DiverTracker(config()), items)
+    late = DiverTracker(config())
+    found = {}
+    for item in [*items[:20], *items[21:25], items[20], *items[25:]]:
+        found.update((e.stamp_ns, e) for e in late.process(item))
+    assert all(same(each, found[each.stamp_ns]) for each in expected)
+
+
+def test_depth_is_a_state_beside_families():
+    tracker = DiverTracker(config(dimensions=3, fix_bias_std=0.5))
+    assert tracker.models.scales == (1.0,) and tracker.models.copies == 3
+    estimate = run(tracker, path(30))[-1]
+    assert np.isfinite(estimate.state).all() and estimate.state_names[2] == 'pz'
+    assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 2.5
+
+
+@pytest.mark.parametrize(
+    ('values', 'says'),
+    [
+        ({'covariance_scales': (0.5, 1.0)}, 'covariance_scales'),
+        ({'covariance_scales': ()}, 'one value at least'),
+        ({'initial_probabilities': (1.0,)}, '37 values'),
+        ({'transition_matrix': (0.5, 0.5)}, '37 x 37'),
+    ],
+)
+def test_bad_parameters_get_a_sentence(values, says):
+    with pytest.raises(ConfigError, match=says):
+        config(**values)
+
+
+def test_one_copy_and_no_hover():
+    tracker = DiverTracker(config(covariance_scales=(1.0,), hover=False, directions=8))
+    assert len(tracker.models.names) == 19
+    estimate = run(tracker, path(30))[-1]
+    assert estimate.extras['covariance_scale'].tolist() == [1.0]
+    assert estimate.extras['hover'].tolist() == [0.0]
+    assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 1.0
