@@ -204,7 +204,7 @@ def test_it_takes_three_and_more_than_half_of_all_to_doubt_the_navigation(
     monkeypatch.setattr(
         behaviours, '_velocity', lambda rows, moves: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
     )
-    filter_ = SimpleNamespace(moves=np.array([False, True]))
+    filter_ = SimpleNamespace(moves=np.array([False, True]), behaviours=('fixed', 'moving'))
     mixture = SimpleNamespace(mu=mu, rows=lambda which: which)
     known = np.arange(confirmed + 1) < confirmed  # the last one is tentative
     assert behaviours.moving_alike(filter_, mixture, known) == alike
