@@ -45,7 +45,6 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..estimation.jit import kernels
 from ..measurements import Rejection
 from ..node_config import node_config_type, type_spec, type_specs
 from ..parameters import Config
@@ -84,7 +83,9 @@ class Warming:
     ):
         """steps: what there is to do for measurements of these classes, None for all. connected:
         the classes that somebody publishes now, None for nobody."""
-        self._steps, self._connected = steps, connected
+        from ..estimation.jit import kernels  # and numba, which the tracker has loaded by now
+
+        self._steps, self._connected, self._kernels = steps, connected, kernels
         self._start = time.monotonic()
         self._said = -self.PERIOD
         self._before = Counter(kernels)
@@ -114,7 +115,7 @@ class Warming:
         """How far it is; empty when everything is there."""
         if self.done():
             return ''
-        made = kernels - self._before
+        made = self._kernels - self._before
         waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
         return (
             f'kernels for {self._doing}: {made["compiled"]} compiled, once for this machine, and '
@@ -137,7 +138,7 @@ class Warming:
         self._ready = True
 
     def _work(self) -> None:
-        if not kernels:  # the node has just begun: give discovery a moment
+        if not self._kernels:  # the node has just begun: give discovery a moment
             end = time.monotonic() + self.DISCOVERY
             while not self._connected() and time.monotonic() < end:
                 self._stopped.wait(_LOOK)
