@@ -15,8 +15,9 @@
 """The one place that knows how hot loops are compiled.
 
 Kernels are compiled on their first call and kept on disk: beside the source when that is writable,
-else in the user's cache folder (or ``NUMBA_CACHE_DIR``). Where neither can be written, as in a
-locked-down container, the kernel still works and is compiled anew in each process.
+else in the user's cache folder; with ``NUMBA_CACHE_DIR`` in that folder and in no other. Where
+none can be written, as in a locked-down container, the kernel still works and is compiled anew in
+each process. What lies beside the source is loaded also by those who cannot write there.
 
 Compiled code contains the kernels it calls and the constants it names, wherever they are defined.
 numba itself compiles anew only when the kernel's own file changes. Here a compiled kernel is valid
@@ -174,8 +175,9 @@ class _FilePerKey:
 
     def __init__(self, folder: Path, function: Callable[..., Any]):
         self.folder = folder
-        # Compiled by who installed the package, for those who may not write there.
-        self._installed = Path(inspect.getfile(function)).parent / '__pycache__'
+        # Who installed the package may have compiled it for those who can only read it.
+        beside = Path(inspect.getfile(function)).parent / '__pycache__'
+        self._readable = [folder] if numba.config.CACHE_DIR else [folder, beside]
         path, code = inspect.getfile(function), function.__code__
         name = re.sub('[<>]', '', f'{Path(path).stem}.{function.__qualname__}')
         python = f'py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, "abiflags", "")}'
@@ -185,7 +187,7 @@ class _FilePerKey:
         self._stem = f'{self._base}{_short_digest(self._stamp)}.'
 
     def load(self, key: Any) -> Any:
-        for folder in (self.folder, self._installed):
+        for folder in self._readable:
             found = self._load(folder / self._path_of(key).name, key)
             if found is not None:
                 return found

@@ -43,9 +43,10 @@ def test_without_any_place_for_a_cache_a_kernel_still_works(monkeypatch):
     assert doubled.stats.cache_path is None
 
 
-def run(code, root, cache):
+def run(code, root, cache, **environment):
     """What `code` prints in a process of its own, with the package at `root`."""
-    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(cache), 'PYTHONPATH': str(root)}
+    environment |= {'NUMBA_CACHE_DIR': str(cache), 'PYTHONPATH': str(root)}
+    environment = {**os.environ, **environment}
     command = [sys.executable, '-c', code]
     done = subprocess.run(
         command, cwd=root, env=environment, capture_output=True, text=True, check=True
@@ -150,11 +151,15 @@ def test_what_was_compiled_beside_the_source_serves_others(tmp_path):
         'product(np.eye(2), np.eye(2), np.empty((2, 2)));'
         'print(sum(product.stats.cache_hits.values()))'
     )
+    elsewhere = (
+        'from numba.core.caching import CacheImpl as impl;'
+        'impl._locator_classes = [c for c in impl._locator_classes if "InTree" not in c.__name__];'
+    )
     root = copied(tmp_path)
     assert run(code, root, '') == ['0']
     assert list((root / 'sonar_imm' / 'estimation' / '__pycache__').glob('*.nbc'))
-    assert run(code, root, tmp_path / 'cache') == ['1']
-    assert not list(tmp_path.glob('cache/**/*.nbc'))
+    assert run(elsewhere + code, root, '', XDG_CACHE_HOME=str(tmp_path / 'home')) == ['1']
+    assert run(code, root, tmp_path / 'told') == ['0']  # NUMBA_CACHE_DIR is the only folder
 
 
 @pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
