@@ -177,7 +177,7 @@ class _FilePerKey:
         self.folder = folder
         # Who installed the package may have compiled it for those who can only read it.
         beside = Path(inspect.getfile(function)).parent / '__pycache__'
-        self._readable = [folder] if numba.config.CACHE_DIR else [folder, beside]
+        self._readable = [folder] if getattr(numba.config, 'CACHE_DIR', '') else [folder, beside]
         path, code = inspect.getfile(function), function.__code__
         name = re.sub('[<>]', '', f'{Path(path).stem}.{function.__qualname__}')
         python = f'py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, "abiflags", "")}'
