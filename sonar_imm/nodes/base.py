@@ -191,12 +191,12 @@ class BaseNode(Node):
                 for name in topic.instances(settings) if topic.wanted(settings) else ():
                     self._inputs[name] = self._input(topic, name, settings)
         required, one_of = needed(topics, settings)
-        topic_names = {
+        self._topic_names = {
             name: self.resolve_topic_name(topic.prefix + name)
             for name, (topic, _, _) in self._inputs.items()
         }
         self._reporter = Reporter(
-            self._full_name, topic_names, self._meter, required=required, one_of=one_of
+            self._full_name, self._topic_names, self._meter, required=required, one_of=one_of
         )
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._node_config.diagnostics_period, self._report, clock=steady)
@@ -294,8 +294,7 @@ class BaseNode(Node):
         connected = {
             measurement
             for name, (topic, _, _) in self._inputs.items()
-            if not topic.companion
-            and self.count_publishers(self.resolve_topic_name(topic.prefix + name))
+            if not topic.companion and self.count_publishers(self._topic_names[name])
             for measurement in topic.measurements
         }
         return connected or None
@@ -306,25 +305,24 @@ class BaseNode(Node):
             self.get_logger().info(sentence)
         if self._warming.ready() and not self._hears:
             with explained_overrides(self):
-                heard = [self._listen(name) for name in self._inputs]
+                for name in self._inputs:
+                    self._listen(name)
             self._hears = True
             self._settings.warn_of_unknown()  # those of the inputs' endpoints are known now
             self._acknowledge(None)
-            self.get_logger().info(f'ready, hears {", ".join(heard)}')
+            self.get_logger().info(f'ready, hears {", ".join(self._topic_names.values())}')
         if self._warming.done():
             self.destroy_timer(self._until_warm)
 
-    def _listen(self, name: str) -> str:
-        """Subscribe to one input, and give the resolved name of its topic."""
+    def _listen(self, name: str) -> None:
+        """Subscribe to one input."""
         topic, type_name, _ = self._inputs[name]
-        subscription = self._endpoints.subscribe(
+        self._endpoints.subscribe(
             message_class(type_name),
             topic.prefix + name,
             functools.partial(self.receive, name),
             transforms_qos() if topic.latched else input_qos(self._node_config.queue_depth),
         )
-        resolved: str = subscription.topic_name
-        return resolved
 
     def _reconfigure(self) -> None:
         self._node_config = self._settings[self._node_config_type]
