@@ -112,7 +112,10 @@ setup(
     ],
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[f'{top}{rest}' for top in PACKAGES for rest in ('', '.*')]),
-    package_data={f'{PACKAGE}_tools.evaluation': ['templates/*']},
+    package_data={
+        f'{PACKAGE}.acoustics': ['*.npz'],
+        f'{PACKAGE}_tools.evaluation': ['templates/*'],
+    },
     data_files=shared_files(),
     install_requires=REQUIRES,
     extras_require=EXTRAS,

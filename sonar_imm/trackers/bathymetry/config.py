@@ -44,6 +44,7 @@ MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
 """The sets of one state, which the grid engine can run."""
 NAVIGATION = ('auto', 'required', 'ignored')
+LAYOVER = ('ignored', 'gated')
 
 
 @frozen(kw_only=True)
@@ -128,6 +129,10 @@ class BathymetryConfig(MountingParameters):
     decorrelation: float = live(0.0, '',
         'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
         'under a wide aperture; it acts as noise', range=(0.0, 0.95))
+    layover: str = live('ignored', '',
+        'bins with echoes of two surfaces, as of a ledge, a box or a wall: gated (no soundings), '
+        'or ignored (as if of one), as always with multipath and in variant paper',
+        choices=LAYOVER)
     multipath: bool = live(False, '',
         'expect echoes by way of the surface, modelled as noise from their directions')
     sonar_depth: float = live(3.0, 'm',
@@ -306,6 +311,12 @@ class BathymetryConfig(MountingParameters):
     def gate_used(self) -> bool:
         """Whether bins without an echo are passed over; the paper tracks through them."""
         return self.shadow_gate and not self.as_printed
+
+    @property
+    def layover_used(self) -> str:
+        """``ignored`` or ``gated``. An echo by way of the surface is a second surface in every
+        bin, which says nothing of the floor."""
+        return 'ignored' if self.as_printed or self.multipath else self.layover
 
     @property
     def drift_used(self) -> bool:

@@ -34,6 +34,7 @@ import numpy as np
 from ...acoustics import variances
 from ...acoustics.coherence import FEWEST_STAVES_ALONE
 from ...acoustics.geometry import Pose
+from ...acoustics.layover import GATE, Layover, layover
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
@@ -92,13 +93,14 @@ class Ping:
 @frozen(eq=False)
 class Look:
     """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
-    noise."""
+    noise; layover: None where it is ignored."""
 
     ping: Ping
     swath: Swath
     models: TerrainModels
     likelihood: PingLikelihood
     loud: BoolArray
+    layover: Layover | None
 
     @property
     def config(self) -> BathymetryConfig:
@@ -107,11 +109,13 @@ class Look:
 
 class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
-    of their power that differs from stave to stave, NaN without any."""
+    of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
+    where layover is ignored."""
 
     bins: int
     silent: int
     decorrelation: float
+    array_error: float = math.nan
 
 
 class Answer(NamedTuple):
@@ -138,7 +142,15 @@ def look(ping: Ping) -> Look:
     likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
     first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
-    return Look(ping, swath, models, likelihood, loud)
+    return Look(ping, swath, models, likelihood, loud, _layover(ping, swath, likelihood))
+
+
+def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
+    if ping.config.layover_used == 'ignored':
+        return None
+    snapshot, spacing = ping.snapshot, swath.geometry.spacing
+    iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
+    return layover(iq, likelihood.signal, likelihood.noise, snapshot.usable, spacing)
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:
@@ -264,7 +276,11 @@ def summarise(seen: Look, track: Track) -> Answer:
         int(seen.loud.sum()),
         int((seen.loud & ~echo).sum()),
         variances.decorrelation(snapshot.iq, seen.loud & echo),
+        math.nan if seen.layover is None else seen.layover.array_error,
     )
+    if seen.layover is not None:
+        counts['bins_two'] = int((echo & (seen.layover.existence > GATE)).sum())
+        health['array_error'] = loud.array_error
     health['decorrelation'] = loud.decorrelation
     health['residual_ratio'] = _residual(seen, track)
     return Answer(estimate_of(seen, track), counts, health, loud, health['residual_ratio'])
@@ -306,6 +322,12 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     }
     if config.in_bank:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
+    if seen.layover is not None:
+        second = np.where(ping.echo, seen.layover.existence, 0.0)
+        two = second > GATE
+        extras['valid'] = (ping.echo & ~two).astype(np.uint8)
+        extras['existence_2'] = second.astype(np.float32)
+        extras['surfaces'] = np.where(ping.echo, 1 + two, 0).astype(np.uint8)
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         extras |= {

@@ -85,6 +85,8 @@ __all__ = ['BathymetryConfig', 'BathymetryTracker']
 SPACING_TOLERANCE = 0.05
 PINGS_JUDGED, FEWEST_LOUD = 100, 200
 """Warnings are drawn from the last pings, when they have so many loud bins."""
+MUCH_ARRAY_ERROR = 0.01
+"""From here on the test for a second surface misses many."""
 SOME_DECORRELATION = 0.04
 """Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
 FEWEST_PINGS = 5
@@ -162,8 +164,9 @@ class BathymetryTracker:
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
         of the particles of a model (NaN for the grid), mean log likelihood of a bin, noise
-        variance, what is left beside the echo in stated noises (`ping.residual_ratio`); and how
-        many pings wait for navigation."""
+        variance, what is left beside the echo in stated noises (`ping.residual_ratio`), what of
+        loud echoes is no plane wave (`layover.array_error`); and how many pings wait for
+        navigation."""
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
         held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
         return {**self._health, **waiting, **held}
@@ -189,6 +192,14 @@ class BathymetryTracker:
                 f'{differ:.0%} of the power of loud echoes differs from stave to stave, where '
                 f'decorrelation says {configured:.0%}: estimates are surer than they should be, '
                 'or lost'
+            )
+        errors = [ping.array_error for ping in self._loud if math.isfinite(ping.array_error)]
+        if errors and (typical := float(np.median(errors))) > MUCH_ARRAY_ERROR:
+            sentences.append(
+                f'{typical:.1%} of the power of loud echoes is no plane wave, counted three times '
+                'for safety: second surfaces in a bin (layover) are mostly missed; check the '
+                'calibration of the staves, noise_variance, decorrelation and '
+                'element_spacing_wavelengths'
             )
         return sentences
 
