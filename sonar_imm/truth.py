@@ -92,6 +92,8 @@ class TrueProfile:
     range (n,) m; height (n,) m above the reference floor; angle (n,) rad from broadside; patch
     (n,) rough floor; valid (n,) False in shadow and water column; xyz (n, 3) m in `frame_id`.
     Where the floor cannot answer, angle and xyz are NaN. `namespace` is that of the snapshot.
+    surfaces (n,): how many surfaces answer in a bin, the height is that of the strongest, and
+    height_2 (n,) m of the next, NaN for none; None where the scene has no objects.
     """
 
     stamp_ns: int
@@ -103,9 +105,12 @@ class TrueProfile:
     valid: NDArray[np.bool_]
     xyz: FloatArray
     namespace: str = ''
+    surfaces: NDArray[np.uint8] | None = None
+    height_2: FloatArray | None = None
 
     def tables(self, frame_id: str) -> Iterator[TruthTable]:
-        """Give one row per range bin: ``x y z range height angle patch valid``."""
+        """Give one row per range bin: ``x y z range height angle patch valid``, with objects
+        ``surfaces height_2`` besides."""
         columns = {
             **dict(zip('xyz', np.asarray(self.xyz, np.float32).T)),
             'range': self.range,
@@ -114,6 +119,8 @@ class TrueProfile:
             'patch': self.patch,
             'valid': self.valid,
         }
+        if self.surfaces is not None and self.height_2 is not None:
+            columns |= {'surfaces': self.surfaces, 'height_2': self.height_2}
         yield TruthTable(self.stamp_ns, self.frame_id, columns, self.namespace)
 
 

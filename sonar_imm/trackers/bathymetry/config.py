@@ -129,7 +129,7 @@ class BathymetryConfig(MountingParameters):
     decorrelation: float = live(0.0, '',
         'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
         'under a wide aperture; it acts as noise', range=(0.0, 0.95))
-    layover: str = live('ignored', '',
+    layover: str = live('gated', '',
         'bins with echoes of two surfaces, as of a ledge, a box or a wall: gated (no soundings), '
         'or ignored (as if of one), as always with multipath and in variant paper',
         choices=LAYOVER)

@@ -146,11 +146,12 @@ def look(ping: Ping) -> Look:
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
+    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two."""
     if ping.config.layover_used == 'ignored':
         return None
-    snapshot, spacing = ping.snapshot, swath.geometry.spacing
-    iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
-    return layover(iq, likelihood.signal, likelihood.noise, snapshot.usable, spacing)
+    iq = np.where(likelihood.echo[:, None], ping.snapshot.iq, 0.0)
+    spacing = swath.geometry.spacing
+    return layover(iq, likelihood.signal, likelihood.noise, likelihood.echo, spacing)
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:

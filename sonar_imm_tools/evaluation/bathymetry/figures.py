@@ -132,11 +132,15 @@ def profile_figure(profile: Profile) -> go.Figure:
         dotted = {'color': INK, 'width': 1.0, 'dash': 'dot'}
         add_line(figure, ranges, true, 'truth', INK, line=dotted)
     add_line(figure, ranges, height, 'estimate', COLOURS[0], 1.4)
-    silent = profile.range[~profile.valid]
-    if len(silent):
-        silent = silent[thin(len(silent), MOST_BINS)]
-        bottom = np.full(len(silent), float(np.nanmin(profile.height)) - 0.3)
-        add_points(figure, silent, bottom, 'no echo', COLOURS[3], symbol='line-ns-open')
+    marks = [('no echo', ~profile.heard, 3)]
+    if profile.two is not None:
+        marks.append(('two surfaces: no sounding', profile.two, 4))
+    for name, marked, colour in marks:
+        place = profile.range[marked]
+        place = place[thin(len(place), MOST_BINS)]
+        bottom = np.full(len(place), float(np.nanmin(profile.height)) - 0.3)
+        if len(place):
+            add_points(figure, place, bottom, name, COLOURS[colour], symbol='line-ns-open')
     y = {'title': 'height above the reference [m]'}
     return styled(figure, 400, SLANT | {'zeroline': False}, y)
 

@@ -22,15 +22,16 @@ from attrs import frozen
 import numpy as np
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from sonar_imm.soundings import SIDES
 
 from ..columns import read_columns
 
 _BINS = (
     'range?', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
+    'surfaces?',
 )  # fmt: skip
-_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?')
+_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?', 'surfaces?')
 FAR = 0.55
 """Share of a bin by which the range of the true floor may differ from that of the estimate: half a
 bin, and a margin for single precision."""
@@ -39,18 +40,21 @@ bin, and a margin for single precision."""
 @frozen(eq=False)
 class TrueFloor:
     """The true floor at the bins of one ping, each (n,): height m and angle rad, NaN where
-    unknown; patch: rough floor; echo: neither shadow nor water column."""
+    unknown; patch: rough floor; echo: neither shadow nor water column; surfaces: how many answer,
+    None where the truth does not say it."""
 
     height: FloatArray
     angle: FloatArray
     patch: BoolArray
     echo: BoolArray
+    surfaces: IntArray | None = None
 
 
 @frozen(eq=False)
 class Profile:
     """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
-    probabilities (n, M) of the models; valid: bins with an echo; truth: None where unknown;
+    probabilities (n, M) of the models; valid: bins with an echo of one surface; two: bins with
+    echoes of two, None where the tracker does not look for them; truth: None where unknown;
     side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
     the estimate itself says it, as those of a bank do."""
 
@@ -65,6 +69,12 @@ class Profile:
     truth: TrueFloor | None
     side: str = ''
     rough: FloatArray | None = None
+    two: BoolArray | None = None
+
+    @property
+    def heard(self) -> BoolArray:
+        """Bins (n,) with an echo."""
+        return self.valid if self.two is None else self.valid | self.two
 
 
 @frozen(eq=False)
@@ -135,12 +145,13 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
         truth=None if truth is None else true_floor(truth, bins['range']),
         rough=bins['rough'] if 'rough' in estimate.extras else None,
         side=SIDES[estimate.source] if 'side' in estimate.extras else '',
+        two=bins['surfaces'] == 2 if 'surfaces' in estimate.extras else None,
     )
 
 
 def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
     """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
-    where, height, angle, patch, valid = read_columns(
+    where, height, angle, patch, valid, surfaces = read_columns(
         truth, _TRUE, "the truth is not that of a floor: it has no column '{}'"
     ).values()
     if not len(where):
@@ -157,4 +168,5 @@ def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
         angle=np.where(found, angle[nearest], np.nan),
         patch=found & (patch[nearest] > 0),
         echo=found & (valid[nearest] > 0),
+        surfaces=np.where(found, surfaces[nearest], 0) if 'surfaces' in truth.extras else None,
     )

@@ -54,13 +54,17 @@ def score(swath: Swath) -> dict[str, Any]:
         'pings': len(profiles),
         'span_s': (max(stamps) - min(stamps)) / SECOND if stamps else 0.0,
         'bins': sum(len(profile.range) for profile in profiles),
-        'heard_share': _mean([profile.valid for profile in profiles]),
+        'heard_share': _mean([profile.heard for profile in profiles]),
         'rough_share': _mean([swath.roughness(profile) > 0.5 for profile in profiles]),
         'height_std_median_m': _median([profile.height_std for profile in profiles]),
     }
+    looked = [profile.two for profile in profiles if profile.two is not None]
+    if looked:
+        metrics['two_share'] = _mean(looked)
     known = [(profile, profile.truth) for profile in profiles if profile.truth is not None]
     if known:
         metrics |= {'scored_pings': len(known), **_errors(known), 'gate': _gate(known)}
+        metrics |= _layover(known)
         if swath.rough.any():
             metrics['segmentation'] = segmentation(swath, known)
     return metrics
@@ -87,13 +91,28 @@ def _errors(known: Known) -> dict[str, Any]:
 
 def _gate(known: Known) -> dict[str, Any]:
     """How well the gate tells shadow from echo."""
-    shadow = [profile.valid[_PLACES['shadow'](truth)] for profile, truth in known]
-    echo = [profile.valid[truth.echo] for profile, truth in known]
+    shadow = [profile.heard[_PLACES['shadow'](truth)] for profile, truth in known]
+    echo = [profile.heard[truth.echo] for profile, truth in known]
     return {
         'shadow_bins': sum(map(len, shadow)),
         'shadow_passed_over': 1.0 - _mean(shadow),
         'echo_heard': _mean(echo),
     }
+
+
+def _layover(known: Known) -> dict[str, Any]:
+    """How many bins with two surfaces were found, become soundings all the same, and how many with
+    one were lost; empty where the truth or the estimate does not say it."""
+    two, one, kept = [], [], []
+    for profile, truth in known:
+        if truth.surfaces is not None and profile.two is not None:
+            two.append(profile.two[truth.surfaces > 1])
+            kept.append(profile.valid[truth.surfaces > 1])
+            one.append(profile.two[truth.surfaces == 1])
+    if not two:
+        return {}
+    counts = {'bins': sum(map(len, two)), 'found': _mean(two), 'soundings': _mean(kept)}
+    return {'layover': {**counts, 'lost': _mean(one)}}
 
 
 def segmentation(swath: Swath, known: Known) -> dict[str, Any]:

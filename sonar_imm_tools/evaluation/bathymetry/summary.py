@@ -34,6 +34,16 @@ def _patches(metrics: Mapping[str, Any]) -> object:
 METRICS = (
     Metric(label='pings, range bins', line='{pings}, {bins}'),
     Metric(label='bins with an echo', line='{heard_share:.0%}'),
+    Metric(
+        label='bins with two surfaces',
+        line='{two_share:.1%}',
+        when=lambda metrics: look_up(metrics, 'two_share') is not None,
+    ),
+    Metric(
+        label='two surfaces: found / soundings all the same / single bins lost',
+        line='{layover.found:.0%} / {layover.soundings:.0%} / {layover.lost:.1%}',
+        when=lambda metrics: look_up(metrics, 'layover.bins'),
+    ),
     Metric(card='Pings', value='{pings}', remark='{bins} range bins', when=_unscored),
     Metric(card='Bins with an echo', value='{heard_share:.0%}', when=_unscored),
     Metric(card='Stated uncertainty, median', value='{height_std_median_m:.2f} m', when=_unscored),

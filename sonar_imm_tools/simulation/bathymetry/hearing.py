@@ -31,6 +31,8 @@ from sonar_imm.estimation.arrays import ComplexArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.truth import TrueProfile
 
+from .objects import Facets
+
 
 def snr(config: Any, ranges: FloatArray) -> FloatArray:
     """Signal-to-noise ratio (n,) at one stave, linear."""
@@ -40,15 +42,23 @@ def snr(config: Any, ranges: FloatArray) -> FloatArray:
     return 10.0 ** (0.1 * decibels)
 
 
-def hear(config: Any, floor: TrueProfile, rng: np.random.Generator) -> Snapshot:
-    """The samples of the staves for one ping over a floor."""
+def hear(
+    config: Any, floor: TrueProfile, rng: np.random.Generator, facets: Facets | None = None
+) -> Snapshot:
+    """The samples of the staves for one ping over a floor, or from its facets."""
     bins = len(floor.range)
     sine = np.nan_to_num(np.sin(floor.angle))
     signal = config.noise_variance * snr(config, floor.range) * floor.valid
-    y = np.sqrt(signal)[:, None] * _echo(config, sine, rng)
+    if facets is None:
+        y = np.sqrt(signal)[:, None] * _echo(config, sine, rng)
+    else:
+        y = _of_facets(config, floor.range, facets, rng)
     noise = math.sqrt(config.noise_variance) * _circular(rng, bins, config.staves)
     fading = np.sqrt(_fading(config, bins, rng))[:, None]
-    y = (y + noise) * fading if config.noise_fades else y * fading + noise
+    if facets is not None:
+        y = y + noise * fading if config.noise_fades else y + noise
+    else:
+        y = (y + noise) * fading if config.noise_fades else y * fading + noise
     if config.multipath:
         level = np.sqrt(signal * 10.0 ** (0.1 * config.multipath_level_db))
         depth = config.sonar_height - floor.height
@@ -73,6 +83,21 @@ def hear(config: Any, floor: TrueProfile, rng: np.random.Generator) -> Snapshot:
         element_spacing=config.spacing_wavelengths * _speed_at_array(config) / config.frequency,
         sample_rate=0.5 * config.sound_speed / config.bin_width,
     )
+
+
+def _of_facets(
+    config: Any, ranges: FloatArray, facets: Facets, rng: np.random.Generator
+) -> ComplexArray:
+    """The echoes (T, P) of facets, each surface of a bin with a texture of its own."""
+    bins = len(ranges)
+    texture = np.stack([_fading(config, bins, rng) for _ in range(4)])
+    power = config.noise_variance * facets.power * texture[facets.surface, facets.bin]
+    depth = config.sonar_height - facets.height
+    tilt = math.radians(config.tilt_deg)
+    sine = array.direction_sine(depth, ranges[facets.bin], tilt)
+    echo = np.sqrt(power)[:, None] * _echo(config, np.nan_to_num(sine), rng)
+    parts = [np.bincount(facets.bin, stave, bins) for stave in echo.view(np.float64).T]
+    return np.column_stack(parts).view(np.complex128)
 
 
 def _speed_at_array(config: Any) -> float:

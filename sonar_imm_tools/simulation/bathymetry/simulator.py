@@ -18,7 +18,8 @@
 The signal-to-noise ratio falls from 30 to 10 dB along the swath, linearly in decibels over the
 logarithm of range, as spreading loss does. The other scenarios add one difficulty each: slope,
 undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
-the surface, Gaussian echoes, a second side; and a ship that moves (`ship`).
+the surface, Gaussian echoes, a second side, objects on the floor (`objects`); and a ship that
+moves (`ship`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
@@ -36,7 +37,8 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueProfile
 
-from .hearing import hear
+from .hearing import hear, snr
+from .objects import Facets, facets_of, OBJECTS, second_of, surfaces_of
 from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
 
 SIDES = ('starboard', 'port', 'both')
@@ -110,6 +112,14 @@ class BathymetryScenario(ShipScenario):
         'standard deviation of the kernel that smooths the heights of the rough patch; 0: white',
         range=(0.0, 100.0))
 
+    object: str = parameter('none', '',
+        'object on the floor, which is level then: a step up (ledge), a box 2 m wide, a wall or a '
+        'boulder; where it answers at the range of the floor a bin has two surfaces',
+        choices=OBJECTS)
+    object_distance: float = parameter(30.0, 'm',
+        'horizontal distance of the object from the sonar', range=(0.1, 10_000.0))
+    object_size: float = parameter(2.0, 'm',
+        'height of the object, or radius of the boulder', range=(0.01, 1000.0))
     shadows: tuple[float, ...] = parameter((), 'm',
         'slant ranges where shadows begin and end, in pairs', range=(0.0, None), kind='float[]')
     spike_probability: float = parameter(0.0, '',
@@ -124,6 +134,11 @@ class BathymetryScenario(ShipScenario):
         problems = super().check()
         if self.multipath and self.moving:
             problems.append('multipath is for a sonar that rests, not for moving: true')
+        if self.object != 'none':
+            if self.moving or self.multipath:
+                problems.append('objects are for a sonar that rests, without multipath')
+            if self.object_size >= self.sonar_height:
+                problems.append('object_size must be less than sonar_height')
         if self.last_range < self.first_range + 2.0 * self.bin_width:
             problems.append('last_range must lie at least two bins beyond first_range')
         elif (self.last_range - self.first_range) / self.bin_width > 100_000:
@@ -180,6 +195,10 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         'tails, noise that does not fade',
         {'noise_fades': False, 'law': 'k', 'roughness_law': 'fractal'},
     ),
+    'ledge': (
+        'a step of 2 m, which answers at the same ranges as the floor; noise that does not fade',
+        {'object': 'ledge', 'noise_fades': False},
+    ),
     'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
     'moving': (
         'a ship under way in a swell, with navigation and its errors; a rough patch with a wavy '
@@ -231,8 +250,12 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
                 profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
             else:
                 profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
+            facets = None
+            if config.object != 'none':
+                facets = facets_of(config, ranges, snr(config, ranges))
+                profile = _with_object(config, profile, facets)
             truth.append(profile)
-            snapshot = hear(config, profile, rng)
+            snapshot = hear(config, profile, rng, facets)
             received.append(Received(stamp + listening_ns, snapshot, namespace))
     if ship is not None:
         seconds = (config.pings - 1) / config.ping_rate
@@ -273,6 +296,25 @@ def _floor(
             [np.zeros(len(ranges)), outward if side == 'port' else -outward, -depth]
         ),
         namespace=namespace,
+    )
+
+
+def _with_object(config: BathymetryScenario, floor: TrueProfile, facets: Facets) -> TrueProfile:
+    """The truth of a level floor with an object on it."""
+    number, height, second = second_of(*surfaces_of(facets, len(floor.range)))
+    valid = number > 0
+    depth = config.sonar_height - np.where(valid, height, 0.0)
+    outward = array.across_track(depth, floor.range)
+    left = outward if floor.xyz[-1, 1] > 0.0 else -outward
+    return evolve(
+        floor,
+        height=np.where(valid, height, 0.0),
+        angle=array.angle_of_depth(depth, floor.range, math.radians(config.tilt_deg)),
+        patch=np.zeros(len(depth), bool),
+        valid=valid,
+        xyz=np.column_stack([np.zeros(len(depth)), left, -depth]),
+        surfaces=number.astype(np.uint8),
+        height_2=second,
     )
 
 

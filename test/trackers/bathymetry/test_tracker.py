@@ -71,6 +71,7 @@ def test_columns_are_those_of_the_contract(model_set, columns):
     after = 'valid log_likelihood label label_probability'
     if model_set == 'height_bank':
         after += ' rough'
+    after += ' existence_2 surfaces'
     assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
     assert table['valid'].dtype == np.uint8
     assert all(len(column) == len(snapshot) for column in table.values())

@@ -1,0 +1,158 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bins with two surfaces: how many are gated, and how many bins of one surface are lost.
+
+    python -m benchmarks.bathymetry_layover --out docs/results/bathymetry_layover.json
+
+Each ping has an object of its own, at 22 to 60 m: a ledge of .8 to 3 m, a box of 1 to 4 m, a wall
+of 2 to 6 m or a boulder of .6 to 2 m radius; or none. A bin has two surfaces if the second one
+lies .5 m or more beside the strongest, at most 15 dB below it and at 0 dB or more at a stave; it
+has one if no other answers. `soundings`: share of the bins with two that become soundings, of
+these `near`: inside two standard deviations of a surface, and `rmse` to the nearest; with layover
+ignored where it says so, else gated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from benchmarks.study import Parts, study
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.hearing import snr
+from sonar_imm_tools.simulation.bathymetry.objects import facets_of, second_of, surfaces_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+
+SIZES = {'ledge': (0.8, 3.0), 'box': (1.0, 4.0), 'wall': (2.0, 6.0), 'boulder': (0.6, 2.0)}
+FAINT = {'snr_near_db': 20.0, 'snr_far_db': 0.0}
+THERMAL = {'noise_fades': False}
+SETTINGS: dict[str, dict[str, Any]] = {
+    '8 staves, 30-10 dB': {},
+    '8 staves, 20-0 dB': FAINT,
+    '4 staves, 30-10 dB': {'staves': 4},
+    '2 staves, 30-10 dB': {'staves': 2},
+    '0.5 % differ': {'decorrelation': 0.005},
+    '2 % differ': {'decorrelation': 0.02},
+}
+FLAT: dict[str, tuple[str, dict[str, Any]]] = {
+    'flat': ('thermal', {'patch_std': 0.0}),
+    'flat, 20-0 dB': ('thermal', {'patch_std': 0.0, **FAINT}),
+    'white patch': ('thermal', {}),
+    'patch over 1 m': ('correlated', THERMAL),
+    'noise that fades': ('paper', {}),
+    'slope .1': ('slope', THERMAL),
+    'undulation .5 m in 15 m': ('undulating', THERMAL),
+    'spikes': ('spikes', THERMAL),
+    'shadows': ('shadow', THERMAL),
+    'noise not stated': ('thermal', {'state_noise': False}),
+    'noise from the water column': ('water_column', THERMAL),
+    '0.5 % differ': ('thermal', {'decorrelation': 0.005}),
+    '2 staves': ('thermal', {'staves': 2}),
+    '4 staves': ('thermal', {'staves': 4}),
+}
+
+
+class Bins:
+    """Counts over pings."""
+
+    def __init__(self) -> None:
+        self.two = self.caught = self.one = self.lost = self.kept = 0
+        self.ignored = self.near_ignored = 0
+        self.error_ignored = 0.0
+
+
+def objects(
+    kind: str, pings: int, seed: int, changes: Mapping[str, Any]
+) -> Iterator[tuple[Snapshot, FloatArray, FloatArray]]:
+    """Pings, with the power and height (T, 4) of their surfaces."""
+    rng = np.random.default_rng((seed, list(SIZES).index(kind)))
+    for _ in range(pings):
+        size, distance = rng.uniform(*SIZES[kind]), rng.uniform(16.0, 58.0)
+        placed = {'object': kind, 'object_size': size, 'object_distance': distance, 'pings': 1}
+        config = scenario('ledge', {**placed, **changes})
+        scene = simulate(config, int(rng.integers(1 << 31)))
+        snapshot: Snapshot = scene.measurements[0].measurement
+        seen = facets_of(config, snapshot.range, snr(config, snapshot.range))
+        yield snapshot, *surfaces_of(seen, len(snapshot))
+
+
+def count(bins: Bins, snapshot: Snapshot, power: FloatArray, height: FloatArray) -> None:
+    """Add what both settings make of one ping."""
+    number, _, _ = second_of(power, height)
+    two, one = number >= 2, (power > 0.0).sum(axis=1) == 1
+    estimates = []
+    for value in ('gated', 'ignored'):
+        config = BathymetryConfig(layover=value, seed=1)
+        (estimate,) = BathymetryTracker(config).process(snapshot)
+        estimates.append(estimate)
+    gated, ignored = (estimate.extras['valid'] > 0 for estimate in estimates)
+    sd = np.sqrt(estimates[0].covariance[:, 0, 0])
+    with np.errstate(invalid='ignore'):
+        off = np.abs(height - estimates[0].state[:, :1])
+    nearest = np.nanmin(np.where(power > 0.0, off, np.inf), axis=1)
+    marked = estimates[0].extras['surfaces'] == 2
+    bins.two, bins.one = bins.two + int(two.sum()), bins.one + int(one.sum())
+    bins.caught += int((marked & two).sum())
+    bins.lost += int((marked & one).sum())
+    bins.kept += int((gated & two).sum())
+    bins.ignored += int((ignored & two).sum())
+    bins.near_ignored += int((nearest < 2.0 * sd)[ignored & two].sum())
+    bins.error_ignored += float(np.square(nearest[ignored & two]).sum())
+
+
+def shares(bins: Bins) -> dict[str, float]:
+    """The row of a table."""
+    return {
+        'bins_two': bins.two,
+        'caught': bins.caught / bins.two,
+        'lost': bins.lost / bins.one,
+        'soundings': bins.kept / bins.two,
+        'soundings_ignored': bins.ignored / bins.two,
+        'near_ignored': bins.near_ignored / bins.ignored,
+        'rmse_ignored_m': float(np.sqrt(bins.error_ignored / bins.ignored)),
+    }
+
+
+def lost(name: str, pings: int, seed: int) -> dict[str, float]:
+    """Bins of a floor without objects that are gated, and the worst ping."""
+    scene_name, changes = FLAT[name]
+    config = scenario(scene_name, {'pings': pings, **changes})
+    values = {**config.instruments(), 'layover': 'gated', 'engine': 'grid', 'grid_step': 0.05}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
+    parts = []
+    for item in simulate(config, seed).measurements:
+        (estimate,) = tracker.process(item.measurement)
+        parts.append(float((estimate.extras['surfaces'] == 2).mean()))
+    return {'lost': float(np.mean(parts)), 'worst_ping': max(parts)}
+
+
+def main(pings: int = 40, seed: int = 1) -> Parts:
+    yield {'pings': pings, 'seed': seed}
+    for name, changes in SETTINGS.items():
+        for kind in SIZES:
+            bins = Bins()
+            for ping in objects(kind, pings, seed, changes):
+                count(bins, *ping)
+            yield {'objects': {f'{kind}, {name}': shares(bins)}}
+    for name in FLAT:
+        yield {'floors': {name: lost(name, pings, seed)}}
+
+
+if __name__ == '__main__':
+    study(main)

@@ -1,0 +1,94 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Objects on the floor: what a ping sees of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.bathymetry_scenes import truth_of
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
+from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.simulation.bathymetry.hearing import snr
+from sonar_imm_tools.simulation.bathymetry.objects import facets_of, second_of, surfaces_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+
+
+def seen(**values):
+    config = scenario('ledge', values)
+    ranges = config.first_range + config.bin_width * np.arange(1200)
+    ratio = snr(config, ranges)
+    return ranges, ratio, *surfaces_of(facets_of(config, ranges, ratio), len(ranges))
+
+
+def test_the_floor_before_an_object_has_the_ratio_of_the_scene():
+    ranges, ratio, power, height = seen(object_distance=50.0)
+    near = (ranges > 18.0) & (ranges < 50.0)
+    assert np.mean(power[near, 0] / ratio[near]) == pytest.approx(1.0, abs=0.01)
+    assert np.abs(power[near, 0] / ratio[near] - 1.0).max() < 0.35  # whole facets
+    assert (height[near, 0] == 0.0).all() and (power[near, 1:] == 0.0).all()
+
+
+def test_a_ledge_has_its_face_before_the_foot_and_its_top_with_the_floor():
+    ranges, _, power, height = seen(object_distance=30.0, object_size=2.0)
+    foot, edge = math.hypot(30.0, 15.0), math.hypot(30.0, 13.0)
+    face = np.flatnonzero(power[:, 1])
+    assert ranges[face[0]] == pytest.approx(edge, abs=0.06)
+    assert ranges[face[-1]] == pytest.approx(foot, abs=0.06)
+    both = (ranges > edge + 0.1) & (ranges < foot - 0.1)
+    assert (power[both][:, :3] > 0.0).all()
+    # The face at range r is at the height where 15 - z = sqrt(r^2 - 30^2).
+    expected = 15.0 - np.sqrt(ranges[both] ** 2 - 900.0)
+    assert height[both, 1] == pytest.approx(expected, abs=0.08)
+    number, main, second = second_of(power, height)
+    assert (number[both] >= 2).mean() > 0.7 and number[ranges < 32.0].max() == 1
+    beside = np.isfinite(second)
+    assert (np.abs(second - main)[beside] >= 0.5).all()
+    np.testing.assert_array_equal(beside, number > 1)
+
+
+@pytest.mark.parametrize('kind', ['box', 'wall', 'boulder'])
+def test_an_object_has_a_shadow(kind):
+    ranges, _, power, _ = seen(object=kind, object_distance=30.0, object_size=3.0)
+    dark = power.sum(axis=1) == 0.0
+    begin, end = ranges[dark][[0, -1]]
+    assert begin > 32.0
+    if kind == 'wall':  # the ray over its far edge meets the floor there
+        assert end == pytest.approx(math.hypot(30.2 * 15.0 / 12.0, 15.0), abs=0.1)
+    assert (power[ranges > end + 0.1, 3] > 0.0).all()
+
+
+def test_a_wall_is_gated_and_scored():
+    """The range of heights is no limit: walls of 4 m."""
+    config = scenario(
+        'ledge', {'object': 'wall', 'object_size': 4.0, 'object_distance': 26.0, 'pings': 4}
+    )
+    scene = simulate(config, 5)
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(config.instruments()))
+    estimates = [made for item in scene.measurements for made in tracker.process(item.measurement)]
+    metrics = score(profiles_of(estimates, truth_of(scene)))
+    assert metrics['layover']['bins'] > 80
+    assert metrics['layover']['found'] > 0.75
+    assert metrics['layover']['soundings'] < 0.2 and metrics['layover']['lost'] < 0.01
+    assert 0.0 < metrics['two_share'] < 0.05
+
+
+@pytest.mark.parametrize('values', [{'multipath': True}, {'object_size': 20.0}])
+def test_what_does_not_go_with_objects(values):
+    with pytest.raises(ConfigError):
+        scenario('ledge', values)
