@@ -52,12 +52,12 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 @frozen(kw_only=True)
 class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
-    """All parameters of the diver tracker. The defaults are the `heading_speed` set of the
+    """All parameters of the diver tracker. The defaults are the `families` of the
     docs."""
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = parameter('heading_speed', '',
+    model_set: str = parameter('families', '',
         'motion models run side by side', choices=MODEL_SETS)
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))

@@ -453,7 +453,7 @@ class DiverTracker:
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
-                birth = Birth(start.position[:2], start.covariance)
+                birth = Birth(start.position[:2], start.covariance, measured=False)
                 now = births.confirmed(self._with_tracks(now, [birth]))
         return now
 
