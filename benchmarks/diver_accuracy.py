@@ -252,7 +252,9 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
         for seed in range(runs):
             scene = simulate(scenario(name), seed)
             measurements = [item.measurement for item in scene.measurements]
-            final = final_estimates(DiverTracker(DiverConfig(max_tracks=1, **HEADINGS)), measurements)
+            final = final_estimates(
+                DiverTracker(DiverConfig(max_tracks=1, **HEADINGS)), measurements
+            )
             path = truths(scene, TrueTrack)[0]
             at = {int(stamp): k for k, stamp in enumerate(path.stamp_ns)}
             ids = set()

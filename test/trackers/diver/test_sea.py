@@ -170,7 +170,7 @@ def run_fixes(total, white, bias, **config):
 def test_covariances_of_fixes_that_cannot_be_true_are_named():
     assert run_fixes(0.25, 0.5, 0.0).warnings() == []
     for model_set, says in (
-        ('families', 'times what they state'),
+        ('families', 'times as far as they state'),
         ('heading_speed', 'miss by more than they state'),
     ):
         optimistic = run_fixes(0.01, 0.8, 0.0, model_set=model_set)
