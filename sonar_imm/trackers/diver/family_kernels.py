@@ -30,8 +30,8 @@ velocity -> hover
 velocity -> heading
     The state given that w'v = 0 with variance q ((u'v)^2 + u'P_v u); then s = u'v. What stands
     behind the four components stays as it is, as if it were only considered: a hypothesis of the
-    heading says nothing of it. Directions share the probability of going to headings as N(w'v; 0, S) E[max(s, 0)], S the variance of w'v
-    and that one.
+    heading says nothing of it. Directions share the probability of going to headings as
+    N(w'v; 0, S) E[max(s, 0)], S the variance of w'v and that one.
 same components
     The state as it is.
 
