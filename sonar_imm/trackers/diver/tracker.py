@@ -293,8 +293,8 @@ class DiverTracker:
             tracks, row = np.nonzero(now.target_id[:, None] == fixes.target_id[None])
             free = ~np.isin(np.arange(len(fixes.z)), row)
             if densities is not None:
-                believed = densities.whole[tracks, row] > families.bound(config)
-                tracks, row = tracks[believed], row[believed]
+                good = densities.whole[tracks, row] > families.bound(config)
+                tracks, row = tracks[good], row[good]
             return Association(tracks, row, expected, now.score, free, densities=densities)
         excluded = now.target_id != NOBODY
         if config.named_tracks == 'share':
@@ -312,7 +312,8 @@ class DiverTracker:
             threshold = gate_threshold(config.gate_probability, 2)
             fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
         else:
-            fit = densities.whole.copy()
+            believed = densities.whole > families.bound(config)
+            fit = np.where(believed, densities.whole, -np.inf)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
