@@ -151,7 +151,8 @@ def test_both_sides_of_a_sonar_are_shown_each_below_its_name(tmp_path):
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *told]) == 0
     with opened(tmp_path / 'run') as (material, problems):
         assert problems == []
-        assert any(name.endswith('/bathymetry/estimate') for name in material.channels)
+        names = [name for name in material.channels if name.endswith('/bathymetry/estimate')]
+        assert len(names) == 2 and '/bathymetry/estimate' not in names
         assert list(material.messages())
 
 
