@@ -19,6 +19,7 @@ import json
 from helpers.obstacle_bags import tracked
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Detections, Navigation
@@ -26,6 +27,7 @@ from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
+from sonar_imm_tools.evaluation.obstacle.figures import error_figure
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -65,6 +67,13 @@ def straight(track_id, offset, bearing=0.0, count=20):
         [60.0 - 2.0 * np.arange(count), np.full(count, bearing), np.full(count, offset)]
     )
     return TruePath(track_id, stamps, seen, np.ones(count, bool))
+
+
+def test_of_true_deviations_nine_in_ten_lie_in_the_shaded_band():
+    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 3.0, 1.0, 2.0, 5.0, 0.1]])]),
+                     (straight(1, 3.0),), cutoff=5.0, gap=60.0)  # fmt: skip
+    (band,) = error_figure(found).layout.shapes
+    assert ndtr(band.y1) - ndtr(band.y0) == pytest.approx(0.9, abs=1e-3)
 
 
 def test_scores_are_those_done_by_hand():
