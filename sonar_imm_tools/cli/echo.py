@@ -75,7 +75,8 @@ def command(
 
     Without TOPIC every topic that ends in /estimate is shown; any other table of this package
     works too, e.g. /detections or /snapshot. A state stands with its standard deviation, the
-    models as the most probable one. Ctrl-C ends it.
+    models as the most probable one. Where the output is no terminal, standard error says what is
+    listened to. Ctrl-C ends it.
     """
     from ..replay.link import Link
     from ..replay.listening import TableListener
@@ -83,8 +84,14 @@ def command(
     left = 1 if once else count
     with Link(NAME) as link, _shower(rows, as_json) as show:
         with contextlib.suppress(KeyboardInterrupt):  # the usual way to end it
-            for table in TableListener(link, topics).tables(timeout):
+            listener = TableListener(link, topics)
+            announced: list[str] = []
+            for table in listener.tables(timeout):
                 if table is None:
+                    # A look after it subscribed, so that publishers know of it by then.
+                    if listener.topics != announced and not sys.stdout.isatty():
+                        announced = listener.topics
+                        click.echo(f'listening to {", ".join(announced)}', err=True)
                     continue
                 show(table)
                 if left is not None and (left := left - 1) == 0:

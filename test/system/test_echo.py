@@ -94,5 +94,8 @@ def test_silence_is_told(monkeypatch):
         assert "did you mean '/diver/estimate'" in said
         said = silent.communicate(timeout=90)[1]
         assert silent.returncode == 1
-        assert own_words(said) == 'sonar-imm: nothing was published on /diver/estimate within 25 s'
+        assert own_words(said).splitlines() == [
+            'listening to /diver/estimate',
+            'sonar-imm: nothing was published on /diver/estimate within 25 s',
+        ]
         assert node.process.poll() is None
