@@ -445,3 +445,51 @@ def test_jipda_merges_two_tracks_of_one_diver(seed, clutter):
     density = max(clutter, 0.25) / 2500.0
     counts, _ = confirmed_by_jipda(scans, clutter_density=density)
     assert counts[29] == 2 and (counts[45:] == 1).all()
+
+
+def polled(seed, divers=3, seconds=60, detection_probability=0.95, std=0.3):
+    """Fixes of divers 20 m apart by a sensor that looks at one after the other, once a second."""
+    rng = np.random.default_rng(seed)
+    for turn in range(5, 5 + seconds):
+        for diver in np.flatnonzero(rng.uniform(size=divers) < detection_probability):
+            when = turn + (diver + 0.5) / divers + 0.01 * rng.normal()
+            across = 20.0 * diver + std * rng.normal()
+            yield fix(when, 0.5 * when, across, std**2 * np.eye(2))
+
+
+def missed(made, divers=3):
+    """Share of divers without a confirmed track within 3 m, after 20 s; who was confirmed."""
+    shares, ids = [], set()
+    for estimate in [item for item in made if item.stamp_ns > 25 * SECOND]:
+        followed = estimate.extras['track_state'] > 0
+        ids.update(estimate.extras['track_id'][followed].tolist())
+        across = estimate.state[followed, 1]
+        shares.append(np.mean([not (abs(across - 20.0 * k) < 3.0).any() for k in range(divers)]))
+    return float(np.mean(shares)), ids
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_fixes_of_a_sensor_that_polls_are_gathered_to_scans(seed):
+    alone, _ = missed(run(DiverTracker(DiverConfig()), polled(seed)))
+    made = run(DiverTracker(DiverConfig(scan_period=1.0)), polled(seed))
+    gathered, ids = missed(made)
+    assert alone > 0.3 and gathered < 0.01 and len(ids) == 3
+    assert {item.stamp_ns % SECOND for item in made} == {SECOND // 2}
+
+
+def test_gathered_scans_are_the_same_in_any_order_and_as_those_gathered_by_hand():
+    config, items = DiverConfig(scan_period=1.0), list(polled(3, seconds=30))
+    order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 9, len(items)))
+    first = run(DiverTracker(config), items)
+    other = run(DiverTracker(config), [items[k] for k in order])
+    half = SECOND // 2
+    middle = [evolve(item, stamp_ns=item.stamp_ns // SECOND * SECOND + half) for item in items]
+    by_hand = run(DiverTracker(DiverConfig()), middle)
+    for made in (other, by_hand):
+        assert len(made) == len(first) and all(same(*pair) for pair in zip(first, made))
+
+
+def test_fixes_with_a_name_keep_their_stamps():
+    tracker = DiverTracker(DiverConfig(scan_period=1.0))
+    (estimate,) = tracker.process(evolve(fix(5.2, 0.0, 0.0), target_id=4))
+    assert estimate.stamp_ns == round(5.2 * SECOND)
