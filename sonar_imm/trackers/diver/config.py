@@ -161,6 +161,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'fixes of one stamp are a whole scan, in which a diver without a fix was missed; false '
         'for transponders polled in turn')
 
+    scan_period: float = parameter(0.0, 's',
+        'time in which a sensor that rotates or polls, and stamps each fix by itself, looks at '
+        'everyone once: fixes without a name within a whole multiple of it and the next are one '
+        'scan, at the middle; 0: those of one stamp are', range=(0.0, 3600.0))
+
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
         description='largest number of divers tracked at once; 1 means that a single diver is '

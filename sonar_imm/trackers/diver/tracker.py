@@ -424,7 +424,7 @@ class DiverTracker:
             status = np.where(doubtful[kept], TENTATIVE, life.status).astype(np.uint8)
             life, alive = evolve(life, status=status), alive & ~over
         if by_existence.any():
-            judged = jipda.judge(now, hit, looked, self._position)
+            judged = jipda.judge(now, hit, looked, self._position, scan.fixes)
             status = np.where(by_existence[kept], judged.status[kept], life.status)
             life = evolve(life, status=status)
             now = now._replace(near_to=judged.near_to, near_for=judged.near_for)
