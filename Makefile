@@ -15,9 +15,9 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
 # Message setters check their types only when asked to before the first import. One thread for each
-# process: the tests run side by side. Compiled kernels and logs stay inside the environment.
+# process: the tests run side by side. Logs stay inside the environment.
 TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
-    NUMBA_CACHE_DIR=$(abspath $(VENV))/numba ROS_LOG_DIR=$(abspath $(VENV))/log
+    ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
 # Real nodes wait more than they work, but some of the tests bound their answers in time.
 SYSTEM_JOBS ?= 2

@@ -18,6 +18,14 @@ Latitude and longitude become metres east and north of the origin. A relative fi
 vessel's pose is known around its stamp, from ``nav`` or from ``nav_fix`` and ``heading``, and is
 composed with it. Everything else goes through as it is.
 
+East, north and up of a vessel that is known by latitude and longitude are not those of the origin:
+what it measures against them (its heading, a position by the transceiver's own compass) is turned
+by the convergence of the meridians and the tilt of the vertical. What is by compass is turned from
+magnetic to true north before.
+
+A sensor that rotates or polls stamps each fix by itself. With ``scan_period`` they get the stamp
+of their scan here, so that those who are not looked at just now are not missed.
+
 Without a stated origin the first position in latitude and longitude is it, once such a position is
 used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
 what came first stays.
@@ -29,6 +37,7 @@ from collections import Counter
 from operator import attrgetter
 from typing import NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -45,6 +54,7 @@ from ...measurements import (
     Measurement,
     nanoseconds,
     Navigation,
+    NOBODY,
     Rejection,
     RelativeFix,
     VesselFix,
@@ -62,11 +72,13 @@ _LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class _Vessel(NamedTuple):
-    """The vessel at an instant, and the frame it is placed in."""
+    """The vessel at an instant, and the frame it is placed in; axes (3, 3): of that frame from
+    east, north, up where the vessel is."""
 
     pose: Pose
     uncertainty: Uncertainty
     frame_id: str
+    axes: FloatArray
 
 
 class _Samples:
@@ -133,6 +145,20 @@ class Georeferencer:
 
     def georeference(self, measurement: Measurement) -> list[Measurement]:
         """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
+        ready = self._placed(measurement)
+        return [self._gathered(item) for item in ready] if self.config.scan_period else ready
+
+    def _gathered(self, item: Measurement) -> Measurement:
+        """A fix without a name at the stamp of its scan, in the middle of its period: that is the
+        same in whatever order the fixes come."""
+        if not isinstance(item, Fix) or item.target_id != NOBODY:
+            return item
+        period_ns = nanoseconds(self.config.scan_period)
+        scan_ns = item.stamp_ns // period_ns * period_ns + period_ns // 2
+        return evolve(item, stamp_ns=scan_ns)
+
+    def _placed(self, measurement: Measurement) -> list[Measurement]:
+        """`georeference`, each at its own stamp."""
         if isinstance(measurement, (Fix, Fixes, Arrivals)):
             return [measurement] if self._in_metres() else []
         if isinstance(measurement, VesselPose):
@@ -259,7 +285,7 @@ class Georeferencer:
         config = self.config
         if config.vessel == 'fixed':
             level, nothing = Pose(np.zeros(3), np.eye(3)), np.zeros((3, 3))
-            return _Vessel(level, Uncertainty(nothing, nothing), config.map_frame)
+            return _Vessel(level, Uncertainty(nothing, nothing), config.map_frame, np.eye(3))
         attitude, heading = np.radians(
             [config.vessel_attitude_std_deg, config.vessel_heading_std_deg]
         )
@@ -270,13 +296,23 @@ class Georeferencer:
         places = self._by_places()
         where = self._places if places else self._poses
         lies = self._headings if places else self._poses
-        pose = Pose(where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R)
+        position, R = where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R
         near = where.nearest(stamp_ns)
         stated = Uncertainty(
             _stated(near, slice(0, 3), assumed.position),
             _stated(lies.nearest(stamp_ns), slice(3, 6), assumed.attitude),
         )
-        return _Vessel(pose, stated, near.frame_id)
+        if not places:
+            return _Vessel(Pose(position, R), stated, near.frame_id, np.eye(3))
+        assert self.origin is not None
+        axes = self.origin.axes(*self.origin.geodetic(position)[:2])
+        turn = axes @ self._true_north()
+        stated = stated._replace(attitude=turn @ stated.attitude @ turn.T)
+        return _Vessel(Pose(position, turn @ R), stated, near.frame_id, axes)
+
+    def _true_north(self) -> FloatArray:
+        """(3, 3) that turns vectors in magnetic axes into true east, north, up."""
+        return geometry.rotation(0.0, 0.0, -np.radians(self.config.magnetic_declination_deg))
 
     def _composed(self, fix: RelativeFix, vessel: _Vessel) -> Fix:
         config = self.config
@@ -285,12 +321,17 @@ class Georeferencer:
             geometry.rotation(*np.radians(config.transceiver_mount_rpy_deg)),
             config.transceiver_lever_std,
         )
+        offset, covariance = fix.offset, fix.covariance
+        if fix.levelled:
+            turn = vessel.axes @ self._true_north()
+            offset = turn @ offset
+            covariance = None if covariance is None else turn @ covariance @ turn.T
         placed = place(
             vessel.pose,
             vessel.uncertainty,
             mounting,
-            fix.offset,
-            fix.covariance,
+            offset,
+            covariance,
             range_std=config.relative_range_std,
             angle_std=float(np.radians(config.relative_angle_std_deg)),
             levelled=fix.levelled,

@@ -73,10 +73,10 @@ def facets_of(config: Any, ranges: FloatArray, snr: FloatArray) -> Facets:
 def surfaces_of(facets: Facets, bins: int) -> tuple[FloatArray, FloatArray]:
     """Power (bins, 4) of each surface and its mean height, NaN where it is not seen."""
     place = 4 * facets.bin + facets.surface
-    power = np.bincount(place, facets.power, 4 * bins)
-    height = np.bincount(place, facets.power * facets.height, 4 * bins)
+    power = np.bincount(place, facets.power, 4 * bins).astype(np.float64)
     with np.errstate(invalid='ignore'):
-        return power.reshape(-1, 4), (height / power).reshape(-1, 4)
+        height = np.bincount(place, facets.power * facets.height, 4 * bins) / power
+    return power.reshape(-1, 4), height.reshape(-1, 4)
 
 
 def second_of(power: FloatArray, height: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
