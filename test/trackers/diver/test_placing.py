@@ -332,7 +332,8 @@ def test_the_declination_turns_no_pose_of_nav():
 
 def test_covariances_turn_with_the_axes():
     """At 88 degrees of latitude, 90 degrees of longitude from the origin, north is west."""
-    config = DiverConfig(origin_latitude=88.0, origin_longitude=1.0, **EXACT)
+    place = {'origin_latitude': 88.0, 'origin_longitude': 1.0}
+    config = DiverConfig(model_set='heading_speed', **place, **EXACT)
     tracker = DiverTracker(config)
     for second in (1, 2):
         where = VesselFix(
