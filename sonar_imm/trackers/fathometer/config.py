@@ -163,6 +163,10 @@ class FathometerConfig(StampParameters):
     depth_std: float = parameter(0.1, 'm',
         'standard deviation of the change of the depth of a reflector from record to record',
         range=(1e-4, 100.0))
+    record_interval: float = parameter(0.0, 's',
+        'time from record to record that depth_std, order_switch_probability and what else is per '
+        'record are meant for: after a gap they count as often as records would have come; 0: the '
+        'median of the first intervals', range=(0.0, 86400.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('positive', '',
@@ -200,7 +204,7 @@ class FathometerConfig(StampParameters):
         'whether reflectors get a probability of being multiples of others, from their depths '
         'below the surface: mark or off; they are never left out', choices=MULTIPLES)
     track_memory: int = live(5, '',
-        'number of records after which a reflector that was not seen gets a new id',
+        'number of records after which a reflector that was not seen in them gets a new id',
         range=(0, 10_000))
 
     # -- time -------------------------------------------------------------------------------------
