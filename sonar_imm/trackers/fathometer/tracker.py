@@ -136,10 +136,12 @@ class FathometerTracker:
     `CrossSpectra`, `Trace` and `ArrayDepth`.
 
     response: the depth response of the newest record or preview, for display; None before.
+    refusals: the sentence of the first record that could not be used, by reason.
     """
 
     STATE = (
         'response',
+        'refusals',
         '_stream',
         '_pace',
         '_ids',
@@ -165,6 +167,7 @@ class FathometerTracker:
         self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
         self.counts = self._stream.counts
         self.response: Response | None = None
+        self.refusals: dict[str, str] = {}
         self._ids = Identities()
         self._depths = CompanionDepths()
         self._forget()
@@ -263,6 +266,7 @@ class FathometerTracker:
             return self._estimates(item)
         except Rejection as rejection:
             self.counts[rejection.reason] += 1
+            self.refusals.setdefault(rejection.reason, rejection.sentence)
             return []
 
     def _estimates(self, item: Pressure | CrossSpectra | Trace) -> list[Estimate]:
