@@ -47,7 +47,7 @@ def make_marker(
         'visualization_msgs/msg/Marker',
         header=make_header(estimate.stamp_ns, estimate.frame_id, make),
         ns=name,
-        id=int(estimate.extras['track_id'][row]),
+        id=_number(int(estimate.extras['track_id'][row])),
         type=kind,
         action=_ADD,
         scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', size))),
@@ -57,6 +57,11 @@ def make_marker(
     )
 
 
+def _number(track_id: int) -> int:
+    """The id of a marker has 31 bits, one less than that of a track."""
+    return track_id & 0x7FFFFFFF
+
+
 def write_ended(frame_id: str, track_ids: Iterable[int], names: Iterable[str], make: Make) -> Any:
     """Write what removes the markers of tracks that are over; names: the namespaces they have."""
     markers = [
@@ -64,7 +69,7 @@ def write_ended(frame_id: str, track_ids: Iterable[int], names: Iterable[str], m
             'visualization_msgs/msg/Marker',
             header=make_header(0, frame_id, make),
             ns=name,
-            id=track_id,
+            id=_number(track_id),
             action=_DELETE,
         )
         for track_id in track_ids

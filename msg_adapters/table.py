@@ -195,7 +195,8 @@ def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float
         raise Rejection(
             'bad_field', f"column '{name}' holds {column.shape[1]} values per row, one is needed"
         )
-    return column.astype(np.float64)
+    with np.errstate(invalid='ignore'):  # bytes can be a signalling NaN, which is just a NaN
+        return column.astype(np.float64)
 
 
 def constant_column(

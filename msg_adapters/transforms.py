@@ -17,6 +17,7 @@ single geometry_msgs/TransformStamped where tf2 is not installed."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ def _pose(stamped: Any) -> tuple[str, tuple[str, Pose]]:
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], np.float64)
     if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
         raise Rejection('nan', f"the transform from '{parent}' to '{child}' is not finite")
-    if np.abs(position).max() > FARTHEST or abs(np.linalg.norm(quaternion) - 1.0) > 0.01:
+    if np.abs(position).max() > FARTHEST or abs(math.hypot(*quaternion) - 1.0) > 0.01:
         raise Rejection(
             'out_of_range',
             f"the transform from '{parent}' to '{child}' is no turn (a quaternion of length 1) "

@@ -92,7 +92,7 @@ def mvdr(
     cross = np.einsum('fm,fm->f', w, solved[..., 0])  # w_-^H is the plain transpose of w
     up = np.einsum('fm,fm->f', w.conj(), solved[..., 0]).real
     down = np.einsum('fm,fm->f', w, solved[..., 1]).real
-    with np.errstate(invalid='ignore', divide='ignore'):
+    with np.errstate(invalid='ignore', divide='ignore', over='ignore'):
         return cross / (up * down), 1.0 / np.sqrt(up * down)
 
 

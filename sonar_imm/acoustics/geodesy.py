@@ -54,15 +54,21 @@ class Origin:
         there = enu2geodetic(east, north, up, self.latitude, self.longitude, self.height)
         return np.stack([np.asarray(part, np.float64) for part in there], axis=-1)
 
+    def axes(self, latitude: float, longitude: float) -> FloatArray:
+        """(3, 3) that turns vectors in east, north, up of a place into those of the origin: the
+        convergence of the meridians and the tilt of the vertical."""
+        there = _to_earth(latitude, longitude)
+        return np.asarray(_to_earth(self.latitude, self.longitude).T @ there)
+
     def turn(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin.
 
-        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees.
-        The vertical tilts by as little, and a height that is not known must not be spread over
-        east and north by it.
+        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees
+        (more near a pole), and the vertical tilts by .1. A height that is not known must not be
+        spread over east and north by the tilt: this is for covariances, `axes` for what is
+        measured whole.
         """
-        here, there = _to_earth(self.latitude, self.longitude), _to_earth(latitude, longitude)
-        east, north = (here.T @ there)[:2, 0]
+        east, north = self.axes(latitude, longitude)[:2, 0]
         c, s = np.array([east, north]) / np.hypot(east, north)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

@@ -21,8 +21,9 @@ objects deal with that.
 belongs when it is neither older than the newest one by more than the window, nor ahead of it by
 more than `max_gap_ns`. One that does not belong is held, because it may be the first of a clock
 that was restarted. Stamps held in a row are a *run*: each follows those before it, and none that
-belongs to the stream came in between. A run is given up as soon as one does. It shows that time
-itself was set anew when nothing else explains it:
+belongs to the stream came in between. A run is given up as soon as one does, and begins again
+with a stamp that does not follow. It shows that time itself was set anew when nothing else
+explains it:
 
 1. It lies ahead, or more than `max_late_ns` behind, where no late message can be: `restart_after`
    distinct stamps are enough.

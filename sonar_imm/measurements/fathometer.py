@@ -38,6 +38,8 @@ _SILENT = 1e-9
 """A hydrophone with so little of the median power of the others is dead."""
 _HERMITIAN = 1e-3
 """Largest asymmetry of a matrix, against the powers of the two hydrophones."""
+_LOUDEST = 1e12
+"""No sample is larger, in any unit; the power spectra of larger ones overflow single precision."""
 
 
 def _depth(value: Any) -> float | None:
@@ -56,7 +58,8 @@ def _depth(value: Any) -> float | None:
 
 
 def _samples(value: Any) -> NDArray[np.float32]:
-    array = np.array(value, np.float32)
+    with np.errstate(over='ignore', invalid='ignore'):  # what is too large becomes infinite
+        array = np.array(value, np.float32)
     array.flags.writeable = False
     return array
 
@@ -157,10 +160,11 @@ class CrossSpectra:
         self._check_size()
         self._check_frequencies()
         power = np.einsum('fmm->fm', self.csdm).real
-        alive = _alive(np.where(np.isfinite(power), power, np.nan), 'cross-spectra')
+        power = np.where(np.isfinite(power), power, np.nan).astype(np.float64)
+        alive = _alive(power, 'cross-spectra')
         inner = self.csdm[:, alive][:, :, alive]
         finite = np.isfinite(inner).all(axis=(1, 2))
-        usable = finite & (np.where(np.isfinite(power), power, 0.0)[:, alive] > 0.0).all(axis=1)
+        usable = finite & (power[:, alive] > 0.0).all(axis=1)
         if not usable.any():
             raise Rejection('nan', 'no row of the cross-spectra has only finite, positive powers')
         self._check_matrices(inner[usable], power[usable][:, alive])
@@ -203,10 +207,12 @@ class CrossSpectra:
         # Some frequencies at a time: the intermediate results of all would leave the cache.
         for first in range(0, len(csdm), 64):
             R, r = csdm[first : first + 64], root[first : first + 64]
-            normalised = R / r[:, :, None] / r[:, None, :]
-            if np.abs(normalised - normalised.conj().swapaxes(1, 2)).max() > _HERMITIAN:
+            with np.errstate(over='ignore', invalid='ignore'):  # far above one, maybe infinite
+                normalised = R / r[:, :, None] / r[:, None, :]
+                asymmetry = np.abs(normalised - normalised.conj().swapaxes(1, 2)).max()
+            if asymmetry > _HERMITIAN:
                 raise Rejection('not_hermitian', 'the cross-spectral matrices are not Hermitian')
-            if np.abs(normalised).max() > 1.0 + _HERMITIAN:
+            if not np.abs(normalised).max() <= 1.0 + _HERMITIAN:
                 raise Rejection(
                     'not_positive',
                     'the cross-spectra claim a coherence between hydrophones above one',
@@ -217,10 +223,11 @@ class CrossSpectra:
 class Pressure:
     """A block of samples of all hydrophones.
 
-    pressure (n, M) in any linear unit, hydrophone 0 the deepest, samples that are not finite made
-    zero; sample_rate Hz; the stamp is that of the first sample; reference_depth: of hydrophone 0,
-    m, None when not known; scale: what a step of whole numbers is worth, 0 for real ones.
-    alive (M,): hydrophones that are finite throughout and not constant.
+    pressure (n, M) in any linear unit, hydrophone 0 the deepest, samples that are not finite or
+    beyond 1e12 made zero; sample_rate Hz; the stamp is that of the first sample; reference_depth:
+    of hydrophone 0, m, None when not known; scale: what a step of whole numbers is worth, 0 for
+    real ones.
+    alive (M,): hydrophones without such a sample that are not constant.
     """
 
     stamp_ns: int
@@ -248,7 +255,7 @@ class Pressure:
                 'out_of_range',
                 f'the sample rate is {self.sample_rate:g} Hz; 1 Hz to 10 MHz are possible',
             )
-        finite = np.isfinite(self.pressure)
+        finite = np.abs(self.pressure) <= _LOUDEST
         clean = np.where(finite, self.pressure, np.float32(0.0))
         power = np.var(clean, axis=0, dtype=np.float64)
         alive = _alive(np.where(finite.all(axis=0), power, np.nan)[None], 'pressure')

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 from attrs import field, frozen
@@ -146,7 +147,7 @@ class Navigation:
             raise Rejection(
                 'out_of_range', 'the vehicle lies further than 100,000 km from the origin'
             )
-        length = float(np.linalg.norm(self.orientation))
+        length = math.hypot(*self.orientation)
         if abs(length - 1.0) > 0.01:
             raise Rejection(
                 'bad_orientation',

@@ -18,6 +18,7 @@ what is known of frames that are fixed to each other."""
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 from attrs import field, frozen
@@ -127,7 +128,7 @@ class VesselHeading:
         check_stamp(self.stamp_ns)
         if not np.isfinite(self.orientation).all():
             raise Rejection('nan', 'the orientation of the vessel is not finite')
-        length = float(np.linalg.norm(np.clip(self.orientation, -1e3, 1e3)))
+        length = math.hypot(*self.orientation)
         if abs(length - 1.0) > 0.01:
             raise Rejection(
                 'bad_orientation',

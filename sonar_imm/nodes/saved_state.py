@@ -51,7 +51,8 @@ class SavedState:
     """
 
     def __init__(self, node: Node, system: str, settings: NodeConfig):
-        """Raises `ConfigError` when the folder of the file is not there."""
+        """Raises `ConfigError` when the folder of the file is not there, or a user without a home
+        says ``~``."""
         self.trouble = ''
         self._node, self._system = node, SYSTEMS[system]
         self._frame_id = settings.frame_id
@@ -60,7 +61,10 @@ class SavedState:
             'frame_id': settings.frame_id,
             'world_frame_convention': settings.world_frame_convention,
         }
-        self._path = Path(settings.state_file).expanduser() if settings.state_file else None
+        try:
+            self._path = Path(settings.state_file).expanduser() if settings.state_file else None
+        except RuntimeError as error:
+            raise ConfigError(f"state_file: '~' stands for no folder ({error})") from None
         self._period = settings.state_interval
         self._refused = self._others = False
         self._loaded_ns: int | None = None

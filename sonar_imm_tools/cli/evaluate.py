@@ -60,7 +60,8 @@ from .common import BAG, example, json_option, print_json, say
     type=click.FloatRange(min=0.0, min_open=True),
     metavar='METRES',
     help='An estimate further away from all targets is on none of them; the default depends '
-    'on the system, 10 for divers.',
+    'on the system: for divers six times the median distance of the raw fixes (of the tracks '
+    'where there are none) from the truth, and at least 10.',
 )
 @click.option(
     '--report',

@@ -104,14 +104,20 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     }
 
 
-def coverage_sentence(coverage: float) -> str:
+def coverage_verdict(coverage: float) -> str:
     """What `coverage`, the share of truth inside the stated 95 % ellipses, says about them."""
+    return 'overconfident' if coverage < 0.90 else 'cautious' if coverage > 0.99 else 'consistent'
+
+
+def coverage_sentence(coverage: float) -> str:
+    """The `coverage_verdict` in words."""
     held = f'its 95 % ellipses hold the truth {100 * coverage:.0f} % of the time'
-    if coverage < 0.90:
-        return f'The tracker is overconfident: {held}.'
-    if coverage > 0.99:
-        return f'The tracker is more cautious than it needs to be: {held}.'
-    return f'The stated uncertainty is consistent with the errors: {held}.'
+    words = {
+        'overconfident': 'The tracker is overconfident',
+        'cautious': 'The tracker is more cautious than it needs to be',
+        'consistent': 'The stated uncertainty is consistent with the errors',
+    }
+    return f'{words[coverage_verdict(coverage)]}: {held}.'
 
 
 def bounds_remark(summary: Mapping[str, Any]) -> str:

@@ -39,14 +39,20 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """So many fresh processes. What has not begun when the context is left by an error is not
     begun any more.
 
-    Raises OSError when one of them dies. They are started anew and not forked: a fork copies the
-    threads of a library half.
+    Raises OSError when one of them dies, or where there is no shared memory (/dev/shm). They are
+    started anew and not forked: a fork copies the threads of a library half.
     """
-    pool = ProcessPoolExecutor(
-        count,
-        mp_context=multiprocessing.get_context('spawn'),
-        initializer=ignore_interrupt,
-    )
+    try:
+        pool = ProcessPoolExecutor(
+            count,
+            mp_context=multiprocessing.get_context('spawn'),
+            initializer=ignore_interrupt,
+        )
+    except (OSError, ImportError, NotImplementedError) as error:  # Python has three ways to say it
+        raise OSError(
+            f'processes cannot share work here ({error}): is there a /dev/shm? with --jobs 1 '
+            'there is only one'
+        ) from None
     try:
         yield pool
     except BrokenProcessPool:

@@ -77,6 +77,7 @@ def test_axes_turn_with_the_place():
     assert origin.turn(59.1, 10.2) == pytest.approx(np.eye(3))
     turn = origin.turn(59.15, 10.5)
     expected = numeric_axes(59.1, 10.2).T @ numeric_axes(59.15, 10.5)
+    assert origin.axes(59.15, 10.5) == pytest.approx(expected, abs=1e-8)
     # Up to the tilt of the vertical, a height of 20 km over the radius of the Earth.
     assert turn == pytest.approx(expected, abs=20.0 / 6371.0)
     assert turn[:2, :2] == pytest.approx(expected[:2, :2], abs=1e-5)

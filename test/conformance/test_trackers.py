@@ -17,6 +17,7 @@ from copy import deepcopy
 import pickle
 
 import attrs
+from helpers.hostile.properties import check_numbers
 from helpers.tracked import as_bytes, published, RUNS, tracked
 import numpy as np
 import pytest
@@ -152,6 +153,35 @@ def test_numbers_that_are_not_finite_harm_nobody(run):
                     assert not np.isinf(estimate.state[there]).any(), field.name
             tracker.process(measurement)
     assert refused + taken > 20
+
+
+LAST = 2**63 - 1
+YEAR = 365 * 86400 * SECOND
+CLOCKS = {
+    'from the first stamp there is': lambda stamps: [s - min(stamps) + 1 for s in stamps],
+    'to the last stamp there is': lambda stamps: [s - max(stamps) + LAST for s in stamps],
+    'standing still': lambda stamps: [stamps[0]] * len(stamps),
+    'leaping by years': lambda stamps: [1 + 2 * YEAR * k for k in range(len(stamps))],
+    'at both ends by turns': lambda stamps: [
+        LAST - k if k // 7 % 2 else 1 + k for k in range(len(stamps))
+    ],
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('clock', CLOCKS)
+def test_any_clock_gives_estimates_or_reasons(run, clock):
+    """No sum of stamps leaves 64 bits, and no time between measurements is too short or long."""
+    stamps = CLOCKS[clock]([m.stamp_ns for m in run.input])
+    tracker, rows = run.build(), 0
+    for measurement, stamp_ns in zip(run.input, stamps):
+        for estimate in tracker.process(attrs.evolve(measurement, stamp_ns=stamp_ns)):
+            check_numbers(estimate)
+            assert estimate.stamp_ns in stamps
+            rows += 1
+    assert rows or sum(tracker.counts.values())
+    if 'stamp there is' in clock:
+        assert rows == sum(map(len, run.whole)) and tracker.counts == run.counts
 
 
 def test_process_is_pure(run):

@@ -302,6 +302,14 @@ def test_off_stream_stamps_that_disagree_never_restart():
     assert sum(d.abandoned for d in decisions) == 3
 
 
+def test_a_stray_stamp_puts_off_a_restart_but_does_not_prevent_it():
+    """What is refused is evidence of the clock too: the run begins again after it."""
+    late = list(range(1000, 1020))
+    for stray, restart in (([], 5), ([3], 9)):
+        decisions = decide(StampGate(5 * S, 600 * S, 5), 1500, *late[:3], *stray, *late[3:])
+        assert [d.verdict for d in decisions].index('restart') == restart
+
+
 def test_good_stamps_between_keep_a_second_wrong_clock_out():
     decisions = decide(gate(), *[s for i in range(20) for s in (1000 + i, 5 + i)])
     assert [d.verdict for d in decisions] == ['use', 'too_late'] * 20

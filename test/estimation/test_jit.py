@@ -121,6 +121,47 @@ def test_a_folder_that_is_deleted_while_a_process_runs_is_made_again(fresh, tmp_
     assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
 
 
+@pytest.mark.parametrize('place', ['the folder', 'a folder in it'])
+def test_a_file_where_the_cache_should_be_costs_a_sentence(fresh, tmp_path, monkeypatch, place):
+    implementation = caching.CompileResultCacheImpl
+    only = [one for one in implementation._locator_classes if 'UserProvided' in one.__name__]
+    monkeypatch.setattr(implementation, '_locator_classes', only)
+    if place == 'a folder in it':
+        fresh()
+        for folder in tmp_path.iterdir():
+            shutil.rmtree(folder)
+            folder.write_text('')
+    else:
+        (tmp_path / 'file').write_text('')
+        monkeypatch.setattr(numba.config, 'CACHE_DIR', str(tmp_path / 'file'))
+    with pytest.warns(RuntimeWarning, match='no folder can be written') as warned:
+        for _ in range(2):
+            assert jit.kernel(lambda x: x + x)(2.0) == 4.0
+    assert len(warned) == 1
+
+
+def test_a_folder_of_another_user_costs_a_sentence(fresh, monkeypatch):
+    def denied(path, content):
+        raise PermissionError(13, 'Permission denied')
+
+    with monkeypatch.context() as patch, pytest.warns(RuntimeWarning, match='denied') as warned:
+        patch.setattr(Path, 'write_bytes', denied)
+        assert [fresh(), fresh()] == [(4.0, 0), (4.0, 0)]
+    assert len(warned) == 1
+    assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
+
+
+@pytest.mark.filterwarnings('error')
+def test_two_versions_of_numba_leave_each_other_alone(fresh, tmp_path, monkeypatch):
+    """Code of one is neither loaded nor removed by the other."""
+    fresh()
+    with monkeypatch.context() as patch:
+        patch.setattr(numba, '__version__', '0.0.1')
+        assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
+    assert fresh() == (4.0, 1)
+    assert len(list(tmp_path.rglob('*.nbc'))) == 2
+
+
 def copied(folder):
     """A copy of the package without anything compiled; gives its root."""
     root = folder / 'copy'
@@ -160,6 +201,10 @@ def test_what_was_compiled_beside_the_source_serves_others(tmp_path):
     assert list((root / 'sonar_imm' / 'estimation' / '__pycache__').glob('*.nbc'))
     assert run(elsewhere + code, root, '', XDG_CACHE_HOME=str(tmp_path / 'home')) == ['1']
     assert run(code, root, tmp_path / 'told') == ['0']  # NUMBA_CACHE_DIR is the only folder
+    for path in (root / 'sonar_imm').rglob('*.nbc'):
+        path.unlink()
+    nowhere = {'HOME': os.devnull, 'XDG_CACHE_HOME': ''}
+    assert run(elsewhere + code, root, '', **nowhere) == ['0']
 
 
 @pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')

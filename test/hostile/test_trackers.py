@@ -35,8 +35,6 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.own_files import write_own_parameters
 
-pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
-
 
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_no_message_breaks_a_tracker(system):
@@ -56,7 +54,7 @@ def test_no_message_breaks_a_tracker(system):
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_no_parameter_breaks_a_tracker(system):
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
+        warnings.simplefilter('error')
         ran = [extremes.run(system, seed) for seed in range(15)]
     assert sum(bool(one) for one in ran) > 5
 

@@ -85,10 +85,27 @@ def overcoherent(R):
     return R
 
 
+def overflowing(R):
+    """Cross terms and powers at the two ends of single precision."""
+    R = (R * 1e-40).astype(np.complex64)
+    R[:, 0, 1] = R[:, 1, 0] = 1e38
+    return R
+
+
+@pytest.mark.filterwarnings('error')
+def test_cross_spectra_of_any_loudness_are_taken():
+    for loudness in (1e-38, 1e-20, 1.0, 3e37):
+        fields = spectra()
+        fields['csdm'] = (fields['csdm'] * loudness).astype(np.complex64)
+        assert CrossSpectra(stamp_ns=1, **fields).alive.all()
+
+
+@pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize(
     'change, reason',
     [
         (lambda R: lopsided(R), 'not_hermitian'),
+        (lambda R: overflowing(R), 'not_positive'),
         (lambda R: overcoherent(R), 'not_positive'),
         (lambda R: np.full_like(R, np.nan), 'nan'),
         (lambda R: np.zeros_like(R), 'silent'),
@@ -156,6 +173,7 @@ def samples():
         (samples() * np.nan, 100.0, 'nan'),
         (samples() * 0.0, 100.0, 'silent'),
         (samples() * (np.arange(M) < 2), 100.0, 'dead_hydrophones'),
+        (samples().astype(float) * 1e300, 100.0, 'nan'),
     ],
 )
 def test_pressure_that_cannot_be_used(pressure, rate, reason):

@@ -138,11 +138,13 @@ def test_a_twist_in_the_world_of_ned_is_turned_into_flu():
     [
         ({'orientation': [0.0, 0.0, 0.0, 0.0]}, 'bad_orientation'),
         ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'bad_orientation'),
+        ({'orientation': [0.0, 1e300, 0.0, 1e300]}, 'bad_orientation'),
         ({'orientation': [0.0, np.nan, 0.0, 1.0]}, 'nan'),
         ({'position': [0, 0, np.inf]}, 'nan'),
         ({'position': [0.0, 2e8, 0.0]}, 'out_of_range'),
     ],
 )
+@pytest.mark.filterwarnings('error')
 def test_a_pose_that_cannot_be_used_is_refused(change, code):
     message = odometry()
     for name, values in change.items():

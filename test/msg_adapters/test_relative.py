@@ -190,6 +190,7 @@ def test_a_heading_is_read_as_it_was_written_and_turned_from_ned():
     assert np.diag(ned.covariance) == pytest.approx([2e-4, 1e-4, 3e-4])
 
 
+@pytest.mark.filterwarnings('error')
 def test_an_imu_without_orientation_is_refused():
     message = write_heading(
         VesselHeading(stamp_ns=STAMP, orientation=(0.0, 0.0, 0.0, 1.0)), ros_message
@@ -198,8 +199,9 @@ def test_an_imu_without_orientation_is_refused():
     message.orientation_covariance[0] = -1.0
     assert reason(read_heading, message) == 'no_orientation'
     message.orientation_covariance[0] = 0.0
-    message.orientation.w = 0.0
-    assert reason(read_heading, message) == 'bad_orientation'
+    for w in (0.0, 1e300):
+        message.orientation.w = w
+        assert reason(read_heading, message) == 'bad_orientation'
 
 
 def test_a_quaternion_alone_is_a_heading():

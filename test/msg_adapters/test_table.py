@@ -57,6 +57,14 @@ def reason(message):
     return caught.value.reason
 
 
+@pytest.mark.filterwarnings('error')
+def test_a_signalling_nan_is_a_nan():
+    """Not every bit pattern of a wire can be converted without a flag of the processor."""
+    bits = np.array([0x7F800001, 0x3F800000], '<u4')
+    columns = decode_table(cloud([('a', 0, 7, 1)], bits.tobytes(), width=2, point_step=4))
+    assert np.isnan(table.scalar_column(columns, 'a')).tolist() == [True, False]
+
+
 class TestDecode:
     def test_every_datatype_in_both_byte_orders(self):
         for order in '<>':

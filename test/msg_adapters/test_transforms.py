@@ -56,6 +56,7 @@ def test_one_transform_alone_is_read_and_a_leading_slash_dropped():
         (lambda one: setattr(one.transform.translation, 'x', math.nan), 'nan'),
         (lambda one: setattr(one.transform.rotation, 'w', math.inf), 'nan'),
         (lambda one: setattr(one.transform.rotation, 'w', 7.0), 'out_of_range'),
+        (lambda one: setattr(one.transform.rotation, 'x', 1e300), 'out_of_range'),
         (lambda one: setattr(one.transform.translation, 'y', 1e9), 'out_of_range'),
         (lambda one: setattr(one.header, 'frame_id', ''), 'no_frame'),
         (lambda one: setattr(one, 'child_frame_id', 'base_link'), 'no_frame'),

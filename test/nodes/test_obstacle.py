@@ -24,6 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.detections import write_detections
 from msg_adapters.estimates import read_estimate
+from msg_adapters.markers import write_ended
 from msg_adapters.navigation import write_navigation, write_range
 from msg_adapters.obstacles import band, write_markers, write_poses
 from sonar_imm.estimates import Estimate
@@ -111,6 +112,20 @@ def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
         marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
         for marker in (bar, ball, label)
     )
+
+
+@pytest.mark.parametrize('half, text', [(1.9, '+3.0 \N{PLUS-MINUS SIGN} 1.9'), (2.1, '+3 ')])
+def test_a_label_says_decimetres_where_the_band_is_within_two_metres(half, text):
+    found = an_estimate([7], [1])
+    ends = {'vertical_offset_lo': np.array([3.0 - half]), 'vertical_offset_hi': [3.0 + half]}
+    *_, label = write_markers(evolve(found, extras={**found.extras, **ends}), [0], make).markers
+    assert text in label.text
+
+
+def test_the_marker_of_a_track_after_two_billion_others_has_a_number_that_ros_can_hold():
+    bar, *_ = write_markers(an_estimate([2**31 + 5], [1]), [0], make).markers
+    (ended,) = write_ended('odom', [2**31 + 5], ['band'], make).markers
+    assert bar.id == ended.id == 5
 
 
 def test_colours_tell_above_from_below_from_unknown():

@@ -181,7 +181,14 @@ def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
     assert rig.node._saved_state.trouble == ''
 
 
-def test_a_folder_that_is_not_there_ends_the_node(make_bench):
-    bench = make_bench('-p', 'state_file:=/nowhere/at/all/state')
-    with pytest.raises(ConfigError, match='there is no folder'):
+@pytest.mark.parametrize(
+    'file, sentence',
+    [
+        ('/nowhere/at/all/state', 'there is no folder'),
+        ('~nobody-here/state', 'stands for no folder'),
+    ],
+)
+def test_a_folder_that_is_not_there_ends_the_node(make_bench, file, sentence):
+    bench = make_bench('-p', f'state_file:={file}')
+    with pytest.raises(ConfigError, match=sentence):
         TrackerNode('walker', context=bench.context)

@@ -283,6 +283,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     vessel_heading_std_deg: float = live(1.0, 'deg',
         "standard deviation of the vessel's heading where its message states none",
         range=(0.0, 45.0))
+    magnetic_declination_deg: float = parameter(0.0, 'deg',
+        'angle from true to magnetic north, positive east: headings (input heading) and relative '
+        'fixes levelled by the compass of the transceiver are from magnetic north by it; 0: they '
+        'are from true north', range=(-180.0, 180.0))
     vessel_attitude_std_deg: float = live(0.5, 'deg',
         "standard deviation of the vessel's roll and pitch where its message states none",
         range=(0.0, 45.0))

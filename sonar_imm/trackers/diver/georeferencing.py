@@ -18,6 +18,11 @@ Latitude and longitude become metres east and north of the origin. A relative fi
 vessel's pose is known around its stamp, from ``nav`` or from ``nav_fix`` and ``heading``, and is
 composed with it. Everything else goes through as it is.
 
+East, north and up of a vessel that is known by latitude and longitude are not those of the origin:
+what it measures against them (its heading, a position by the transceiver's own compass) is turned
+by the convergence of the meridians and the tilt of the vertical. What is by compass is turned from
+magnetic to true north before.
+
 Without a stated origin the first position in latitude and longitude is it, once such a position is
 used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
 what came first stays.
@@ -62,11 +67,13 @@ _LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class _Vessel(NamedTuple):
-    """The vessel at an instant, and the frame it is placed in."""
+    """The vessel at an instant, and the frame it is placed in; axes (3, 3): of that frame from
+    east, north, up where the vessel is."""
 
     pose: Pose
     uncertainty: Uncertainty
     frame_id: str
+    axes: FloatArray
 
 
 class _Samples:
@@ -259,7 +266,7 @@ class Georeferencer:
         config = self.config
         if config.vessel == 'fixed':
             level, nothing = Pose(np.zeros(3), np.eye(3)), np.zeros((3, 3))
-            return _Vessel(level, Uncertainty(nothing, nothing), config.map_frame)
+            return _Vessel(level, Uncertainty(nothing, nothing), config.map_frame, np.eye(3))
         attitude, heading = np.radians(
             [config.vessel_attitude_std_deg, config.vessel_heading_std_deg]
         )
@@ -270,13 +277,23 @@ class Georeferencer:
         places = self._by_places()
         where = self._places if places else self._poses
         lies = self._headings if places else self._poses
-        pose = Pose(where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R)
+        position, R = where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R
         near = where.nearest(stamp_ns)
         stated = Uncertainty(
             _stated(near, slice(0, 3), assumed.position),
             _stated(lies.nearest(stamp_ns), slice(3, 6), assumed.attitude),
         )
-        return _Vessel(pose, stated, near.frame_id)
+        if not places:
+            return _Vessel(Pose(position, R), stated, near.frame_id, np.eye(3))
+        assert self.origin is not None
+        axes = self.origin.axes(*self.origin.geodetic(position)[:2])
+        turn = axes @ self._true_north()
+        stated = stated._replace(attitude=turn @ stated.attitude @ turn.T)
+        return _Vessel(Pose(position, turn @ R), stated, near.frame_id, axes)
+
+    def _true_north(self) -> FloatArray:
+        """(3, 3) that turns vectors in magnetic axes into true east, north, up."""
+        return geometry.rotation(0.0, 0.0, -np.radians(self.config.magnetic_declination_deg))
 
     def _composed(self, fix: RelativeFix, vessel: _Vessel) -> Fix:
         config = self.config
@@ -285,12 +302,17 @@ class Georeferencer:
             geometry.rotation(*np.radians(config.transceiver_mount_rpy_deg)),
             config.transceiver_lever_std,
         )
+        offset, covariance = fix.offset, fix.covariance
+        if fix.levelled:
+            turn = vessel.axes @ self._true_north()
+            offset = turn @ offset
+            covariance = None if covariance is None else turn @ covariance @ turn.T
         placed = place(
             vessel.pose,
             vessel.uncertainty,
             mounting,
-            fix.offset,
-            fix.covariance,
+            offset,
+            covariance,
             range_std=config.relative_range_std,
             angle_std=float(np.radians(config.relative_angle_std_deg)),
             levelled=fix.levelled,

@@ -381,10 +381,10 @@ def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCohe
         raise Rejection('singular', _SINGULAR)
     alive = np.flatnonzero(record.alive)
     heights = config.element_spacing * alive
-    csdm = record.csdm[rows[use]][:, alive[:, None], alive]
+    csdm, scale = _near_one(record.csdm[rows[use]][:, alive[:, None], alive])
     w = fathometer.steering(record.frequency[rows[use]], heights, config.sound_speed)
     try:
-        found, power = _both_beams(csdm, w, config)
+        found, power = _both_beams(csdm, scale, w, config)
     except np.linalg.LinAlgError:
         found, power = np.full(len(csdm), np.nan), np.full(len(csdm), np.nan)
     if config.output == 'coherence':
@@ -403,17 +403,31 @@ def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCohe
     return ArrayCoherence(gamma, float(record.frequency[rows[0]]), spacing, aperture, weight)
 
 
-def _both_beams(
-    csdm: NDArray[np.complexfloating], w: NDArray[np.complexfloating], config: FathometerConfig
+def _near_one(
+    csdm: NDArray[np.complexfloating],
 ) -> tuple[NDArray[np.complexfloating], FloatArray]:
-    """The output of the processor (F,), and the root of the powers of its beams (F,)."""
+    """`csdm` over `scale` (F,), powers of two that bring the mean power of a hydrophone near one.
+    No digit changes, but products of powers stay inside single precision in any unit."""
+    power = np.einsum('fmm->fm', csdm).real.mean(axis=1, dtype=np.float64)
+    scale = np.exp2(np.clip(np.frexp(power)[1], -120, 120))
+    return csdm * (1.0 / scale).astype(csdm.real.dtype)[:, None, None], scale
+
+
+def _both_beams(
+    csdm: NDArray[np.complexfloating],
+    scale: FloatArray,
+    w: NDArray[np.complexfloating],
+    config: FathometerConfig,
+) -> tuple[NDArray[np.complexfloating], FloatArray]:
+    """The output of the processor (F,) for ``scale * csdm``, and the root of the powers of its
+    beams (F,) for `csdm`."""
     if config.output == 'printed':
         found = fathometer.printed_correlation(csdm, w, config.processor, loading=config.loading)
-        return found, np.ones(len(found))
+        return found * scale, 1.0 / scale
     gamma, power = fathometer.coherence_and_power(
         csdm, w, config.processor, loading=config.loading, gain_db=config.white_noise_gain_db
     )
-    return (gamma if config.output == 'coherence' else gamma * power), power
+    return (gamma if config.output == 'coherence' else gamma * power * scale), power
 
 
 def rank_deficient(record: CrossSpectra) -> bool:

@@ -46,9 +46,6 @@ LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 """Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
 tracker 0.85 m on average; one recording can be worse than the average."""
 
-CUTOFF = 10.0
-"""Metres from which an estimate is on no diver, where there are several."""
-
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
@@ -61,8 +58,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     placed = chain.from_iterable(map(georeferencer.georeference, read_measurements(run)))
     fixes = [item for item in placed if isinstance(item, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
-    cutoff = CUTOFF if options.cutoff is None else options.cutoff
-    metrics = score(series, truth, fixes=raw, cutoff=cutoff)
+    metrics = score(series, truth, fixes=raw, cutoff=options.cutoff)
     metrics['truth_lag_s'] = options.lag
 
     def sections() -> Iterable[Section]:
@@ -94,6 +90,8 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
     if not position.get('n'):
         return None
     raw = metrics.get('raw_fix', {}).get('rmse_m')
-    return LIMIT.check(
-        position['rmse_m'], at_most=at_most, remark=f' (raw fixes {raw:.2f} m)' if raw else ''
-    )
+    remarks = [f'raw fixes {raw:.2f} m'] if raw else []
+    if metrics['beyond_cutoff']['n']:
+        remarks.insert(0, f'{metrics["tracks"]["completeness"]:.0%} complete')
+    remark = f' ({", ".join(remarks)})' if remarks else ''
+    return LIMIT.check(position['rmse_m'], at_most=at_most, remark=remark)

@@ -17,7 +17,9 @@
 With one target and never more than one track they belong together, however far apart, so that no
 large error is left out. Otherwise the rows of each stamp are assigned to the true targets by least
 total distance (Hungarian method). Pairs further apart than the cutoff do not count: the target was
-missed and the track is false.
+missed and the track is false. Whether that was so, or the error is large, nobody can tell: what is
+left over on both sides is paired too, and kept apart, so that a verdict that would change with it
+can be withheld.
 """
 
 from __future__ import annotations
@@ -41,13 +43,16 @@ class Matching:
     row: (k,) row of the series; target: (k,) index of the true path; truth: (k, 4) its state.
     scan_ns: (s,) the stamps at which some truth is known. present: (paths, s) whether a target is
     there; followed_by: (paths, s) id of the track on it, -1 without. scored: (n,) which rows of
-    the series lie on such a stamp.
+    the series lie on such a stamp. beyond_row, beyond_truth: rows and true states (b, 4) of the
+    pairs that the cutoff keeps out.
     """
 
     series: Series
     row: IntArray
     target: IntArray
     truth: FloatArray
+    beyond_row: IntArray
+    beyond_truth: FloatArray
     scan_ns: IntArray
     present: NDArray[np.bool_]
     followed_by: IntArray
@@ -73,24 +78,33 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     starts = np.searchsorted(series.stamp_ns, series.scan_ns, side='left')
     ends = np.searchsorted(series.stamp_ns, series.scan_ns, side='right')
     followed_by = np.full(present.shape, -1, np.int64)
-    rows: list[int] = []
-    targets: list[int] = []
-    scans: list[int] = []
+    near: list[tuple[np.integer, ...]] = []
+    beyond: list[tuple[np.integer, ...]] = []
     for scan in np.flatnonzero(known & (ends > starts)):
         there = np.flatnonzero(present[:, scan])
         offset = series.state[starts[scan] : ends[scan], None, :2] - states[None, there, scan, :2]
-        for at, column in assign(np.hypot(offset[..., 0], offset[..., 1]), limit):
-            rows.append(int(starts[scan]) + at)
-            targets.append(int(there[column]))
-            scans.append(int(scan))
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        pairs = assign(distance, limit)
+        for at, column in pairs:
+            near.append((starts[scan] + at, there[column], scan))
             followed_by[there[column], scan] = series.track_id[starts[scan] + at]
-    row, target, ping = (np.array(values, np.int64) for values in (rows, targets, scans))
+        if len(pairs) < min(distance.shape):
+            rows = np.setdiff1d(np.arange(len(distance)), [at for at, _ in pairs])
+            columns = np.setdiff1d(np.arange(len(there)), [column for _, column in pairs])
+            beyond += [
+                (starts[scan] + rows[at], there[columns[column]], scan)
+                for at, column in assign(distance[np.ix_(rows, columns)], np.inf)
+            ]
+    row, target, ping = np.array(near, np.int64).reshape(-1, 3).T
+    beyond_row, beyond_target, beyond_ping = np.array(beyond, np.int64).reshape(-1, 3).T
     scan_ns = series.scan_ns[known]
     return Matching(
         series=series,
         row=row,
         target=target,
         truth=states[target, ping],
+        beyond_row=beyond_row,
+        beyond_truth=states[beyond_target, beyond_ping],
         scan_ns=scan_ns,
         present=present[:, known],
         followed_by=followed_by[:, known],

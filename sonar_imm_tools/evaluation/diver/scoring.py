@@ -21,6 +21,8 @@ raw_fix              the same for the raw fixes, which a tracker has to beat
 lag                  the shift of truth with the smallest error: late stamps, a towed tag
 consistency          NEES and NIS with their chi-square bounds, coverage of the ellipses
 tracks, gospa        several targets: identity switches, losses, false tracks, and GOSPA
+beyond_cutoff        pairs of an estimate and a target that are too far apart to be one: in none of
+                     the errors, and no verdict is given that would change with them
 models               probability of each motion model, and how often the most probable one changed
 """
 
@@ -33,17 +35,28 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import gospa, switches_by_scan, switching_gospa
 from sonar_imm.measurements import Fix, Fixes, scan_of
 
 from ... import SECOND
-from ..numbers import chi2_summary, error_summary, nis_summary, usable_nees
+from ..numbers import (
+    chi2_summary,
+    coverage_verdict,
+    error_summary,
+    nis_summary,
+    usable_nees,
+)
 from .matching import match, Matching, track_summary
 from .series import Series
 from .truth import Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0
+LEAST_CUTOFF = 10.0
+CUTOFF_MEDIANS = 6.0
+"""The cutoff in medians of the distance, seven standard deviations of an axis: errors that many
+times the usual ones are on another target, or on none."""
 
 
 def score(
@@ -51,11 +64,12 @@ def score(
     truth: Truth | None = None,
     *,
     fixes: Series | None = None,
-    cutoff: float = 10.0,
+    cutoff: float | None = None,
 ) -> dict[str, Any]:
     """All metrics of a run. Without `truth` only those that need none: NIS, models, counts.
 
-    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is on no target.
+    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is on no target,
+    None for `usual_cutoff`.
     """
     confirmed = series.confirmed()
     hits = confirmed.hits()
@@ -71,9 +85,16 @@ def score(
     }
     if truth is None or not len(truth):
         return metrics
+    if cutoff is None:
+        cutoff = usual_cutoff(confirmed if fixes is None or not len(fixes) else fixes, truth)
     matching = match(confirmed, truth, cutoff=cutoff)
     metrics['cutoff_m'] = float(cutoff)
     metrics['scored_stamps'] = len(matching.scan_ns)
+    beyond = len(matching.beyond_row)
+    metrics['beyond_cutoff'] = {
+        'n': beyond,
+        'share': beyond / max(1, beyond + len(matching.row)),
+    }
     metrics['position'] = error_summary(matching.distance)
     speed_error = np.hypot(*matching.error[:, 2:].T)
     metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
@@ -84,6 +105,15 @@ def score(
     metrics['gospa'] = gospa_summary(matching, truth, cutoff)
     metrics['lag'] = best_lag(matching, truth)
     return metrics
+
+
+def usual_cutoff(series: Series, truth: Truth) -> float:
+    """Metres from which an estimate is on no target, by the raw fixes, so that all trackers of a
+    recording have the same, or by the tracks where there are none: six times the median distance
+    from the truth, and at least 10."""
+    distance = match(series, truth, cutoff=np.inf).distance
+    median = float(np.median(distance)) if len(distance) else 0.0
+    return max(LEAST_CUTOFF, CUTOFF_MEDIANS * median)
 
 
 def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
@@ -113,24 +143,49 @@ def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
 
 
 def truth_consistency(matching: Matching) -> dict[str, Any]:
-    """NEES on position and on the whole state, and the coverage of the position ellipses."""
-    error, covariance = matching.error, matching.series.covariance[matching.row]
-    position = usable_nees(error[:, :2], covariance[:, :2, :2])
-    state = usable_nees(error, covariance)
+    """NEES on position and on the whole state, and the coverage of the position ellipses.
+
+    verdict: what the coverage says; it, and `believable` of a NEES, are None where the pairs
+    beyond the cutoff would change them.
+    """
+    series = matching.series
+    error, covariance = matching.error, series.covariance[matching.row]
+    far = series.state[matching.beyond_row] - matching.beyond_truth, matching.beyond_row
+    position, position_far = (
+        usable_nees(e[:, :2], series.covariance[rows, :2, :2])
+        for e, rows in ((error, matching.row), far)
+    )
+    coverage = {f'{100 * level:g}': _coverage(position, level) for level in COVERAGE_LEVELS}
+    whole = _coverage(np.concatenate([position, position_far]), 0.95)
+    verdict = coverage_verdict(coverage['95']) if len(position) else None
     result: dict[str, Any] = {
-        'nees_position': chi2_summary(position, 2),
-        'coverage': {
-            f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
-            if len(position)
-            else float('nan')
-            for level in COVERAGE_LEVELS
-        },
+        'nees_position': _summary(position, position_far, 2),
+        'coverage': coverage,
+        'verdict': verdict if verdict == coverage_verdict(whole) else None,
         'singular_position_covariances': len(error) - len(position),
     }
     if known := int(np.isfinite(error).all(axis=1).sum()):
-        result['nees_state'] = chi2_summary(state, 4)
+        state = usable_nees(error, covariance)
+        far_state = usable_nees(far[0], series.covariance[far[1]])
+        result['nees_state'] = _summary(state, far_state, 4)
         result['singular_state_covariances'] = known - len(state)
     return result
+
+
+def _coverage(position: FloatArray, level: float) -> float:
+    """Share of the NEES of positions inside the ellipse of a level; NaN for none."""
+    return float(np.mean(position <= chi2.ppf(level, 2))) if len(position) else float('nan')
+
+
+def _summary(nees: FloatArray, beyond: FloatArray, dof: int) -> dict[str, Any]:
+    """`chi2_summary` of the pairs within the cutoff."""
+    kept = chi2_summary(nees, dof)
+    if len(nees) and len(beyond):
+        whole = chi2_summary(np.concatenate([nees, beyond]), dof)
+        sides = [np.searchsorted([s['low'], s['high']], s['mean']) for s in (kept, whole)]
+        if sides[0] != sides[1]:
+            kept['believable'] = None
+    return kept
 
 
 def model_summary(series: Series) -> dict[str, Any]:

@@ -42,7 +42,20 @@ def _several(metrics: Mapping[str, Any]) -> bool:
     return max(counts) > 1 and not _unscored(metrics)
 
 
+def _truncated(metrics: Mapping[str, Any]) -> bool:
+    return bool(look_up(metrics, 'beyond_cutoff.n')) and not _unscored(metrics)
+
+
 METRICS = (
+    Metric(
+        label='divers found',
+        line='{tracks.completeness:.0%} of the time, within {cutoff_m:.3g} m; the errors below '
+        'are those of then',
+        card='Divers found',
+        value='{tracks.completeness:.0%}',
+        remark='within {cutoff_m:.3g} m; the errors are those of then',
+        when=_truncated,
+    ),
     Metric(
         card='Confirmed tracks',
         value='{tracks_confirmed}',
@@ -95,9 +108,21 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
             UNMATCHED if 'scored_stamps' in metrics else NO_TRUTH
         )
     sentences = ['On average the track lies {position.rmse_m:.2f} m from the truth (RMS).']
-    if look_up(metrics, 'raw_fix.n'):
+    judged = metrics['consistency']['verdict'] is not None
+    if _truncated(metrics):
+        sentences = [
+            'The divers are found {tracks.completeness:.0%} of the time, within {cutoff_m:.3g} m; '
+            'then the track lies {position.rmse_m:.2f} m from the truth (RMS).'
+        ]
+    if judged and look_up(metrics, 'raw_fix.n'):
         sentences.append(_against_fixes(metrics))
-    sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
+    if judged:
+        sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
+    elif _truncated(metrics):
+        sentences.append(
+            'Whether the stated uncertainty holds cannot be said: {beyond_cutoff.share:.0%} of '
+            'the estimates that may be of a diver lie further away.'
+        )
     return fill(' '.join(sentences), metrics)
 
 

@@ -52,6 +52,13 @@ def test_pairs_beyond_the_cutoff_are_no_pairs():
     assert assign(np.array([[9.9, 50.0], [50.0, 10.0]]), 10.0) == [(0, 0)]
 
 
+def test_what_is_left_over_on_both_sides_is_kept_apart():
+    matching = scene([[(1.0, 0.0), (60.0, 0.0)], [(30.0, 0.0)]], [[1, 2], [2]])
+    assert matching.distance.tolist() == [1.0, 0.0]
+    assert matching.beyond_row.tolist() == [1]
+    assert matching.beyond_truth[:, 0].tolist() == [30.0]
+
+
 def test_one_target_with_one_track_is_matched_however_far():
     matching = scene([[(FAR, 0.0)]], [[7]], targets=[(0.0, 0.0)])
     assert matching.distance.tolist() == [FAR]

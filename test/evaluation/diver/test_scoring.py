@@ -32,7 +32,9 @@ import pytest
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
 from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.numbers import lines
 from sonar_imm_tools.offline.run_folder import finite
 
 
@@ -114,6 +116,77 @@ def test_several_targets_are_scored_by_gospa():
     assert gospa['mean_m'] == pytest.approx(np.sqrt(25.0 + 50.0) / 2.0)
     assert gospa['missed_per_scan'] == pytest.approx(0.5)
     assert gospa['false_per_scan'] == 0.0
+
+
+def two_divers(errors, stated_std, fix_std, seed=4):
+    """Two divers 300 m apart, tracks with `errors` (n, 2, 2) m that state `stated_std`, and fixes
+    with `fix_std`."""
+    rng = np.random.default_rng(seed)
+    there = np.array([[0.0] * 4, [300.0, 0.0, 0.0, 0.0]])
+    stated = np.diag([stated_std**2] * 2 + [1.0] * 2)
+    truth, estimates, fixes = [], [], []
+    for k, error in enumerate(errors):
+        stamp = START_NS + k * SECOND
+        truth.append(truth_estimate(stamp, there, [1, 2]))
+        state = there + np.pad(error, [(0, 0), (0, 2)])
+        estimates.append(estimate_at(stamp, state, [5, 6], stated=stated))
+        for place in there:
+            noisy = [*(place[:2] + fix_std * rng.normal(size=2)), 0.0]
+            fixes.append(Fix(stamp_ns=stamp, position=noisy))
+    return estimates, truth, fix_series(fixes)
+
+
+def lost_for_a_while(count=200):
+    """Errors of a metre, but the first diver's track is 25 m off for two scans of five."""
+    errors = np.random.default_rng(1).normal(size=(count, 2, 2))
+    errors[: 2 * count // 5, 0] += [25.0, 0.0]
+    return errors
+
+
+def test_no_verdict_is_given_that_pairs_beyond_the_cutoff_would_change():
+    """Judged by the pairs within 10 m the tracker was too cautious, within 50 m overconfident."""
+    estimates, truth, fixes = two_divers(lost_for_a_while(), 3.0, 1.0)
+    within_10 = scored(estimates, truth, fixes=fixes)
+    assert within_10['cutoff_m'] == 10.0 and within_10['position']['rmse_m'] < 1.6
+    assert within_10['consistency']['coverage']['95'] > 0.99
+    assert within_10['consistency']['verdict'] is None
+    assert within_10['consistency']['nees_position']['believable'] is None
+    assert within_10['beyond_cutoff'] == {'n': 80, 'share': 0.2}
+    said = summary_sentence(within_10)
+    assert said.startswith('The divers are found 80 % of the time, within 10 m; then ')
+    assert 'cannot be said: 20 % of the estimates' in said
+    assert 'cautious' not in said and 'removes' not in said
+    assert lines(METRICS, within_10)[0][0] == 'divers found'
+    within_50 = scored(estimates, truth, fixes=fixes, cutoff=50.0)
+    assert within_50['consistency']['verdict'] == 'overconfident'
+    assert within_50['tracks']['completeness'] == 1.0
+    assert 'The tracker is overconfident' in summary_sentence(within_50)
+    assert lines(METRICS, within_50)[0][0] != 'divers found'
+
+
+def test_the_cutoff_follows_the_errors_of_the_fixes():
+    """Errors of 8 m stated as 5: too cautious within 10 m, which is less than the 95 % radius."""
+    errors = 8.0 * np.random.default_rng(2).normal(size=(300, 2, 2))
+    estimates, truth, fixes = two_divers(errors, 5.0, 8.0)
+    within_10 = scored(estimates, truth, fixes=fixes, cutoff=10.0)['consistency']
+    assert within_10['coverage']['95'] == 1.0 and within_10['verdict'] is None
+    for known in (fixes, None):  # without fixes the tracks themselves
+        metrics = scored(estimates, truth, fixes=known)
+        assert 45.0 < metrics['cutoff_m'] < 70.0
+        assert metrics['consistency']['verdict'] == 'overconfident'
+        assert metrics['beyond_cutoff']['n'] == 0 and metrics['tracks']['completeness'] == 1.0
+        assert metrics['position']['rmse_m'] == pytest.approx(8.0 * np.sqrt(2.0), rel=0.1)
+
+
+def test_a_verdict_that_no_pair_would_change_is_given():
+    """A miss beside a false track for a few scans."""
+    errors = 3.0 * np.random.default_rng(3).normal(size=(200, 2, 2))
+    errors[:4, 0] += [40.0, 0.0]
+    estimates, truth, fixes = two_divers(errors, 3.0, 3.0)
+    metrics = scored(estimates, truth, fixes=fixes)
+    assert metrics['beyond_cutoff']['n'] == 4
+    assert metrics['consistency']['verdict'] == 'consistent'
+    assert 'consistent with the errors' in summary_sentence(metrics)
 
 
 def test_a_singular_state_covariance_is_counted_not_believed():

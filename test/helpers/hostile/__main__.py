@@ -110,7 +110,7 @@ def _told(error):
 
 
 def _all(system, cases, draws):
-    warnings.simplefilter('ignore')  # of numpy: what overflows is looked at in the estimates
+    warnings.simplefilter('error')
     return {'messages': messages(system, cases), 'parameters': parameters(system, draws)}
 
 

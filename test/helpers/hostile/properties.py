@@ -33,6 +33,12 @@ def check_refusal(rejection):
 
 
 def check_estimate(estimate):
+    """`check_numbers`, and that a message can hold it."""
+    check_numbers(estimate)
+    write_estimate(estimate, make)
+
+
+def check_numbers(estimate):
     """Numbers that are finite where they must be, covariances, probabilities."""
     valid = np.asarray(estimate.extras.get('valid', np.ones(len(estimate))), bool)
     if estimate.state_names == ('depth', 'amplitude') and len(estimate) == 1:
@@ -51,7 +57,6 @@ def check_estimate(estimate):
         assert len(column) == len(estimate), name
         if name in ('existence', 'label_probability'):
             assert not ((column < 0.0) | (column > 1.0)).any(), f'{name} {column}'
-    write_estimate(estimate, make)
 
 
 def check_covariances(covariance):

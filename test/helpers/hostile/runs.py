@@ -17,15 +17,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import cache
+from functools import cache, partial
 from time import process_time
 from typing import NamedTuple
+import warnings
 
 from attrs import define, field
 from hypothesis import strategies as st
 import numpy as np
 
 from msg_adapters.inputs import inputs_of, made_inputs
+from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import DetectedImages
@@ -42,6 +44,9 @@ REFUSALS = {
 }  # fmt: skip
 """What trackers count of a measurement that changes nothing; ``doubted`` is counted of earlier
 ones when one is believed."""
+
+REFUSED = 'refused'
+"""Stands for the number of a good message where the tracker refused a bad one."""
 
 
 class Bad(NamedTuple):
@@ -100,28 +105,37 @@ def _tracker(system, variant):
 
 
 def run(system, batch, tally=None):
-    """Send the bad messages between good ones; every property is checked on the way."""
-    tally = Tally() if tally is None else tally
+    """Send the bad messages between good ones; every property is checked on the way, and a warning
+    of numpy is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        _run(system, batch, Tally() if tally is None else tally)
+
+
+def _run(system, batch, tally):
     variant, bads = batch
     tracker, readers, good = _tracker(system, variant)
     tracker.reset()
+    intake = Intake(tracker)
     kept, estimates = [], {}
     for i, measurement in enumerate(good):
         kept.append((i, measurement))
-        estimates[i] = _processed(tracker, measurement, tally)
+        estimates[i] = _processed(intake, measurement, tally)
         for j in range(len(bads) * i // len(good), len(bads) * (i + 1) // len(good)):
             hostile = _read(system, bads[j], readers, measurement.stamp_ns, tally)
             if hostile is None:
                 continue
             before = Counter(tracker.counts)
-            found = _processed(tracker, hostile, tally)
+            found = _processed(intake, hostile, tally)
             delta = Counter(tracker.counts) - before
+            if found is None:
+                continue
             if found or not delta or set(delta) - REFUSALS:
                 kept.append((None, hostile))
             else:
+                kept.append((REFUSED, hostile))
                 tally.counted.update(delta)
-    refused = len(kept) < len(good) + len(bads)
-    if refused and bads[0].seed % 2 and not tracker.counts['restarts']:
+    if bads and bads[0].seed % 2:
         _check_nothing_lost(tracker, kept, estimates)
 
 
@@ -146,9 +160,15 @@ def _read(system, bad, readers, stamp_ns, tally):
     return measurement
 
 
-def _processed(tracker, measurement, tally):
+def _processed(intake, measurement, tally):
+    """The estimates that a measurement gives, None when the intake refuses it."""
     start = process_time()
-    found = tracker.process(measurement)
+    try:
+        found = _estimates(intake, measurement)
+    except Rejection as rejection:
+        check_refusal(rejection)
+        tally.refused[rejection.reason] += 1
+        return None
     tally.seconds.append(process_time() - start)
     for estimate in found:
         check_estimate(estimate)
@@ -156,13 +176,28 @@ def _processed(tracker, measurement, tally):
     return found
 
 
+def _estimates(intake, measurement):
+    admitted = intake.admit(measurement)
+    return [] if admitted is None else intake.tracker.process(admitted)
+
+
 def _check_nothing_lost(tracker, kept, estimates):
-    """Without what was refused, every good message gives the same estimates."""
+    """Without what was refused, every good message gives the same estimates, until either run
+    takes the clock for restarted: a stamp that is refused is evidence of it, for or against.
+    What the tracker refused still passes the intake, which remembers that these numbers came."""
+    restarted = tracker.counts['restarts'] > 0
     tracker.reset()
+    intake = Intake(tracker)
     for i, measurement in kept:
-        found = tracker.process(measurement)
-        if i is None:
+        try:
+            found = (intake.admit if i is REFUSED else partial(_estimates, intake))(measurement)
+        except Rejection:
+            found = None
+        if restarted or tracker.counts['restarts']:
+            return
+        if i in (None, REFUSED) or found is estimates[i] is None:
             continue
+        assert found is not None and estimates[i] is not None
         assert len(found) == len(estimates[i])
         for one, other in zip(found, estimates[i]):
             assert one.stamp_ns == other.stamp_ns

@@ -285,7 +285,7 @@ IMAGES = {'image_near_range': 1.0, 'image_far_range': 20.0, 'image_fov_deg': 60.
 _FIELDS = {
     'w': 0.9273618495495704, 'x': 0.3, 'y': 0.2, 'z': 0.1, 'sec': T0 // SECOND, 'nanosec': 0,
     'sound_speed': 1500.0, 'sample_rate': 1000.0, 'beam_count': 4, 'samples_per_beam': 4,
-    'dtype': 0, 'flags': [],
+    'dtype': 0, 'flags': [], 'child_frame_id': 'other',
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@
 """Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
 
 import numpy as np
+import pymap3d
 import pytest
 
 from sonar_imm.acoustics.geodesy import Origin
@@ -254,6 +255,98 @@ def test_a_position_and_a_heading_make_a_pose():
     expected = [101.0 - 20.0 * np.sin(half), 20.0 * np.cos(half)]
     assert made[-1].state[0, :2] == pytest.approx(expected, abs=0.05)
     assert made[-1].frame_id == 'map' and 'latitude' in made[-1].extras
+
+
+EXACT = {
+    'relative_range_std': 0.01,
+    'relative_angle_std_deg': 0.001,
+    'vessel_heading_std_deg': 0.0,
+    'vessel_attitude_std_deg': 0.0,
+}
+"""Instruments without errors: what errors turn is shorter on average, which is undone."""
+
+
+def towards_north(yaw):
+    return (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+
+
+def placed(config, vessel, offset, yaw=0.0, **values):
+    """Where (2,) a vessel at latitude, longitude and height places a target."""
+    tracker = DiverTracker(config)
+    latitude, longitude, height = vessel
+    for second in (1, 2):
+        heading = VesselHeading(stamp_ns=second * SECOND, orientation=towards_north(yaw))
+        where = VesselFix(
+            stamp_ns=second * SECOND, latitude=latitude, longitude=longitude, height=height
+        )
+        run(tracker, [where, heading])
+    (estimate,) = run(tracker, [relative(1.5, offset, **values)])
+    return estimate.state[0, :2]
+
+
+def on_earth_and_back(origin, vessel, east_north_up):
+    """The same (2,) by latitude and longitude of the target."""
+    there = pymap3d.enu2geodetic(*east_north_up, *vessel)
+    return np.array(pymap3d.geodetic2enu(*there, *origin))[:2]
+
+
+@pytest.mark.parametrize('latitude', [0.0, 60.0, -60.0, 80.0, 88.0, -88.0])
+@pytest.mark.parametrize('levelled', [False, True])
+def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latitude, levelled):
+    """A vessel 10 km from the origin, a diver 1 km from the vessel."""
+    origin = (latitude, 170.0, 12.0)
+    config = DiverConfig(
+        origin_latitude=origin[0], origin_longitude=origin[1], origin_height=origin[2], **EXACT
+    )
+    for east, north, yaw in ((1e4, 0.0, 0.3), (-7e3, 7e3, 2.0), (0.0, -1e4, -1.0)):
+        vessel = tuple(float(part) for part in pymap3d.enu2geodetic(east, north, 0.0, *origin))
+        offset = np.array([800.0, -600.0, -40.0])
+        seen = offset if levelled else rotation(0.0, 0.0, yaw) @ offset
+        expected = on_earth_and_back(origin, vessel, seen)
+        found = placed(config, vessel, offset, yaw, levelled=levelled)
+        assert found == pytest.approx(expected, abs=0.01)
+        if abs(latitude) > 50.0 and abs(east) > 1.0:  # it matters there
+            flat = np.array(pymap3d.geodetic2enu(*vessel, *origin))[:2] + seen[:2]
+            assert np.hypot(*(flat - expected)) > 1.8
+
+
+@pytest.mark.parametrize('levelled', [False, True])
+def test_magnetic_north_is_turned_to_true_north(levelled):
+    """Magnetic north lies 20 degrees east of true north: what a compass shows as due north is at
+    20 degrees clockwise."""
+    stated = {'origin_latitude': 70.0, 'origin_longitude': 10.0, **EXACT}
+    config = DiverConfig(magnetic_declination_deg=20.0, **stated)
+    ahead = (0.0, 500.0, 0.0) if levelled else (500.0, 0.0, 0.0)
+    found = placed(config, (70.0, 10.0, 0.0), ahead, np.pi / 2, levelled=levelled)
+    east, north = 500.0 * np.sin(np.radians(20.0)), 500.0 * np.cos(np.radians(20.0))
+    assert found == pytest.approx([east, north], abs=0.01)
+
+
+def test_the_declination_turns_no_pose_of_nav():
+    config = DiverConfig(magnetic_declination_deg=20.0)
+    poses = [pose(s, (0, 0, 0), 0.0) for s in (1, 2)]
+    (estimate,) = run(DiverTracker(config), [*poses, relative(1.5, (30.0, 0.0, 0.0))])
+    assert estimate.state[0, :2] == pytest.approx([30.0, 0.0], abs=0.05)
+
+
+def test_covariances_turn_with_the_axes():
+    """At 88 degrees of latitude, 90 degrees of longitude from the origin, north is west."""
+    config = DiverConfig(origin_latitude=88.0, origin_longitude=1.0, **EXACT)
+    tracker = DiverTracker(config)
+    for second in (1, 2):
+        where = VesselFix(
+            stamp_ns=second * SECOND,
+            latitude=88.0,
+            longitude=91.0,
+            height=0.0,
+            covariance=np.diag([1e-4, 1e-4, 1e-4]),
+        )
+        heading = VesselHeading(stamp_ns=second * SECOND, orientation=towards_north(0.0))
+        run(tracker, [where, heading])
+    spread = np.diag([25.0, 1.0, 1.0])
+    (estimate,) = run(tracker, [relative(1.5, (10.0, 0.0, 0.0), covariance=spread, levelled=True)])
+    P = estimate.covariance[0, :2, :2]
+    assert np.diag(P) == pytest.approx([1.0, 25.0], rel=0.05)
 
 
 def test_a_transceiver_on_a_pier_needs_no_pose():

@@ -250,6 +250,36 @@ def test_spectrum_and_pulse_of_the_processor_are_those_of_the_vectors(vectors, r
     assert pulse(np.array([0.14]))[0] > 0.0
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('processor', ['conventional', 'mvdr', 'white_noise'])
+def test_the_unit_of_the_pressure_changes_no_digit_of_an_echo(vectors, processor):
+    """Products of two powers of beams would leave single precision at both ends."""
+    config, found = collected(vectors, 0)
+    for output, gain in (('coherence', 0), ('correlation', 1)):
+        config = evolve(config, processor=processor, output=output)
+        plain = array_coherence(found.spectra, config)
+        for exponent in (-70, 60):
+            spectra = evolve(found.spectra, csdm=found.spectra.csdm * np.float32(2.0**exponent))
+            other = array_coherence(spectra, config)
+            scaled = plain.gamma * 2.0 ** (gain * exponent)
+            assert np.array_equal(other.gamma, scaled, equal_nan=True)
+            assert np.array_equal(other.weight, plain.weight, equal_nan=True)
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_hydrophone_that_is_too_loud_for_any_unit_is_dead():
+    rng = np.random.default_rng(0)
+    samples = rng.standard_normal((600, 5)).astype(np.float32)
+    samples[7, 2] = 1e30
+    block = Pressure(stamp_ns=1, pressure=samples, sample_rate=6000.0)
+    assert np.flatnonzero(~block.alive).tolist() == [2]
+    loudest = np.float32(9e11) * np.sign(samples)
+    loudest[7, 2] = 0.0
+    config = FathometerConfig(phones=5, record_seconds=0.1, snapshot_seconds=0.02, particles=40)
+    (found, *_), _ = PressureStream(config, Counter()).push(evolve(block, pressure=loudest), 40.0)
+    assert found.spectra.alive.all() and np.isfinite(found.spectra.csdm).all()
+
+
 @pytest.mark.parametrize('record', [0, 1])
 def test_the_model_of_the_scene_is_that_of_the_vectors_and_its_draw_scatters_as_it_should(
     vectors, record

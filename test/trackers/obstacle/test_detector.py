@@ -103,6 +103,18 @@ def test_the_order_of_rows_and_beams_does_not_matter():
         np.testing.assert_array_equal(again.var_bearing, expected.var_bearing)
 
 
+def test_bearings_in_either_order_begin_after_beams_without_a_place():
+    """The echoes lie in the outermost beams that have one."""
+    beam = np.arange(len(BEARINGS))
+    bearing = np.where((beam < 5) | (beam > 33), np.nan, BEARINGS)
+    rising = image(bearing=bearing)
+    falling = evolve(rising, bearing=bearing[::-1], amplitude=rising.amplitude[:, ::-1])
+    expected, again = detect(rising, SHARP), detect(falling, SHARP)
+    assert expected.intensity.tolist() == [200.0, 120.0]
+    for name in ('range', 'bearing', 'var_bearing', 'intensity'):
+        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))
+
+
 def test_the_vehicle_is_no_obstacle_and_the_strongest_come_first():
     near = detect(image(), DetectorConfig(min_range=15.0))
     assert near.range == pytest.approx([RANGES[90]], abs=0.05)

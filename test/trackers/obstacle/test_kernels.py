@@ -144,7 +144,7 @@ def test_soft_update_equals_two_cases_put_together():
     z = x[:, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
     R = np.tile(np.diag([0.025, 2.5e-5]), (3, 1, 1))
     h = np.ascontiguousarray(x[..., :2])
-    after, covariance, weight, *_ = kernels.jipda_update(x, P, mu, h, z, R, 0.1, 0.5)
+    after, covariance, weight, nis, _ = kernels.jipda_update(x, P, mu, h, z, R, 0.1, 0.5)
     H = np.eye(2, 4)
     for t in range(3):
         likelihood = np.empty(4)
@@ -164,6 +164,11 @@ def test_soft_update_equals_two_cases_put_together():
             assert_allclose(after[t, k], mean, rtol=1e-9)
             assert_allclose(covariance[t, k], spread, rtol=1e-7, atol=1e-12)
         assert_allclose(weight[t], likelihood / likelihood.sum(), rtol=1e-9)
+        # The innovation is that of the mixture, of which the components' means are a part.
+        v = z[t] - x[t, :, :2]
+        off = v - mu[t] @ v
+        S = np.einsum('k,kij->ij', mu[t], P[t, :, :2, :2] + R[t] + off[:, :, None] * off[:, None])
+        assert_allclose(nis[t], mu[t] @ v @ np.linalg.solve(S, mu[t] @ v), rtol=1e-9)
 
 
 def test_an_update_that_no_component_explains_keeps_the_weights():
