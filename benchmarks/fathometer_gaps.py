@@ -97,7 +97,9 @@ def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
 def tracked(traces: Sequence[Trace], truth: FloatArray, **parameters: Any) -> dict[str, Any]:
     """right (records,), errors and stated standard deviations of layers that were found
     (records, 6, 2), ids (records, 6), 0 where a layer was not found."""
-    config = FathometerConfig(array_depth_std=ARRAY_STD, **parameters)
+    config = FathometerConfig(
+        **{'array_depth_std': ARRAY_STD, 'sound_speed_std': 0.0, **parameters}
+    )
     tracker = FathometerTracker(config)
     right = np.zeros(len(traces), bool)
     found, ids = np.full((*truth.shape, 2), np.nan), np.zeros(truth.shape, int)

@@ -46,6 +46,9 @@ class FathometerConfig(StampParameters):
         'distance between hydrophones', range=(1e-4, 100.0))
     sound_speed: float = parameter(1500.0, 'm/s',
         'speed of sound in the water', range=(1300.0, 1700.0))
+    sound_speed_std: float = live(10.0, 'm/s',
+        'standard deviation of sound_speed, a part of the error of every reflector that grows '
+        'with its depth below the array; 0: the speed is exact', range=(0.0, 200.0))
     array_depth: float = parameter(0.0, 'm',
         'depth of the deepest hydrophone, where neither the record nor a companion instrument '
         'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))

@@ -36,7 +36,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
-from attrs import evolve, frozen
+from attrs import evolve, Factory, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -170,6 +170,10 @@ class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
     covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
     above it; heave and heave_std: stated minus true depth of the array, m, 0 where it is no state.
+
+    What they share: the error of the array's depth, datum_std (m), a part of the covariance; and
+    that of the speed of sound, speed_std (K,), m, the same share of the depth of each below the
+    array, which is no part of it.
     """
 
     depth: FloatArray
@@ -177,8 +181,20 @@ class Reflectors:
     covariance: FloatArray
     existence: FloatArray
     is_bottom: FloatArray
+    speed_std: FloatArray = Factory(lambda self: np.zeros(len(self.depth)), takes_self=True)
+    datum_std: float = 0.0
     heave: float = 0.0
     heave_std: float = 0.0
+
+    @property
+    def common_std(self) -> FloatArray:
+        """Standard deviation (K,) of what all of a record share, m."""
+        return np.asarray(np.hypot(self.datum_std, self.speed_std))
+
+    @property
+    def relative_variance(self) -> FloatArray:
+        """Variance (K,) of the depths without what all of a record share, m^2."""
+        return np.asarray(np.maximum(self.covariance[:, 0, 0] - self.datum_std**2, 1e-6))
 
 
 def reflectors_of(
@@ -204,12 +220,17 @@ def reflectors_of(
     # Where it is a state, the places of the particles are spread by what is not known of it.
     if heave is None:
         covariance[:, 0, 0] += config.array_depth_std**2
+    # Where the depth of the array is not known, depths count from it.
+    height = depth + (heave[0] if heave else 0.0) - np.nan_to_num(response.reference_depth)
+    speed_std = np.abs(height) * config.sound_speed_std / config.sound_speed
     return Reflectors(
         depth,
         sigma * members.amplitude,
         covariance,
         members.existence,
         members.foremost,
+        speed_std,
+        heave[1] if heave else config.array_depth_std,
         *(heave or (0.0, 0.0)),
     )
 
@@ -250,7 +271,11 @@ def sediment_depths(
     time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
     speed = config.sediment_sound_speed or config.sound_speed
     thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
-    variance = reflectors.covariance[:, 0, 0]
+    speed_std = reflectors.speed_std
+    if config.sediment_sound_speed:
+        # Below the bottom the water's speed tells the time only, which is seen.
+        speed_std = np.minimum(speed_std, speed_std[np.argmax(reflectors.is_bottom)])
+    variance = reflectors.covariance[:, 0, 0] + np.square(speed_std)
     variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
     depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
     return depth, np.sqrt(variance)
@@ -260,10 +285,9 @@ def seen_as(
     reflectors: Reflectors, ids: IdArray, config: FathometerConfig, records: int = 1
 ) -> Seen:
     """What `multiples` needs to know of a record, `records` after the one before."""
-    shared = config.array_depth_std if config.heave == 'none' else reflectors.heave_std
-    variance = np.maximum(reflectors.covariance[:, 0, 0] - shared**2, 1e-6)
     sign = np.sign(reflectors.amplitude)
-    return Seen(ids, reflectors.depth, variance, sign, shared**2, records)
+    datum = reflectors.datum_std**2
+    return Seen(ids, reflectors.depth, reflectors.relative_variance, sign, datum, records)
 
 
 def write_estimate(
@@ -287,6 +311,8 @@ def write_estimate(
         'polarity': np.zeros(rows, np.int8),
         'heave': np.full(rows, reflectors.heave),
         'heave_std': np.full(rows, reflectors.heave_std),
+        'depth_common_std': np.full(rows, np.nan),
+        'depth_relative_std': np.full(rows, np.nan),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
         'multiple_probability': np.full(rows, np.nan),
@@ -298,9 +324,12 @@ def write_estimate(
     if len(ids):
         state[:] = np.column_stack([reflectors.depth, reflectors.amplitude])
         covariance[:] = reflectors.covariance
+        covariance[:, 0, 0] += np.square(reflectors.speed_std)
         extras['track_id'][:] = ids
         extras['existence'][:] = reflectors.existence
         extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
+        extras['depth_common_std'][:] = reflectors.common_std
+        extras['depth_relative_std'][:] = np.sqrt(reflectors.relative_variance)
         height = reflectors.depth - response.reference_depth
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
         extras['polarity'][:] = np.sign(reflectors.amplitude)
