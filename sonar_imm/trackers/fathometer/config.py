@@ -46,7 +46,7 @@ class FathometerConfig(StampParameters):
         'distance between hydrophones', range=(1e-4, 100.0))
     sound_speed: float = parameter(1500.0, 'm/s',
         'speed of sound in the water', range=(1300.0, 1700.0))
-    sound_speed_std: float = live(10.0, 'm/s',
+    sound_speed_std: float = parameter(10.0, 'm/s',
         'standard deviation of sound_speed, a part of the error of every reflector that grows '
         'with its depth below the array; 0: the speed is exact', range=(0.0, 200.0))
     array_depth: float = parameter(0.0, 'm',
