@@ -59,6 +59,9 @@ BASELINES = {
     'cv_cv': 'IMM CV+CV, tuned',
     'cv_ct': 'IMM CV+CT+-, tuned',
 }
+HEADINGS: dict[str, Any] = {'model_set': 'heading_speed'}
+"""The set after the paper."""
+
 TRACKERS: dict[str, dict[str, Any]] = {
     'world_headings, 1 m/s given': {
         'model_set': 'world_headings',
@@ -66,10 +69,10 @@ TRACKERS: dict[str, dict[str, Any]] = {
         'heading_concentration': 2.5,
     },
     'relative_headings': {'model_set': 'relative_headings', 'velocity_noise': 0.1},
-    'heading_speed (default)': {},
-    'heading_speed, fixed transitions': {'adaptation': 'fixed'},
-    'heading_speed, paper (guarded)': {'adaptation': 'paper'},
-    'heading_speed, ratio (guarded)': {'adaptation': 'ratio'},
+    'heading_speed': HEADINGS,
+    'heading_speed, fixed transitions': {**HEADINGS, 'adaptation': 'fixed'},
+    'heading_speed, paper (guarded)': {**HEADINGS, 'adaptation': 'paper'},
+    'heading_speed, ratio (guarded)': {**HEADINGS, 'adaptation': 'ratio'},
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
 }
 LITERAL = {'product': 'paper', 'ratio': 'ratio', 'not adapted': 'fixed'}
@@ -209,7 +212,7 @@ def consistency(runs: int) -> dict[str, dict[str, float]]:
         'still',
     ):
         truth, z, R = load([name], range(runs))
-        estimate, covariance = track(DiverConfig(), z, R)
+        estimate, covariance = track(DiverConfig(**HEADINGS), z, R)
         squared = nees((estimate - truth)[..., :2], covariance[..., :2, :2])[:, 5:]
         low, high = average_bounds(squared.size // 10, 2)
         table[name] = {
@@ -249,7 +252,9 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
         for seed in range(runs):
             scene = simulate(scenario(name), seed)
             measurements = [item.measurement for item in scene.measurements]
-            final = final_estimates(DiverTracker(DiverConfig(max_tracks=1)), measurements)
+            final = final_estimates(
+                DiverTracker(DiverConfig(max_tracks=1, **HEADINGS)), measurements
+            )
             path = truths(scene, TrueTrack)[0]
             at = {int(stamp): k for k, stamp in enumerate(path.stamp_ns)}
             ids = set()

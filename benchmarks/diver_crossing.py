@@ -86,6 +86,7 @@ def scans_to_confirm(series: Series, truth: Truth) -> list[float]:
 def case(probability: float, clutter: float, association: str, runs: int) -> dict[str, float]:
     config = DiverConfig.from_mapping(
         {
+            'model_set': 'heading_speed',
             'association': association,
             'detection_probability': probability,
             'clutter_density': clutter / 160.0**2,

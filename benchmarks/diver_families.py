@@ -382,7 +382,7 @@ def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: A
         'nees': float(np.mean(squared[there])),
         'followed': float(np.mean(there)),
         'tracks': float(tracker._stream.state.life.next_id - 1),
-        'warns': float('times what they state' in said),
+        'warns': float('times as far as they state' in said),
         'advice': float((re.findall(r'are ([\d.e+]+) times too small', said) or ['nan'])[0]),
     }
 

@@ -101,6 +101,7 @@ def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
     """The scores of one run."""
     truth = truth_of(scene, seed)
     config = DiverConfig(
+        model_set='heading_speed',
         association=association,
         named_tracks=mode,
         detection_probability=P_DETECTION,

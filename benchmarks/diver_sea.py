@@ -72,7 +72,7 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
     for seed in range(1000, 1000 + runs):
         made = simulate(scenario(name, scene), seed)
         values = {key: v(made) if callable(v) else v for key, v in config.items()}
-        rows.append(score(made, DiverConfig(max_tracks=1, **values)))
+        rows.append(score(made, DiverConfig(model_set='heading_speed', max_tracks=1, **values)))
     every = np.concatenate(rows)
     seen = np.isfinite(every[:, 0])
     mean = every[seen].mean(axis=0)

@@ -87,7 +87,10 @@ def case_of(system: str, count: int) -> Case:
         for item in simulated.measurements
         for entry in [entries[type(item.measurement)]]
     ]
-    return Case(system, scene.instruments(), timed, messages)
+    options = scene.instruments()
+    if system == 'diver':
+        options['model_set'] = 'heading_speed'
+    return Case(system, options, timed, messages)
 
 
 class Echo(Node):

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, load, row
+from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, HEADINGS, load, row
 from benchmarks.study import final_estimates
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
@@ -109,7 +109,7 @@ def ours(**values: Any) -> Make:
     """A tracker of this package; the noise that is tuned is that of its motion."""
 
     def make(noise: float, std: float, life: tuple[int, int]) -> DiverTracker:
-        name = 'speed_noise' if 'model_set' not in values else 'acceleration_noise'
+        name = 'acceleration_noise' if values['model_set'] == 'cv' else 'speed_noise'
         tuned = noise if name == 'speed_noise' else (noise,)
         settings = {
             name: tuned,
@@ -126,8 +126,8 @@ TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
     'plain CV Kalman': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
     'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
     'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
-    'heading_speed, gnn': (ours(**BOATS), (0.03, 0.1, 0.3)),
-    'heading_speed, jipda': (ours(**BOATS, association='jipda'), (0.03, 0.1, 0.3)),
+    'heading_speed, gnn': (ours(**HEADINGS, **BOATS), (0.03, 0.1, 0.3)),
+    'heading_speed, jipda': (ours(**HEADINGS, **BOATS, association='jipda'), (0.03, 0.1, 0.3)),
 }
 
 

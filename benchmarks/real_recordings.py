@@ -57,22 +57,23 @@ TAG: dict[str, Any] = {
 sound speed, with receivers of this accuracy. Everything else is at its default."""
 
 BOATS: dict[str, Any] = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
-PACE: dict[str, Any] = {'speed_noise': 0.07}
+HEADINGS: dict[str, Any] = {'model_set': 'heading_speed'}
+PACE: dict[str, Any] = {**HEADINGS, 'speed_noise': 0.07}
 """A swimmer whose speed, spread by `speed_std` = .4 m/s, is another one after a minute: a random
 walk of sqrt(2 / 60 s) .4 m/s over a second, as that of a process that forgets within a minute."""
 COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
 SETS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
-    'heading_speed': {},
+    'heading_speed': HEADINGS,
     'heading_speed, pace kept a minute': PACE,
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
 }
 OF_BOATS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-    'heading_speed': BOATS,
-    'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
+    'heading_speed': {**HEADINGS, **BOATS},
+    'heading_speed, jipda': {**HEADINGS, **BOATS, 'association': 'jipda'},
 }
 
 
@@ -201,9 +202,9 @@ def seeds_table(pings: list, truth: np.ndarray) -> None:
     print('\n### yaps, raw arrivals thinned in eight ways: RMSE, GPS 3.4 s later\n')
     header('5 receivers', '4 receivers', '3 receivers')
     for name, values in {
-        'heading_speed': {},
+        'heading_speed': HEADINGS,
         'heading_speed, pace kept a minute': PACE,
-        'heading_speed, receivers known to 1.4 m': {'receiver_position_std': 1.4},
+        'heading_speed, receivers known to 1.4 m': {**HEADINGS, 'receiver_position_std': 1.4},
     }.items():
         cells = []
         for receivers in (5, 4, 3):

@@ -52,7 +52,7 @@ def main() -> None:
     z, R = observe(path)
     trackers = {
         'single direction (IMM CV+CV, tuned)': (RED, tuned('cv_cv', ['table1'])),
-        '16 directions (heading_speed)': (BLUE, DiverConfig()),
+        '16 directions (heading_speed)': (BLUE, DiverConfig(model_set='heading_speed')),
     }
     tracks = {
         label: (colour, track(config, z, R)[0][..., :2])

@@ -21,6 +21,7 @@ covariance between position and velocity.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -165,16 +166,21 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
     )
 
 
-def write_model_probabilities(estimate: Estimate, row: int, make: Make) -> Any:
-    """Write one row's model probabilities as JointState: name = model, position = probability.
+def write_model_probabilities(
+    estimate: Estimate, row: int, make: Make, sums: Sequence[str] = ()
+) -> Any:
+    """Write one row's model probabilities as JointState: name = model, position = probability;
+    behind the models those `sums` of them that the estimate has among its extras.
 
     JointState is borrowed because every plotting tool shows its values by name.
     """
+    sums = [name for name in sums if name in estimate.extras]
+    values = [float(estimate.extras[name][row]) for name in sums]
     return make(
         'sensor_msgs/msg/JointState',
         header=make_header(estimate.stamp_ns, estimate.frame_id, make),
-        name=list(estimate.model_names),
-        position=np.asarray(estimate.probabilities[row], np.float64),
+        name=[*estimate.model_names, *sums],
+        position=np.append(np.asarray(estimate.probabilities[row], np.float64), values),
     )
 
 

@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 import time
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from benchmarks.speed import Bench, seconds_of
@@ -42,6 +42,9 @@ RATIO_WANTED = 100.0
 SCAN_WANTED_MS = 25.0
 STAMPS_WANTED = 1.5
 CLUTTER_WANTED_MS = 0.3
+
+HEADINGS = DiverConfig(model_set='heading_speed')
+"""The set for which these times are wanted."""
 
 
 @frozen(eq=False)
@@ -193,7 +196,7 @@ def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
     """CPU milliseconds that a whole tracker takes for a fix, with stamps every second and with
     stamps that never have the same distance twice, and their ratio in paired rounds. CPU time,
     because threads that nobody asked for show in nothing else."""
-    DiverTracker(DiverConfig()).warm()
+    DiverTracker(HEADINGS).warm()
     regular, irregular = (
         _fixes(np.ones(fixes)),
         _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes)),
@@ -221,7 +224,7 @@ def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
     setting = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
     scene = [item.measurement for item in simulate(setting, 0).measurements]
     configs = [
-        DiverConfig(**{**setting.instruments(), 'association': association})
+        evolve(HEADINGS, **setting.instruments(), association=association)
         for association in ('gnn', 'jipda')
     ]
     DiverTracker(configs[1]).warm()
@@ -254,7 +257,7 @@ def _fixes(steps: FloatArray) -> list[Fix]:
 
 def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) -> float:
     """CPU seconds of this process, all its threads, for a new tracker."""
-    tracker = DiverTracker(config or DiverConfig())
+    tracker = DiverTracker(config or HEADINGS)
     begin = time.process_time()
     for item in items:
         tracker.process(item)

@@ -26,6 +26,9 @@ from ..estimates import write_odometry
 from ..headers import Make
 from .tracks import confirmed_rows, Drawn, Markers, MODELS, models_of_the_oldest, NAMED_SCALARS
 
+FAMILIES = ('family_steady', 'family_brisk', 'family_lively', 'family_quiet', 'hover')
+"""Sums of the models of the set `families`, easier to plot than its 37 models."""
+
 
 class Displays:
     """One Odometry per diver, told apart by ``child_frame_id``; all at once as poses and as
@@ -49,7 +52,7 @@ class Displays:
         if is_wanted('divers'):
             yield 'divers', write_poses(estimate, rows, make)
         yield from self._markers.of(estimate, rows, make, is_wanted)
-        yield from models_of_the_oldest(estimate, rows, make, is_wanted)
+        yield from models_of_the_oldest(estimate, rows, make, is_wanted, FAMILIES)
 
     def forget(self, make: Make) -> Drawn:
         return self._markers.forget(make)

@@ -22,7 +22,7 @@ of ``~/estimate``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,12 +47,16 @@ def confirmed_rows(estimate: Estimate) -> np.ndarray:
 
 
 def models_of_the_oldest(
-    estimate: Estimate, rows: np.ndarray, make: Make, is_wanted: Callable[[str], Any]
+    estimate: Estimate,
+    rows: np.ndarray,
+    make: Make,
+    is_wanted: Callable[[str], Any],
+    sums: Sequence[str] = (),
 ) -> Drawn:
-    """Draw the models of the track in `rows` that lasted longest."""
+    """Draw the models of the track in `rows` that lasted longest, and `sums` of them."""
     if len(rows) and is_wanted(MODELS):
         oldest = rows[np.argmin(estimate.extras['track_id'][rows])]
-        yield MODELS, write_model_probabilities(estimate, oldest, make)
+        yield MODELS, write_model_probabilities(estimate, oldest, make, sums)
 
 
 class Markers:

@@ -26,13 +26,18 @@ import numpy as np
 
 from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
-from sonar_imm.measurements import Rejection
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.measurements import Fix, GeodeticFix, Rejection
 from sonar_imm.trackers import SYSTEMS
 
 from .. import SECOND
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
 from ..recordings.topics import fitting_systems, instruments
 
+MOST_FIXES = 1000
+"""Fixes of a topic by which it is told whether each has a stamp of its own."""
+BEFORE = 30
+"""Fixes before one among which the last one of the same diver is looked for."""
 LONG_GAP = 10.0
 """A gap is reported when it is this many times the usual time between two messages."""
 
@@ -50,6 +55,7 @@ class _Found:
     refused: dict[tuple[str, str], Counter[str]] = field(factory=dict)
     doubts: Counter[str] = field(factory=Counter)
     examples: dict[str, str] = field(factory=dict)
+    fixes: list[tuple[int, float, float]] = field(factory=list)
 
 
 def inspect(
@@ -98,6 +104,8 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
             settings = detector if entry.makes else {}
             made = entry.reader(item.type_name, 'enu', settings)(item.message)
             found.good[system, entry.name] += 1
+            if isinstance(made, (Fix, GeodeticFix)) and len(found.fixes) < MOST_FIXES:
+                found.fixes.append((made.stamp_ns, *_place(made)))
             if (code := entry.doubt(item.message, made)) is not None:
                 found.doubts[code] += 1
         except Rejection as rejection:
@@ -145,8 +153,52 @@ def _topic_entry(found: _Found) -> dict[str, Any]:
         'frames': list(found.frames),
         'suits': suits,
         'scans': _scans(found),
-        'problems': _stamp_problems(found) + _content_problems(found),
+        'problems': _stamp_problems(found) + _content_problems(found) + _scan_hint(found),
     }
+
+
+def _place(fix: Fix | GeodeticFix) -> tuple[float, float]:
+    """Metres east and north, of latitudes nearly."""
+    if isinstance(fix, Fix):
+        return float(fix.position[0]), float(fix.position[1])
+    degree = 111e3
+    return degree * fix.longitude * float(np.cos(np.radians(fix.latitude))), degree * fix.latitude
+
+
+def _scan_hint(found: _Found) -> list[str]:
+    """What to do about fixes of several divers, each with a stamp of its own."""
+    if len(found.fixes) <= BEFORE:
+        return []
+    stamps = np.array([stamp for stamp, _, _ in found.fixes], np.int64)
+    order = np.argsort(stamps, kind='stable')
+    period = turn_of(stamps[order], np.array([place for _, *place in found.fixes])[order])
+    if period is None:
+        return []
+    return [
+        f'every fix has a stamp of its own, and each diver comes again after {period:.3g} s: '
+        f'where the sensor rotates or polls, --set scan_period={period:.3g} makes scans of them'
+    ]
+
+
+def turn_of(stamps_ns: IntArray, places: FloatArray) -> float | None:
+    """Seconds after which a sensor that stamps each fix by itself comes back to the same diver;
+    None where it does not.
+
+    stamps_ns (n,) rising, places (n, 2). Of the fixes before one the last that is as near as those
+    of one diver are is his; between the two lie fixes of others, and the time is always the same.
+    """
+    if 10 * len(np.unique(stamps_ns)) < 9 * len(stamps_ns):
+        return None
+    rows = range(BEFORE, len(stamps_ns))
+    apart = [np.hypot(*(places[k - BEFORE : k] - places[k]).T) for k in rows]
+    near = 4.0 * float(np.median([distance.min() for distance in apart]))
+    back = [(k, np.flatnonzero(distance <= near)) for k, distance in zip(rows, apart)]
+    last = np.array([(k, k - BEFORE + before[-1]) for k, before in back if len(before)])
+    seconds = (stamps_ns[last[:, 0]] - stamps_ns[last[:, 1]]) / SECOND
+    period = float(np.median(seconds))
+    regular = np.abs(seconds - period) <= 0.25 * period
+    between = last[:, 0] - last[:, 1] > 1
+    return period if np.mean(regular & between) > 0.6 else None
 
 
 def _scans(found: _Found) -> dict[str, int] | None:

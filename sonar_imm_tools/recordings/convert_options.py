@@ -25,6 +25,7 @@ from attrs import frozen, NOTHING
 
 from .csv_table import CsvOptions
 from .options import group, nanoseconds, option
+from .polar_rows import BEARINGS
 
 
 def _origin(text: str) -> tuple[float, ...]:
@@ -70,22 +71,70 @@ def _truth_file() -> Any:
 
 
 # fmt: off
+def _bearings(default: str) -> Any:
+    help = 'Where bearings count from: bow or north, clockwise, or east, counter-clockwise.'
+    return option(default, '', help, choices=BEARINGS)
+
+
+def _range_std() -> Any:
+    help = 'Standard deviation of ranges, for rows that state none.'
+    return option(None, 'METRES', help, kind='float', above=0.0)
+
+
+def _bearing_std() -> Any:
+    help = 'Standard deviation of bearings, for rows that state none.'
+    return option(None, 'DEGREES', help, flag='bearing-std', kind='float', above=0.0)
+
+
 @frozen(kw_only=True)
 class FixesOptions:
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
 
     Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
-    var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. Usual names are
-    recognised; which columns were taken, and which not, is said. Times may count from 0; one that
-    is written without a zone needs --time-zone. Rows flagged as invalid are left out and counted;
-    repeated polls are counted, and left out by `track`.
+    var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. In place of x and y: range
+    [m, horizontal] and bearing from a sensor at the origin, with std_range and std_bearing;
+    degrees unless the header says rad. Usual names are recognised; which columns were taken, and
+    which not, is said. Times may count from 0; one that is written without a zone needs
+    --time-zone. A row with a time and no position is a scan in which nobody was seen. Rows flagged
+    as invalid are left out and counted; repeated polls are counted, and left out by `track`.
     """
 
     EXAMPLES: ClassVar = (
         'fixes.csv dive.bag --truth gps.csv',
         'usbl.csv dive.bag --column x=easting --column y=northing',
+        'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
     options: CsvOptions = group(CsvOptions)
+    bearings: str = _bearings('north')
+    range_std: float | None = _range_std()
+    bearing_std_deg: float | None = _bearing_std()
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class RelativeOptions:
+    """CSV of positions that a vessel has measured from itself, with its own pose in the same row,
+    to /relative and /nav, or /nav_fix and /heading.
+
+    Columns: stamp; forward and starboard [m], or range [m, horizontal] and bearing, with std_range
+    and std_bearing, degrees unless the header says rad; vessel_x and vessel_y [m], or
+    vessel_latitude and vessel_longitude [deg]; heading [deg, clockwise from north], which only
+    bearings from north or east can do without; optional depth of the target below the vessel, std
+    [m], id and valid. A row with the pose and no position is a scan in which nobody was seen.
+    """
+
+    EXAMPLES: ClassVar = (
+        'usbl.csv dive.bag',
+        'usbl.csv dive.bag --bearings north --column vessel_x=ship_e --column vessel_y=ship_n',
+    )
+    options: CsvOptions = group(CsvOptions)
+    bearings: str = _bearings('bow')
+    range_std: float | None = _range_std()
+    bearing_std_deg: float | None = _bearing_std()
     truth: Path | str | None = _truth_file()
     truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
     frame_id: str = _map_frame()
@@ -273,6 +322,7 @@ class TracesOptions:
 
 OPTIONS: dict[str, type] = {
     'fixes': FixesOptions,
+    'relative': RelativeOptions,
     'arrivals': ArrivalsOptions,
     'truth': TruthOptions,
     'autoferry': AutoferryOptions,

@@ -67,6 +67,19 @@ USUAL_NAMES = {
     'std_x': 'std_east sigma_x sigma_east sd_x sx',
     'std_y': 'std_north sigma_y sigma_north sd_y sy',
     'std': 'sigma accuracy std_xy sigma_xy position_std',
+    'range': 'distance dist',
+    'std_range': 'sigma_range range_std',
+    'forward': 'ahead fwd rel_forward',
+    'starboard': 'stbd rel_starboard',
+    'vessel_x': 'vessel_east vessel_easting ship_x ship_east ship_easting boat_x boat_east own_x',
+    'vessel_y': (
+        'vessel_north vessel_northing ship_y ship_north ship_northing boat_y boat_north own_y'
+    ),
+    'vessel_latitude': 'vessel_lat ship_latitude ship_lat boat_latitude boat_lat own_lat',
+    'vessel_longitude': (
+        'vessel_lon vessel_long ship_longitude ship_lon boat_longitude boat_lon own_lon'
+    ),
+    'heading': 'hdg vessel_heading ship_heading boat_heading gyro',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
     'id': 'track_id target target_id tag diver name',
@@ -79,10 +92,10 @@ USUAL_NAMES = {
     'toa': 'travel_time delay tof time_of_flight',
     'var_toa': 'toa_variance var_arrival',
     'std_toa': 'sigma_toa std_arrival sigma_arrival',
-    'bearing': 'azimuth doa',
+    'bearing': 'azimuth doa brg',
     'amplitude': 'amp response value',
     'var_bearing': '',
-    'std_bearing': 'sigma_bearing',
+    'std_bearing': 'sigma_bearing bearing_std',
     'elevation': 'elevation_angle',
     'var_elevation': '',
     'std_elevation': 'sigma_elevation',
@@ -175,6 +188,10 @@ class Row:
             raise BadRow(f'{self.table.header(name)} is empty')
         return value
 
+    def empty(self, *names: str) -> bool:
+        """Whether all of these cells are empty, or not a number, as some write that."""
+        return all(self.text(name).lower() in ('', 'nan') for name in names)
+
     def optional(self, name: str) -> float:
         """A number; NaN when the cell is empty, missing or NaN."""
         text = self.text(name)
@@ -187,6 +204,11 @@ class Row:
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
         return value
+
+    def height(self) -> float:
+        """z, or minus the depth, in metres; 0 without either."""
+        z = self.optional('z') if self.table.has('z') else -self.optional('depth')
+        return 0.0 if math.isnan(z) else z
 
     def require_valid(self) -> None:
         """Raise `BadRow` for a row whose column ``valid`` says that it is not."""

@@ -45,14 +45,13 @@ class LocalFrame:
                     f'has {", ".join(table.headers)}; say which columns hold the position'
                 )
             table.require('x', 'y')
-        self.origin = None if origin is None or not self.geodetic else _checked(origin)
+        self.origin = checked_origin(origin) if self.geodetic else None
 
     def position(self, row: Row) -> tuple[float, float, float]:
         """Give x, y, z of a row in metres. Raises `BadRow`."""
         if self.geodetic:
             return self._from_geodetic(row)
-        z = row.optional('z') if row.table.has('z') else -row.optional('depth')
-        x, y, z = row.number('x'), row.number('y'), 0.0 if math.isnan(z) else z
+        x, y, z = row.number('x'), row.number('y'), row.height()
         if max(abs(x), abs(y), abs(z)) > FARTHEST:
             raise BadRow(f'the position {x:g}, {y:g}, {z:g} is more than 100,000 km away')
         return x, y, z
@@ -83,8 +82,10 @@ def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, float]:
     return {} if origin is None else dict(zip(names, origin))
 
 
-def _checked(origin: tuple[float, ...]) -> tuple[float, float, float]:
-    """Complete an origin with height 0."""
+def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, float] | None:
+    """Complete an origin with height 0. Raises `BagError`."""
+    if origin is None:
+        return None
     if len(origin) not in (2, 3) or not all(map(math.isfinite, origin)) or abs(origin[0]) > 90.0:
         raise BagError(f'an origin is latitude, longitude and optionally height, got {origin}')
     latitude, longitude, height = (*map(float, origin), 0.0)[:3]

@@ -132,6 +132,17 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
     assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3
 
 
+def test_a_search_begins_evenly_all_round():
+    """The points of an ellipse have its centre as their mean, those of a circle theirs."""
+    fit = problem(KINDS['active'])
+    rows = np.argsort(-fit.weight[:5], kind='stable')[:3]
+    middle = 0.5 * (fit.tx + fit.rx)[rows, :2]
+    assert_allclose(fit._ellipses(np.arange(5)).mean(axis=1)[:3], middle, atol=1e-9)
+    fit = problem(KINDS['passive'])
+    circles = fit._polar_grid().mean(axis=1)
+    assert_allclose(circles, np.tile(fit.centre, (len(circles), 1)), atol=1e-9)
+
+
 def test_runs_that_leave_for_infinity_end():
     fit = problem(KINDS['passive'], offset=40.0, bearings=0)
     minima = minimise(fit, np.array([TRUTH, [5e3, 8e3]]), fit.weight)

@@ -19,7 +19,13 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.rays import launch_table, profile_of, profile_problem, trace
+from sonar_imm.acoustics.rays import (
+    launch_table,
+    look_up_each,
+    profile_of,
+    profile_problem,
+    trace,
+)
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'rays.npz'
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
@@ -124,6 +130,18 @@ def test_the_launch_table_of_straight_rays_is_the_depth():
     table = launch_table(profile_of([0.0, 1500.0]), 5.0, 77.0, 1500.0)
     depth = np.linspace(-11.0, 29.0, 50)  # also beyond straight down, where it says r sin > r
     assert table_at(table, 12.5, depth) == pytest.approx(depth, abs=1e-9)
+
+
+def test_between_cells_of_the_launch_table_there_is_a_bilinear_function():
+    """In a table that is one there is no error anywhere, also in the second of two rows."""
+    row, column = np.arange(4.0)[:, None], np.arange(6.0)
+    table = 1.0 + 2.0 * row + 0.5 * column - 0.3 * row * column
+    rng = np.random.default_rng(0)
+    rows, columns = rng.uniform(0.0, 3.0, 50), rng.uniform(0.0, 5.0, 50)
+    found = look_up_each(table, rows, 10.0, 0.25, 10.0 + 0.25 * columns)
+    assert found == pytest.approx(1.0 + 2.0 * rows + 0.5 * columns - 0.3 * rows * columns)
+    outside = look_up_each(table, np.ones(2), 10.0, 0.25, np.array([9.99, 11.26]))
+    assert np.isnan(outside).all()
 
 
 def test_where_rays_fold_back_nothing_is_heard():

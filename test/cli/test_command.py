@@ -23,6 +23,7 @@ import time
 import pytest
 
 from sonar_imm import __version__
+from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,3 +197,18 @@ def test_what_a_signal_leaves_half_made_is_no_traceback():
     done = subprocess.run([sys.executable, '-c', ENDED], capture_output=True, text=True)
     assert done.returncode == 143 and 'this one is told' in done.stderr
     assert 'AttributeError' not in done.stderr and 'Half' not in done.stderr
+
+
+def test_parameters_of_the_detector_come_from_a_file_the_command_or_both(tmp_path):
+    from sonar_imm_tools.cli.common import load_detector
+
+    path = tmp_path / 'parameters.yaml'
+    path.write_text('fls_detector:\n  ros__parameters:\n    min_range: 15.0\n')
+    obstacle, diver = SYSTEMS['obstacle'], SYSTEMS['diver']
+    asked = {'max_detections': '7', 'history': '1.0'}  # the second is no parameter of it
+    assert load_detector(obstacle, None, {}) == {}
+    assert load_detector(obstacle, path, {}) == {'min_range': 15.0}
+    assert load_detector(obstacle, None, asked) == {'max_detections': 7}
+    both = load_detector(obstacle, path, {**asked, 'min_range': '16'})
+    assert both == {'max_detections': 7, 'min_range': 16.0}
+    assert load_detector(diver, path, asked) == {}

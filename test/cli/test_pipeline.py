@@ -69,7 +69,7 @@ def test_run_json_accounts_for_every_message(call, dive, tmp_path):
     assert run['counts']['used'] == 118 and run['counts']['refused'] == 2
     assert run['refused']['nan']['count'] == 2
     assert run['topics'] == {'/fix': 'fix'} and run['bag'] == str(dive.resolve())
-    assert run['parameters']['model_set'] == 'heading_speed'
+    assert run['parameters']['model_set'] == 'families'
     assert {'sonar_imm', 'numpy', 'rosbags'} <= run['versions'].keys()
 
 

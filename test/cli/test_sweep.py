@@ -98,7 +98,7 @@ def test_json_is_what_the_folder_holds(tmp_path, capsys):
     assert content == json.loads((tmp_path / 'sweep.json').read_text()) and not printed.err
     assert content['seeds'] == [0, 1] and content['failures'] == {}
     assert content['scene']['duration'] == 15.0
-    assert content['parameters']['model_set'] == 'heading_speed'
+    assert content['parameters']['model_set'] == 'families'
     assert {'sonar_imm', 'numpy', 'numba'} <= content['versions'].keys()
 
 

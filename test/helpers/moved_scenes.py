@@ -138,12 +138,13 @@ def same_divers(plain, moved, motion, tolerance):
 
 def _headings(names, motion):
     """Which model each model is after the motion, by the direction in its name."""
-    headings = [name for name in names if name.startswith('heading_')]
     found = []
     for name in names:
-        if name not in headings:
+        family, heading, _ = name.partition('heading_')
+        if not heading:
             found.append(names.index(name))
             continue
+        headings = [each for each in names if each.startswith(family + heading)]
         k = headings.index(name)
         direction = 2.0 * math.pi * k / len(headings)
         x, y, _ = motion.A @ [math.cos(direction), math.sin(direction), 0.0]

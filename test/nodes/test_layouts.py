@@ -23,9 +23,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 import pytest
 import yaml
 
+from msg_adapters.displays.diver import FAMILIES
+from msg_adapters.estimates import write_model_probabilities
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.offline.tracking import OfflineRun
+from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.resources import shared_file
@@ -119,7 +122,8 @@ def check_path(path, topics, estimate):
         if '/' in kind:
             cls = message_class(kind)
     if topic.endswith('/model_probabilities'):
-        assert estimate.model_names[int(index)] == path['label']
+        drawn = write_model_probabilities(estimate, 0, ros_message, FAMILIES)
+        assert drawn.name[int(index)] == path['label']
 
 
 def placed(tree):

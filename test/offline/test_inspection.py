@@ -131,3 +131,37 @@ def test_a_companion_counts_by_its_name_and_not_alone(tmp_path):
     alone, topics = found(write_dive(tmp_path / 'alone', topic='/array_depth', truth=False))
     assert 'fathometer array_depth' in topics['/array_depth']['suits']
     assert 'fathometer' not in alone['systems']
+
+
+def fixes_by_hint(tmp_path, seed, divers, *, speed=0.5, together=False, clutter=0.0):
+    """What is said of fixes of divers 20 m apart, polled within 2 s, or of all at one stamp."""
+    rng = np.random.default_rng(seed)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for turn in range(60):
+            phases = np.zeros(divers) if together else (np.arange(divers) + 0.5) / divers
+            for diver, phase in enumerate(phases):
+                if rng.uniform() > 0.9:
+                    continue
+                when = 2.0 * (turn + phase) + (0.0 if together else 0.02 * rng.normal())
+                place = [speed * when, 20.0 * diver, 0.0] + 0.3 * rng.normal(size=3)
+                if rng.uniform() < clutter:
+                    place = rng.uniform(-100.0, 100.0, 3)
+                stamp = START_NS + round(when * SECOND)
+                fix = Fix(stamp_ns=stamp, position=place, frame_id='map')
+                bag.write('/fix', write_fix(fix, ros_message), stamp)
+    _, topics = found(tmp_path / 'bag')
+    return [text for text in topics['/fix']['problems'] if 'scan_period' in text]
+
+
+@pytest.mark.parametrize('divers', [2, 3, 7])
+@pytest.mark.parametrize('clutter', [0.0, 0.15])
+def test_fixes_that_are_stamped_one_by_one_are_hinted_at(tmp_path, divers, clutter):
+    (hint,) = fixes_by_hint(tmp_path, divers, divers, clutter=clutter)
+    assert 1.9 < float(hint.partition('scan_period=')[2].split()[0]) < 2.1
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('speed', [0.0, 0.5])
+@pytest.mark.parametrize('divers, together', [(1, False), (3, True)])
+def test_one_diver_and_whole_scans_need_no_hint(tmp_path, seed, speed, divers, together):
+    assert fixes_by_hint(tmp_path, seed, divers, speed=speed, together=together) == []

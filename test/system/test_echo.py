@@ -73,7 +73,7 @@ def test_estimates_are_found_and_shown(playing):
     lines = told['lines'][0].splitlines()
     assert told['lines'][2] == 0 and lines[0].startswith('/diver/estimate  20')
     assert 'frame map  1 row' in lines[0] and lines[1].split()[2:4] == ['px', 'py']
-    assert '±' in lines[2] and re.search(r'(heading_\d{3}|hover) +\d+%', lines[2])
+    assert '±' in lines[2] and re.search(r'(heading_\d{3}|hover|lively_\w+|quiet) +\d+%', lines[2])
     tables = [json.loads(line) for line in told['json'][0].splitlines()]
     assert told['json'][2] == 0 and len(tables) == 3
     assert {one['topic'] for one in tables} == {'/diver/estimate'}

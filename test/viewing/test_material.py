@@ -160,3 +160,8 @@ def test_runs_of_several_recordings_are_not_mixed(run, tmp_path):
     assert main(['track', *bags, str(tmp_path / 'out')]) == 0
     with pytest.raises(BagError, match='holds runs of 2 recordings'), opened(tmp_path / 'out'):
         pass
+    for path in (tmp_path / 'out').glob('*/run.json'):  # now two instruments of the same one
+        path.write_text(json.dumps({**json.loads(path.read_text()), 'bag': bags[0]}))
+    with opened(tmp_path / 'out') as (material, _):
+        names = {name for name in material.channels if name.endswith('/diver/odometry')}
+        assert names == {f'/diver_{name}/diver/odometry' for name in ('table1', 'multistatic')}

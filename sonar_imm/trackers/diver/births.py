@@ -63,7 +63,7 @@ MOST_FOUND = 10
 class Birth(NamedTuple):
     """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
     which it is, None for a fix; the probability that there is a diver, NaN where its hits will
-    tell; whose track it is."""
+    tell; whose track it is; whether it is measured, and no start."""
 
     position: FloatArray
     covariance: FloatArray
@@ -71,6 +71,7 @@ class Birth(NamedTuple):
     rows: IndexArray | None = None
     existence: float = math.nan
     target_id: int = NOBODY
+    measured: bool = True
 
 
 def births_from_fixes(
@@ -212,7 +213,8 @@ def new_tracks(
     if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
         position = np.array([birth.position for birth in births])
         covariance = np.array([birth.covariance for birth in births])
-        x, P, mu = models.new_tracks(position, covariance)
+        # A start comes alone.
+        x, P, mu = models.new_tracks(position, covariance, measured=births[0].measured)
         return *layout.widened(x, P), mu
     parts = [_new_track(birth, models, layout, config, plain) for birth in births]
     x, P, mu = (np.concatenate(part) for part in zip(*parts))

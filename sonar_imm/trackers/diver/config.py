@@ -52,12 +52,12 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 @frozen(kw_only=True)
 class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
-    """All parameters of the diver tracker. The defaults are the `heading_speed` set of the
+    """All parameters of the diver tracker. The defaults are the `families` of the
     docs."""
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = parameter('heading_speed', '',
+    model_set: str = parameter('families', '',
         'motion models run side by side', choices=MODEL_SETS)
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))
@@ -160,6 +160,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     fixes_are_scans: bool = live(True, '',
         'fixes of one stamp are a whole scan, in which a diver without a fix was missed; false '
         'for transponders polled in turn')
+
+    scan_period: float = parameter(0.0, 's',
+        'time in which a sensor that rotates or polls, and stamps each fix by itself, looks at '
+        'everyone once: fixes without a name within a whole multiple of it and the next are one '
+        'scan, at the middle; 0: those of one stamp are', range=(0.0, 3600.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,

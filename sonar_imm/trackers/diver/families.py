@@ -220,7 +220,11 @@ def densities(
     """The densities of fixes z (D, 2), R (D, 2, 2); h (T, K M, 2) expected."""
     copies = family_kernels.log_densities(h, layout.H, now.P, now.mu, z, R, layout.scales)
     _, weight = _each_copy(now.mu, len(layout.scales))
-    whole = np.logaddexp.reduce(copies + np.log(weight)[..., None], axis=1)
+    log_weight = np.log(weight)[..., None]
+    # Copy by copy: a scan of ten thousand fixes fills the memory otherwise.
+    whole = copies[:, 0] + log_weight[:, 0]
+    for k in range(1, copies.shape[1]):
+        np.logaddexp(whole, copies[:, k] + log_weight[:, k], out=whole)
     return Densities(copies, whole)
 
 

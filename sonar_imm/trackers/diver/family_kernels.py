@@ -28,9 +28,10 @@ hover -> velocity
 velocity -> hover
     s as in a new track, uncorrelated.
 velocity -> heading
-    The state given that w'v = 0 with variance q ((u'v)^2 + u'P_v u); then s = u'v. Directions
-    share the probability of going to headings as N(w'v; 0, S) E[max(s, 0)], S the variance of w'v
-    and that one.
+    The state given that w'v = 0 with variance q ((u'v)^2 + u'P_v u); then s = u'v. What stands
+    behind the four components stays as it is, as if it were only considered: a hypothesis of the
+    heading says nothing of it. Directions share the probability of going to headings as
+    N(w'v; 0, S) E[max(s, 0)], S the variance of w'v and that one.
 same components
     The state as it is.
 
@@ -61,6 +62,10 @@ LEAST_ACROSS = 1e-9
 
 NEGLIGIBLE = 40.0
 """A density by so much below another, in logarithms, adds nothing to it."""
+
+FAR = 1000.0
+"""Normalised distance squared along an axis, from what every model expects, beyond which a density
+is nothing but small: what counts is which one is nearer."""
 
 
 class Mixing(NamedTuple):
@@ -286,9 +291,11 @@ def _as_heading(
     S += mixing.sector_variance * (speed * speed + along) + LEAST_ACROSS
     for a in range(n):
         g = u * P[a, 3] - v * P[a, 2]
-        out_x[a] = x[a] - g * across / S
+        out_x[a] = x[a] - g * across / S if a < 4 else x[a]
         for b in range(n):
-            out_P[a, b] = P[a, b] - g * (u * P[b, 3] - v * P[b, 2]) / S
+            out_P[a, b] = P[a, b]
+            if a < 4 or b < 4:
+                out_P[a, b] -= g * (u * P[b, 3] - v * P[b, 2]) / S
     speed = u * out_x[2] + v * out_x[3]
     variance = u * u * out_P[2, 2] + 2.0 * u * v * out_P[2, 3] + v * v * out_P[3, 3]
     for a in range(n):
@@ -325,24 +332,45 @@ def log_densities(
 ) -> FloatArray:
     """ln of the predictive density of each fix in each copy of the models, (T, K, D): h
     (T, K M, 2) expected by H (1, K M, 2, n), P (T, K M, n, n), c (T, K M); z (D, 2), R (D, 2, 2),
-    which copy k takes `scales` (K,) times."""
+    which copy k takes `scales` (K,) times. Of fixes that are `FAR` off it is a rough figure, all
+    the smaller the farther."""
     T, models, _ = h.shape
     K, D, n = len(scales), len(z), P.shape[2]
     M = models // K
     out = np.empty((T, K, D))
     PHt, nothing, S = np.empty((n, 2)), np.zeros((2, 2)), np.empty((M, 2, 2))
     logs, weight = np.empty(M), np.empty(M)
+    low, high, widest = np.empty(2), np.empty(2), np.zeros(2)
+    for d in range(D):
+        for r in range(2):
+            widest[r] = max(widest[r], R[d, r, r])
     for t in range(T):
         for k in range(K):
             total = 0.0
+            low[:], high[:] = np.inf, -np.inf
             for j in range(M):
                 own = k * M + j
                 total += c[t, own]
                 innovation_covariance(P[t, own], H[0, own], nothing, PHt, S[j])
+                for r in range(2):
+                    reach = math.sqrt(FAR * max(S[j, r, r] + scales[k] * widest[r], 0.0))
+                    low[r] = min(low[r], h[t, own, r] - reach)
+                    high[r] = max(high[r], h[t, own, r] + reach)
             for j in range(M):
                 share = c[t, k * M + j] / total
                 weight[j] = math.log(share) - LOG_2PI if share > 0.0 else -np.inf
             for d in range(D):
+                off = 0.0
+                for r in range(2):
+                    half = 0.5 * (high[r] - low[r])
+                    if not low[r] <= z[d, r] <= high[r] and half > 0.0:
+                        off = max(off, abs(z[d, r] - 0.5 * (low[r] + high[r])) / half)
+                if off > 1.0:
+                    out[t, k, d] = -0.5 * FAR * off * off
+                    continue
+                # The least determinant of an innovation covariance is that of the fix alone.
+                sharpest = scales[k] ** 2 * (R[d, 0, 0] * R[d, 1, 1] - R[d, 0, 1] * R[d, 1, 0])
+                sharpest = math.log(sharpest) if sharpest > 0.0 else -np.inf
                 best = -np.inf
                 for j in range(M):
                     # The Cholesky factor of 2 x 2, written out.
@@ -355,6 +383,8 @@ def log_densities(
                         first = z[d, 0] - h[t, own, 0]
                         second = z[d, 1] - h[t, own, 1] - b / a * first
                         nis = first * first / a + second * second / e
+                        if weight[j] - 0.5 * (nis + sharpest) < best - NEGLIGIBLE:
+                            continue
                         logs[j] = weight[j] - 0.5 * (nis + math.log(a * e))
                         best = max(best, logs[j])
                 out[t, k, d] = best

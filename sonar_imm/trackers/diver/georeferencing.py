@@ -23,6 +23,9 @@ what it measures against them (its heading, a position by the transceiver's own 
 by the convergence of the meridians and the tilt of the vertical. What is by compass is turned from
 magnetic to true north before.
 
+A sensor that rotates or polls stamps each fix by itself. With ``scan_period`` they get the stamp
+of their scan here, so that those who are not looked at just now are not missed.
+
 Without a stated origin the first position in latitude and longitude is it, once such a position is
 used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
 what came first stays.
@@ -34,6 +37,7 @@ from collections import Counter
 from operator import attrgetter
 from typing import NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -50,6 +54,7 @@ from ...measurements import (
     Measurement,
     nanoseconds,
     Navigation,
+    NOBODY,
     Rejection,
     RelativeFix,
     VesselFix,
@@ -140,6 +145,20 @@ class Georeferencer:
 
     def georeference(self, measurement: Measurement) -> list[Measurement]:
         """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
+        ready = self._placed(measurement)
+        return [self._gathered(item) for item in ready] if self.config.scan_period else ready
+
+    def _gathered(self, item: Measurement) -> Measurement:
+        """A fix without a name at the stamp of its scan, in the middle of its period: that is the
+        same in whatever order the fixes come."""
+        if not isinstance(item, Fix) or item.target_id != NOBODY:
+            return item
+        period_ns = nanoseconds(self.config.scan_period)
+        scan_ns = item.stamp_ns // period_ns * period_ns + period_ns // 2
+        return evolve(item, stamp_ns=scan_ns)
+
+    def _placed(self, measurement: Measurement) -> list[Measurement]:
+        """`georeference`, each at its own stamp."""
         if isinstance(measurement, (Fix, Fixes, Arrivals)):
             return [measurement] if self._in_metres() else []
         if isinstance(measurement, VesselPose):

@@ -21,6 +21,7 @@ of existence is here: it says when a track is confirmed, published and ended.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from ...estimation import jipda as joint_association
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
-from . import families
+from . import families, names
 from .config import DiverConfig
 from .scan import Positions
 from .state import DiverState
@@ -53,7 +54,8 @@ NEAR_TENTATIVE, SCANS_TENTATIVE = 4.0, 2
 one in so many scans in a row."""
 
 NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
-"""The same of a confirmed track and an older confirmed one: two tracks on one diver."""
+"""The same of a confirmed track and an older confirmed one: two tracks on one diver. There may be
+more scans where two divers are seldom detected both, see `names.patience`."""
 
 
 StatusArray = NDArray[np.uint8]
@@ -184,11 +186,17 @@ class Judged(NamedTuple):
     near_for: IntArray
 
 
-def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> Judged:
+def judge(
+    now: DiverState,
+    hit: BoolArray,
+    looked: BoolArray,
+    E: FloatArray,
+    fixes: Sequence[Positions],
+) -> Judged:
     """Judge tracks by their existence and by how near they are to older ones.
 
     hit (T,): a detection is more probable than a miss; looked (T,): whether one would have been
-    seen; E (M, 2, n): to the position.
+    seen; E (M, 2, n): to the position; fixes: of this scan.
     """
     was = now.life.status != TENTATIVE
     confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
@@ -198,21 +206,40 @@ def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> 
     status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
-    near_to, near_for = coalescence(now, was, *now.positions(E))
-    patience = np.where(was, SCANS_CONFIRMED, SCANS_TENTATIVE)
+    nameless = [group for group in fixes if group.target_id is None]
+    near_to, near_for = coalescence(now, was, *now.positions(E), nameless)
+    scans = [names.patience(group.config.detection_probability) for group in nameless]
+    patience = np.where(was, max([SCANS_CONFIRMED, *scans]), SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)
 
 
 def coalescence(
-    now: DiverState, confirmed: BoolArray, mean: FloatArray, covariance: FloatArray
+    now: DiverState,
+    confirmed: BoolArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    fixes: Sequence[Positions],
 ) -> tuple[IntArray, IntArray]:
     """The older track that each one is near (T,), 0 for none, and for how many scans (T,).
 
-    mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part.
+    mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part. Tracks that
+    are seen in the same scan are two divers, however near they are.
     """
     ids, free = now.life.track_id.astype(np.int64), now.target_id == NOBODY
     partner, distance = joint_association.nearest_older(mean, covariance, ids, free, confirmed)
     near = distance < np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
+    for track in np.flatnonzero(near):
+        pair = [track, partner[track]]
+        near[track] = not any(_both_seen(group, mean[pair], covariance[pair]) for group in fixes)
     near_to = np.where(near, ids[partner], 0)
     near_for = np.where(near, np.where(near_to == now.near_to, now.near_for, 0) + 1, 0)
     return near_to, near_for
+
+
+def _both_seen(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> bool:
+    """Whether a scan has two fixes near two tracks, mean (2, 2) and covariance (2, 2, 2). Two that
+    are as near to each other as tracks of one diver are one that came twice."""
+    near = names.near(fixes, mean, covariance)
+    z, R = fixes.z[near], fixes.R[near]
+    distance = names.squared(z[:, None] - z[None], R[:, None] + R[None])
+    return bool((distance >= NEAR_CONFIRMED).any())

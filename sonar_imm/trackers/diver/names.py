@@ -33,7 +33,7 @@ import math
 
 import numpy as np
 
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold, TrackStatus
 from ...measurements import NOBODY
 from .scan import Positions
@@ -81,7 +81,7 @@ def merged(
         return now
     mean, covariance = now.positions(E)
     apart = mean[nameless][:, None] - mean[named][None]
-    distance = _squared(apart, covariance[nameless][:, None] + covariance[named][None])
+    distance = squared(apart, covariance[nameless][:, None] + covariance[named][None])
     ids = now.life.track_id.astype(np.int64)
     ago = dict(zip(before.life.track_id.tolist(), zip(before.near_to, before.near_for)))
     limit = max(patience(group.config.detection_probability) for group in seen)
@@ -93,7 +93,7 @@ def merged(
         if distance[nameless == row, place].min() > BESIDE or not going_on[other]:
             continue
         pair = [row, other]
-        if sum(_near(group, mean[pair], covariance[pair]) for group in seen) > 1:
+        if sum(int(near(group, mean[pair], covariance[pair]).sum()) for group in seen) > 1:
             continue
         partner, count = ago.get(int(ids[row]), (0, 0))
         near_to[row], near_for[row] = ids[other], 1 + (count if partner == ids[other] else 0)
@@ -117,14 +117,15 @@ def _prefer(now: DiverState, row: int, other: int) -> bool:
     return bool(now.life.track_id[row] < now.life.track_id[other])
 
 
-def _near(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> int:
-    """How many fixes of a scan are near one of two tracks: mean (2, 2), covariance (2, 2, 2)."""
+def near(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> BoolArray:
+    """Which fixes (D,) of a scan are near one of two tracks: mean (2, 2), covariance (2, 2,
+    2)."""
     apart = fixes.z[:, None] - mean[None]
-    distance = _squared(apart, covariance[None] + fixes.R[:, None])
+    distance = squared(apart, covariance[None] + fixes.R[:, None])
     threshold = gate_threshold(fixes.config.gate_probability, 2)
-    return int((distance.min(axis=1) <= threshold).sum())
+    return np.asarray(distance.min(axis=1) <= threshold)
 
 
-def _squared(apart: FloatArray, S: FloatArray) -> FloatArray:
+def squared(apart: FloatArray, S: FloatArray) -> FloatArray:
     """Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2, 2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

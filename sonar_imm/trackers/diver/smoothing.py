@@ -150,6 +150,7 @@ class SmoothingDiverTracker(DiverTracker):
                 mu[:, own] = result.mu * weight[:, None] if parts > 1 else result.mu
         if parts > 1:
             mu /= mu.sum(axis=1, keepdims=True)
+            mu[-1] = forward.mu[-1]
         return x, P, mu
 
     def _passes(self, scans: Sequence[DiverState]) -> list[tuple[int, _Pass]]:

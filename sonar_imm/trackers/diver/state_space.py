@@ -148,16 +148,21 @@ class ModelSet:
         return found
 
     def new_tracks(
-        self, position: FloatArray, covariance: FloatArray, from_fix: bool = True
+        self,
+        position: FloatArray,
+        covariance: FloatArray,
+        from_fix: bool = True,
+        measured: bool = True,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """x (k, K M, n), P (k, K M, n, n), mu (k, K M) of tracks first seen at `position` (k, 2)
-        with `covariance` (k, 2, 2)."""
+        with `covariance` (k, 2, 2), which the copies multiply where it is that of what was
+        `measured`."""
         M, n, K = len(self.names), self.n, self.copies
         shape = len(position), K * M
         x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
         x[..., :2], x[..., 2:] = position[:, None], self._for_copies(self.start_mean)
         P[..., :2, :2] = covariance[:, None]
-        if from_fix and len(self.scales) > 1:
+        if from_fix and measured and len(self.scales) > 1:
             P[..., :2, :2] *= np.repeat(self.scales, M)[:, None, None]
         P[..., range(2, n), range(2, n)] = self._for_copies(self.start_variance)
         if self.height >= 0:

@@ -293,8 +293,8 @@ class DiverTracker:
             tracks, row = np.nonzero(now.target_id[:, None] == fixes.target_id[None])
             free = ~np.isin(np.arange(len(fixes.z)), row)
             if densities is not None:
-                believed = densities.whole[tracks, row] > families.bound(config)
-                tracks, row = tracks[believed], row[believed]
+                good = densities.whole[tracks, row] > families.bound(config)
+                tracks, row = tracks[good], row[good]
             return Association(tracks, row, expected, now.score, free, densities=densities)
         excluded = now.target_id != NOBODY
         if config.named_tracks == 'share':
@@ -312,7 +312,8 @@ class DiverTracker:
             threshold = gate_threshold(config.gate_probability, 2)
             fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
         else:
-            fit = densities.whole.copy()
+            believed = densities.whole > families.bound(config)
+            fit = np.where(believed, densities.whole, -np.inf)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
@@ -423,7 +424,7 @@ class DiverTracker:
             status = np.where(doubtful[kept], TENTATIVE, life.status).astype(np.uint8)
             life, alive = evolve(life, status=status), alive & ~over
         if by_existence.any():
-            judged = jipda.judge(now, hit, looked, self._position)
+            judged = jipda.judge(now, hit, looked, self._position, scan.fixes)
             status = np.where(by_existence[kept], judged.status[kept], life.status)
             life = evolve(life, status=status)
             now = now._replace(near_to=judged.near_to, near_for=judged.near_for)
@@ -453,7 +454,7 @@ class DiverTracker:
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
-                birth = Birth(start.position[:2], start.covariance)
+                birth = Birth(start.position[:2], start.covariance, measured=False)
                 now = births.confirmed(self._with_tracks(now, [birth]))
         return now
 

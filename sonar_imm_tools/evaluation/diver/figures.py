@@ -231,21 +231,23 @@ def sigma_figure(series: Series, track_id: int) -> go.Figure:
 def models_figure(
     series: Series, track_id: int, truth_course: tuple[FloatArray, FloatArray] | None
 ) -> go.Figure:
-    """Model probabilities of one track as a heat strip, headings in order, other models below.
+    """Model probabilities of one track as a heat strip, headings in order, other models below;
+    what several families have (`headings_together`) in one row.
 
     truth_course: (seconds, degrees) of the true course, drawn over the heading rows; None without.
     """
     track = series.pick(series.track_id == track_id)
     track = track.pick(thin(len(track), 4000))
-    order = np.array(model_order(track.model_names), int)
-    names = np.array(track.model_names)[order]
-    headings = sum(name.startswith('heading_') for name in track.model_names)
+    names, probabilities = headings_together(track.model_names, track.probabilities)
+    order = np.array(model_order(names), int)
+    headings = sum(name.startswith('heading_') for name in names)
+    names = np.array(names)[order]
     figure = go.Figure()
     add_image(
         figure,
         seconds(track.stamp_ns, track.scan_ns),
         np.arange(len(order)),
-        track.probabilities[:, order].T,
+        probabilities[:, order].T,
         customdata=np.tile(names[:, None], (1, len(track))),
         hovertemplate='%{x:.1f} s, %{customdata}: %{z:.3f}<extra></extra>',
     )
@@ -272,6 +274,17 @@ def outlines(
     shape = vectors @ (radii[:, :, None] * circle)
     closed = mean[shown, None] + shape.transpose(0, 2, 1)
     return np.concatenate([closed, np.full((len(closed), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+
+
+def headings_together(
+    names: tuple[str, ...], probabilities: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Models and their probabilities (n, M), those of the families `steady` and `brisk` with the
+    same heading added up."""
+    short = [name.removeprefix('steady_').removeprefix('brisk_') for name in names]
+    first = tuple(dict.fromkeys(short))
+    added = np.array([[name == each for each in first] for name in short], float)
+    return first, probabilities @ added
 
 
 def model_order(names: tuple[str, ...]) -> list[int]:

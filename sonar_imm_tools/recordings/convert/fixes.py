@@ -30,9 +30,11 @@ from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import FixesOptions
-from ..csv_table import CsvTable, Row
+from ..csv_table import BadRow, CsvTable, Row
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
+from ..polar_rows import PolarRows
+from ..sources import BagError
 from .truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
@@ -44,8 +46,10 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
 
     Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
     (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
-    position it is, a number or a name. A row with empty uncertainties becomes a fix without
-    covariance. Latitudes become metres around the origin, which the tracker finds in
+    position it is, a number or a name. In place of x and y ``range`` [m] and ``bearing`` from a
+    sensor at the origin, see `PolarRows`. A row with empty uncertainties becomes a fix without
+    covariance, one with a time and no position an empty scan: then all rows become scans,
+    ``/fixes``. Latitudes become metres around the origin, which the tracker finds in
     ``parameters.yaml`` beside the bag. values: as in `FixesOptions`; truth is a CSV as in
     `convert_truth`, for the same bag and the same origin.
 
@@ -56,36 +60,71 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
     how = FixesOptions(**values)
     table = CsvTable(path, how.options)
     table.require('stamp')
-    frame = LocalFrame(table, how.origin)
+    polar = None
+    if table.has('range', 'bearing') and not _has_places(table):
+        if how.bearings == 'bow':
+            raise BagError(
+                f'{table.path}: bearings from the bow need the pose of the vessel; see '
+                'sonar-imm convert relative'
+            )
+        polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
+    frame = None if polar else LocalFrame(table, how.origin)
+    origin = frame.origin if frame else None
     report = ConversionReport(Path(out))
+    place = ('range', 'bearing') if polar else ('x', 'y')
+    if frame and frame.geodetic:
+        place = ('latitude', 'longitude')
 
     repeats: dict[str, RepeatFilter] = {}
     repeated: list[int] = []
 
-    def parse(row: Row) -> tuple[Fix, str]:
+    def parse(row: Row) -> tuple[int, Fix | None, str]:
         row.require_valid()
-        name = row.text('id')
+        name, stamp_ns = row.text('id'), row.stamp_ns()
+        if row.empty(*place):
+            if name:
+                raise BadRow(f'{name} has no position')
+            return stamp_ns, None, name
+        if frame:
+            position, covariance = frame.position(row), _covariance(row)
+        else:
+            assert polar is not None
+            flat, covariance = polar.place(row)
+            position = (*flat.tolist(), row.height())
         fix = Fix(
-            stamp_ns=row.stamp_ns(),
-            position=frame.position(row),
-            covariance=_covariance(row),
-            frame_id=how.frame_id,
+            stamp_ns=stamp_ns, position=position, covariance=covariance, frame_id=how.frame_id
         )
         check_size(fix)
         try:
             repeats.setdefault(name, RepeatFilter(REPEAT_TIME)).fresh(fix)
         except Rejection:
             repeated.append(row.line)
-        return fix, name
+        return stamp_ns, fix, name
 
-    rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
-    if _names_divers(table, rows, report):
-        records = _named_scans(rows, report, how.frame_id)
+    read = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
+    rows = [(row, fix, name) for row, _, fix, name in read if fix is not None]
+    empty = [(row, stamp_ns) for row, stamp_ns, fix, _ in read if fix is None]
+    if polar:
+        polar.check_unit()
+    if not rows:
+        for row, _ in empty:
+            report.bad_row(table.path, f'line {row.line}', f'{" and ".join(place)} are empty')
+        empty = []
+    named = _names_divers(table, rows, report)
+    if named or empty:
+        records = _scans(rows, [stamp for _, stamp in empty], named, report, how.frame_id)
     else:
         records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for _, fix, _ in rows]
+    if frame:
+        origin = frame.origin
+        report.notes.update(frame.notes())
     if how.truth is not None and records:
-        records += truth_records(how.truth, report, how.truth_options, how.frame_id, frame.origin)
-    report.notes.update(frame.notes())
+        records += truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
+    if empty:
+        report.notes['empty scans'] = (
+            f'{len(empty)} rows have a time and no position, the first in line '
+            f'{empty[0][0].line}: nobody was seen then'
+        )
     if repeated:
         report.notes['repeated'] = (
             f'{len(repeated)} rows hold a position that came before, the first in line '
@@ -97,8 +136,12 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
         report,
         source=Path(path).name,
         storage=how.storage,
-        parameters={'diver': origin_parameters(frame.origin)},
+        parameters={'diver': origin_parameters(origin)},
     )
+
+
+def _has_places(table: CsvTable) -> bool:
+    return table.has('x', 'y') or table.has('latitude', 'longitude')
 
 
 def _names_divers(
@@ -115,14 +158,19 @@ def _names_divers(
     return True
 
 
-def _named_scans(
-    rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport, frame_id: str
+def _scans(
+    rows: Sequence[tuple[Row, Fix, str]],
+    empty: Sequence[int],
+    named: bool,
+    report: ConversionReport,
+    frame_id: str,
 ) -> list[Record]:
-    """Scans of the rows with the same stamp, each with the number of its diver."""
-    numbers = number_names([name for _, _, name in rows if name])
+    """Scans of the rows with the same stamp, each with the number of its diver where the rows are
+    named, and those at the stamps `empty`, in which nobody was seen."""
+    numbers = number_names([name for _, _, name in rows if name]) if named else {}
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
-    by_stamp: dict[int, list[tuple[Fix, int]]] = {}
+    by_stamp: dict[int, list[tuple[Fix, int]]] = {stamp_ns: [] for stamp_ns in empty}
     for row, fix, name in rows:
         scan = by_stamp.setdefault(fix.stamp_ns, [])
         number = numbers.get(name, NOBODY)
@@ -138,11 +186,11 @@ def _named_scans(
             write_scan(
                 Fixes(
                     stamp_ns=stamp_ns,
-                    position=[fix.position for fix, _ in scan],
+                    position=np.array([fix.position for fix, _ in scan]).reshape(-1, 3),
                     covariance=np.array(
                         [unknown if fix.covariance is None else fix.covariance for fix, _ in scan]
-                    ),
-                    target_id=[number for _, number in scan],
+                    ).reshape(-1, 2, 2),
+                    target_id=[number for _, number in scan] if named else None,
                     frame_id=frame_id,
                 ),
                 ros_message,

@@ -17,6 +17,7 @@
 import numpy as np
 import pytest
 
+from sonar_imm_tools.evaluation.bathymetry.figures import profile_figure
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
 from sonar_imm_tools.evaluation.bathymetry.summary import METRICS, summary_sentence
@@ -52,6 +53,15 @@ def profile(
 
 def swath(*profiles, names=('rw_smooth', 'rw_rough')):
     return Swath(profiles, names, np.array([False, True]))
+
+
+def test_the_picture_of_a_ping_shades_the_patch_and_the_band_of_two_deviations():
+    drawn = profile()
+    figure = profile_figure(drawn)
+    ((begin, end),) = [(shape.x0, shape.x1) for shape in figure.layout.shapes]
+    assert (begin, end) == (drawn.range[PATCH][0], drawn.range[PATCH][-1])
+    edges = np.concatenate([np.asarray(trace.y, float) for trace in figure.data[:2]])
+    assert (edges.min(), edges.max()) == pytest.approx((0.1 - 0.12, 0.1 + 0.12))
 
 
 def test_errors_by_place_and_the_share_inside_the_band():

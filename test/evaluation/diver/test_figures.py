@@ -45,6 +45,16 @@ def test_models_are_ordered_by_heading_with_the_others_below():
     assert figures.model_label('heading_022') == '22°'
 
 
+def test_the_same_heading_of_two_families_is_one_row():
+    names = ('steady_heading_000', 'steady_hover', 'brisk_heading_000', 'brisk_hover', 'quiet')
+    found, added = figures.headings_together(names, np.array([[0.1, 0.2, 0.3, 0.25, 0.15]]))
+    assert found == ('heading_000', 'hover', 'quiet')
+    np.testing.assert_allclose(added, [[0.4, 0.45, 0.15]])
+    alone = figures.headings_together(('heading_000', 'hover'), np.eye(2))
+    assert alone[0] == ('heading_000', 'hover')
+    np.testing.assert_array_equal(alone[1], np.eye(2))
+
+
 def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
     estimates, true_rows, _ = single_run(count=60)
     truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])

@@ -72,6 +72,7 @@ def test_numbers_of_three_known_errors():
         for k, error in enumerate(errors)
     ]
     metrics = scored(estimates, truth)
+    assert (metrics['stamps'], metrics['span_s']) == (3, 2.0)
     assert metrics['position']['rmse_m'] == pytest.approx(np.sqrt(30.0 / 3.0))
     assert metrics['position']['median_m'] == pytest.approx(2.0)
     assert metrics['velocity']['rmse_mps'] == pytest.approx(np.sqrt(7.0 / 3.0))

@@ -19,10 +19,15 @@ import json
 from helpers.obstacle_bags import tracked
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
+from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
+from sonar_imm_tools.evaluation.obstacle.figures import error_figure
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -62,6 +67,13 @@ def straight(track_id, offset, bearing=0.0, count=20):
         [60.0 - 2.0 * np.arange(count), np.full(count, bearing), np.full(count, offset)]
     )
     return TruePath(track_id, stamps, seen, np.ones(count, bool))
+
+
+def test_of_true_deviations_nine_in_ten_lie_in_the_shaded_band():
+    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 3.0, 1.0, 2.0, 5.0, 0.1]])]),
+                     (straight(1, 3.0),), cutoff=5.0, gap=60.0)  # fmt: skip
+    (band,) = error_figure(found).layout.shapes
+    assert ndtr(band.y1) - ndtr(band.y0) == pytest.approx(0.9, abs=1e-3)
 
 
 def test_scores_are_those_done_by_hand():
@@ -200,6 +212,23 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
     assert any(title.startswith('Deferred estimate: RMSD') for title in titles)
     assert main(['evaluate', str(run), '--report', str(tmp_path / 'report.html')]) == 0
     assert 'Diamonds: least RMSD' in (tmp_path / 'report.html').read_text()
+
+
+def test_online_and_deferred_estimates_hold_at_the_first_echo_of_a_vehicle_that_dives():
+    """An obstacle 8 m below the sonar at first, which sinks towards it by 0.2 m each second."""
+    received, estimates = [], []
+    for k in range(20):
+        below, ahead = 8.0 - 0.2 * k, 60.0 - 2.0 * k
+        slant = np.hypot(ahead, below)
+        row = [4, 1, slant, 0.0, below, 1.0, below - 1.0, below + 2.0, 0.1]
+        estimates.append(estimate(k + 1, [row]))
+        pose = {'position': [2.0 * k, 0.0, -10.0 - 0.2 * k], 'orientation': [0.0, 0.0, 0.0, 1.0]}
+        received.append(Navigation(stamp_ns=(k + 1) * SECOND, **pose))
+        echo = {'range': [slant], 'bearing': [0.0], 'var_range': [0.01], 'var_bearing': [1e-4]}
+        received.append(Detections(stamp_ns=(k + 1) * SECOND, **echo))
+    found = deferred_estimates(series_of(estimates), received, ObstacleConfig(), {}, 60.0)
+    assert found.echoes == 20 and found.plain.best == pytest.approx(8.0, abs=0.3)
+    assert (found.online, *found.band) == pytest.approx((8.0, 7.0, 10.0))
 
 
 def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):

@@ -117,6 +117,14 @@ def test_what_comes_after_the_horizon_is_no_collision():
     assert happened.astype(int).tolist() == [0, 0, 1, 1, 1, 0]
 
 
+def test_within_the_horizon_of_the_end_of_the_truth_nothing_is_known():
+    truth = path([40.0, 30.0, 20.0, 10.0])
+    found = matched([estimate(k + 1, 10.0, 0.5) for k in range(4)], truth)
+    found = evolve(found, row=np.arange(4), target=np.zeros(4, int))
+    _, happened = forecasts(found, (truth,), ObstacleConfig(cpa_horizon=2.0))
+    assert happened.astype(int).tolist() == [0, 0]
+
+
 def test_forecasts_as_often_right_as_stated_lie_on_the_diagonal():
     rng = np.random.default_rng(1)
     stated = rng.uniform(0.0, 1.0, 20_000)

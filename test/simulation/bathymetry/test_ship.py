@@ -18,6 +18,7 @@ import pytest
 from sonar_imm.acoustics import geometry, rays, sounding
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
+from sonar_imm_tools.simulation.bathymetry.ship import in_outline
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, SUMMER
 
 
@@ -77,6 +78,19 @@ def test_under_a_profile_the_points_are_where_rays_end():
     far = np.hypot(*(true.xyz[-1] - ship)[:2])
     launch = rays.launch_table(profile, 5.0, 77.0, 1500.0)
     assert 60.0 < far < 90.0 and launch.value.shape[0] == 78
+
+
+def test_the_outline_of_the_patch_waves_by_its_length_and_height():
+    config = scenario(
+        'moving', {'patch_outline': 2.0, 'patch_outline_length': 8.0, 'patch_along': []}
+    )
+    along, off = np.meshgrid(np.arange(0.0, 24.0, 0.25), np.arange(0.0, 40.0, 0.25))
+    inside = in_outline(config, along, off, 10.0, 20.0)
+    alike = [(inside[:, :-shift] == inside[:, shift:]).mean() for shift in (32, 16)]
+    assert alike[0] > 0.995 and alike[1] < 0.95
+    inner = off[inside.argmax(axis=0), 0]
+    assert (inner.min(), inner.max()) == pytest.approx((8.0, 12.0), abs=0.25)
+    assert (inside[60:72].all(), inside[:30].any(), inside[90:].any()) == (True, False, False)
 
 
 def test_the_patch_has_an_outline_on_the_map():

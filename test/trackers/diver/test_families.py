@@ -181,9 +181,9 @@ def test_scale_of_the_stated_covariances(stated):
     scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
     said = ' '.join(tracker.warnings())
     if stated < 1.0:
-        assert 3.0 < scale < 10.0 and 'times what they state' in said
+        assert 3.0 < scale < 10.0 and 'times as far as they state' in said
     else:
-        assert 1.0 <= scale < 1.6 and 'times what they state' not in said
+        assert 1.0 <= scale < 1.6 and 'times as far as they state' not in said
 
 
 def test_a_name_does_not_make_a_fix_good():

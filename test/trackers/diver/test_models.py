@@ -91,6 +91,7 @@ def test_world_headings_compose_in_position():
         (
             'A12_speedstate16_hover',
             DiverConfig(
+                model_set='heading_speed',
                 stay_probability=0.88,
                 heading_concentration=2.0,
                 speed_noise=0.03,
@@ -115,7 +116,7 @@ def test_the_sets_are_those_of_the_reference(case, config, exact):
 
 
 def test_headings_and_the_velocity_they_put_out():
-    models = build_models(DiverConfig(hover=True))
+    models = build_models(DiverConfig(model_set='heading_speed', hover=True))
     assert models.names[:3] == ('heading_000', 'heading_022', 'heading_045')
     assert models.names[-2:] == ('heading_337', 'hover')
     x = np.tile([0.0, 0.0, 0.5], (17, 1))
@@ -139,10 +140,12 @@ def test_turning_models_turn_left_and_right():
     [
         ({'model_set': 'heading_sped'}, 'did you mean'),
         ({'confirm_hits': 6}, 'cannot exceed'),
-        ({'transition_matrix': (0.5, 0.5)}, '17 x 17'),
+        ({'transition_matrix': (0.5, 0.5)}, '37 x 37'),
+        ({'model_set': 'heading_speed', 'transition_matrix': (0.5, 0.5)}, '17 x 17'),
         ({'model_set': 'cv_cv', 'transition_matrix': (0.9, 0.2, 0.5, 0.5)}, 'row 0 .* 1.1'),
         ({'model_set': 'cv_cv', 'acceleration_noise': (0.1,)}, 'each of the 2'),
-        ({'initial_probabilities': (1.0,)}, '17 values'),
+        ({'initial_probabilities': (1.0,)}, '37 values'),
+        ({'model_set': 'heading_speed', 'initial_probabilities': (1.0,)}, '17 values'),
         ({'model_set': 'cv_cv', 'initial_probabilities': (0.5, 0.6)}, 'sum to 1.1'),
         ({'history': float('nan')}, 'finite'),
         ({'directions': 3}, 'between 4 and 64'),

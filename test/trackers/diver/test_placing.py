@@ -14,6 +14,7 @@
 
 """Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
 
+from attrs import evolve
 import numpy as np
 import pymap3d
 import pytest
@@ -168,7 +169,7 @@ def test_a_relative_fix_is_composed_with_the_pose_between_two_messages():
 
 def test_what_the_vessel_states_of_itself_counts_and_else_the_parameters():
     def covariance(config=None, **values):
-        tracker = DiverTracker(config or DiverConfig())
+        tracker = DiverTracker(evolve(config or DiverConfig(), covariance_scales=(1.0,)))
         near = [pose(s, (0, 0, 0), 0.0, **values) for s in (1, 2)]
         (estimate,) = run(tracker, [*near, relative(1.5, (100.0, 0.0, 0.0))])
         return estimate.covariance[0, :2, :2]

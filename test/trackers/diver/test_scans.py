@@ -373,7 +373,7 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
         near_for=np.array([0, 5, 5, 5]),
     )
     tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
-    near_to, near_for = jipda.coalescence(now, tentative, mean, wide)
+    near_to, near_for = jipda.coalescence(now, tentative, mean, wide, [])
     assert near_to.tolist() == [0, 0, 2, 1]
     assert near_for.tolist() == [0, 0, 1, 6]
 
@@ -389,3 +389,107 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     for stated in (False, True):
         assert 'raise covariance_scale' in optimistic.warnings(stated)[0]
     assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []
+
+
+def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=0.0):
+    """Scans of divers 0.4 m apart, as many as `seen` says for each second, in clutter (fixes in a
+    square of 50 m)."""
+    rng = np.random.default_rng(seed)
+    for second, count in enumerate(seen, start=1):
+        places = np.array([[0.5 * second, 0.4 * number] for number in range(count)])
+        places = places[rng.uniform(size=count) < detection_probability]
+        places = places + std * rng.normal(size=places.shape)
+        false = [0.5 * second, 0.0] + rng.uniform(-25.0, 25.0, (rng.poisson(clutter), 2))
+        places = np.vstack([places, false])
+        yield Fixes(
+            stamp_ns=second * SECOND,
+            position=np.pad(places, [(0, 0), (0, 1)]),
+            covariance=np.tile(std**2 * np.eye(2), (len(places), 1, 1)),
+            frame_id='map',
+        )
+
+
+def confirmed_by_jipda(scans, **values):
+    """How many divers are confirmed after each scan, and who ever was."""
+    config = DiverConfig(association='jipda', **values)
+    tracker, counts, ids = DiverTracker(config), [], set()
+    for item in scans:
+        (estimate,) = tracker.process(item)
+        followed = estimate.extras['track_state'] != TrackStatus.TENTATIVE
+        counts.append(int(followed.sum()))
+        ids.update(estimate.extras['track_id'][followed].tolist())
+    return np.array(counts), ids
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('std', [0.1, 0.3])
+def test_jipda_keeps_two_divers_that_are_seen_in_the_same_scans(seed, std):
+    """Their tracks are nearer to each other than any two of one diver may be."""
+    counts, ids = confirmed_by_jipda(beside_each_other(seed, [2] * 80, std), clutter_density=1e-4)
+    assert (counts[10:] == 2).mean() > 0.98 and len(ids) == 2
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_jipda_keeps_two_divers_that_are_seldom_both_detected(seed):
+    scans = beside_each_other(seed, [2] * 150, detection_probability=0.6)
+    counts, _ = confirmed_by_jipda(scans, detection_probability=0.6, clutter_density=1e-4)
+    both = int(np.flatnonzero(counts == 2)[0])
+    assert both < 60 and (counts[both:] == 2).all()
+
+
+@pytest.mark.parametrize('clutter', [0.0, 4.0])
+@pytest.mark.parametrize('seed', range(3))
+def test_jipda_merges_two_tracks_of_one_diver(seed, clutter):
+    """A diver who gave two echoes for a while, then one."""
+    scans = beside_each_other(seed, [2] * 30 + [1] * 30, clutter=clutter)
+    density = max(clutter, 0.25) / 2500.0
+    counts, _ = confirmed_by_jipda(scans, clutter_density=density)
+    assert counts[29] == 2 and (counts[45:] == 1).all()
+
+
+def polled(seed, divers=3, seconds=60, detection_probability=0.95, std=0.3):
+    """Fixes of divers 20 m apart by a sensor that looks at one after the other, once a second."""
+    rng = np.random.default_rng(seed)
+    for turn in range(5, 5 + seconds):
+        for diver in np.flatnonzero(rng.uniform(size=divers) < detection_probability):
+            when = turn + (diver + 0.5) / divers + 0.01 * rng.normal()
+            across = 20.0 * diver + std * rng.normal()
+            yield fix(when, 0.5 * when, across, std**2 * np.eye(2))
+
+
+def missed(made, divers=3):
+    """Share of divers without a confirmed track within 3 m, after 20 s; who was confirmed."""
+    shares, ids = [], set()
+    for estimate in [item for item in made if item.stamp_ns > 25 * SECOND]:
+        followed = estimate.extras['track_state'] > 0
+        ids.update(estimate.extras['track_id'][followed].tolist())
+        across = estimate.state[followed, 1]
+        shares.append(np.mean([not (abs(across - 20.0 * k) < 3.0).any() for k in range(divers)]))
+    return float(np.mean(shares)), ids
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_fixes_of_a_sensor_that_polls_are_gathered_to_scans(seed):
+    alone, _ = missed(run(DiverTracker(DiverConfig()), polled(seed)))
+    made = run(DiverTracker(DiverConfig(scan_period=1.0)), polled(seed))
+    gathered, ids = missed(made)
+    assert alone > 0.3 and gathered < 0.01 and len(ids) == 3
+    assert {item.stamp_ns % SECOND for item in made} == {SECOND // 2}
+
+
+def test_gathered_scans_are_the_same_in_any_order_and_as_those_gathered_by_hand():
+    config, items = DiverConfig(scan_period=1.0), list(polled(3, seconds=30))
+    order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 9, len(items)))
+    first = run(DiverTracker(config), items)
+    other = run(DiverTracker(config), [items[k] for k in order])
+    half = SECOND // 2
+    middle = [evolve(item, stamp_ns=item.stamp_ns // SECOND * SECOND + half) for item in items]
+    by_hand = run(DiverTracker(DiverConfig()), middle)
+    for made in (other, by_hand):
+        assert len(made) == len(first) and all(same(*pair) for pair in zip(first, made))
+
+
+def test_fixes_with_a_name_keep_their_stamps():
+    tracker = DiverTracker(DiverConfig(scan_period=1.0))
+    (estimate,) = tracker.process(evolve(fix(5.2, 0.0, 0.0), target_id=4))
+    assert estimate.stamp_ns == round(5.2 * SECOND)

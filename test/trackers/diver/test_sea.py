@@ -56,7 +56,7 @@ def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
     rmse, nees, estimates = judged('at_depth', {}, {'dimensions': 3})
     assert told_wrong[1] > 5.0 and rmse < 0.4 and nees < 2.6
     assert estimates[-1].state_names == ('px', 'py', 'pz', 'vx', 'vy', 'vz')
-    assert estimates[-1].model_names[0] == 'heading_000'
+    assert estimates[-1].model_names[0] == 'steady_heading_000'
     np.testing.assert_allclose(estimates[-1].probabilities.sum(axis=1), 1.0)
     assert estimates[-1].xyz[0, 2] == estimates[-1].state[0, 2]
 
@@ -75,9 +75,13 @@ def test_where_nothing_is_said_of_the_depth_it_stays_as_wide_as_the_water():
 
 @pytest.mark.parametrize('errors', ['mixed', 'consider', 'estimate'])
 def test_misplaced_instruments_are_in_the_covariance(errors):
-    ignored = judged('misplaced_receivers', {}, {})
-    rmse, nees, _ = judged('misplaced_receivers', {}, {**OFF, 'systematic_errors': errors})
-    assert ignored[1] > 8.0 and nees < 2.6 and rmse < ignored[0]
+    named = {'model_set': 'heading_speed'}
+    ignored = judged('misplaced_receivers', {}, named)
+    assert ignored[1] > 8.0
+    for config in ({}, named):
+        config = {**config, **OFF, 'systematic_errors': errors}
+        rmse, nees, _ = judged('misplaced_receivers', {}, config)
+        assert nees < 2.6 and rmse < ignored[0]
 
 
 def test_what_is_considered_is_the_same_in_all_models_and_times():
@@ -88,7 +92,7 @@ def test_what_is_considered_is_the_same_in_all_models_and_times():
         tracker.process(scan.measurement)
     state = tracker._stream.state
     layout = state.instruments.layout(config, tracker.models)
-    assert layout.size == 3 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
+    assert layout.size == 4 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
     considered = slice(tracker.models.n, layout.size)
     assert (state.x[..., considered] == 0.0).all()
     np.testing.assert_allclose(
@@ -108,9 +112,9 @@ def test_receivers_that_come_later_bring_their_prior():
     assert [receiver for receiver, _ in first.known] == [3, 7]
     both = first.with_receivers(ping, config)
     assert [receiver for receiver, _ in both.known] == [3, 7, 0, 1, 2]
-    x, P = both.layout(config, build_models(config)).widened(np.ones((2, 5)), np.ones((2, 5, 5)))
-    assert x.shape == (2, 8) and (P[:, :5, 5:] == 0.0).all()
-    np.testing.assert_allclose(P[0, 5:, 5:], 1.5**2 * np.eye(3))
+    x, P = both.layout(config, build_models(config)).widened(np.ones((2, 6)), np.ones((2, 6, 6)))
+    assert x.shape == (2, 9) and (P[:, :6, 6:] == 0.0).all()
+    np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
 
 def test_lasting_errors_of_fixes_are_in_the_covariance():
@@ -165,9 +169,13 @@ def run_fixes(total, white, bias, **config):
 
 def test_covariances_of_fixes_that_cannot_be_true_are_named():
     assert run_fixes(0.25, 0.5, 0.0).warnings() == []
-    optimistic = run_fixes(0.01, 0.8, 0.0)
-    assert 'miss by more than they state' in optimistic.warnings()[0]
-    assert optimistic.health()['fixes_mean_nis'] > 1.7
+    for model_set, says in (
+        ('families', 'times as far as they state'),
+        ('heading_speed', 'miss by more than they state'),
+    ):
+        optimistic = run_fixes(0.01, 0.8, 0.0, model_set=model_set)
+        assert says in optimistic.warnings()[0]
+        assert optimistic.health()['fixes_mean_nis'] > 1.7
     lasting = run_fixes(4.0, 0.05, 2.0)
     assert 'the data cannot tell which' in lasting.warnings()[0]
     pessimistic = run_fixes(4.0, 0.5, 0.0)
@@ -190,7 +198,7 @@ def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
 def test_without_anything_stated_no_state_is_added():
     tracker = DiverTracker(DiverConfig())
     tracker.process(simulate(scenario('multistatic'), 1).measurements[0].measurement)
-    assert tracker.models.n == 3 and tracker._stream.state.x.shape[1:] == (17, 3)
+    assert tracker.models.n == 4 and tracker._stream.state.x.shape[1:] == (3 * 37, 4)
     assert tracker._stream.state.instruments == Instruments()
 
 

@@ -65,9 +65,17 @@ def test_the_estimate_is_the_contract():
     estimate = tracker.process(fix(1, 2.0, 3.0))[0]
     columns = estimate.columns()
     assert list(columns)[:8] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px']
-    assert [name for name in columns if name.startswith('prob_')][0] == 'prob_heading_000'
-    assert list(columns)[-6:-2] == ['track_id', 'track_state', 'nis', 'nis_dof']
-    assert list(columns)[-2:] == ['existence', 'target_id']
+    models = [name for name in columns if name.startswith('prob_')]
+    assert [models[0], models[17], models[-1]] == [
+        'prob_steady_heading_000',
+        'prob_brisk_heading_000',
+        'prob_quiet',
+    ]
+    assert list(columns)[-12:] == [
+        *('track_id', 'track_state', 'nis', 'nis_dof', 'existence', 'target_id'),
+        *('family_steady', 'family_brisk', 'family_lively', 'family_quiet'),
+        *('hover', 'covariance_scale'),
+    ]
     assert np.isnan(columns['existence']).all() and columns['target_id'].tolist() == [-1]
     assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
     assert columns['track_id'].dtype == np.uint32 and columns['track_state'].dtype == np.uint8
@@ -79,7 +87,12 @@ def test_consistency_where_the_models_hold():
     """A diver drawn from the models themselves: NEES within its bounds."""
     rng = np.random.default_rng(4)
     config = DiverConfig(
-        adaptation='fixed', max_tracks=1, confirm_hits=1, hover=False, gate_probability=0.9999999
+        model_set='heading_speed',
+        adaptation='fixed',
+        max_tracks=1,
+        confirm_hits=1,
+        hover=False,
+        gate_probability=0.9999999,
     )
     models = SYSTEMS['diver'].build(config).models
     runs, steps, squared = 100, 40, []
@@ -303,7 +316,13 @@ def test_a_long_gap_is_no_straight_line():
     """The spread predicted over half a minute is that of divers who turn as the chain says, not
     that of divers who pick a heading and keep it."""
     rng = np.random.default_rng(11)
-    config = DiverConfig(hover=False, adaptation='fixed', speed_noise=0.0, lateral_noise=0.0)
+    config = DiverConfig(
+        model_set='heading_speed',
+        hover=False,
+        adaptation='fixed',
+        speed_noise=0.0,
+        lateral_noise=0.0,
+    )
     tracker = DiverTracker(config)
     tracker.process(fix(1, 0.0, 0.0, 1e-6 * np.eye(2)))
     before, dt = tracker._stream.state, 30.0
