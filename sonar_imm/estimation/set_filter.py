@@ -41,9 +41,15 @@ Data-driven proposals
     filter: with eight sharp peaks in a record, all but a handful of its particles are lost at
     every step.
 
+Gaps
+    Where the time of several records passed since the last one, members may have walked far and
+    been replaced. The gains of all peaks are then lowered to what births get at most, each peak
+    keeping its own shape (`levelled`): by its full gain the strongest peak within reach would draw
+    all members to itself.
+
 Random numbers are counter based: those of a record come from a Philox generator whose key is the
 seed and the record's own name (its stamp), and each particle has its row of them, ``(1 + c + J)``
-for the order, the c members that can come or go at once, and the J that can walk. The result is
+for the order, the c members that can come and go at once, and the J that can walk. The result is
 therefore the same whatever was processed before, and on one thread or several.
 
 From weighted sets to a list of members (`find_members`): the **intensity** of the particles, how
@@ -66,23 +72,36 @@ from typing import NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from . import set_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise, systematic
-from .set_model import SetModel, Sets
+from .set_model import repeated_walk, SetModel, Sets, turnover
 from .set_scatter import fit_scatter, guide, NO_SCATTER, ScatterFit
-from .set_shifts import shift_tables, ShiftPath
+from .set_shifts import Shift, shift_tables, ShiftPath, ShiftTables
 
 _STEP, _START, _RESAMPLE, _MOVE = range(4)
 _VALLEY, _ASIDE = 0.05, 0.1
+_PASSAGES = 16
+
+
+class Passage(NamedTuple):
+    """How sets change while the time of so many `records` passes: walk (2 r + 1,); motion; shift,
+    None without one, and its tables."""
+
+    records: int
+    walk: FloatArray
+    motion: kernels.SetMotion
+    shift: Shift | None
+    shifts: ShiftTables
 
 
 class Record(NamedTuple):
     """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
     key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign, see
     `gains`; amplitudes: how members answer in it; background: of its scatter; proposals: its
-    tables, walks not filled in."""
+    tables, walks not filled in; passage: since the record before."""
 
     b: FloatArray
     key: tuple[int, int]
@@ -90,6 +109,7 @@ class Record(NamedTuple):
     amplitudes: kernels.AmplitudeModel
     background: ScatterFit
     proposals: kernels.Proposals
+    passage: Passage
 
 
 class Weighted(NamedTuple):
@@ -144,14 +164,9 @@ class SetFilter:
         self.threads = threads
         shape = model.record_cells * len(model.signs), len(model.walk)
         self._walk, self._walk_ratio = np.empty(shape), np.empty(shape)
-        log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
-        self._shifts = shift_tables(model.shift, log_sum, model.walk_share)
-        self._motion = kernels.SetMotion(
-            order_min=model.order_min,
-            separation=model.separation,
-            most_changes=model.most_changes,
-            cumulative=np.cumsum(model.transition, axis=1),
-        )
+        self._log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
+        self._passages: dict[int, Passage] = {}
+        self._passage(1)
         self._amplitudes = kernels.AmplitudeModel(
             gram=model.gram,
             ridge=float(model.ridge),
@@ -166,20 +181,50 @@ class SetFilter:
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
-        self._uniforms = model.uniforms
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
+    def _passage(self, records: int) -> Passage:
+        if records in self._passages:
+            return self._passages[records]
+        model, shift, walk = self.model, self.model.shift, self.model.walk
+        chances, changes = model.transition, model.most_changes
+        if records > 1:
+            walk = repeated_walk(walk, records)
+            chances, changes = turnover(chances, model.order_min, records), 2 * model.order_max
+            shift = shift and evolve(shift, memory=shift.memory**records)
+        motion = kernels.SetMotion(
+            order_min=model.order_min,
+            separation=model.separation,
+            most_changes=changes,
+            cumulative=np.cumsum(chances, axis=1),
+        )
+        tables = shift_tables(shift, self._log_sum, model.walk_share)
+        found = Passage(records, walk, motion, shift, tables)
+        if len(self._passages) > _PASSAGES:
+            self._passages = {1: self._passages[1]}
+        self._passages[records] = found
+        return found
+
     def record(
-        self, b: FloatArray, key: tuple[int, int], gram: FloatArray | None = None
+        self,
+        b: FloatArray,
+        key: tuple[int, int],
+        gram: FloatArray | None = None,
+        records: int = 1,
     ) -> Record:
-        """The record b, see `Record`. gram (n,): of this record, where it is not the model's."""
-        model = self.model
+        """The record b, see `Record`. gram (n,): of this record, where it is not the model's;
+        records: how many records' time passed since the one before."""
+        model, passage = self.model, self._passage(records)
         amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
         background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
-        g = gains(model, b, background)
+        g, tables = gains(model, b, background), (self._walk, self._walk_ratio)
+        if records > 1:
+            g = levelled(model, g)
+            shape = len(self._walk), len(passage.walk)
+            tables = np.empty(shape), np.empty(shape)
         births = propose_births(model, g)
-        proposals = kernels.Proposals(self._walk, self._walk_ratio, *births, self._shifts)
-        return Record(b, key, g, amplitudes, background, proposals)
+        proposals = kernels.Proposals(*tables, *births, passage.shifts)
+        return Record(b, key, g, amplitudes, background, proposals, passage)
 
     def start(self, record: Record) -> Weighted:
         """Sets before the first record, drawn where it will want them."""
@@ -187,10 +232,10 @@ class SetFilter:
         uniform = _generator(record.key, _START).random(
             (self.particles, 1 + model.order_max + (model.shift is not None))
         )
-        log_ratio = np.zeros(self.particles)
+        log_ratio, motion = np.zeros(self.particles), self._passage(1).motion
         self._split(
             lambda first, last: kernels.start(
-                first, last, self._motion, self._charge, record.proposals, uniform, sets, log_ratio
+                first, last, motion, self._charge, record.proposals, uniform, sets, log_ratio
             )
         )
         # An impossible set has members that mean nothing; it must not walk.
@@ -200,9 +245,12 @@ class SetFilter:
 
     def propagate(self, before: Weighted, record: Record) -> Weighted:
         """Sets as they may have become by the time of the record: shift, deaths, walks, births."""
-        uniform = _generator(record.key, _STEP).random((self.particles, self._uniforms))
-        sets, log_ratio = self._drawn(before.sets, record, uniform)
-        path, shift = None, self.model.shift
+        path, shift = None, record.passage.shift
+        more = record.passage.motion.most_changes - self.model.most_changes
+        uniform = _generator(record.key, _STEP).random(
+            (self.particles, self.model.uniforms + more)
+        )
+        sets, log_ratio = self._drawn(self._aged(before.sets, record), record, uniform)
         if shift is not None:
             path = ShiftPath.begin(shift, sets.shift)
             if before.path is not None:
@@ -282,16 +330,27 @@ class SetFilter:
         # Weights add up to one but for rounding: no probability may pass it for that.
         return Summary(np.minimum(pmf, 1.0), sums, shift)
 
+    def _aged(self, sets: Sets, record: Record) -> Sets:
+        """Sets whose amplitudes, expected for the next record, are those for this one."""
+        more = record.passage.records - 1
+        if not more or not self.model.amplitude_memory:
+            return sets
+        phi = self.model.amplitude_memory**more
+        fresh = (1.0 - phi**2) * self.model.amplitude_std**2
+        return sets._replace(
+            prior_mean=phi * sets.prior_mean, prior_variance=phi**2 * sets.prior_variance + fresh
+        )
+
     def _drawn(self, old: Sets, record: Record, uniform: FloatArray) -> tuple[Sets, FloatArray]:
         """Sets drawn from the proposals by uniform (N, uniforms), and log of model to proposal."""
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio, proposals = np.empty(self.particles), record.proposals
+        walk, motion, amplitudes = record.passage.walk, record.passage.motion, self._amplitudes
         if model.shift:
-            kernels.fill_all_walks(old, record.gains, model.walk, model.walk_share, proposals)
+            kernels.fill_all_walks(old, record.gains, walk, model.walk_share, proposals)
         else:
             filled = np.zeros(len(self._walk), np.bool_)
-            kernels.fill_walks(old, record.gains, model.walk, model.walk_share, filled, proposals)
-        motion, amplitudes = self._motion, self._amplitudes
+            kernels.fill_walks(old, record.gains, walk, model.walk_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first, last, motion, amplitudes, proposals, uniform, old, new, log_ratio
@@ -313,6 +372,17 @@ def gains(model: SetModel, b: FloatArray, fit: ScatterFit) -> FloatArray:
     if model.scatter:
         b = guide(fit, b)
     return np.stack([0.5 * np.square(np.maximum(sign * b, 0.0)) for sign in model.signs])
+
+
+def levelled(model: SetModel, g: FloatArray) -> FloatArray:
+    """The gains g (S, n), lowered where the sum of ``exp(g)`` over a peak exceeds what it were if
+    all of it were at `birth_cap`. What lies within half of the separation is one peak, and is
+    lowered by as much, so that it keeps its shape."""
+    half = model.separation // 2
+    around = sliding_window_view(np.pad(g, ((0, 0), (half, half))), 2 * half + 1, axis=1)
+    height = around.max(axis=2)
+    mass = height + np.log(np.exp(around - height[:, :, None]).mean(axis=2))
+    return np.asarray(g - np.maximum(mass - model.birth_cap, 0.0))
 
 
 def propose_births(model: SetModel, g: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

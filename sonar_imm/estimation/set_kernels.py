@@ -39,8 +39,8 @@ SLOTS = 8192
 
 class SetMotion(NamedTuple):
     """How sets change from record to record: order_min; separation in cells; most_changes, how
-    many members can come or go at once; cumulative (orders, orders), the running sums of the rows
-    of the transition matrix."""
+    many members can come and go at once; cumulative (orders, columns), the running sums of the
+    rows of the transition matrix, or of `set_model.turnover`."""
 
     order_min: int
     separation: int
@@ -275,21 +275,20 @@ def propagate(
     """Steps 1 to 5 of `set_model`: from the sets `old` to `new`, and log_ratio (N,) of model to
     proposal, -inf for impossible sets (whose members mean nothing)."""
     order_min, separation, changes, cumulative = motion
-    orders, width, cells = (
-        cumulative.shape[0],
-        proposals.walk.shape[1],
-        proposals.birth_ratio.shape[1],
-    )
+    orders, columns = cumulative.shape
+    width, cells = proposals.walk.shape[1], proposals.birth_ratio.shape[1]
     J, G = new.cell.shape[1], len(proposals.shifts.start)
     last_cell = cells - 1 - proposals.shifts.step * (G - 1)
     parent, rows, memory = np.empty(J, np.int64), np.empty(J, np.int64), empty_memory(J, G)
     for i in range(first, last):
         before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
-        m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
+        column = min(_search(cumulative[before - order_min], 0, columns, u[0]), columns - 1)
+        m = order_min + column % orders
         left, ratio = before, 0.0
+        deaths = max(before - m, 0) + column // orders
         for k in range(before):
             parent[k] = k
-        for k in range(before - m):
+        for k in range(deaths):
             death = min(int(u[1 + k] * left), left - 1)
             left -= 1
             for j in range(death, left):
@@ -330,7 +329,7 @@ def propagate(
             if ratio > -math.inf:
                 count = left + k
                 at, place, drawn, paid = _birth(
-                    here, count, separation, proposals, u[1 + k], offset
+                    here, count, separation, proposals, u[1 + deaths + k], offset
                 )
                 ratio += paid
                 if at >= 0:

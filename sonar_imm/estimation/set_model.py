@@ -25,6 +25,10 @@ The set, in the order in which it is drawn
     3. each survivor walks by ``walk``; what leaves the lattice is impossible;
     4. births: for m' > m, m' - m are born, each uniformly on the lattice;
     5. sets whose members come closer than ``separation`` cells are impossible.
+    Where the time of k records passed since the last one, 1 is drawn as k such changes of the
+    order make it, together with how many members left and were replaced on the way (`turnover`),
+    and 3 is the sum of k walks (`repeated_walk`). Where they were in between is of no interest, so
+    that 5 is asked at the end only.
     Before the first record, m is uniform, and so is the set among the possible ones of that size.
 
 The record
@@ -90,6 +94,54 @@ def gaussian_walk(std: float, *, reach: float = 4.0) -> FloatArray:
     radius = int(walk_reach(std, reach=reach))
     K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
     return np.asarray(K / K.sum())
+
+
+def repeated_walk(walk: FloatArray, times: int, *, reach: float = 4.0) -> FloatArray:
+    """Probabilities (2 r + 1,) of the sum of so many walks (2 r' + 1,), cut at `reach` standard
+    deviations of it."""
+    radius = len(walk) // 2
+    size = 1 << (2 * radius * times).bit_length()
+    one = np.roll(np.append(walk, np.zeros(size - len(walk))), -radius)
+    total = np.maximum(np.fft.irfft(np.fft.rfft(one) ** times, size), 0.0)
+    std = math.sqrt(times * float(walk @ np.square(np.arange(-radius, radius + 1.0))))
+    cut = int(min(walk_reach(std, reach=reach), radius * times))
+    K = total[np.arange(-cut, cut + 1)]
+    return np.asarray(K / K.sum())
+
+
+def turnover(transition: FloatArray, order_min: int, records: int) -> FloatArray:
+    """How sets change while the time of so many records passes: probabilities
+    (orders, (order_max + 1) orders), rows from. Column ``e * orders + j``: the order becomes
+    order_min + j, and e members more have left, and come, than that takes.
+
+    A Markov chain of the order and of the number of first members that are left: of the d that
+    leave at once, those of the first are hypergeometric."""
+    from scipy import sparse
+
+    orders = len(transition)
+    most = order_min + orders - 1
+    rows, columns, values = [], [], []
+    for i, j in zip(*np.nonzero(transition > 0.0)):
+        m, deaths = order_min + int(i), max(int(i) - int(j), 0)
+        for left in range(m + 1):
+            for gone in range(max(0, deaths - (m - left)), min(deaths, left) + 1):
+                ways = math.comb(left, gone) * math.comb(m - left, deaths - gone)
+                rows.append(left * orders + i)
+                columns.append((left - gone) * orders + j)
+                values.append(transition[i, j] * ways / math.comb(m, deaths))
+    shape = ((most + 1) * orders,) * 2
+    step = sparse.csr_matrix((values, (rows, columns)), shape)
+    chance = np.zeros((shape[0], orders))
+    first = np.arange(orders)
+    chance[(order_min + first) * orders + first, first] = 1.0
+    for _ in range(records):
+        chance = step.T @ chance
+    kept, to, start = np.meshgrid(np.arange(most + 1), first, first, indexing='ij')
+    extra = order_min + np.minimum(start, to) - kept
+    found = np.zeros((orders, (most + 1) * orders))
+    use = extra >= 0
+    found[start[use], (extra * orders + to)[use]] = chance.reshape(kept.shape)[use]
+    return found
 
 
 @frozen(eq=False, kw_only=True)

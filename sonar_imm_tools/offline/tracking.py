@@ -42,7 +42,7 @@ from sonar_imm.trackers import System
 
 from .. import SECOND
 from ..recordings.measurements import measurements_of
-from ..recordings.reader import BagReader
+from ..recordings.reader import BagError, BagReader
 from ..recordings.topics import fitting_topics
 from .jobs import processes
 from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
@@ -287,6 +287,23 @@ class OfflineRun:
         """Count and example by reason, as plain values."""
         return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
 
+    def failure(self) -> str:
+        """Why nothing came of the recording, when all of it was refused; else nothing."""
+        found = {reason: (entry.count, entry.example) for reason, entry in self.refused.items()}
+        counts, refusals = self.tracker.counts, getattr(self.tracker, 'refusals', None)
+        # A tracker that refuses records itself counts those that it used.
+        if refusals is None:
+            used = self.messages - sum(count for count, _ in found.values())
+        else:
+            used = counts['used']
+            found |= {reason: (counts[reason], refusals[reason]) for reason in refusals}
+        if used or not found:
+            return ''
+        reasons = sorted(found.items(), key=lambda item: -item[1][0])
+        return 'nothing could be used of the recording; refused: ' + '; '.join(
+            f'{count} ({reason}: {sentence})' for reason, (count, sentence) in reasons
+        )
+
     def timings(self) -> dict[str, float]:
         """Milliseconds that the tracker takes per measurement: total, median and 99 % point."""
         spent = np.array(self.durations) * 1e3
@@ -313,7 +330,7 @@ def write_run(
     parquet: bool = False,
 ) -> dict[str, Any]:
     """Track into a fresh folder; gives the content of run.json, which is written last. parquet:
-    write the tables as Parquet too."""
+    write the tables as Parquet too. Raises `BagError` when all was refused."""
     begin = time.perf_counter()
     system, path = offline.system.name, offline.bag.path
     recipe = offline.recipe()
@@ -326,6 +343,8 @@ def write_run(
     written = folder.write_estimates(
         offline.estimates(advance), system, parquet=notes if parquet else None
     )
+    if not written['estimates'] and (failure := offline.failure()):
+        raise BagError(f'{path}: {failure}')
     run = run_record(
         bag=str(path.resolve()),
         **recipe,

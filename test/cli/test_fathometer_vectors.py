@@ -17,6 +17,7 @@
 import json
 import os
 from pathlib import Path
+import shutil
 
 import attrs
 import numpy as np
@@ -142,3 +143,26 @@ def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
         if hits[-1]:
             ids.add(int(row['track_id'][np.argmin(away)]))
     assert np.mean(hits) >= 0.94 and len(ids) <= 0.012 * len(traces)
+
+
+@pytest.mark.parametrize(
+    ('setting', 'reason'),
+    [
+        ('min_separation=20.0', 'too_crowded: 12 members'),
+        ('phones=9', 'wrong_hydrophones: the array has 8 hydrophones, not 9'),
+    ],
+)
+def test_a_run_whose_records_were_all_refused_fails_with_the_reason(
+    tmp_path, capsys, setting, reason
+):
+    out = tmp_path / 'out'
+    bag = Path(__file__).resolve().parents[2] / 'bags' / 'fathometer_array'
+    assert main(['track', str(bag), str(out), '--set', setting]) == 2
+    assert f'refused: 12 ({reason}' in capsys.readouterr().err
+    assert not out.exists()
+    # Among several it is a failed run, and its reason is in the summary.
+    other = shutil.copytree(bag, tmp_path / 'other')
+    assert main(['track', str(bag), str(other), str(out), '--set', setting]) == 1
+    runs = json.loads((out / 'summary.json').read_text())['runs']
+    assert [run['state'] for run in runs] == ['failed', 'failed']
+    assert all(reason in run['failure'] for run in runs)

@@ -92,6 +92,7 @@ def test_refused_messages_are_counted_with_their_reason(tmp_path):
     assert run.refused['nan'].count == 2
     assert run.refused['nan'].example.startswith('/fix: ')
     assert run.outcomes() == {'used': 118, 'refused': 2}
+    assert not run.failure()
     assert sum(advanced) == run.total == run.messages == 120
 
 
@@ -109,6 +110,7 @@ def test_the_expected_frame_refuses_the_others(tmp_path):
         run = OfflineRun(bag, DIVER, CONFIG, InputOptions(frame_id='odom'))
         assert list(run.estimates()) == []
     assert run.refused['frame'].count == 120
+    assert 'refused: 120 (frame: ' in run.failure()
 
 
 def test_topics_can_be_named(tmp_path):

@@ -44,7 +44,7 @@ def test_only_what_differs_from_the_defaults_is_told():
 def test_drawn_cross_spectra_have_no_window():
     config = SYSTEMS['fathometer'].config_type()
     # The length of a snapshot, which the tracker would choose by itself, is part of the scene.
-    common = {'snapshot_seconds': 1.4}
+    common = {'snapshot_seconds': 1.4, 'sound_speed_std': 0.0}
     assert unusual(fathometer_scenario('drift_traces').instruments(), config) == common
     told = unusual(fathometer_scenario('drift_spectra').instruments(), config)
     assert told == common | {'window': 'rectangular', 'overlap': 0.0}

@@ -46,6 +46,9 @@ class FathometerConfig(StampParameters):
         'distance between hydrophones', range=(1e-4, 100.0))
     sound_speed: float = parameter(1500.0, 'm/s',
         'speed of sound in the water', range=(1300.0, 1700.0))
+    sound_speed_std: float = parameter(10.0, 'm/s',
+        'standard deviation of sound_speed, a part of the error of every reflector that grows '
+        'with its depth below the array; 0: the speed is exact', range=(0.0, 200.0))
     array_depth: float = parameter(0.0, 'm',
         'depth of the deepest hydrophone, where neither the record nor a companion instrument '
         'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))
@@ -163,6 +166,10 @@ class FathometerConfig(StampParameters):
     depth_std: float = parameter(0.1, 'm',
         'standard deviation of the change of the depth of a reflector from record to record',
         range=(1e-4, 100.0))
+    record_interval: float = parameter(0.0, 's',
+        'time from record to record that depth_std, order_switch_probability and what else is per '
+        'record are meant for: after a gap they count as often as records would have come; 0: the '
+        'median of the first intervals', range=(0.0, 86400.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('positive', '',
@@ -200,7 +207,7 @@ class FathometerConfig(StampParameters):
         'whether reflectors get a probability of being multiples of others, from their depths '
         'below the surface: mark or off; they are never left out', choices=MULTIPLES)
     track_memory: int = live(5, '',
-        'number of records after which a reflector that was not seen gets a new id',
+        'number of records after which a reflector that was not seen in them gets a new id',
         range=(0, 10_000))
 
     # -- time -------------------------------------------------------------------------------------

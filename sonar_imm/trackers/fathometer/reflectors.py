@@ -16,7 +16,8 @@
 
 **Identity.** The filter knows sets; who is who from record to record is decided here, after it. A
 reflector found near one of the record before takes over its id, the nearest pair first; one that
-was missed is waited for `track_memory` records, and ids are never used again.
+was missed is waited for `track_memory` records, and ids are never used again. Where no records
+came, none was missed: how far a reflector may have walked grows with the time, nothing else.
 
 **Multiples** are echoes that were reflected more than once. By depths from the surface, in which
 every way is counted once: a surface multiple lies at ``z_i + z_j``, its amplitude has the sign of
@@ -35,7 +36,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
-from attrs import evolve, frozen
+from attrs import evolve, Factory, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,11 +58,18 @@ _NEAR = 6.0
 
 
 class Identified(NamedTuple):
-    """A reflector that has an id: where it was last seen, and for how many records it was not."""
+    """A reflector that has an id: where it was last seen, in how many records since it was not,
+    and for how many more there was time."""
 
     track_id: int
     depth: float
     missed: int
+    absent: int = 0
+
+    @property
+    def walked(self) -> int:
+        """How many records' walks lie between where it was seen and the next record."""
+        return 1 + self.missed + self.absent
 
 
 @frozen
@@ -108,12 +116,19 @@ class Identities:
         before = next((each for each in self.reflectors if each.track_id == self.bottom_id), None)
         if before is None:
             return int(ids[row])
-        steps = abs(depth[row] - before.depth) / np.sqrt(1.0 + before.missed) / config.depth_std
+        steps = abs(depth[row] - before.depth) / np.sqrt(before.walked) / config.depth_std
         if steps > (BOTTOM_REACH if not ids[row] else _REACH):
             return int(ids[row])
         ids[ids == before.track_id] = 0
         ids[row] = before.track_id
         return before.track_id
+
+    def wait(self, records: int) -> Identities:
+        """The time of so many records passes, and none comes."""
+        if not records:
+            return self
+        waited = (known._replace(absent=known.absent + records) for known in self.reflectors)
+        return evolve(self, reflectors=tuple(waited))
 
     def forget(self) -> Identities:
         """Ids given so far belong to no reflector any more; later ones go on counting."""
@@ -140,7 +155,7 @@ def nearest_ids(
     if not len(depth) or not earlier:
         return ids
     distance = np.abs(depth[:, None] - np.array([known.depth for known in earlier]))
-    records = 1.0 + np.array([known.missed for known in earlier])
+    records = np.array([known.walked for known in earlier], np.float64)
     reach = np.maximum(config.min_separation, _REACH * config.depth_std * np.sqrt(records))
     surprise = np.square(distance / config.depth_std) / records + np.log(records)
     for place in np.argsort(surprise, axis=None, kind='stable'):
@@ -155,6 +170,10 @@ class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
     covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
     above it; heave and heave_std: stated minus true depth of the array, m, 0 where it is no state.
+
+    What they share: the error of the array's depth, datum_std (m), a part of the covariance; and
+    that of the speed of sound, speed_std (K,), m, the same share of the depth of each below the
+    array, which is no part of it.
     """
 
     depth: FloatArray
@@ -162,8 +181,20 @@ class Reflectors:
     covariance: FloatArray
     existence: FloatArray
     is_bottom: FloatArray
+    speed_std: FloatArray = Factory(lambda self: np.zeros(len(self.depth)), takes_self=True)
+    datum_std: float = 0.0
     heave: float = 0.0
     heave_std: float = 0.0
+
+    @property
+    def common_std(self) -> FloatArray:
+        """Standard deviation (K,) of what all of a record share, m."""
+        return np.asarray(np.hypot(self.datum_std, self.speed_std))
+
+    @property
+    def relative_variance(self) -> FloatArray:
+        """Variance (K,) of the depths without what all of a record share, m^2."""
+        return np.asarray(np.maximum(self.covariance[:, 0, 0] - self.datum_std**2, 1e-6))
 
 
 def reflectors_of(
@@ -189,12 +220,17 @@ def reflectors_of(
     # Where it is a state, the places of the particles are spread by what is not known of it.
     if heave is None:
         covariance[:, 0, 0] += config.array_depth_std**2
+    # Where the depth of the array is not known, depths count from it.
+    height = depth + (heave[0] if heave else 0.0) - np.nan_to_num(response.reference_depth)
+    speed_std = np.abs(height) * config.sound_speed_std / config.sound_speed
     return Reflectors(
         depth,
         sigma * members.amplitude,
         covariance,
         members.existence,
         members.foremost,
+        speed_std,
+        heave[1] if heave else config.array_depth_std,
         *(heave or (0.0, 0.0)),
     )
 
@@ -235,18 +271,23 @@ def sediment_depths(
     time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
     speed = config.sediment_sound_speed or config.sound_speed
     thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
-    variance = reflectors.covariance[:, 0, 0]
+    speed_std = reflectors.speed_std
+    if config.sediment_sound_speed:
+        # Below the bottom the water's speed tells the time only, which is seen.
+        speed_std = np.minimum(speed_std, speed_std[np.argmax(reflectors.is_bottom)])
+    variance = reflectors.covariance[:, 0, 0] + np.square(speed_std)
     variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
     depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
     return depth, np.sqrt(variance)
 
 
-def seen_as(reflectors: Reflectors, ids: IdArray, config: FathometerConfig) -> Seen:
-    """What `multiples` needs to know of a record."""
-    shared = config.array_depth_std if config.heave == 'none' else reflectors.heave_std
-    variance = np.maximum(reflectors.covariance[:, 0, 0] - shared**2, 1e-6)
+def seen_as(
+    reflectors: Reflectors, ids: IdArray, config: FathometerConfig, records: int = 1
+) -> Seen:
+    """What `multiples` needs to know of a record, `records` after the one before."""
     sign = np.sign(reflectors.amplitude)
-    return Seen(ids, reflectors.depth, variance, sign, shared**2)
+    datum = reflectors.datum_std**2
+    return Seen(ids, reflectors.depth, reflectors.relative_variance, sign, datum, records)
 
 
 def write_estimate(
@@ -270,6 +311,8 @@ def write_estimate(
         'polarity': np.zeros(rows, np.int8),
         'heave': np.full(rows, reflectors.heave),
         'heave_std': np.full(rows, reflectors.heave_std),
+        'depth_common_std': np.full(rows, np.nan),
+        'depth_relative_std': np.full(rows, np.nan),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
         'multiple_probability': np.full(rows, np.nan),
@@ -281,9 +324,12 @@ def write_estimate(
     if len(ids):
         state[:] = np.column_stack([reflectors.depth, reflectors.amplitude])
         covariance[:] = reflectors.covariance
+        covariance[:, 0, 0] += np.square(reflectors.speed_std)
         extras['track_id'][:] = ids
         extras['existence'][:] = reflectors.existence
         extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
+        extras['depth_common_std'][:] = reflectors.common_std
+        extras['depth_relative_std'][:] = np.sqrt(reflectors.relative_variance)
         height = reflectors.depth - response.reference_depth
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
         extras['polarity'][:] = np.sign(reflectors.amplitude)
@@ -307,13 +353,15 @@ def write_estimate(
 
 class Seen(NamedTuple):
     """The reflectors of one record, by depth: track_id (K,), depth (K,) m, variance (K,) of the
-    depth without the error of the array's, sign (K,), datum: variance of the array's depth."""
+    depth without the error of the array's, sign (K,), datum: variance of the array's depth,
+    records: how many records' time passed since the one before."""
 
     track_id: NDArray[np.uint32]
     depth: FloatArray
     variance: FloatArray
     sign: FloatArray
     datum: float
+    records: int = 1
 
 
 class Ways(NamedTuple):
@@ -345,6 +393,7 @@ class Multiples:
         past = (*self.seen, record)[-RECORDS:]
         depth, variance = _histories(past, record.track_id)
         datum = np.array([record.datum for record in past])
+        time = np.cumsum([record.records for record in past])
         for target in range(1, K):
             ways = ways_above(record.depth, record.sign, target)
             off = _offsets(depth[-1:], variance[-1:], datum[-1:], ways, target)
@@ -355,9 +404,8 @@ class Multiples:
             if not len(near):
                 continue
             close = Ways(ways.member[near], ways.factor[near], ways.datum[near], ways.sign[near])
-            odds = np.exp(
-                np.minimum(_log_odds(depth, variance, datum, close, target, config, span), 300.0)
-            )
+            logs = _log_odds(depth, variance, datum, time, close, target, config, span)
+            odds = np.exp(np.minimum(logs, 300.0))
             if config.negative_share:
                 odds *= _sign_odds(close.sign == record.sign[target], record.sign[target], config)
             total = PRIOR / (1.0 - PRIOR) * float(odds.sum()) / len(ways.sign)
@@ -407,12 +455,13 @@ def _log_odds(
     depth: FloatArray,
     variance: FloatArray,
     datum: FloatArray,
+    time: IntArray,
     ways: Ways,
     target: int,
     config: FathometerConfig,
     span: float,
 ) -> FloatArray:
-    """Log likelihood ratio (H,) of a multiple to a primary."""
+    """Log likelihood ratio (H,) of a multiple to a primary; time (T,), in records."""
     off, spread = _offsets(depth, variance, datum, ways, target)
     walk = config.depth_std**2 * (1.0 + np.square(ways.factor).sum(axis=1))
     seen = np.isfinite(off)
@@ -421,7 +470,7 @@ def _log_odds(
     last = np.maximum.accumulate(np.where(seen, record, -1), axis=0)
     last = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
     there, way = np.maximum(last, 0), np.arange(off.shape[1])
-    walked = spread + spread[there, way] + (record - last) * walk
+    walked = spread + spread[there, way] + (time[:, None] - time[there]) * walk
     # Before the first a primary can be anywhere.
     primary = np.where(last >= 0, _density(off - off[there, way], walked, span), 1.0 / span)
     ratio = np.log(_density(off, spread, span)) - np.log(primary)

@@ -31,6 +31,7 @@ The cycle of the particle filter, for each record (`FathometerTracker._cycle`):
 
 Records are minutes of averaging apart, so that each is taken in once and for good: one that is
 late or repeated is counted and dropped. The random numbers of a record come from its own stamp.
+After a gap, what is per record happens as often as records would have come (`Pace`).
 
 With a `smoothing_lag`, `process` gives the revised estimate of an earlier record before that of
 the newest. A preview is the newest, too, but leaves the filter as it was: windows that overlap are
@@ -54,7 +55,7 @@ from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
-from ...estimation.set_model import banded_transition, gaussian_walk, SetModel
+from ...estimation.set_model import banded_transition, gaussian_walk, SetModel, walk_reach
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
@@ -79,6 +80,7 @@ from .response import (
     Lattice,
     lattice_of_array,
     lattice_of_trace,
+    MAX_MOVES,
     MAX_SIGMAS,
     pulse_of,
     rank_deficient,
@@ -91,6 +93,7 @@ from .response import (
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
 _RECORDS, _LEAST = 100, 10
+_INTERVALS, LONGEST_GAP = 15, 5000
 _FULL, _UNEXPLAINED, _NEGATIVE = 0.5, 0.05, 1e-9
 
 
@@ -102,16 +105,45 @@ class _Taken:
     named: tuple[Identified, ...]
 
 
+@frozen
+class Pace:
+    """How many records' time passes from record to record: whole numbers, so that stamps may be
+    off by half an interval and change nothing. A value: `after` makes a new one.
+
+    newest_ns: stamp of the newest record; intervals: the first ones, ns, whose median is that of
+    the tracker where none is configured. While there are two, the longer one counts: no gap is
+    seen where there is none."""
+
+    newest_ns: int | None = None
+    intervals: tuple[int, ...] = ()
+
+    def after(self, stamp_ns: int) -> Pace:
+        if self.newest_ns is None or len(self.intervals) == _INTERVALS:
+            return Pace(stamp_ns, self.intervals)
+        return Pace(stamp_ns, (*self.intervals, stamp_ns - self.newest_ns))
+
+    def records(self, stamp_ns: int, config: FathometerConfig) -> int:
+        """How many from the newest one to that of `stamp_ns`, 1 at least."""
+        if self.newest_ns is None:
+            return 1
+        intervals = sorted(self.after(stamp_ns).intervals)
+        interval = config.record_interval * 1e9 or intervals[len(intervals) // 2]
+        return max(1, round((stamp_ns - self.newest_ns) / max(interval, 1)))
+
+
 class FathometerTracker:
     """The tracker of `trackers.Tracker` for reflectors: `process` takes `Pressure`,
     `CrossSpectra`, `Trace` and `ArrayDepth`.
 
     response: the depth response of the newest record or preview, for display; None before.
+    refusals: the sentence of the first record that could not be used, by reason.
     """
 
     STATE = (
         'response',
+        'refusals',
         '_stream',
+        '_pace',
         '_ids',
         '_depths',
         '_hydrophones',
@@ -135,6 +167,7 @@ class FathometerTracker:
         self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
         self.counts = self._stream.counts
         self.response: Response | None = None
+        self.refusals: dict[str, str] = {}
         self._ids = Identities()
         self._depths = CompanionDepths()
         self._forget()
@@ -142,6 +175,7 @@ class FathometerTracker:
     def _forget(self) -> None:
         """Begin anew, but for counts and ids."""
         self._hydrophones = self.config.phones
+        self._pace = Pace()
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
         self._multiples = Multiples()
@@ -232,6 +266,7 @@ class FathometerTracker:
             return self._estimates(item)
         except Rejection as rejection:
             self.counts[rejection.reason] += 1
+            self.refusals.setdefault(rejection.reason, rejection.sentence)
             return []
 
     def _estimates(self, item: Pressure | CrossSpectra | Trace) -> list[Estimate]:
@@ -315,19 +350,20 @@ class FathometerTracker:
         self._lattice = lattice
         self._padded = lattice.padded(self._filter.model.pad)
 
-    def _filtered(self, response: Response) -> tuple[Response, SetStep]:
-        """What this record would change. Where its noise is not known, it is measured in what the
-        reflectors of a first round leave."""
-        step = self._cycle(response)
+    def _filtered(self, response: Response) -> tuple[Response, SetStep, int]:
+        """What this record would change, and how many records' time passed. Where its noise is not
+        known, it is measured in what the reflectors of a first round leave."""
+        records = self._pace.records(response.stamp_ns, self.config)
+        step = self._cycle(response, records)
         if response.noise_unknown:
             found, _ = self._summarise(step, response)
             away = response.depth[:, None] - (found.depth + found.heave)
             response = residual_sigma(response, self.pulse(away) @ found.amplitude)
-            step = self._cycle(response)
+            step = self._cycle(response, records)
         self.response = response
-        return response, step
+        return response, step, records
 
-    def _cycle(self, response: Response) -> SetStep:
+    def _cycle(self, response: Response, records: int) -> SetStep:
         """The particle filter over one record; what is kept of it is decided by the caller."""
         assert self._filter is not None
         # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
@@ -339,21 +375,40 @@ class FathometerTracker:
             assert self._lattice is not None
             lags = self._lattice.step * np.arange(self._lattice.cells, dtype=np.float64)
             gram = np.ascontiguousarray(response.pulse(lags))
-        particles = self._filter
-        record = particles.record(b, key, gram)
-        before = self._before or particles.start(record)
+        particles, before = self._filter, self._before
+        if not self._bridged(records):
+            records, before = 1, None
+        record = particles.record(b, key, gram, records)
+        before = before or particles.start(record)
         sets = particles.propagate(before, record)
         step = particles.weigh(sets, record)
         step = particles.resample(step, record)
         return particles.move(step, record)
 
+    def _bridged(self, records: int) -> bool:
+        """Whether sets can be followed over so many records: a short enough time, and not more
+        walks than there is room for. Otherwise they begin anew."""
+        assert self._lattice is not None
+        reach = walk_reach(math.sqrt(records) * self.config.depth_std / self._lattice.step)
+        tables = self._lattice.cells * (2.0 * reach + 1.0)
+        return records == 1 or (records <= LONGEST_GAP and tables <= MAX_MOVES)
+
+    def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
+        known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
+        return known.name(reflectors.depth, reflectors.is_bottom, self.config)
+
     def _record(self, response: Response) -> list[Estimate]:
-        response, step = self._filtered(response)
+        response, step, records = self._filtered(response)
         self._before = step.after if step.ok else None
+        self._pace = self._pace.after(response.stamp_ns)
         self.counts['used'] += 1
+        if records > 1:
+            self.counts['gaps'] += 1
+        if not self._bridged(records):
+            self._smoother = LagSmoother(self.config.smoothing_lag)
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
-        self._ids, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
+        self._ids, ids = self._named(reflectors, records)
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
@@ -362,16 +417,16 @@ class FathometerTracker:
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]))
-        newest = self._write(reflectors, ids, pmf, response)
-        self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config))
+        newest = self._write(reflectors, ids, pmf, response, records)
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config, records))
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
-        response, step = self._filtered(response)
+        response, step, records = self._filtered(response)
         reflectors, pmf = self._summarise(step, response)
-        _, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
+        _, ids = self._named(reflectors, records)
         self.counts['previews'] += 1
-        return self._write(reflectors, ids, pmf, response, preview=True)
+        return self._write(reflectors, ids, pmf, response, records, preview=True)
 
     def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
@@ -394,6 +449,7 @@ class FathometerTracker:
         ids: IdArray,
         pmf: FloatArray,
         response: Response,
+        records: int = 1,
         *,
         preview: bool = False,
     ) -> Estimate:
@@ -401,7 +457,7 @@ class FathometerTracker:
         if self.config.multiples == 'mark':
             assert self._lattice is not None
             span = self._lattice.step * self._lattice.cells
-            seen = seen_as(reflectors, ids, self.config)
+            seen = seen_as(reflectors, ids, self.config, records)
             multiple = self._multiples.probabilities(seen, self.config, span)
         return write_estimate(
             reflectors, ids, pmf, multiple, response, self.config, preview=preview

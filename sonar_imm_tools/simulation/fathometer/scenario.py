@@ -178,7 +178,8 @@ class FathometerScenario(Scenario):
             # A profiler has no array: of the instrument only its pulse and its noise matter.
             known = {'sound_speed': self.sound_speed}
             known |= envelope_parameters(self.pulse_width, self.noise_sigma)
-        return known
+        # The speed of a scene is the one that it has.
+        return {**known, 'sound_speed_std': 0.0}
 
     def spectra_bytes(self) -> float:
         """Size of all cross-spectra of the scene."""

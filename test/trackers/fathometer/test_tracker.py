@@ -101,7 +101,7 @@ def depth_nees(found, true_depths):
 def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
     """All reflectors of a record share the error of the array's depth, 0.03 m in the vectors and
     the scenes, and it is greater than what the trace leaves open."""
-    options = {'particles': 3000}
+    options = {'particles': 3000, 'sound_speed_std': 0.0}
     true = {
         (k + 1) * RECORD_NS: vectors['reflector_depth'][k][vectors['present'][k]]
         for k in range(300)
@@ -120,7 +120,10 @@ def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
 def test_a_perfect_depth_sensor_needs_no_allowance():
     scene = simulate(scenario('drift_traces', {'records': 100, 'array_depth_std': 0.0}), 0)
     _, found = run(
-        [each.measurement for each in scene.measurements], particles=3000, array_depth_std=0.0
+        [each.measurement for each in scene.measurements],
+        particles=3000,
+        array_depth_std=0.0,
+        sound_speed_std=0.0,
     )
     assert 0.6 < depth_nees(found, {each.stamp_ns: each.depth for each in scene.truth}) < 1.2
 
