@@ -96,7 +96,9 @@ def scene(kind: str, seed: int) -> tuple[list[Trace], np.ndarray]:
 def run(kind: str, options: dict[str, Any], seed: int, particles: int) -> dict[str, float]:
     traces, truth = scene(kind, seed)
     tracker = FathometerTracker(
-        FathometerConfig(**{'particles': particles, 'seed': seed, **options})
+        FathometerConfig(
+            **{'particles': particles, 'seed': seed, 'sound_speed_std': 0.0, **options}
+        )
     )
     scores, common, relative, scaled = [], [], [], []
     for k, trace in enumerate(traces):

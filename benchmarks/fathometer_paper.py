@@ -111,7 +111,9 @@ def of_vectors(particles: int) -> dict[str, dict[str, float]]:
     sigma = np.broadcast_to(np.ravel(kept['sigma']).astype(float), len(value))
     table = {}
     for label, (kind, factor, options) in OF_VECTORS.items():
-        tracker = FathometerTracker(FathometerConfig(particles=particles, **options))
+        tracker = FathometerTracker(
+            FathometerConfig(particles=particles, sound_speed_std=0.0, **options)
+        )
         scores = []
         for k, column in enumerate(value if kind == 'real' else envelope):
             trace = Trace(
