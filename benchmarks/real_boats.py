@@ -106,13 +106,17 @@ Make = Callable[[float, float, tuple[int, int]], Any]
 
 
 def ours(**values: Any) -> Make:
-    """A tracker of this package; the noise that is tuned is that of its motion."""
+    """A tracker of this package; the noise that is tuned is that of its motion, which the families
+    find themselves."""
 
     def make(noise: float, std: float, life: tuple[int, int]) -> DiverTracker:
-        name = 'acceleration_noise' if values['model_set'] == 'cv' else 'speed_noise'
-        tuned = noise if name == 'speed_noise' else (noise,)
-        settings = {
-            name: tuned,
+        motions: dict[str, dict[str, Any]] = {
+            'cv': {'acceleration_noise': (noise,)},
+            'heading_speed': {'speed_noise': noise},
+            'families': {},
+        }
+        settings: dict[str, Any] = {
+            **motions[values['model_set']],
             'fix_std': std,
             'confirm_hits': life[0],
             'confirm_window': life[1],
@@ -126,6 +130,8 @@ TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
     'plain CV Kalman': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
     'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
     'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
+    'families (default), gnn': (ours(model_set='families'), (0.0,)),
+    'families (default), jipda': (ours(model_set='families', association='jipda'), (0.0,)),
     'heading_speed, gnn': (ours(**HEADINGS, **BOATS), (0.03, 0.1, 0.3)),
     'heading_speed, jipda': (ours(**HEADINGS, **BOATS, association='jipda'), (0.03, 0.1, 0.3)),
 }

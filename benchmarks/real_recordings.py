@@ -65,6 +65,7 @@ COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_beari
 SETS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
+    'families (default)': {},
     'heading_speed': HEADINGS,
     'heading_speed, pace kept a minute': PACE,
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
@@ -72,6 +73,8 @@ SETS: dict[str, dict[str, Any]] = {
 OF_BOATS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
+    'families (default)': {},
+    'families, jipda': {'association': 'jipda'},
     'heading_speed': {**HEADINGS, **BOATS},
     'heading_speed, jipda': {**HEADINGS, **BOATS, 'association': 'jipda'},
 }
@@ -202,6 +205,7 @@ def seeds_table(pings: list, truth: np.ndarray) -> None:
     print('\n### yaps, raw arrivals thinned in eight ways: RMSE, GPS 3.4 s later\n')
     header('5 receivers', '4 receivers', '3 receivers')
     for name, values in {
+        'families (default)': {},
         'heading_speed': HEADINGS,
         'heading_speed, pace kept a minute': PACE,
         'heading_speed, receivers known to 1.4 m': {**HEADINGS, 'receiver_position_std': 1.4},
