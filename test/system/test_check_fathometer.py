@@ -49,6 +49,6 @@ def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out
     from sonar_imm_tools.resources import share_folder
 
     bag = share_folder() / 'bags' / 'fathometer_array'
-    assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 0
-    run = json.loads(capsys.readouterr().out)
-    assert run['counts']['wrong_hydrophones'] == 12 and run['estimates'] == 0
+    assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 2
+    assert 'refused: 12 (wrong_hydrophones: ' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
