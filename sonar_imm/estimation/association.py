@@ -227,8 +227,8 @@ class Tracks:
     """Hits, misses and status of T tracks. An immutable value: `scan` and `born` return the next
     one.
 
-    track_id: (T,) increasing and not used again (`new_ids`); status: (T,) TrackStatus; age: (T,) scans; seen:
-    (T, confirm_window) True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,);
+    track_id: (T,) increasing and not used again, but for `new_ids`; status: (T,) TrackStatus;
+    age: (T,) scans; seen: (T, confirm_window) True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,);
     next_id: of the next track.
     """
 
