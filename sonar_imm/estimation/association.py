@@ -228,8 +228,8 @@ class Tracks:
     one.
 
     track_id: (T,) increasing and not used again, but for `new_ids`; status: (T,) TrackStatus;
-    age: (T,) scans; seen: (T, confirm_window) True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,);
-    next_id: of the next track.
+    age: (T,) scans; seen: (T, confirm_window) True for hits, newest last; misses: (T,)
+    in a row; last_hit_ns: (T,); next_id: of the next track.
     """
 
     track_id: NDArray[np.uint32]
