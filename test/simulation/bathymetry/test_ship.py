@@ -80,6 +80,17 @@ def test_under_a_profile_the_points_are_where_rays_end():
     assert 60.0 < far < 90.0 and launch.value.shape[0] == 78
 
 
+@pytest.mark.parametrize('profile', [[], list(SUMMER)])
+def test_what_is_nearer_than_the_floor_is_no_echo(profile):
+    level = {'roll_deg': 0.0, 'pitch_deg': 0.0, 'yaw_deg': 0.0, 'sonar_mount_rpy_deg': (0.0,) * 3}
+    config = exact(first_range=8.0, sound_speed_profile=profile, pings=1, **level)
+    (true,) = simulate(config, 4).truth
+    echoes = true.range > config.sonar_height + 0.5
+    assert np.isfinite(true.angle[echoes]).all() and true.valid[echoes].any()
+    early = true.range < config.sonar_height - 0.5
+    assert early.sum() > 10 and not true.valid[early].any() and np.isnan(true.angle[early]).all()
+
+
 def test_the_outline_of_the_patch_waves_by_its_length_and_height():
     config = scenario(
         'moving', {'patch_outline': 2.0, 'patch_outline_length': 8.0, 'patch_along': []}
