@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver import figures
+from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import fix_series
 from sonar_imm_tools.evaluation.diver.series import series_of
 from sonar_imm_tools.evaluation.diver.truth import Truth
@@ -68,3 +69,14 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
 
 def test_no_points_leave_the_view_open():
     assert figures.view_of(np.empty((0, 2))) == (None, None)
+
+
+def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band():
+    estimates, true_rows, times = single_run(count=60)
+    matching = match(series_of(estimates), Truth.from_series(series_of(true_rows)), cutoff=10.0)
+    drawn = figures.error_figure(matching, 7).data
+    lines = [line for line in drawn if line.name == 'error of the track']
+    assert len(lines) == 2
+    for axis, line in enumerate(lines):
+        np.testing.assert_allclose(line.x, times[matching.row] - times[0], atol=1e-3)
+        np.testing.assert_allclose(line.y, matching.error[:, axis], atol=1e-3)

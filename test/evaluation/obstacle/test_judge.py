@@ -70,9 +70,13 @@ def straight(track_id, offset, bearing=0.0, count=20):
 
 
 def test_of_true_deviations_nine_in_ten_lie_in_the_shaded_band():
-    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 3.0, 1.0, 2.0, 5.0, 0.1]])]),
+    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1]])]),
                      (straight(1, 3.0),), cutoff=5.0, gap=60.0)  # fmt: skip
-    (band,) = error_figure(found).layout.shapes
+    figure = error_figure(found)
+    (band,), (points,) = figure.layout.shapes, figure.data
+    # 4 m stated where 3 m are true, at a range of 42 m
+    assert np.ravel(points.x) == pytest.approx([42.0])
+    assert np.ravel(points.y) == pytest.approx(found.series.covariance[:1, 2, 2] ** -0.5)
     assert ndtr(band.y1) - ndtr(band.y0) == pytest.approx(0.9, abs=1e-3)
 
 
