@@ -14,9 +14,9 @@
 
 """The figures of divers: ellipses, order of models, first view."""
 
-from helpers.dive_scenes import single_run
+from helpers.dive_scenes import covariance, single_run
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver import figures
@@ -78,7 +78,10 @@ def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band()
     matching = match(series, Truth.from_series(series_of(true_rows)), cutoff=10.0)
     drawn = figures.error_figure(matching, 7).data
     lines = [line for line in drawn if line.name == 'error of the track']
-    assert len(lines) == 2
+    bands = [line for line in drawn if line.name == 'predicted 95 % band']
+    assert len(lines) == len(bands) == 2
     for axis, line in enumerate(lines):
         np.testing.assert_allclose(line.x, times[10:], atol=1e-3)
         np.testing.assert_allclose(line.y, matching.error[10:, axis], atol=1e-3)
+        half = norm.ppf(0.975) * np.sqrt(covariance()[axis, axis])
+        np.testing.assert_allclose(np.sort(bands[axis].y), np.repeat([-half, half], 50), rtol=1e-3)
