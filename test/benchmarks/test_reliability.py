@@ -194,6 +194,14 @@ def test_the_page_is_of_one_folder_and_says_how_long_it_took(toy, monkeypatch, c
     assert 'parts are of 2 versions' in capsys.readouterr().out
 
 
+def test_a_try_of_the_machinery_leaves_the_page_alone(toy, monkeypatch):
+    monkeypatch.setattr(reliability, 'SHARE', 0.1)
+    before = reliability.PAGE.read_text()
+    assert run(monkeypatch, toy, '--run') == 0
+    assert reliability.PAGE.read_text() == before and not reliability.RESULT.exists()
+    assert '`SHARE` 0.1; minutes of each part' in (toy / 'page.md').read_text()
+
+
 def test_of_moved_scenes_the_hardest_is_shown_with_the_worst_of_all():
     some = {'system': 'diver', 'how': 'gnn', 'probabilities': None}
     scenes = [
