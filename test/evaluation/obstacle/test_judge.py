@@ -83,7 +83,9 @@ def test_of_true_deviations_nine_in_ten_lie_in_the_shaded_band():
 def test_the_image_is_seen_from_above_with_starboard_to_the_right():
     ping = Detections(stamp_ns=SECOND, range=[20.0, 40.0], bearing=[0.5, -1.0])
     series = series_of([estimate(10, [[4, 1, 10.0, 0.2, 3.0, 1.0, 2.0, 5.0, 0.1]])])
-    echoes, path, track = image_figure(series, [ping], (straight(1, 3.0, bearing=0.1),)).data
+    figure = image_figure(series, [ping], (straight(1, 3.0, bearing=0.1),))
+    assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ('x', 1)
+    echoes, path, track = figure.data
     for drawn, distance, bearing in (
         (echoes, ping.range, ping.bearing),
         (path, 60.0 - 2.0 * np.arange(20), 0.1),
