@@ -18,7 +18,7 @@ import pytest
 from sonar_imm.acoustics import geometry, rays, sounding
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm_tools.simulation.bathymetry.ship import in_outline
+from sonar_imm_tools.simulation.bathymetry.ship import in_outline, Terrain
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, SUMMER
 
 
@@ -170,3 +170,15 @@ def test_positions_of_an_array_ahead_of_the_reference():
     axes = sounding.array_axes('port', 0.5, np.eye(3))
     look = sounding.looks(axes, np.array([2.0, 0.0, 0.0]), pose, pose)
     assert look.position == pytest.approx([0.0, 2.0, 0.0])
+
+
+def test_the_floor_is_known_by_places_along_the_track_and_off_it():
+    terrain = Terrain(-9.0, np.radians(30.0), lambda a, off: a + 100.0 * off, lambda a, off: a > 4)
+    ahead, port = (
+        np.array([np.sqrt(3.0), 1.0, 0.0]) / 2.0,
+        np.array([-1.0, np.sqrt(3.0), 0.0]) / 2.0,
+    )
+    places = np.array([5.0 * ahead + 2.0 * port, 3.0 * ahead - 2.0 * port, 3.0 * ahead])
+    z, rough = terrain.at(places + [0.0, 0.0, 7.0], np.array([0.5, 0.5, 0.5]))
+    assert z == pytest.approx([-9.0 + 5.0 + 200.0 + 0.5, -9.0 + 3.0 + 200.0, -9.0 + 3.0])
+    assert rough.tolist() == [True, False, False]
