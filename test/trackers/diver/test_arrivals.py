@@ -247,6 +247,7 @@ def test_elevations_show_the_depth():
     assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(P[-1, 2, 2])
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('passive', [False, True])
 @pytest.mark.parametrize('scale', [1.01, 4.0])
 def test_the_scale_of_arrival_times_is_learnt(scale, passive):

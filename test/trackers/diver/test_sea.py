@@ -73,6 +73,7 @@ def test_where_nothing_is_said_of_the_depth_it_stays_as_wide_as_the_water():
         assert estimate.covariance[0, 2, 2] >= 0.9 * 30.0**2 / 12.0
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('errors', ['mixed', 'consider', 'estimate'])
 def test_misplaced_instruments_are_in_the_covariance(errors):
     named = {'model_set': 'heading_speed'}

@@ -32,8 +32,17 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 
-@pytest.mark.parametrize('model_set', MODEL_SETS)
-@pytest.mark.parametrize('adaptation', ADAPTATIONS)
+@pytest.mark.parametrize(
+    'model_set, adaptation',
+    [
+        *((model_set, DiverConfig().adaptation) for model_set in MODEL_SETS),
+        *(
+            (model_set, kind)
+            for model_set in ('heading_speed', 'families')
+            for kind in ADAPTATIONS
+        ),
+    ],
+)
 def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
     scene = simulate(scenario('zigzag'), seed=3)
     tracker = SYSTEMS['diver'].build(
