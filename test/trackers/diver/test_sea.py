@@ -118,6 +118,7 @@ def test_receivers_that_come_later_bring_their_prior():
     np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
 
+@pytest.mark.statistics
 def test_lasting_errors_of_fixes_are_in_the_covariance():
     scene = {'duration': 200.0}
     white = judged('lasting_errors', scene, {})
