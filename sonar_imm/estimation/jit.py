@@ -60,13 +60,14 @@ import pickle
 import re
 import sys
 import time
-from types import CodeType
+from types import CodeType, ModuleType
 from typing import Any, cast, TypeVar
 import uuid
 import warnings
 
 import numba
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -157,10 +158,11 @@ def with_callees(function: Callable[..., Any]) -> dict[str, int]:
         if name in found:
             continue
         found[name] = _lines(caller.__code__)
-        for called in caller.__code__.co_names:
-            callee = getattr(caller.__globals__.get(called), 'py_func', None)
-            if callee is not None:
-                waiting.append(callee)
+        names = caller.__code__.co_names
+        values = [caller.__globals__.get(each) for each in names]
+        for module in [value for value in values if isinstance(value, ModuleType)]:
+            values += [getattr(module, each, None) for each in names]
+        waiting += [value.py_func for value in values if isinstance(value, Dispatcher)]
     return found
 
 
