@@ -242,7 +242,10 @@ def filter_block(
     scratch = imm.ResampleScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
     mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
-    step, alone = np.empty((n, G.shape[2])), np.eye(M)
+    step, alone = np.empty((n, G.shape[2])), np.empty((M, M))
+    for i in range(M):
+        for j in range(M):
+            alone[i, j] = 1.0 if i == j else 0.0
     for b in range(noise.shape[0]):
         t = first + b
         if echo[t]:
