@@ -202,7 +202,7 @@ def expect(needed: tuple[int, int]) -> None:
     progress = Progress(needed)
 
 
-class _RareCollections(event.Listener):  # type: ignore[misc]
+class _RareCollections(event.Listener):
     """Have Python look for cycles of garbage rarely while numba compiles: it makes millions of
     objects that stay, and a tenth of the time went into looking at them."""
 

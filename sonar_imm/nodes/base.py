@@ -140,7 +140,7 @@ class Warming:
             end = time.monotonic() + self.DISCOVERY
             while not self._connected() and time.monotonic() < end:
                 self._stopped.wait(_LOOK)
-        left, done = dict(self._steps(None)), []
+        left, done = dict(self._steps(None)), list[str]()
         while left and not self._stopped.is_set():
             called_for = dict(self._steps(self._connected()))
             wanted = [name for name in left if name in called_for]
