@@ -15,21 +15,23 @@
 """How long live nodes take from message to estimate, beside a node that only answers.
 
     python -m benchmarks.node_latency --messages 600
-    python -m benchmarks.node_latency --messages 600 --rate 0
+    python -m benchmarks.node_latency --messages 600 --rates 0
 
 The diver node hears scans of four divers in clutter (`simulate diver --scenario crossing --set
 clutter=3`), the obstacle node detections of two obstacles with navigation and altitudes
 (`simulate obstacle --scenario rolling --set ping_rate=10`). Each scan or ping goes to the node,
 and to a plain rclpy node that answers with a PointCloud2 without fields, of as many bytes as the
 estimate had: what is left is the cost of the middleware and of Python. Which of the two is asked
-first changes every time. `--rate` such pairs a second, or one after the other (0). Needs ROS 2.
-The second table is where the node's own time goes, measured in this process.
+first changes every time. `--rates`: so many such pairs a second, or one after the other (0). Needs
+ROS 2. The load is that of the machine in the last minute, jobs that run or wait; with more of them
+than cores p99 is mostly waiting for a core. The last table is where the node's own time goes,
+measured in this process.
 """
 
 from __future__ import annotations
 
 import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 import os
 import signal
@@ -228,7 +230,10 @@ def parts(case: Case) -> dict[str, float]:
 
 
 def main(
-    messages: int = 600, rate: float = 10.0, system: str | None = None, echo: bool = False
+    messages: int = 600,
+    rates: Sequence[float] = (10.0, 50.0, 200.0),
+    system: str | None = None,
+    echo: bool = False,
 ) -> Parts:
     if echo:
         rclpy.init()
@@ -237,14 +242,16 @@ def main(
         except (KeyboardInterrupt, ExternalShutdownException):
             return
     for name in [system] if system else ['diver', 'obstacle']:
-        spent = latencies(case_of(name, messages), rate)
-        rows = np.percentile(spent, (50, 99), axis=0).T.tolist()
-        rows.append([node / other for node, other in zip(*rows)])
-        labels = (f'{name}_node', 'a node that only answers', f'ratio, of {len(spent)}')
-        table = {label: dict(zip(('p50', 'p99'), row)) for label, row in zip(labels, rows)}
+        for rate in rates:
+            spent = latencies(case_of(name, messages), rate)
+            node, other = np.percentile(spent, (50, 99), axis=0).T
+            row: dict[str, float] = {'messages': len(spent), 'load': os.getloadavg()[0]}
+            for k, point in enumerate(('p50', 'p99')):
+                row |= {f'{point} ms': node[k], f'{point} of a node that only answers': other[k]}
+                row[f'{point} ratio'] = node[k] / other[k]
+            yield {'from message to estimate': {f'{name}, {rate:g} Hz': row}}
         steps = parts(case_of(name, min(messages, 200)))
         yield {
-            f'{name}: ms from message to estimate': table,
             f'{name}: steps of the node, in one process': {
                 step: {'median ms': value} for step, value in steps.items()
             },
@@ -255,7 +262,7 @@ if __name__ == '__main__':
     study(
         main,
         digits=2,
-        rate={'help': 'messages a second; 0: no pause'},
+        rates={'help': 'messages a second; 0: no pause'},
         system={'choices': ('diver', 'obstacle'), 'help': 'only that node'},
         echo={'help': 'be the node that only answers'},
     )

@@ -339,8 +339,11 @@ def choose(
     could go to two targets of the same rank: then the choice has to be weighed.
     """
     T, D = fit.shape
-    chosen = np.full(T, -1, dtype=np.int64)
-    taken_by = np.full(D, -1, dtype=np.int64)
+    chosen, taken_by = np.empty(T, dtype=np.int64), np.empty(D, dtype=np.int64)
+    for t in range(T):
+        chosen[t] = -1
+    for d in range(D):
+        taken_by[d] = -1
     for turn in range(2):
         for t in range(T):
             if tentative[t] != (turn == 1):
@@ -374,8 +377,7 @@ def count(
     """See `Tracks.scan`: status, age, seen, misses and last_hit_ns of the tracks that
     live on, and the mask kept (T,) of those."""
     T, window = seen.shape
-    kept = np.zeros(T, dtype=np.bool_)
-    out = 0
+    kept, out = np.empty(T, dtype=np.bool_), 0
     status_1, age_1 = np.empty(T, dtype=np.uint8), np.empty(T, dtype=np.int64)
     seen_1 = np.empty((T, window), dtype=np.bool_)
     misses_1, last_1 = np.empty(T, dtype=np.int64), np.empty(T, dtype=np.int64)

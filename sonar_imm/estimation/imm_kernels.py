@@ -479,11 +479,15 @@ def combine(
     """See `imm.combine`."""
     T, M, n = x.shape
     q = E.shape[1]
-    mean = np.zeros((T, q))
-    covariance = np.zeros((T, q, q))
+    mean = np.empty((T, q))
+    covariance = np.empty((T, q, q))
     y = np.empty((M, q))
     EP = np.empty((q, n))
     for t in range(T):
+        for a in range(q):
+            mean[t, a] = 0.0
+            for b in range(q):
+                covariance[t, a, b] = 0.0
         for j in range(M):
             for a in range(q):
                 value = 0.0

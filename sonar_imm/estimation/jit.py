@@ -51,6 +51,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
+import gc
 import hashlib
 import inspect
 import os
@@ -59,11 +60,14 @@ import pickle
 import re
 import sys
 import time
+from types import CodeType, ModuleType
 from typing import Any, cast, TypeVar
 import uuid
 import warnings
 
 import numba
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -75,6 +79,10 @@ kernels: Counter[str] = Counter()
 
 listeners: list[Callable[[], object]] = []
 """Called after each kernel that was compiled."""
+
+present: dict[str, int] = {}
+"""The kernels that this process can run, by name, each with its lines of source: what was compiled
+or loaded, and what it calls."""
 
 _CHECKSUM = hashlib.sha256().digest_size
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
@@ -113,20 +121,23 @@ def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
     replaced: Any = type(compiled._cache)
     _check_verbs(files, replaced)
     numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
-    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded')
-    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled')
+    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded', function)
+    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled', function)
     compiled._cache = numbas_own
 
 
-def _or_none(use_cache: Callable[..., Any], counted_as: str) -> Callable[..., Any]:
+def _or_none(
+    use_cache: Callable[..., Any], counted_as: str, function: Callable[..., Any]
+) -> Callable[..., Any]:
     """`use_cache`, which gives None and warns where it failed: the kernel is compiled then. Counts
-    in `kernels` what was found, or is to be kept."""
+    in `kernels` and `present` what was found, or is to be kept."""
 
     def guarded(*args: Any) -> Any:
         try:
             found = use_cache(*args)
             if found is not None or counted_as == 'compiled':
                 kernels[counted_as] += 1
+                present.update(with_callees(function))
             if counted_as == 'compiled':
                 for listener in listeners:
                     listener()
@@ -136,6 +147,84 @@ def _or_none(use_cache: Callable[..., Any], counted_as: str) -> Callable[..., An
             return None
 
     return guarded
+
+
+def with_callees(function: Callable[..., Any]) -> dict[str, int]:
+    """A kernel's function and the kernels it calls, directly or not: lines of source by name."""
+    waiting, found = [function], dict[str, int]()
+    while waiting:
+        caller = waiting.pop()
+        name = f'{caller.__module__}.{caller.__qualname__}'
+        if name in found:
+            continue
+        found[name] = _lines(caller.__code__)
+        names = caller.__code__.co_names
+        values = [caller.__globals__.get(each) for each in names]
+        for module in [value for value in values if isinstance(value, ModuleType)]:
+            values += [getattr(module, each, None) for each in names]
+        waiting += [value.py_func for value in values if isinstance(value, Dispatcher)]
+    return found
+
+
+def _lines(code: CodeType) -> int:
+    return max(line or 0 for *_, line in code.co_lines()) - code.co_firstlineno + 1
+
+
+class Progress:
+    """How far the kernels are that something needs from now on. needed: about how many, and how
+    many lines of source they have; (0, 0) where that is not known."""
+
+    def __init__(self, needed: tuple[int, int] = (0, 0)):
+        self.needed = needed
+        self._before, self._compiled = frozenset(present), kernels['compiled']
+        self._start = time.monotonic()
+
+    def sentence(self) -> str:
+        """Empty as long as nothing was compiled. Time goes with lines of source."""
+        compiled = kernels['compiled'] - self._compiled
+        if not compiled:
+            return ''
+        made = [lines for name, lines in [*present.items()] if name not in self._before]
+        once, (count, lines) = 'kernels, once for this machine', self.needed
+        if not 0 < len(made) < count:
+            return f'compiling {once}: {compiled} so far'
+        left = (time.monotonic() - self._start) * max(lines / sum(made) - 1.0, 0.0)
+        return f'compiling {len(made) + 1} of {count} {once}, some {left:.0f} s more'
+
+
+progress = Progress()
+"""Of what this process is compiling for now, see `expect`."""
+
+
+def expect(needed: tuple[int, int]) -> None:
+    """Begin a new `progress`."""
+    global progress
+    progress = Progress(needed)
+
+
+class _RareCollections(event.Listener):
+    """Have Python look for cycles of garbage rarely while numba compiles: it makes millions of
+    objects that stay, and a tenth of the time went into looking at them."""
+
+    WHILE_COMPILING = 100_000, 50, 100
+
+    def __init__(self) -> None:
+        self._depth, self._before = 0, gc.get_threshold()
+
+    def on_start(self, event: Any) -> None:
+        if self._depth == 0:
+            self._before = gc.get_threshold()
+            if self._before[0]:  # else somebody wants none at all
+                gc.set_threshold(*self.WHILE_COMPILING)
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            gc.set_threshold(*self._before)
+
+
+event.register('numba:compile', _RareCollections())
 
 
 @cache

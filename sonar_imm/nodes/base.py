@@ -80,15 +80,17 @@ class Warming:
         self,
         steps: Callable[[Collection[type] | None], list[WarmStep]],
         connected: Callable[[], Collection[type] | None],
+        kernels_of: Callable[[Collection[str]], tuple[int, int]],
     ):
         """steps: what there is to do for measurements of these classes, None for all. connected:
-        the classes that somebody publishes now, None for nobody."""
-        from ..estimation.jit import kernels  # and numba, which the tracker has loaded by now
+        the classes that somebody publishes now, None for nobody. kernels_of: what steps need, see
+        `trackers.System.kernels_of`."""
+        from ..estimation import jit  # and numba, which the tracker has loaded by now
 
-        self._steps, self._connected, self._kernels = steps, connected, kernels
+        self._steps, self._connected, self._kernels_of = steps, connected, kernels_of
+        self._jit, self._progress = jit, jit.Progress()
         self._start = time.monotonic()
         self._said = -self.PERIOD
-        self._before = Counter(kernels)
         self._doing, self._ready = 'what is published', False
         self._stopped = threading.Event()
         self._trouble: Exception | None = None
@@ -115,12 +117,8 @@ class Warming:
         """How far it is; empty when everything is there."""
         if self.done():
             return ''
-        made = self._kernels - self._before
         waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
-        return (
-            f'kernels for {self._doing}: {made["compiled"]} compiled, once for this machine, and '
-            f'{made["loaded"]} loaded after {time.monotonic() - self._start:.0f} s; {waiting}'
-        )
+        return f'{self._progress.sentence() or "loading kernels"} ({self._doing}); {waiting}'
 
     def due_sentence(self) -> str:
         """The same when it is time to say it (again), else empty."""
@@ -138,17 +136,19 @@ class Warming:
         self._ready = True
 
     def _work(self) -> None:
-        if not self._kernels:  # the node has just begun: give discovery a moment
+        if not self._jit.kernels:  # the node has just begun: give discovery a moment
             end = time.monotonic() + self.DISCOVERY
             while not self._connected() and time.monotonic() < end:
                 self._stopped.wait(_LOOK)
-        left = dict(self._steps(None))
+        left, done = dict(self._steps(None)), list[str]()
         while left and not self._stopped.is_set():
             called_for = dict(self._steps(self._connected()))
             wanted = [name for name in left if name in called_for]
             self._ready = self._ready or not wanted
+            self._progress.needed = self._kernels_of([*done, *(wanted or left)])
             self._doing = (wanted or [*left])[0]
             left.pop(self._doing)()
+            done.append(self._doing)
 
 
 class BaseNode(Node):
@@ -201,7 +201,7 @@ class BaseNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._node_config.diagnostics_period, self._report, clock=steady)
         self._settings.on_change(self._reconfigure)
-        self._warming = Warming(self.warm_steps, self._connected)
+        self._warming = Warming(self.warm_steps, self._connected, self.kernels_of)
         self._until_warm = self.create_timer(_LOOK, self._hear_when_warm, clock=steady)
 
     @property
@@ -259,6 +259,11 @@ class BaseNode(Node):
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """What compiles or loads the kernels that these measurements need, None: all."""
         raise NotImplementedError
+
+    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
+        """About how many kernels these steps of `warm_steps` need, and how many lines of source
+        they have; (0, 0): not known."""
+        return 0, 0
 
     def answer(self) -> dict[str, int]:
         """The row on ``~/processed``."""
@@ -475,6 +480,10 @@ class TrackerNode(BaseNode):
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """Those of the tracker."""
         return self.tracker.warm_steps(inputs)
+
+    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
+        """Those of the system."""
+        return SYSTEMS[self._name].kernels_of(steps)
 
     def error_words(self) -> str:
         """What follows of an internal error."""

@@ -35,11 +35,11 @@ sonar_imm.parameters.ConfigError: parameter 'fix_std' must be between 0.0001 and
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from importlib import import_module
 from typing import Any, Protocol
 
-from attrs import frozen
+from attrs import field, frozen
 
 from ..estimates import Estimate
 from ..intake import KnownFrames
@@ -116,7 +116,9 @@ class System:
 
     config, tracker, smoother: classes below `sonar_imm.trackers.<name>`, as ``module.Class``;
     smoother: '' when the tracker cannot look back. node_config: a class of
-    `sonar_imm.node_config`.
+    `sonar_imm.node_config`. kernels: about how many kernels each of the tracker's `warm_steps`
+    needs in the default configuration, and how many lines of source they have, shared ones
+    included; all_kernels: the same of all steps.
     """
 
     name: str
@@ -125,6 +127,8 @@ class System:
     tracker: str
     smoother: str = ''
     node_config: str = 'NodeConfig'
+    kernels: Mapping[str, tuple[int, int]] = field(factory=dict)
+    all_kernels: tuple[int, int] = (0, 0)
 
     @property
     def scenes(self) -> str:
@@ -155,6 +159,19 @@ class System:
             raise ConfigError(f'the {self.name} tracker has no smoother')
         return self._own(self.smoother)(config)
 
+    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
+        """About how many kernels these steps need, and how many lines of source they have."""
+        each = [self.kernels.get(step, (0, 0)) for step in steps]
+        count, lines = (sum(column) for column in zip((0, 0), *each))
+        return min(count, self.all_kernels[0]), min(lines, self.all_kernels[1])
+
+    def warm(self, tracker: Tracker, inputs: Collection[type] | None = None) -> None:
+        """`Tracker.warm`, with a `jit.progress` that knows how much there is to do."""
+        from ..estimation import jit  # and numba, which the tracker has loaded by now
+
+        jit.expect(self.kernels_of([name for name, _ in tracker.warm_steps(inputs)]))
+        tracker.warm(inputs)
+
     def _own(self, dotted: str) -> Any:
         module, _, name = dotted.rpartition('.')
         return getattr(import_module(f'{__name__}.{self.name}.{module}'), name)
@@ -170,6 +187,8 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
+            kernels={'pings': (21, 629)},
+            all_kernels=(21, 629),
         ),
         System(
             name='diver',
@@ -178,6 +197,8 @@ SYSTEMS = {
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
             node_config='ReplayNodeConfig',
+            kernels={'fixes': (32, 880), 'echoes': (28, 810), 'tags': (35, 899)},
+            all_kernels=(50, 1410),
         ),
         System(
             name='fathometer',
@@ -185,6 +206,8 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
+            kernels={'records': (14, 465)},
+            all_kernels=(14, 465),
         ),
         System(
             name='obstacle',
@@ -193,6 +216,8 @@ SYSTEMS = {
             config='config.ObstacleConfig',
             tracker='tracker.ObstacleTracker',
             node_config='ReplayNodeConfig',
+            kernels={'pings': (41, 1179), 'avoidance': (8, 226)},
+            all_kernels=(49, 1405),
         ),
     )
 }

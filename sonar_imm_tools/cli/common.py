@@ -259,26 +259,23 @@ def progress(
         else:
             advance, say_now = _plain_progress(what, total)
         if compiles:
-            stack.enter_context(_compiling(say_now))
+            stack.enter_context(compiling(say_now))
         yield advance
 
 
 @contextlib.contextmanager
-def _compiling(say_now: Callable[[str], object]) -> Iterator[None]:
+def compiling(say_now: Callable[[str], object]) -> Iterator[None]:
     """Have `say_now` called with a sentence after each kernel that this process compiles."""
-    from sonar_imm.estimation.jit import kernels, listeners
-
-    before = kernels['compiled']
+    from sonar_imm.estimation import jit
 
     def compiled() -> None:
-        done = kernels['compiled'] - before
-        say_now(f'compiling kernels, once for this machine: {done} so far')
+        say_now(jit.progress.sentence())
 
-    listeners.append(compiled)
+    jit.listeners.append(compiled)
     try:
         yield
     finally:
-        listeners.remove(compiled)
+        jit.listeners.remove(compiled)
 
 
 def _bar_progress(bar: Any, what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
@@ -293,15 +290,21 @@ def _bar_progress(bar: Any, what: str, total: int) -> tuple[Advance, Callable[[s
     return advance, say_now
 
 
-def _plain_progress(what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
-    """Print a line every few seconds, so that the log of a short job stays empty."""
-    done, printed = 0, time.monotonic()
+def plain_lines() -> Callable[[str], None]:
+    """Prints a line every few seconds (stderr), so that the log of a short job stays empty."""
+    printed = time.monotonic()
 
     def say_now(sentence: str) -> None:
         nonlocal printed
         if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
             printed = time.monotonic()
             click.echo(sentence, err=True)
+
+    return say_now
+
+
+def _plain_progress(what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
+    done, say_now = 0, plain_lines()
 
     def advance(count: int) -> None:
         nonlocal done

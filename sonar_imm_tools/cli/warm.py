@@ -25,7 +25,7 @@ import click
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 
-from .common import example, load_config, say, set_option
+from .common import compiling, example, load_config, plain_lines, say, set_option
 
 
 @click.command(
@@ -76,6 +76,8 @@ def _compile(system: str, config: Config) -> tuple[int, int, float]:
     from sonar_imm.estimation.jit import kernels
 
     start, before = time.perf_counter(), Counter(kernels)
-    SYSTEMS[system].build(config).warm()
+    say_now = plain_lines()
+    with compiling(lambda sentence: say_now(f'{system}: {sentence}')):
+        SYSTEMS[system].warm(SYSTEMS[system].build(config))
     made = kernels - before
     return made['compiled'], made['loaded'], time.perf_counter() - start

@@ -166,7 +166,7 @@ class OfflineRun:
     def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
         """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
         revisions = Revisions(self._window_ns)
-        self.tracker.warm(self._kinds)
+        self.system.warm(self.tracker, self._kinds)
         share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
         for made in self._shared_out(advance) if share else self._in_turn(advance):
             final = revisions.add(made)

@@ -22,6 +22,8 @@ import sys
 from helpers.tracked import RUNS
 import pytest
 
+from sonar_imm.trackers import SYSTEMS
+
 RUN = """
 import json, sys
 
@@ -53,6 +55,21 @@ class Warmed(Tracked):
 run = Warmed(sys.argv[1])
 print(json.dumps([run.warmed, signatures()]))
 """
+WARM = """
+import json, sys
+
+from sonar_imm.estimation import jit
+from sonar_imm.trackers import SYSTEMS
+
+system = SYSTEMS[sys.argv[1]]
+steps = system.build(system.config_type()()).warm_steps()
+figures = {}
+for name, compile_step in steps:
+    jit.present.clear()
+    compile_step()
+    figures[name] = len(jit.present), sum(jit.present.values())
+print(json.dumps(figures))
+"""
 COLD = {'_repair', '_update_again'}
 """Compiled when the first covariance needs it, and what they call."""
 
@@ -80,3 +97,25 @@ def test_nothing_is_left_to_compile_after_warm(compilations):
 def test_a_kernel_has_one_kind_of_arguments(compilations):
     several = {name: kinds for name, kinds in compilations[1].items() if len(kinds) > 1}
     assert several == {}
+
+
+@pytest.mark.parametrize('name', SYSTEMS)
+def test_a_system_knows_about_how_many_kernels_its_steps_need(name):
+    """Those of the default configuration, as `jit.Progress` counts them; a shared kernel that an
+    earlier step has loaded is not loaded again, so that a later step may have fewer."""
+    found = subprocess.run(
+        [sys.executable, '-c', WARM, name],
+        cwd=Path(__file__).resolve().parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    figures = json.loads(found.stdout.splitlines()[-1])
+    system = SYSTEMS[name]
+    assert set(figures) == set(system.kernels)
+    first = next(iter(figures))
+    for known, right in zip(system.kernels[first], figures[first]):
+        assert 0.8 * right < known < 1.25 * right, figures
+    for column in (0, 1):
+        each = [figure[column] for figure in system.kernels.values()]
+        assert max(each) <= system.all_kernels[column] <= sum(each)

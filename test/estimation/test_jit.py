@@ -14,6 +14,7 @@
 
 """Compiling: the cache is used when it can be, and is no condition."""
 
+import gc
 import hashlib
 import importlib
 import os
@@ -82,6 +83,62 @@ def test_a_full_disk_costs_a_sentence_and_not_the_process(fresh, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert len(warned) == 1 and not list(tmp_path.rglob('*.nbc*'))
     assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
+
+
+@jit.kernel
+def caller(x, y):
+    return callee(x) + callee(y)
+
+
+@jit.kernel
+def callee(x):
+    """It has
+    four lines."""
+    return 0.5 * x
+
+
+def test_progress_counts_kernels_with_their_callees_and_time_goes_with_lines(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(jit.time, 'monotonic', lambda: clock[0])
+    monkeypatch.setattr(jit, 'present', {})
+    caller._cache.flush()
+    callee._cache.flush()
+    progress = jit.Progress((5, 32))
+    assert progress.sentence() == ''
+    assert caller(1.0, 2.0) == 1.5
+    assert jit.present == {f'{__name__}.caller': 3, f'{__name__}.callee': 5}
+    clock[0] += 2.0
+    once = 'kernels, once for this machine'
+    assert progress.sentence() == f'compiling 3 of 5 {once}, some 6 s more'
+    progress.needed = 2, 8
+    assert progress.sentence() == f'compiling {once}: 2 so far'
+    assert jit.Progress((5, 32)).sentence() == ''
+
+
+def test_a_loaded_kernel_counts_with_its_callees(monkeypatch):
+    caller(1.0, 2.0)
+    monkeypatch.setattr(jit, 'present', {})
+    loaded = jit.kernel(caller.py_func)
+    assert loaded(1.0, 2.0) == 1.5 and sum(loaded.stats.cache_hits.values()) == 1
+    assert set(jit.present) == {f'{__name__}.caller', f'{__name__}.callee'}
+
+
+@pytest.mark.parametrize('before', [(700, 10, 10), (0, 10, 10)])
+def test_garbage_is_looked_for_rarely_while_numba_compiles_and_then_as_before(before, monkeypatch):
+    seen = []
+    monkeypatch.setattr(jit, 'listeners', [lambda: seen.append(gc.get_threshold())])
+    other = gc.get_threshold()
+    gc.set_threshold(*before)
+    try:
+        caller._cache.flush()
+        callee._cache.flush()
+        monkeypatch.setitem(globals(), 'callee', jit.kernel(callee.py_func))
+        assert jit.kernel(caller.py_func)(1.0, 2.0) == 1.5
+        after = gc.get_threshold()
+    finally:
+        gc.set_threshold(*other)
+    # The callee is compiled inside of the caller, which is kept when it is compiled.
+    assert seen == [(100_000, 50, 100) if before[0] else before, before] and after == before
 
 
 DAMAGE = {

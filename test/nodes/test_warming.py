@@ -25,6 +25,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from helpers.walker import WalkerTracker  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 
+from sonar_imm.estimation import jit  # noqa: E402
 from sonar_imm.measurements import Arrivals, Fix  # noqa: E402
 from sonar_imm.nodes.base import TrackerNode, Warming  # noqa: E402
 from sonar_imm.nodes.qos import output_qos  # noqa: E402
@@ -54,6 +55,11 @@ class Steps:
             event.set()
 
 
+def kernels_of(steps):
+    """Three kernels with three lines each for every step."""
+    return 3 * len(steps), 9 * len(steps)
+
+
 def finish(warming, steps):
     steps.let_go()
     warming.stop(wait=True)
@@ -61,10 +67,10 @@ def finish(warming, steps):
 
 def test_what_is_published_comes_first_and_the_rest_after_the_node_is_ready():
     steps = Steps(fixes=Fix, echoes=Arrivals)
-    warming = Warming(steps, lambda: {Arrivals})
+    warming = Warming(steps, lambda: {Arrivals}, kernels_of)
     try:
         assert steps.begun['echoes'].wait(30.0) and not warming.ready()
-        assert 'kernels for echoes' in warming.sentence()
+        assert 'kernels (echoes)' in warming.sentence()
         assert 'no input is heard until then' in warming.sentence()
         steps.go['echoes'].set()
         assert steps.begun['fixes'].wait(30.0)
@@ -77,7 +83,7 @@ def test_what_is_published_comes_first_and_the_rest_after_the_node_is_ready():
 
 def test_when_nobody_publishes_everything_is_there_before_the_node_is_ready():
     steps = Steps(fixes=Fix, echoes=Arrivals)
-    warming = Warming(steps, lambda: None)
+    warming = Warming(steps, lambda: None, kernels_of)
     try:
         steps.go['fixes'].set()
         assert steps.begun['echoes'].wait(30.0) and not warming.ready()
@@ -86,11 +92,35 @@ def test_when_nobody_publishes_everything_is_there_before_the_node_is_ready():
     assert steps.done == ['fixes', 'echoes'] and warming.ready()
 
 
+def test_the_sentence_counts_the_kernels_of_what_is_published_and_then_of_all(monkeypatch):
+    monkeypatch.setattr(jit, 'present', {})
+    steps = Steps(fixes=Fix, echoes=Arrivals)
+    warming = Warming(steps, lambda: {Fix}, kernels_of)
+
+    def compiled(name):
+        jit.present[name] = 3
+        jit.kernels['compiled'] += 1
+        return warming.sentence()
+
+    try:
+        assert steps.begun['fixes'].wait(30.0)
+        assert warming.sentence() == 'loading kernels (fixes); no input is heard until then'
+        once, end = 'kernels, once for this machine, some 0 s more', 'no input is heard until then'
+        assert compiled('first') == f'compiling 2 of 3 {once} (fixes); {end}'
+        steps.go['fixes'].set()
+        assert steps.begun['echoes'].wait(30.0)
+        end = 'messages may wait for it'
+        assert compiled('second') == f'compiling 3 of 6 {once} (echoes); {end}'
+    finally:
+        jit.kernels['compiled'] -= 2
+        finish(warming, steps)
+
+
 def test_what_goes_wrong_is_raised_where_somebody_asks():
     def fails():
         raise ZeroDivisionError('a bug')
 
-    warming = Warming(lambda inputs: [('fixes', fails)], lambda: {Fix})
+    warming = Warming(lambda inputs: [('fixes', fails)], lambda: {Fix}, kernels_of)
     while not warming.done():
         time.sleep(0.01)
     with pytest.raises(ZeroDivisionError):

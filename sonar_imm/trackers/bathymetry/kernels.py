@@ -242,7 +242,10 @@ def filter_block(
     scratch = imm.ResampleScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
     mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
-    step, alone = np.empty((n, G.shape[2])), np.eye(M)
+    step, alone = np.empty((n, G.shape[2])), np.empty((M, M))
+    for i in range(M):
+        for j in range(M):
+            alone[i, j] = 1.0 if i == j else 0.0
     for b in range(noise.shape[0]):
         t = first + b
         if echo[t]:
@@ -440,7 +443,7 @@ def smooth_ping(
     scratch, work = np.empty((7, max(G, 128) + 16)), np.empty((4, G))
     value, sines = np.empty(G), np.empty(G)
     carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
-    end = 0
+    backwards, end = motion.transition.T.copy(), 0  # in rows, as `grid.mix` is compiled for
     for t in range(T):
         end += M * (window[t, 1] - window[t, 0])
     low, high = window[T - 1, 0], window[T - 1, 1]
@@ -472,7 +475,7 @@ def smooth_ping(
         if echo:
             if motion.favour.shape[0] > 0:
                 _favour_cells(back, low, high, motion.favour[t + 1])
-            grid.mix(back, low, high, motion.transition.T, beta)
+            grid.mix(back, low, high, backwards, beta)
         else:
             for j in range(M):
                 for g in range(low, high):

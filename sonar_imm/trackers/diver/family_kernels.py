@@ -338,16 +338,18 @@ def log_densities(
     K, D, n = len(scales), len(z), P.shape[2]
     M = models // K
     out = np.empty((T, K, D))
-    PHt, nothing, S = np.empty((n, 2)), np.zeros((2, 2)), np.empty((M, 2, 2))
+    PHt, nothing, S = np.empty((n, 2)), np.empty((2, 2)), np.empty((M, 2, 2))
     logs, weight = np.empty(M), np.empty(M)
-    low, high, widest = np.empty(2), np.empty(2), np.zeros(2)
-    for d in range(D):
-        for r in range(2):
+    low, high, widest = np.empty(2), np.empty(2), np.empty(2)
+    for r in range(2):
+        nothing[r, 0] = nothing[r, 1] = widest[r] = 0.0
+        for d in range(D):
             widest[r] = max(widest[r], R[d, r, r])
     for t in range(T):
         for k in range(K):
             total = 0.0
-            low[:], high[:] = np.inf, -np.inf
+            for r in range(2):
+                low[r], high[r] = np.inf, -np.inf
             for j in range(M):
                 own = k * M + j
                 total += c[t, own]

@@ -39,10 +39,11 @@ def expected(x: FloatArray, H: FloatArray) -> FloatArray:
     """What each model expects, (T, M, m): x (T, M, n), H (1, M, m, n)."""
     T, M, n = x.shape
     m = H.shape[2]
-    h = np.zeros((T, M, m))
+    h = np.empty((T, M, m))
     for t in range(T):
         for j in range(M):
             for r in range(m):
+                h[t, j, r] = 0.0
                 for a in range(n):
                     h[t, j, r] += H[0, j, r, a] * x[t, j, a]
     return h
@@ -52,8 +53,9 @@ def expected(x: FloatArray, H: FloatArray) -> FloatArray:
 def finite(x: FloatArray, P: FloatArray) -> BoolArray:
     """Which tracks (T,) have finite numbers only: x (T, M, n), P (T, M, n, n)."""
     T = len(x)
-    out = np.ones(T, dtype=np.bool_)
+    out = np.empty(T, dtype=np.bool_)
     for t in range(T):
+        out[t] = True
         # A sum of finite numbers may overflow, so each is asked.
         for value in x[t].flat:
             out[t] = out[t] and math.isfinite(value)

@@ -1,0 +1,65 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A real node that compiles its kernels, with the defaults, is there for others meanwhile."""
+
+import contextlib
+import re
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+import pytest
+from rcl_interfaces.srv import GetParameters
+
+from sonar_imm.nodes.qos import output_qos
+from sonar_imm_tools.replay.harness import local_discovery, NodeProcess, reserved_domain_id
+from sonar_imm_tools.replay.link import Link
+
+pytestmark = pytest.mark.system
+LIMIT = 60.0
+ANSWER = 2.0
+"""Seconds in which a service is answered."""
+
+
+@pytest.mark.parametrize('system', ['diver', 'bathymetry', 'obstacle'])
+def test_a_node_answers_and_reports_while_it_compiles(system, tmp_path, monkeypatch):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    with contextlib.ExitStack() as stack:
+        domain = stack.enter_context(reserved_domain_id())
+        stack.enter_context(local_discovery())
+        link = stack.enter_context(Link('asks', domain_id=domain))
+        reports, answers = [], []
+        link.node.create_subscription(
+            DiagnosticArray, '/diagnostics', reports.append, output_qos()
+        )
+        client = link.node.create_client(GetParameters, f'/{system}/get_parameters')
+        node = stack.enter_context(NodeProcess(system, domain_id=domain))
+
+        def wait_for(predicate):
+            assert link.wait_for(predicate, LIMIT, node.trouble), node.log()
+
+        def compiles():
+            sentences = [status.message for report in reports for status in report.status]
+            return any(re.match(r'compiling \d+ of \d+ kernels, once', s) for s in sentences)
+
+        wait_for(client.service_is_ready)
+        for _ in range(3):
+            begun = time.monotonic()
+            request = GetParameters.Request(names=['frame_id'])
+            client.call_async(request).add_done_callback(answers.append)
+            wait_for(lambda: answers and answers.pop())
+            assert time.monotonic() - begun < ANSWER
+            del reports[:]
+            wait_for(compiles)
+        assert 'ready, hears' not in node.log()
