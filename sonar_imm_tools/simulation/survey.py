@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
+from pathlib import Path
 from typing import Any
 
 from attrs import frozen
@@ -167,6 +168,24 @@ def simulate(config: SurveyScenario, seed: int) -> SurveyScene:
         first = int(line.stamp_ns.max()) + 120_000_000_000
     names = tuple(f'line_{k:03d}' for k in range(len(starts)))
     return SurveyScene(names, tuple(points), corrections, tuple(bad), tuple(fish), floor)
+
+
+def write_truth(path: Path, scene: SurveyScene) -> None:
+    """Truth as npz: `names` and `corrections` (L, 6) of the lines; `truth_z` (nx, ny) at the nodes
+    (x0 + i + .5, y0 + j + .5) of 1 m cells, `ext` = x0, y0, nx, ny; `bad` and `fish`: flags of all
+    soundings, line after line in the order of their tables."""
+    x0, y0 = math.ceil(scene.floor.x0), math.ceil(scene.floor.y0)
+    nx, ny = (np.array(scene.floor.z.shape) * _STEP - 2.0).astype(int).tolist()
+    x, y = np.meshgrid(x0 + np.arange(nx) + 0.5, y0 + np.arange(ny) + 0.5, indexing='ij')
+    np.savez_compressed(
+        path,
+        names=np.array(scene.names),
+        corrections=scene.corrections,
+        ext=np.array([x0, y0, nx, ny]),
+        truth_z=scene.floor.at(x, y).astype(np.float32),
+        bad=np.concatenate(scene.bad),
+        fish=np.concatenate(scene.fish),
+    )
 
 
 def budget() -> ErrorBudget:

@@ -47,8 +47,8 @@ PARAMETERS = ('roll', 'pitch', 'heading', 'offset', 'sound_speed', 'latency')
 """Corrections in this order everywhere: rad, rad, rad, m, m/s, s."""
 BASIS = 9
 """Columns of `Line.basis`."""
-PING_SECONDS = 1.0
-"""Pings this near share their direction and speed."""
+DIRECTION_SECONDS, SPEED_SECONDS = 1.0, 5.0
+"""Pings this near share their direction, and their speed: a keel point moves by D times pitch."""
 LEAST_NOISE = 0.01**2
 
 
@@ -222,12 +222,16 @@ def _directions(
     t_mean, p_mean = mean(t), mean(p)
     slope = mean((t - t_mean[ping])[:, None] * (p - p_mean[ping])) * n[:, None]
     seconds = (stamps - stamps[0]) * 1e-9
-    first = np.searchsorted(seconds, seconds - PING_SECONDS, 'left')
-    last = np.searchsorted(seconds, seconds + PING_SECONDS, 'right')
+    first, last = _around(seconds, DIRECTION_SECONDS)
     near = _windowed(slope, first, last)
     length = np.hypot(near[:, 0], near[:, 1])
     port = near / np.where(length > 0.0, length, 1.0)[:, None]
     keel = p_mean - t_mean[:, None] * port
+    # Speed needs a ping before and one after, however far they are.
+    first, last = _around(seconds, SPEED_SECONDS)
+    ping_number = np.arange(len(stamps))
+    first = np.minimum(first, np.maximum(ping_number - 1, 0))
+    last = np.maximum(last, np.minimum(ping_number + 2, len(stamps)))
     width = (last - first).astype(np.float64)
     t0 = _windowed(seconds[:, None], first, last)[:, 0] / width
     k0 = _windowed(keel, first, last) / width[:, None]
@@ -237,6 +241,13 @@ def _directions(
     velocity = tk / np.where(known, tt, 1.0)[:, None] * known[:, None]
     speed = velocity[:, 0] * port[:, 1] - velocity[:, 1] * port[:, 0]
     return port[ping], speed[ping]
+
+
+def _around(seconds: FloatArray, most: float) -> tuple[IntArray, IntArray]:
+    """First and one behind the last of the pings (P,) within `most` seconds of each."""
+    most += 1e-3
+    first = np.searchsorted(seconds, seconds - most, 'left')
+    return first, np.searchsorted(seconds, seconds + most, 'right')
 
 
 def _windowed(values: FloatArray, first: IntArray, last: IntArray) -> FloatArray:

@@ -89,6 +89,17 @@ def read_points(path: Path) -> Points:
     return Points(stamps, columns)
 
 
+def write_table(path: Path, points: Points) -> None:
+    """Points as a soundings.csv, their places exact in px py pz and coarse in x y z."""
+    exact = dict(zip(PLACES, 'xyz'))
+    names = list(COLUMNS)
+    values = [points[exact.get(name, name)].astype(COLUMNS[name]).tolist() for name in names]
+    with path.open('w', encoding='utf-8', newline='') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(['stamp_ns', *names])
+        writer.writerows(zip(points.stamp_ns.tolist(), *values))
+
+
 def write_xyz(path: Path, points: Points) -> None:
     """One line per sounding: easting, northing, height and vertical standard deviation, in m."""
     deviation = np.sqrt(points['vertical_uncertainty'])
