@@ -33,6 +33,7 @@ MAD = 1.4826
 """Standard deviation of normal errors over their median absolute deviation."""
 FLOOR = 0.02**2
 """Variance of a look's height that no number of soundings reduces: terrain inside the cell."""
+GRADIENT_STD = 0.2
 SLOPE_STD = 0.5
 """Prior of both components of a gradient."""
 STEEPEST = 1.0
@@ -81,12 +82,15 @@ class Looks:
 
     def variances(self, g: FloatArray) -> FloatArray:
         """Variances (m,) of heights: the larger of own noise and scatter about the plane, of half
-        as many soundings, since neighbours along a ping share the errors of the filter."""
+        as many soundings, since neighbours along a ping share the errors of the filter; and of the
+        way from their mean place to the centre, on a gradient that is known to `GRADIENT_STD`."""
         xx, xy, yy, xz, yz, zz = self.moments.T
         gx, gy = g.T
         squares = zz - 2.0 * (gx * xz + gy * yz) + gx * gx * xx + 2.0 * gx * gy * xy + gy * gy * yy
         scatter = np.maximum(squares, 0.0) / np.maximum(self.count - 1.0, 1.0)
-        return np.asarray(np.maximum(self.noise, scatter) / (0.5 * (self.count + 1.0)) + FLOOR)
+        height = np.maximum(self.noise, scatter) / (0.5 * (self.count + 1.0))
+        carried = GRADIENT_STD**2 * np.square(self.place).sum(axis=1)
+        return np.asarray(height + FLOOR + carried)
 
 
 def looks_of(line: Line, cell: float, number: IntArray | int = 0) -> Looks:
