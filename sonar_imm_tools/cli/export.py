@@ -29,7 +29,7 @@ FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
 
 
-def _numbers(
+def coordinates(
     _ctx: click.Context, _param: click.Parameter, value: str
 ) -> tuple[float, float, float]:
     try:
@@ -63,7 +63,7 @@ def _numbers(
 @click.option(
     '--origin',
     default='0,0',
-    callback=_numbers,
+    callback=coordinates,
     metavar='X,Y[,Z]',
     help='Coordinates in that system of the origin of the navigation.',
 )

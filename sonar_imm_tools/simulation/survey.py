@@ -155,7 +155,9 @@ def simulate(config: SurveyScenario, seed: int) -> SurveyScene:
     corrections = np.zeros((len(starts), 6))
     corrections[:, :3] = np.radians([config.roll_bias_deg, config.pitch, config.heading])
     corrections[:, 3] = config.tide_std * rng.standard_normal(len(starts))
-    corrections[:, 4:] = config.sound_speed_error, config.latency
+    spread = config.nav_errors * budget().sound_speed
+    corrections[:, 4] = config.sound_speed_error + spread * rng.standard_normal(len(starts))
+    corrections[:, 5] = config.latency
     points, bad, fish = [], [], []
     first = FIRST_STAMP_NS
     for k, (start, course) in enumerate(starts):
@@ -251,7 +253,6 @@ def _line(
     }
     attitude = [config.nav_errors * _slow(rng, t, SECONDS['attitude']) for _ in range(2)]
     position = [config.nav_errors * _slow(rng, t, SECONDS['position']) for _ in range(2)]
-    drift = config.nav_errors * errors.sound_speed * rng.standard_normal()
     roll = math.radians(2.0) * np.sin(2.0 * math.pi * t / 7.0 + rng.uniform(0.0, 6.0))
     pitch = math.radians(1.0) * np.sin(2.0 * math.pi * t / 5.5 + rng.uniform(0.0, 6.0))
     yaw = course + math.radians(0.8) * np.sin(2.0 * math.pi * t / 12.0 + rng.uniform(0.0, 6.0))
@@ -273,8 +274,8 @@ def _line(
     angle = np.concatenate([np.arctan(over), -np.arctan(over)])
     fan = np.column_stack([np.zeros(len(angle)), np.sin(angle), -np.cos(angle)])
     n = np.einsum('pij,bj->pbi', true, fan)
-    below = _depth_below(config, floor, place, n, corrections[4] + drift)
-    _, seconds = _ray(config, place[:, None, 2], n, below, corrections[4] + drift)
+    below = _depth_below(config, floor, place, n, corrections[4])
+    _, seconds = _ray(config, place[:, None, 2], n, below, corrections[4])
     slant = SOUND_SPEED * seconds
     stated = np.einsum('pij,bj->pbi', reported, fan)
     xyz = reported_place[:, None, :] + slant[..., None] * stated

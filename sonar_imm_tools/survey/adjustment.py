@@ -46,13 +46,14 @@ from scipy.sparse.linalg import splu
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
-from .grid import Correction
 from .line import PARAMETERS, partials
 from .looks import gradients, joined, Looks, MAD, runs_of
 
 NU, REWEIGHTINGS = 4.0, 8
 ROUNDS = 3
 BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
+DRIFT_SECONDS = 60.0
+"""How long errors of heading and position last, which are considered only."""
 MOST_UNKNOWNS = 20_000
 ROWS_AT_ONCE = 200_000
 MOST_PARAMETERS = 1000
@@ -103,12 +104,12 @@ class Adjustment:
         """`told` of each unknown (P,): the share of the prior variance that is gone."""
         return np.asarray(1.0 - np.square(self.std / self.prior_std))
 
-    def of_lines(self, lines: Sequence[int]) -> Correction:
-        """Covariance of the total corrections of some lines."""
+    def of_lines(self, lines: Sequence[int]) -> FloatArray:
+        """Covariance (L, 6, L, 6) of the total corrections of some lines."""
         T = _totals(self.owner, self.kind, lines)
         K = len(PARAMETERS)
         full = T @ (T @ self.covariance).T
-        return Correction(np.asarray(full).reshape(len(lines), K, len(lines), K))
+        return np.asarray(full).reshape(len(lines), K, len(lines), K)
 
     def not_known(self) -> list[tuple[FloatArray, float]]:
         """Combinations (P,) of unknowns, in their priors, of which the data say less than the
@@ -396,24 +397,25 @@ class _Equations:
         """J' M (V + U S U') M J (P, P): what errors of looks, and those that last for seconds, do
         to the right-hand side. In parts of the looks, for memory."""
         size = len(self.unknowns.owner)
-        b, (block, count) = self.budget, self._blocks(BLOCK_SECONDS)
+        b = self.budget
+        short, long = self._blocks(BLOCK_SECONDS), self._blocks(DRIFT_SECONDS)
         lasting = [
-            (self.a[:, 0], b.attitude),
-            (self.a[:, 1], b.attitude),
-            (self.a[:, 2], b.heading),
-            (self.a[:, 3], b.heave),
-            (self.g[:, 0], b.position),
-            (self.g[:, 1], b.position),
+            (self.a[:, 0], b.attitude, short),
+            (self.a[:, 1], b.attitude, short),
+            (self.a[:, 3], b.heave, short),
+            (self.a[:, 2], b.heading, long),
+            (self.g[:, 0], b.position, long),
+            (self.g[:, 1], b.position, long),
         ]
         total = np.zeros((size, size))
-        sums = [csr_array((size, count)) for _ in lasting]
+        sums = [csr_array((size, count)) for _, _, (_, count) in lasting]
         weight = self.in_cell @ self.w
         for start in range(0, len(self.w), ROWS_AT_ONCE):
             rows = slice(start, start + ROWS_AT_ONCE)
             R = self._eliminated(rows, weight)
             total += (R.T @ (diags_array(self.v[rows]) @ R)).toarray()
             n = np.arange(R.shape[0])
-            for k, (partial, deviation) in enumerate(lasting):
+            for k, (partial, deviation, (block, count)) in enumerate(lasting):
                 U = csr_array((deviation * partial[rows], (n, block[rows])), shape=(len(n), count))
                 sums[k] = sums[k] + (R.T @ U).tocsr()
         for B in sums:

@@ -58,7 +58,7 @@ class Chart:
     west: float
     north: float
     cell: float
-    bands: Mapping[str, FloatArray]
+    bands: Mapping[str, np.ndarray]
 
     @property
     def shape(self) -> tuple[int, int]:

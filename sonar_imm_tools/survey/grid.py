@@ -89,14 +89,6 @@ class Nodes:
 
 
 @frozen(eq=False)
-class Correction:
-    """What is known of corrections that were applied: covariance (L, 6, L, 6) of the total of each
-    line, in the order of line numbers and `PARAMETERS`."""
-
-    covariance: FloatArray
-
-
-@frozen(eq=False)
 class _Hypotheses:
     """Hypotheses (h,) sorted by node, and their looks (m,)."""
 
@@ -120,13 +112,14 @@ def grid_of_looks(
     cell: float,
     box: tuple[int, int, int, int],
     budget: ErrorBudget,
-    correction: Correction | None = None,
+    covariance: FloatArray | None = None,
     crossing_rms: float = 0.0,
 ) -> Nodes:
     """The nodes of a box (first column, first row, columns, rows) of cells of `cell` metres.
 
-    soundings: all of the box and of `HALO` cells around it. correction: of an adjustment, by line
-    number. crossing_rms: added to the uncertainty without one, m.
+    soundings: all of the box and of `HALO` cells around it. covariance (L, 6, L, 6): of the total
+    corrections that were applied, by line number and `PARAMETERS`. crossing_rms: added to the
+    uncertainty without them, m.
     """
     x0, y0, columns, rows = box
     # Nodes around the box are needed for the medians of the second pass.
@@ -153,8 +146,8 @@ def grid_of_looks(
     top, second, odds = _ranked(found, len(keys), found.score - 2.0 * np.log1p(off / (3.0 * wide)))
     inside = (ix >= x0) & (ix < x0 + columns) & (iy >= y0) & (iy < y0 + rows)
     variance = found.variance + crossing_rms**2
-    if correction is not None:
-        variance = variance + _of_corrections(found, correction)
+    if covariance is not None:
+        variance = variance + _of_corrections(found, covariance)
     return _nodes(found, ix, iy, inside, top, second, odds, np.sqrt(variance))
 
 
@@ -308,16 +301,16 @@ def _median_of_rows(values: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (ordered[row, (n - 1) // 2] + ordered[row, n // 2]))
 
 
-def _of_corrections(found: _Hypotheses, correction: Correction) -> FloatArray:
+def _of_corrections(found: _Hypotheses, covariance: FloatArray) -> FloatArray:
     """a' C a (h,): variance of each hypothesis by what is not known of the corrections."""
     from scipy.sparse import csr_array
 
-    L, K = correction.covariance.shape[0], len(PARAMETERS)
+    L, K = covariance.shape[0], len(PARAMETERS)
     values = found.look_weight[:, None] * found.look_partials
     columns = found.look_line[:, None] * K + np.arange(K)
     rows = np.repeat(found.look_hypothesis, K)
     a = csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(found.z), L * K))
-    half = a @ correction.covariance.reshape(L * K, L * K)
+    half = a @ covariance.reshape(L * K, L * K)
     return np.asarray(np.maximum((a.multiply(half)).sum(axis=1), 0.0)).ravel()
 
 

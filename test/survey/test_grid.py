@@ -23,7 +23,7 @@ from sonar_imm_tools.recordings.export.points import Points
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.simulation.survey import budget, scenario, simulate
 from sonar_imm_tools.survey.chart import chart_of, OF_ONE_RUN, write_geotiff
-from sonar_imm_tools.survey.grid import Correction, grid_of_looks
+from sonar_imm_tools.survey.grid import grid_of_looks
 from sonar_imm_tools.survey.line import budget_of, line_of
 
 BUDGET = budget()
@@ -126,7 +126,7 @@ def test_what_is_not_known_of_corrections_is_added():
     covariance = np.zeros((2, 6, 2, 6))
     covariance[0, 3, 0, 3], covariance[1, 3, 1, 3] = 0.09, 0.01
     covariance[0, 3, 1, 3] = covariance[1, 3, 0, 3] = 0.02
-    made = node(parts, correction=Correction(covariance))
+    made = node(parts, covariance=covariance)
     assert made.sd == pytest.approx([np.sqrt((OWN + HEAVE) / 2 + (0.09 + 0.01 + 0.04) / 4)])
     assert node(parts, crossing_rms=0.3).sd == pytest.approx([np.sqrt((OWN + HEAVE) / 2 + 0.09)])
 
