@@ -114,7 +114,6 @@ def command(
     from ..survey.jobs import Options
     from ..survey.making import epsg_of, make, Progress, sources_of
     from ..survey.products import folder_of, write
-    from ..survey.report import write_report
 
     require_parquet()
     sources = sources_of(runs)
@@ -141,7 +140,6 @@ def command(
             )
             survey = make(sources, out, options, run, heard)
         content = write(survey, out)
-        write_report(out, survey)
     failed = [line for line in content['lines'] if line['failure']]
     if as_json:
         print_json(content)

@@ -54,6 +54,8 @@ ROUNDS = 3
 BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
 DRIFT_SECONDS = 60.0
 """How long errors of heading and position last, which are considered only."""
+SECOND_ORDER = 0.04
+"""Share of a correction of sound speed that its partial misses, where the water has layers."""
 MOST_UNKNOWNS = 20_000
 ROWS_AT_ONCE = 200_000
 MOST_PARAMETERS = 1000
@@ -157,6 +159,9 @@ def adjust(
     # The last step moved no place by much: the equations of the last statistics are those of it.
     equations.reweight(value)
     covariance, information = equations.covariance(states)
+    # To first order only the mean over the column counts; what a second layer adds is common.
+    bent = np.where(unknowns.kind == 4, SECOND_ORDER * value, 0.0)
+    covariance = covariance + np.outer(bent, bent)
     return Adjustment(
         owner=unknowns.owner,
         kind=unknowns.kind,

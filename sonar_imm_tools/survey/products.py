@@ -37,7 +37,8 @@ from .adjustment import described, robust_rms
 from .chart import BANDS, Chart, values_of, write_geotiff
 from .grid import Nodes
 from .jobs import Options, TILE, Tile, write_json
-from .making import extent_of, Options, SURVEY, Survey, TILE, Tile, WORK
+from .making import extent_of, SURVEY, Survey, WORK
+from .report import write_report
 
 CHART, TILES, PROVENANCE, COVERAGE, ADJUSTMENT, CROSSINGS = (
     'survey.tif',
@@ -143,6 +144,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
     if survey.adjustment is not None:
         told = described(survey.adjustment, names)
     write_json(out / ADJUSTMENT, {**told, 'crossings': crossings})
+    write_report(out, survey, chart, told)
     options = survey.options
     content = {
         'version': __version__,

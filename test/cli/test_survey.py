@@ -17,6 +17,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 
 import numpy as np
@@ -38,6 +39,7 @@ PRODUCTS = (
     'coverage.geojson',
     'adjustment.json',
     'crossings.csv',
+    'report.html',
 )
 
 
@@ -137,6 +139,15 @@ def test_the_other_files_say_what_they_should(lines, made):
     assert survey['crs'] == {'epsg': None} and survey['options']['adjust'] is True
     coverage = json.loads((made / 'coverage.geojson').read_text())
     assert 'local' in coverage['name'] and coverage['features']
+
+
+def test_the_page_shows_chart_misties_and_what_is_not_known(made):
+    page = (made / 'report.html').read_text(encoding='utf-8')
+    for words in ('<h2>Depth', '<h2>Uncertainty', '<h2>Competing depths', '<h2>Misties'):
+        assert words in page
+    assert page.count('Plotly.newPlot(') >= 4 and 'What could not be told' in page
+    assert '4 lines with' in page and 'roll_deg' in page and 'offset_m line_000' in page
+    assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
 
 
 def test_the_same_bytes_with_two_processes(lines, made, tmp_path):
