@@ -77,7 +77,7 @@ def main(runs: int = 6) -> Parts:
 
 def survey(seed: int) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Errors of the corrections of a scene, and scores of its charts."""
-    scene = simulate(scenario('survey', {'ping_interval': 0.5}), seed)
+    scene = simulate(scenario('survey'), seed)
     lines = [line_of(points, budget()) for points in scene.points]
 
     def statistics(corrections: FloatArray) -> list[Looks]:

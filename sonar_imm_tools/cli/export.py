@@ -23,23 +23,10 @@ import click
 
 from sonar_imm.files import whole
 
-from .common import example, json_option, print_json, say
+from .common import example, json_option, place_options, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
-
-
-def coordinates(
-    _ctx: click.Context, _param: click.Parameter, value: str
-) -> tuple[float, float, float]:
-    try:
-        numbers = tuple(float(part) for part in value.split(','))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (2, 3):
-        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
-    x, y, z = (*numbers, 0.0)[:3]
-    return x, y, z
 
 
 @click.command(
@@ -53,20 +40,7 @@ def coordinates(
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
 @click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    '--crs',
-    '--epsg',
-    'epsg',
-    type=click.IntRange(min=1),
-    help='Coordinate system, by its EPSG number.',
-)
-@click.option(
-    '--origin',
-    default='0,0',
-    callback=coordinates,
-    metavar='X,Y[,Z]',
-    help='Coordinates in that system of the origin of the navigation.',
-)
+@place_options
 @click.option(
     '--cell',
     type=click.FloatRange(min=0.0, min_open=True),

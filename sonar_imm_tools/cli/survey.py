@@ -22,8 +22,7 @@ from pathlib import Path
 
 import click
 
-from .common import example, json_option, print_json, progress, say
-from .export import coordinates
+from .common import example, json_option, place_options, print_json, progress, say
 
 
 def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> float:
@@ -57,20 +56,7 @@ def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> flo
 )
 @click.option('--adjust', 'adjusted', is_flag=True, help='Adjust the lines where they cross.')
 @click.option('--fix', 'fixed', metavar='LINE', multiple=True, help='A line whose tide is known.')
-@click.option(
-    '--crs',
-    '--epsg',
-    'epsg',
-    type=click.IntRange(min=1),
-    help='Coordinate system, by its EPSG number.',
-)
-@click.option(
-    '--origin',
-    default='0,0',
-    callback=coordinates,
-    metavar='X,Y[,Z]',
-    help='Coordinates in that system of the origin of the navigation.',
-)
+@place_options
 @click.option(
     '--jobs', type=click.IntRange(min=1), default=1, show_default=True, help='Processes.'
 )

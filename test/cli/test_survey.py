@@ -155,6 +155,21 @@ def test_the_same_bytes_with_two_processes(lines, made, tmp_path):
     assert products(tmp_path / 'two') == products(made)
 
 
+def test_the_same_bytes_on_a_cluster(lines, made, tmp_path):
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=None,
+        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+        silence_logs='CRITICAL',
+    ) as there:
+        address = ('--scheduler', there.scheduler_address)
+        assert run('survey', lines, tmp_path / 'out', '--adjust', *address) == 0
+    assert products(tmp_path / 'out') == products(made)
+
+
 def test_names_of_lines_move_no_depth(lines, made, tmp_path):
     shutil.copytree(lines, tmp_path / 'runs')
     for k, name in enumerate(('d', 'b', 'c', 'a')):
