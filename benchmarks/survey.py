@@ -53,8 +53,8 @@ FLOORS = {
 }
 
 
-def main(runs: int = 6) -> Parts:
-    yield {'runs': runs}
+def main(runs: int = 6, interval: float = 1.0) -> Parts:
+    yield {'runs': runs, 'ping_interval': interval}
     for name, (terrain, slope, cell) in FLOORS.items():
         rows = [one_run(terrain, slope, cell, seed) for seed in range(runs)]
         worst = {
@@ -64,7 +64,7 @@ def main(runs: int = 6) -> Parts:
     adjusted: list[dict[str, float]] = []
     charts: dict[str, list[dict[str, float]]] = {}
     for seed in range(runs):
-        corrections, made = survey(seed)
+        corrections, made = survey(seed, interval)
         adjusted.append(corrections)
         for name, row in made.items():
             charts.setdefault(name, []).append(row)
@@ -75,9 +75,9 @@ def main(runs: int = 6) -> Parts:
         yield {'grid': {name: mean_of(rows)}}
 
 
-def survey(seed: int) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+def survey(seed: int, interval: float) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Errors of the corrections of a scene, and scores of its charts."""
-    scene = simulate(scenario('survey'), seed)
+    scene = simulate(scenario('survey', {'ping_interval': interval}), seed)
     lines = [line_of(points, budget()) for points in scene.points]
 
     def statistics(corrections: FloatArray) -> list[Looks]:
@@ -112,14 +112,14 @@ def survey(seed: int) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     true = [line.corrected(c) for line, c in zip(lines, scene.corrections)]
     moved = [line.corrected(c) for line, c in zip(lines, found.corrections)]
     covariance = found.of_lines(range(n))
-    for name, parts, C in (
-        ('adjusted', moved, covariance),
-        ('truth applied', true, None),
-        ('not adjusted', lines, None),
+    for name, parts, C, left in (
+        ('adjusted', moved, covariance, 0.0),
+        ('truth applied', true, None, 0.0),
+        ('not adjusted', lines, None, found.rms[0]),
     ):
         number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
         soundings = Soundings(joined_lines(parts), number)
-        charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, found.rms[0])
+        charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, left)
         whole = soundings.line
         x, y = whole.xy.T
         points = Points(whole.stamp_ns, {'x': x, 'y': y, 'z': whole.z})
@@ -140,8 +140,7 @@ def looks_scores(
     """Of the grid of looks over the middle."""
     first, last = MIDDLE
     box = (first, first, last - first, last - first)
-    rms_left = 0.0 if covariance is not None else crossing_rms
-    nodes = grid_of_looks(soundings, 1.0, box, errors, covariance, rms_left)
+    nodes = grid_of_looks(soundings, 1.0, box, errors, covariance, crossing_rms)
     place = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64)
     competing = float(np.mean(nodes.hypotheses > 1))
     return {**about_level(floor, place, nodes.z, nodes.sd), 'competing': competing}
