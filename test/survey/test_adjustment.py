@@ -101,6 +101,7 @@ def plain(monkeypatch):
     monkeypatch.setattr(module, 'REWEIGHTINGS', 1)
     monkeypatch.setattr(module, 'ROUNDS', 1)
     monkeypatch.setattr(module, 'NU', 1e12)
+    monkeypatch.setattr(module, 'SECOND_ORDER', 0.0)
 
 
 def test_states_are_generalized_least_squares(plain):
