@@ -60,6 +60,7 @@ FLOORS = {
     'sonar_imm_tools.replay': 8,
     'sonar_imm_tools.offline': 8,
     'sonar_imm_tools.evaluation': 9,
+    'sonar_imm_tools.survey': 9,
     'sonar_imm_tools.viewing': 10,
     'sonar_imm_tools.cli': 11,
 }

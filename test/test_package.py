@@ -72,10 +72,11 @@ PEERS = {
     'sonar_imm_tools.viewing.server': {'foxglove'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
-    'sonar_imm_tools.recordings.export.grid': {'rasterio'},
     'sonar_imm_tools.recordings.export.horizons': {'rasterio'},
     'sonar_imm_tools.recordings.export.picks': {'segyio'},
-    'sonar_imm_tools.recordings.export.points': {'laspy', 'rasterio'},
+    'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
+    'sonar_imm_tools.survey.chart': {'rasterio'},
+    'sonar_imm_tools.survey.products': {'pyarrow', 'rasterio'},
 }
 
 HEADER = """\

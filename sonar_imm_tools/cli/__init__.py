@@ -47,6 +47,7 @@ COMMANDS = {
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
+    'survey': 'Make one chart of many survey lines, adjusted where they cross.',
     'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',
     'echo': 'Show the estimates of running nodes as a live table.',

@@ -61,6 +61,38 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )
 
 
+def _coordinates(
+    _ctx: click.Context, _param: click.Parameter, value: str
+) -> tuple[float, float, float]:
+    try:
+        numbers = tuple(float(part) for part in value.split(','))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
+    x, y, z = (*numbers, 0.0)[:3]
+    return x, y, z
+
+
+def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--crs`` and ``--origin``: where the local frame lies."""
+    crs = click.option(
+        '--crs',
+        '--epsg',
+        'epsg',
+        type=click.IntRange(min=1),
+        help='Coordinate system, by its EPSG number.',
+    )
+    origin = click.option(
+        '--origin',
+        default='0,0',
+        callback=_coordinates,
+        metavar='X,Y[,Z]',
+        help='Coordinates in that system of the origin of the navigation.',
+    )
+    return crs(origin(function))
+
+
 def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--set name=value``, may be repeated."""
     return pairs_option(

@@ -23,23 +23,10 @@ import click
 
 from sonar_imm.files import whole
 
-from .common import example, json_option, print_json, say
+from .common import example, json_option, place_options, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
-
-
-def _numbers(
-    _ctx: click.Context, _param: click.Parameter, value: str
-) -> tuple[float, float, float]:
-    try:
-        numbers = tuple(float(part) for part in value.split(','))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (2, 3):
-        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
-    x, y, z = (*numbers, 0.0)[:3]
-    return x, y, z
 
 
 @click.command(
@@ -53,14 +40,7 @@ def _numbers(
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
 @click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
-@click.option('--epsg', type=click.IntRange(min=1), help='Coordinate system, by its EPSG number.')
-@click.option(
-    '--origin',
-    default='0,0',
-    callback=_numbers,
-    metavar='X,Y[,Z]',
-    help='Coordinates in that system of the origin of the navigation.',
-)
+@place_options
 @click.option(
     '--cell',
     type=click.FloatRange(min=0.0, min_open=True),
@@ -90,15 +70,17 @@ def command(
 
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
     its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
-    depth, uncertainty, label and count); they come from recordings with navigation. Horizons of
-    the fathometer: .csv (picks by horizon), .geojson (points along the track), .sgy, .segy or .seg
-    (the file given by --segy with picks in place of its samples). Where the recording has no fixes
-    by satellite, the places of horizons come from its navigation, with --epsg and --origin.
+    depth, uncertainty, label, count and what competes with the depth); they come from recordings
+    with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
+    the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
+    Where the recording has no fixes by satellite, the places of horizons come from its navigation,
+    with --crs and --origin.
     """
     from ..offline.run_folder import RunFolder, SOUNDINGS
-    from ..recordings.export.grid import grid_of, write_geotiff
     from ..recordings.export.points import read_points, write_las, write_xyz
     from ..recordings.sources import BagError
+    from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
+    from ..survey.line import budget_of
 
     kind = out.suffix.lower().lstrip('.')
     if kind not in FORMATS + HORIZON_FORMATS:
@@ -119,9 +101,9 @@ def command(
     result: dict[str, Any] = {'out': str(out), 'soundings': len(points)}
     with whole(out) as unfinished:
         if kind == 'tif':
-            grid = grid_of(points, cell)
-            write_geotiff(unfinished, grid, epsg)
-            result |= {'rows': grid.height.shape[0], 'columns': grid.height.shape[1]}
+            chart = chart_of(points, cell, *budget_of(record))
+            write_geotiff(unfinished, chart, epsg, OF_ONE_RUN)
+            result |= dict(zip(('rows', 'columns'), chart.shape))
         elif kind == 'xyz':
             write_xyz(unfinished, points)
         else:

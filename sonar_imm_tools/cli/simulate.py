@@ -28,14 +28,18 @@ from sonar_imm.trackers import SYSTEMS
 
 from .common import example, json_option, print_json, say, set_option, typed_overrides
 
+SURVEY, SURVEY_SCENES = 'survey', 'sonar_imm_tools.simulation.survey'
+"""Not a system: lines of soundings over one floor."""
+
 
 @click.command(
     epilog=example(
         'sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
         'sonar-imm simulate diver --list',
+        'sonar-imm simulate survey out --soundings --set lines=5',
     )
 )
-@click.argument('system', type=click.Choice(list(SYSTEMS)))
+@click.argument('system', type=click.Choice([*SYSTEMS, SURVEY]))
 @click.argument('out_bag', type=click.Path(path_type=Path), required=False)
 @click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
 @click.option(
@@ -46,6 +50,9 @@ from .common import example, json_option, print_json, say, set_option, typed_ove
     help='The same scenario and seed give the same bag.',
 )
 @set_option
+@click.option(
+    '--soundings', is_flag=True, help='survey: folders of soundings, as `survey` reads them.'
+)
 @click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
 @click.option(
     '--list',
@@ -60,17 +67,27 @@ def command(
     scenario: str | None,
     seed: int,
     overrides: dict[str, str],
+    soundings: bool,
     compress: bool,
     list_scenarios: bool,
     as_json: bool,
 ) -> None:
-    """Write a bag of simulated measurements with their truth to OUT_BAG."""
-    scenes = import_module(SYSTEMS[system].scenes)
+    """Write a bag of simulated measurements with their truth to OUT_BAG.
+
+    SYSTEM `survey` is many lines over one floor: with --soundings OUT_BAG is a folder of lines,
+    each a folder with soundings.csv, and truth.npz.
+    """
+    if soundings and system != SURVEY:
+        raise click.UsageError(f'--soundings is for {SURVEY}')
+    scenes = import_module(SYSTEMS[system].scenes if system != SURVEY else SURVEY_SCENES)
     if list_scenarios:
         _list(scenes, as_json)
         return
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
+    if system == SURVEY:
+        _simulate_survey(scenes, out_bag, scenario, seed, overrides, soundings, as_json)
+        return
     from sonar_imm.truth import TrueTrack
 
     from ..recordings.own_files import own_parameters, unusual
@@ -113,6 +130,43 @@ def command(
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  parameters of the instruments, for the tracker: {parameters}')
+
+
+def _simulate_survey(
+    scenes: Any,
+    out: Path,
+    scenario: str | None,
+    seed: int,
+    overrides: dict[str, str],
+    soundings: bool,
+    as_json: bool,
+) -> None:
+    """Folders of lines and truth.npz."""
+    from sonar_imm.files import whole
+
+    from ..recordings.export.points import write_table
+    from ..recordings.sources import BagError
+
+    if not soundings:
+        raise click.UsageError('a survey is simulated as soundings: say --soundings')
+    name = scenario or next(iter(scenes.SCENARIOS))
+    config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))
+    if out.exists():
+        raise BagError(f'{out} is there already; choose another folder')
+    scene = scenes.simulate(config, seed)
+    with whole(out) as folder:
+        folder.mkdir()
+        for line, points in zip(scene.names, scene.points):
+            (folder / line).mkdir()
+            write_table(folder / line / 'soundings.csv', points)
+        scenes.write_truth(folder / 'truth.npz', scene)
+    total = sum(len(points) for points in scene.points)
+    result = {'out': str(out), 'scenario': name, 'seed': seed, 'lines': len(scene.names)}
+    result['soundings'] = total
+    if as_json:
+        print_json(result)
+    else:
+        say(f'{out}: {len(scene.names)} lines, {total} soundings ({name}, seed {seed})')
 
 
 def _list(scenes: Any, as_json: bool) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import as_completed, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
 import multiprocessing
@@ -42,17 +42,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     Raises OSError when one of them dies, or where there is no shared memory (/dev/shm). They are
     started anew and not forked: a fork copies the threads of a library half.
     """
-    try:
-        pool = ProcessPoolExecutor(
-            count,
-            mp_context=multiprocessing.get_context('spawn'),
-            initializer=ignore_interrupt,
-        )
-    except (OSError, ImportError, NotImplementedError) as error:  # Python has three ways to say it
-        raise OSError(
-            f'processes cannot share work here ({error}): is there a /dev/shm? with --jobs 1 '
-            'there is only one'
-        ) from None
+    pool = _fresh(count)
     try:
         yield pool
     except BrokenProcessPool:
@@ -64,6 +54,103 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     pool.shutdown()
+
+
+def _fresh(count: int) -> ProcessPoolExecutor:
+    try:
+        return ProcessPoolExecutor(
+            count,
+            mp_context=multiprocessing.get_context('spawn'),
+            initializer=ignore_interrupt,
+        )
+    except (OSError, ImportError, NotImplementedError) as error:  # Python has three ways to say it
+        raise OSError(
+            f'processes cannot share work here ({error}): is there a /dev/shm? with --jobs 1 '
+            'there is only one'
+        ) from None
+
+
+Run = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[tuple[int, Any, str]]]
+"""``run(work, calls)``: as they end, the number of each call, what came of it, and the sentence
+why nothing did."""
+
+
+@contextlib.contextmanager
+def workers(
+    count: int = 1,
+    address: str | None = None,
+    note: Callable[[str], None] = lambda sentence: None,
+) -> Iterator[Run]:
+    """What runs calls in this process, in `count` processes, or on a dask cluster.
+
+    A process that dies costs what it was doing: the rest is done by others, and so is that, a
+    second time by itself. Raises as `cluster` does.
+    """
+    if address is not None:
+        with cluster(address, note) as client:
+            yield lambda work, calls: as_they_end(client, work, calls)
+    elif count == 1:
+        yield _in_turn
+    else:
+        with _Pool(count) as pool:
+            yield pool.run
+
+
+def _in_turn(
+    work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, Any, str]]:
+    for k, call in enumerate(calls):
+        try:
+            result = work(*call)
+        except Exception as error:
+            yield k, None, sentence_of(error)
+        else:
+            yield k, result, ''
+
+
+class _Pool:
+    """Processes that are started again when one of them dies."""
+
+    def __init__(self, count: int):
+        self._count = count
+        self._executor: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> _Pool:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(wait=error[0] is None, cancel_futures=True)
+
+    def run(
+        self, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any, str]]:
+        left = dict(enumerate(calls))
+        yield from self._some(work, left)
+        for k in list(left):  # those that were under way or not begun when a process died
+            alone = {k: left.pop(k)}
+            yield from self._some(work, alone)
+            if alone:
+                yield k, None, 'the process that did it was ended, perhaps for lack of memory'
+
+    def _some(
+        self, work: Callable[..., Any], left: dict[int, tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any, str]]:
+        """Do what is `left`, and take away what was done, until a process dies."""
+        if self._executor is None:
+            self._executor = _fresh(self._count)
+        try:
+            futures = {self._executor.submit(work, *call): k for k, call in left.items()}
+            for future in as_completed(futures):
+                error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    raise error
+                del left[futures[future]]
+                result = None if error else future.result()
+                yield futures[future], result, sentence_of(error) if error else ''
+        except BrokenProcessPool:
+            self._executor.shutdown(wait=False, cancel_futures=True)
+            self._executor = None
 
 
 def ignore_interrupt() -> None:
@@ -115,10 +202,10 @@ def as_they_end(
     """``work(*call)`` for each of `calls` on the workers of a dask client: the number of the call,
     what came of it, and the sentence why nothing did. A worker may have died, or the scheduler be
     gone."""
-    from distributed import as_completed
+    from distributed import as_completed as ended
 
     futures = {client.submit(work, *call, pure=False): k for k, call in enumerate(calls)}
-    for future in as_completed(futures):
+    for future in ended(futures):
         if future.cancelled():
             yield futures[future], None, 'the connection to the scheduler was lost'
         elif (error := future.exception()) is not None:

@@ -16,9 +16,10 @@
 
 from multiprocessing import synchronize
 
+from helpers.dying import work
 import pytest
 
-from sonar_imm_tools.offline.jobs import processes
+from sonar_imm_tools.offline.jobs import processes, workers
 
 
 @pytest.mark.parametrize('error', [FileNotFoundError(2, 'No such file'), OSError(38, 'Not there')])
@@ -31,3 +32,21 @@ def test_without_shared_memory_there_is_a_sentence_that_helps(monkeypatch, error
     monkeypatch.setattr(synchronize.SemLock, '__init__', refused)
     with pytest.raises(OSError, match='--jobs 1'), processes(2):
         pass
+
+
+def test_a_process_that_dies_costs_its_call_only(tmp_path):
+    with workers(2) as run:
+        found = {
+            k: (result, failure)
+            for k, result, failure in run(work, [(tmp_path, k) for k in range(6)])
+        }
+        again = list(run(work, [(tmp_path, 5)]))
+    assert {k: found[k] for k in (0, 1, 2, 5)} == {k: (k * k, '') for k in (0, 1, 2, 5)}
+    assert 'was ended' in found[3][1] and 'not this one' in found[4][1]
+    assert again == [(0, 25, '')]
+
+
+def test_one_process_does_calls_in_turn(tmp_path):
+    with workers() as run:
+        found = list(run(work, [(tmp_path, 1), (tmp_path, 4)]))
+    assert found == [(0, 1, ''), (1, None, 'ValueError: not this one')]

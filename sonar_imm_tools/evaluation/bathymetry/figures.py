@@ -32,8 +32,9 @@ from sonar_imm.trackers.bathymetry.likelihood import spacing_of
 
 from ... import SECOND
 from ...offline.run_folder import read_measurements, SOUNDINGS
-from ...recordings.export.grid import EMPTY_LABEL, Grid, grid_of
 from ...recordings.export.points import Points, read_points
+from ...survey.chart import Chart, chart_of
+from ...survey.line import budget_of
 from ..plotting import (
     add_band,
     add_image,
@@ -65,7 +66,7 @@ def sections(run: Mapping[str, Any], folder: Path, swath: Swath) -> Iterator[Sec
     if swath.profiles:
         yield from _of_pings(run, swath)
     if (points := points_of(folder)) is not None:
-        grid = chart_of(points)
+        grid = finest_chart(points, run)
         yield Section(
             'Chart',
             f'{len(points)} soundings in cells of {grid.cell:g} m, as `sonar-imm export` writes '
@@ -259,27 +260,23 @@ def track_of(run: Mapping[str, Any]) -> FloatArray:
     return track[thin(len(track), MOST_POSES)]
 
 
-def chart_of(points: Points) -> Grid:
-    """The grid of the chart, with cells as small as fit."""
+def finest_chart(points: Points, run: Mapping[str, Any]) -> Chart:
+    """The chart of a run, with cells as small as fit."""
     extent = max(np.ptp(points['x']), np.ptp(points['y']))
     cell = next((c for c in CELLS if extent / c <= MOST_CELLS), math.ceil(extent / MOST_CELLS))
-    return grid_of(points, float(cell))
+    return chart_of(points, float(cell), *budget_of(run))
 
 
-def chart_figure(grid: Grid, track: FloatArray) -> go.Figure:
+def chart_figure(grid: Chart, track: FloatArray) -> go.Figure:
     """Height of the floor in the grid, north up, and the track of the ship."""
-    rows, columns = grid.height.shape
+    rows, columns = grid.shape
     figure = go.Figure()
     figure.add_heatmap(
         x=grid.west + grid.cell * (np.arange(columns) + 0.5),
         y=grid.north - grid.cell * (np.arange(rows) + 0.5),
-        z=grid.height.astype(np.float32),
+        z=-grid.bands['depth'].astype(np.float32),
         customdata=np.dstack(
-            [
-                grid.uncertainty.astype(np.float32),
-                np.where(grid.label == EMPTY_LABEL, np.nan, grid.label).astype(np.float32),
-                grid.count,
-            ]
+            [grid.bands[name].astype(np.float32) for name in ('uncertainty', 'label', 'count')]
         ),
         colorscale='Viridis',
         colorbar={'title': 'z [m]'},

@@ -64,8 +64,11 @@ class Points:
 
 
 def read_points(path: Path) -> Points:
-    """The soundings of a soundings.csv. Raises `BagError` for a file that is none."""
+    """The soundings of a soundings.csv or soundings.parquet, which needs pyarrow. Raises
+    `BagError` for a file that is none."""
     wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
+    if path.suffix == '.parquet':
+        return _read_parquet(path, wanted)
     try:
         with path.open(encoding='utf-8', newline='') as file:
             reader = csv.reader(file)
@@ -84,9 +87,43 @@ def read_points(path: Path) -> Points:
         }
     except (ValueError, IndexError):
         raise BagError(f'{path} has a row that is not numbers throughout') from None
+    return _exact(stamps, columns)
+
+
+def _read_parquet(path: Path, wanted: list[str]) -> Points:
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(path)
+    except (OSError, pyarrow.ArrowException) as error:
+        sentence = ' '.join(str(error).split())
+        raise BagError(f'{path} cannot be read: {sentence}') from None
+    if missing := [name for name in wanted if name not in table.column_names]:
+        raise BagError(f'{path} has no column {" and ".join(missing)}')
+    columns = {
+        name: table[name].to_numpy().astype(np.float64)
+        for name in COLUMNS
+        if name in table.column_names
+    }
+    return _exact(table['stamp_ns'].to_numpy().astype(np.int64), columns)
+
+
+def _exact(stamps: IntArray, columns: dict[str, FloatArray]) -> Points:
     for name, exact in zip('xyz', PLACES):
         columns[name] = columns.pop(exact, columns[name])  # older tables have the coarse ones only
     return Points(stamps, columns)
+
+
+def write_table(path: Path, points: Points) -> None:
+    """Points as a soundings.csv, their places exact in px py pz and coarse in x y z."""
+    exact = dict(zip(PLACES, 'xyz'))
+    names = list(COLUMNS)
+    values = [points[exact.get(name, name)].astype(COLUMNS[name]).tolist() for name in names]
+    with path.open('w', encoding='utf-8', newline='') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(['stamp_ns', *names])
+        writer.writerows(zip(points.stamp_ns.tolist(), *values))
 
 
 def write_xyz(path: Path, points: Points) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from sonar_imm.estimates import PLACES
 from sonar_imm.soundings import COLUMNS
-from sonar_imm_tools.recordings.export.grid import grid_of, write_geotiff
 from sonar_imm_tools.recordings.export.points import Points, read_points, write_las, write_xyz
 from sonar_imm_tools.recordings.sources import BagError
 
@@ -64,72 +63,6 @@ def test_las_is_read_by_laspy(tmp_path, name):
     if name.endswith('laz'):
         write_las(tmp_path / 'b.las', one, 32632)
         assert (tmp_path / name).stat().st_size < (tmp_path / 'b.las').stat().st_size
-
-
-def brute_force(one, grid, row, column):
-    west, north = grid.west + column * grid.cell, grid.north - row * grid.cell
-    inside = (one['x'] >= west) & (one['x'] < west + grid.cell)
-    inside &= (one['y'] < north) & (one['y'] >= north - grid.cell)
-    return inside
-
-
-def test_each_cell_is_the_weighted_mean_of_its_soundings():
-    one = points()
-    grid = grid_of(one, 2.5)
-    assert grid.count.sum() == len(one)
-    for row, column in np.ndindex(grid.height.shape):
-        inside = brute_force(one, grid, row, column)
-        assert grid.count[row, column] == inside.sum()
-        if not inside.any():
-            assert np.isnan(grid.height[row, column]) and grid.label[row, column] == 255
-            continue
-        v = one['vertical_uncertainty'][inside]
-        mean = np.average(one['z'][inside], weights=1.0 / v)
-        assert grid.height[row, column] == pytest.approx(mean)
-        share = one['label'][inside].mean()
-        if share != 0.5:
-            assert grid.label[row, column] == round(share)
-        pings = len(set(one.stamp_ns[inside]))
-        assert grid.uncertainty[row, column] >= np.sqrt(v.min() / pings) * (1 - 1e-12)
-
-
-def test_soundings_of_one_ping_share_their_errors():
-    """A thousand soundings of one ping do not make its attitude better known."""
-    n = 1000
-    columns = {name: np.zeros(n) for name in COLUMNS} | {'vertical_uncertainty': np.full(n, 0.04)}
-    one = grid_of(Points(np.full(n, 5), columns), 1.0)
-    four = grid_of(Points(np.arange(n) % 4, columns), 1.0)
-    assert one.uncertainty == pytest.approx(0.2) and four.uncertainty == pytest.approx(0.1)
-
-
-def test_geotiff_is_read_by_rasterio_north_up_in_its_crs(tmp_path):
-    rasterio = pytest.importorskip('rasterio')
-    one = points().moved((500_000.0, 6_000_000.0, 0.0))
-    grid = grid_of(one, 1.0)
-    write_geotiff(tmp_path / 'g.tif', grid, 32632)
-    with rasterio.open(tmp_path / 'g.tif') as file:
-        assert file.crs.to_epsg() == 32632 and np.isnan(file.nodata)
-        assert file.descriptions == ('depth', 'uncertainty', 'label', 'count')
-        depth, uncertainty, label, count = file.read()
-        k = 17
-        row, column = file.index(one['x'][k], one['y'][k])
-        inside = brute_force(one, grid, row, column)
-        assert inside[k] and count[row, column] == inside.sum()
-        assert depth[row, column] == pytest.approx(-grid.height[row, column], rel=1e-6)
-        # The floor rises to the east: so do the columns.
-        assert np.nanmean(depth[:, 0]) > np.nanmean(depth[:, -1]) + 1.5
-        assert np.isnan(depth[count == 0]).all() and np.isnan(label[count == 0]).all()
-        assert np.isfinite(uncertainty[count > 0]).all()
-
-
-def test_what_cannot_be_done_is_said_in_a_sentence(tmp_path):
-    with pytest.raises(BagError, match='no soundings'):
-        grid_of(Points(np.zeros(0, np.int64), {name: np.zeros(0) for name in COLUMNS}), 1.0)
-    with pytest.raises(BagError, match='too large'):
-        grid_of(points(), 1e-4)
-    pytest.importorskip('rasterio')
-    with pytest.raises(BagError, match='EPSG number 1'):
-        write_geotiff(tmp_path / 'g.tif', grid_of(points(), 1.0), 1)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,489 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Crossing adjustment: what lines that see the same floor say of each other's errors.
+
+Unknowns are corrections, true less reported: roll, pitch and heading (latency when asked for) of
+the survey; offset, speed of sound and a little roll of each line. Every look (what a line sees of
+a cell with one side) is a height; the height of the cell itself is eliminated, so that only cells
+with two lines or more say anything. The prior holds the totals, not the steps of a round, and it
+alone knows the common level.
+
+Errors of attitude and heave last for seconds. As *error states*, roll and heave in blocks of ten
+seconds, they are unknowns of the estimate, in one sparse factorization. Beside it stands the
+*consider* covariance of the estimate without states,
+
+    C = N^-1 (J' M V M J + J' M U S U' M J + P) N^-1,
+
+J the partials, M the weights after elimination, V the variances of looks, U the blocks with their
+budget S, P the prior information. The larger standard deviation of both is published.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import math
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.sparse import csc_array, csr_array, diags_array, hstack
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from sonar_imm.acoustics.sounding import ErrorBudget
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+
+from .line import PARAMETERS, partials
+from .looks import gradients, joined, Looks, MAD, runs_of
+
+NU, REWEIGHTINGS = 4.0, 8
+ROUNDS = 3
+BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
+DRIFT_SECONDS = 60.0
+"""How long errors of heading and position last, which are considered only."""
+SECOND_ORDER = 0.04
+"""Share of a correction of sound speed that its partial misses, where the water has layers."""
+MOST_UNKNOWNS = 20_000
+ROWS_AT_ONCE = 200_000
+MOST_PARAMETERS = 1000
+"""Above it the covariance with states is not worked out: the consider covariance stands alone."""
+FIXED = 1e-3
+"""Standard deviation of the offset of a line whose tide is known, m."""
+UNITS = ('roll_deg', 'pitch_deg', 'heading_deg', 'offset_m', 'sound_speed_m_s', 'latency_s')
+SCALE = np.array([math.degrees(1.0)] * 3 + [1.0] * 3)
+"""From `PARAMETERS` to `UNITS`."""
+
+
+@frozen(kw_only=True)
+class Priors:
+    """Standard deviations of corrections: of the survey, of a line. latency 0: not free."""
+
+    roll: float = math.radians(2.0)
+    pitch: float = math.radians(2.0)
+    heading: float = math.radians(3.0)
+    latency: float = 0.0
+    line_offset: float = 0.5
+    line_sound_speed: float = 5.0
+    line_roll: float = math.radians(0.02)
+
+
+@frozen(eq=False)
+class Adjustment:
+    """What came of it. P unknowns: of the survey first, then those of each line.
+
+    owner (P,): number of the line, -1 the survey; kind (P,): index into `PARAMETERS`; value, std,
+    prior_std (P,); covariance (P, P); information (P, P) of the data alone; corrections (L, 6):
+    total of each line; cells: how many have two lines; rms: of looks about their cells, robust,
+    before the first round and after each.
+    """
+
+    owner: IntArray
+    kind: IntArray
+    value: FloatArray
+    std: FloatArray
+    prior_std: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    corrections: FloatArray
+    cells: int
+    rms: tuple[float, ...]
+    groups: int
+
+    def known_share(self) -> FloatArray:
+        """`told` of each unknown (P,): the share of the prior variance that is gone."""
+        return np.asarray(1.0 - np.square(self.std / self.prior_std))
+
+    def of_lines(self, lines: Sequence[int]) -> FloatArray:
+        """Covariance (L, 6, L, 6) of the total corrections of some lines."""
+        T = _totals(self.owner, self.kind, lines)
+        K = len(PARAMETERS)
+        full = T @ (T @ self.covariance).T
+        return np.asarray(full).reshape(len(lines), K, len(lines), K)
+
+    def not_known(self) -> list[tuple[FloatArray, float]]:
+        """Combinations (P,) of unknowns, in their priors, of which the data say less than the
+        prior does, and the share of the prior variance that stays; the least known first."""
+        scaled = self.information * np.outer(self.prior_std, self.prior_std)
+        values, vectors = eigh(scaled, subset_by_value=(-np.inf, 1.0))
+        return [
+            (vectors[:, k] * np.sign(vectors[np.argmax(np.abs(vectors[:, k])), k]), float(share))
+            for k, share in enumerate(1.0 / (1.0 + np.maximum(values, 0.0)))
+        ]
+
+
+def adjust(
+    statistics: Callable[[FloatArray], Sequence[Looks]],
+    count: int,
+    budget: ErrorBudget,
+    priors: Priors | None = None,
+    fixed: Sequence[int] = (),
+    sound_speed: float = 1500.0,
+    states: bool = True,
+    note: Callable[[int, float], None] = lambda number, rms: None,
+) -> Adjustment:
+    """Adjust `count` lines in three rounds.
+
+    statistics: the looks of each line, at places corrected by (L, 6). fixed: lines whose offset is
+    known to be 0. note: called after each round with its number and the rms of looks.
+    Raises ValueError where no two lines see the same cell.
+    """
+    unknowns = _Unknowns.of(count, priors or Priors(), fixed)
+    corrections = np.zeros((count, len(PARAMETERS)))
+    history: list[float] = []
+    for number in range(ROUNDS + 1):
+        looks, g, cell, cells = crossing(joined(statistics(corrections)))
+        if not cells:
+            raise ValueError('no two lines overlap')
+        equations = _Equations(looks, g, cell, cells, unknowns, corrections, budget, sound_speed)
+        history.append(equations.rms())
+        if number == ROUNDS:
+            break
+        if number:
+            note(number, history[-1])
+        value = equations.solve(states)
+        corrections = unknowns.totals(value)
+    note(ROUNDS, history[-1])
+    # The last step moved no place by much: the equations of the last statistics are those of it.
+    equations.reweight(value)
+    covariance, information = equations.covariance(states)
+    # To first order only the mean over the column counts; what a second layer adds is common.
+    bent = np.where(unknowns.kind == 4, SECOND_ORDER * value, 0.0)
+    covariance = covariance + np.outer(bent, bent)
+    return Adjustment(
+        owner=unknowns.owner,
+        kind=unknowns.kind,
+        value=value,
+        std=np.sqrt(np.diag(covariance)),
+        prior_std=unknowns.prior_std,
+        covariance=covariance,
+        information=information,
+        corrections=corrections,
+        cells=cells,
+        rms=tuple(history),
+        groups=groups_of(looks, cell, count),
+    )
+
+
+def crossing(looks: Looks) -> tuple[Looks, FloatArray, IntArray, int]:
+    """The looks in cells that two lines or more see, with gradients (m, 2), the number of the cell
+    of each, and how many cells there are."""
+    if not len(looks):
+        return looks, np.zeros((0, 2)), np.zeros(0, np.int64), 0
+    starts, counts, group = runs_of(looks.ix, looks.iy)
+    least = np.minimum.reduceat(looks.line, starts)
+    most = np.maximum.reduceat(looks.line, starts)
+    shared = least < most
+    rows = shared[group]
+    if not rows.any():
+        return looks.chosen(rows), np.zeros((0, 2)), np.zeros(0, np.int64), 0
+    g = gradients(looks, looks.ix[starts][shared], looks.iy[starts][shared])
+    cell = (np.cumsum(shared) - 1)[group[rows]]
+    return looks.chosen(rows), g[cell], cell, int(shared.sum())
+
+
+def groups_of(looks: Looks, cell: IntArray, count: int) -> int:
+    """How many groups of lines there are that do not overlap each other."""
+    see = csr_array((np.ones(len(cell)), (cell, looks.line)), shape=(cell.max() + 1, count))
+    return int(connected_components(see.T @ see, directed=False)[0])
+
+
+def misties(looks: Looks) -> Iterator[tuple[int, int, FloatArray]]:
+    """Of each pair of lines that share cells: their numbers and the differences of their heights,
+    first less second."""
+    looks, g, cell, cells = crossing(looks)
+    if not cells:
+        return
+    starts, _, group = runs_of(cell, looks.line)
+    weight = 1.0 / looks.variances(g)
+    total = np.add.reduceat(weight, starts)
+    z = np.add.reduceat(weight * looks.heights(g), starts) / total
+    cell, line = cell[starts], looks.line[starts]
+    first, second, apart = [], [], []
+    for step in range(1, int(np.bincount(cell).max())):
+        pairs = np.flatnonzero(cell[step:] == cell[:-step])
+        first.append(line[pairs])
+        second.append(line[pairs + step])
+        apart.append(z[pairs] - z[pairs + step])
+    a, b, d = np.concatenate(first), np.concatenate(second), np.concatenate(apart)
+    order = np.lexsort((b, a))
+    a, b, d = a[order], b[order], d[order]
+    starts, counts, _ = runs_of(a, b)
+    for start, n in zip(starts.tolist(), counts.tolist()):
+        yield int(a[start]), int(b[start]), d[start : start + n]
+
+
+def robust_rms(values: FloatArray) -> float:
+    """1.4826 times the median magnitude; NaN for none."""
+    return float(MAD * np.median(np.abs(values))) if len(values) else math.nan
+
+
+def _totals(owner: IntArray, kind: IntArray, lines: Sequence[int]) -> csr_array:
+    """The matrix (6 L, P) from unknowns to the total corrections of lines."""
+    place = {number: row for row, number in enumerate(lines)}
+    rows, columns = [], []
+    for column, (line, what) in enumerate(zip(owner.tolist(), kind.tolist())):
+        for row in range(len(lines)) if line < 0 else [place[line]] if line in place else []:
+            rows.append(row * len(PARAMETERS) + what)
+            columns.append(column)
+    shape = len(lines) * len(PARAMETERS), len(owner)
+    return csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+
+
+@frozen(eq=False)
+class _Unknowns:
+    """Which unknowns there are: see `Adjustment`."""
+
+    owner: IntArray
+    kind: IntArray
+    prior_std: FloatArray
+    count: int
+
+    @classmethod
+    def of(cls, count: int, priors: Priors, fixed: Sequence[int]) -> _Unknowns:
+        survey = [(0, priors.roll), (1, priors.pitch), (2, priors.heading), (5, priors.latency)]
+        line = [(3, priors.line_offset), (4, priors.line_sound_speed), (0, priors.line_roll)]
+        rows = [(-1, kind, std) for kind, std in survey if std > 0.0]
+        rows += [(k, kind, std) for k in range(count) for kind, std in line]
+        owner, kind, std = (np.array(column) for column in zip(*rows))
+        std[(kind == 3) & np.isin(owner, list(fixed))] = FIXED
+        return cls(owner.astype(np.int64), kind.astype(np.int64), std, count)
+
+    def totals(self, value: FloatArray) -> FloatArray:
+        """Total corrections (L, 6) of the lines."""
+        T = _totals(self.owner, self.kind, range(self.count))
+        return np.asarray(T @ value).reshape(self.count, len(PARAMETERS))
+
+
+class _Equations:
+    """Heights of looks as equations of the unknowns, at one round's places."""
+
+    def __init__(
+        self,
+        looks: Looks,
+        g: FloatArray,
+        cell: IntArray,
+        cells: int,
+        unknowns: _Unknowns,
+        corrections: FloatArray,
+        budget: ErrorBudget,
+        sound_speed: float,
+    ):
+        self.looks, self.g, self.unknowns, self.budget = looks, g, unknowns, budget
+        self.a = partials(looks.basis, g, sound_speed)
+        self.J = self._jacobian()
+        rows = np.arange(len(looks))
+        self.in_cell = csr_array((np.ones(len(looks)), (cell, rows)), shape=(cells, len(looks)))
+        self.cell = cell
+        # As the sounding was reported: the prior holds the total, not what this round adds.
+        self.y = looks.heights(g) - (self.a * corrections[looks.line]).sum(axis=1)
+        self.now = looks.heights(g)
+        self.v = looks.variances(g)
+        self.w = 1.0 / self.v
+
+    def _jacobian(self) -> csr_array:
+        known, line = self.unknowns, self.looks.line
+        survey = np.flatnonzero(known.owner < 0)
+        m, k = len(line), len(survey)
+        values = np.column_stack([self.a[:, known.kind[survey]], self.a[:, [3, 4, 0]]])
+        columns = np.empty((m, k + 3), np.int64)
+        columns[:, :k] = survey
+        columns[:, k:] = k + 3 * line[:, None] + np.arange(3)
+        pointers = np.arange(0, m * (k + 3) + 1, k + 3)
+        return csr_array((values.ravel(), columns.ravel(), pointers), shape=(m, len(known.owner)))
+
+    def rms(self) -> float:
+        """Of looks about the weighted means of their cells, robust."""
+        return robust_rms(self._off_cell(self.now))
+
+    def _off_cell(self, z: FloatArray) -> FloatArray:
+        mean = (self.in_cell @ (self.w * z)) / (self.in_cell @ self.w)
+        return np.asarray(z - mean[self.cell])
+
+    def reweight(self, value: FloatArray) -> None:
+        """Student weights of the residuals at a solution."""
+        u = self._off_cell(self.y + self.J @ value) / np.sqrt(self.v)
+        self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
+
+    def normal(self, J: csr_array) -> tuple[csc_array, FloatArray]:
+        """Information (k, k) and right-hand side (k,) of the unknowns of J, heights of cells
+        eliminated."""
+        WJ = diags_array(self.w) @ J
+        K = (self.in_cell @ WJ).tocsr()
+        weight = self.in_cell @ self.w
+        N = J.T @ WJ - K.T @ (diags_array(1.0 / weight) @ K)
+        rhs = K.T @ ((self.in_cell @ (self.w * self.y)) / weight) - WJ.T @ self.y
+        return N.tocsc(), np.asarray(rhs)
+
+    def states(self, seconds: float) -> tuple[csr_array, FloatArray]:
+        """Columns (m, S) of roll and heave in blocks of each line, and the prior information."""
+        block, count = self._blocks(seconds)
+        rows = np.arange(len(block))
+        shape = len(block), count
+        roll = csr_array((self.a[:, 0], (rows, block)), shape=shape)
+        heave = csr_array((np.ones(len(block)), (rows, block)), shape=shape)
+        prior = np.repeat([self.budget.attitude, self.budget.heave], count)
+        return hstack([roll, heave]).tocsr(), 1.0 / np.square(np.maximum(prior, 1e-9))
+
+    def _blocks(self, seconds: float) -> tuple[IntArray, int]:
+        key = self.looks.line * (1 << 40) + np.floor(self.looks.time / seconds).astype(np.int64)
+        found, block = np.unique(key, return_inverse=True)
+        return block, len(found)
+
+    def _affordable(self) -> float:
+        """Seconds of a block with which the unknowns are few enough, 0 for none."""
+        seconds = BLOCK_SECONDS
+        while 2 * self._blocks(seconds)[1] + len(self.unknowns.owner) > MOST_UNKNOWNS:
+            seconds *= 2.0
+            if seconds > LONGEST_BLOCK:
+                return 0.0
+        return seconds
+
+    def _system(self, states: bool) -> tuple[csr_array, FloatArray]:
+        """Columns of all unknowns, states last, and their prior information."""
+        prior = 1.0 / np.square(self.unknowns.prior_std)
+        seconds = self._affordable() if states else 0.0
+        if not seconds:
+            return self.J, prior
+        columns, information = self.states(seconds)
+        return hstack([self.J, columns]).tocsr(), np.concatenate([prior, information])
+
+    def solve(self, states: bool) -> FloatArray:
+        """The unknowns (P,), by iterated Student weights."""
+        J, prior = self._system(states)
+        size = len(self.unknowns.owner)
+        value = np.zeros(len(prior))
+        scale = 1.0 / np.sqrt(prior)
+        for _ in range(REWEIGHTINGS):
+            N, rhs = self.normal(J)
+            before, value = value, _factored(N, prior, scale)(rhs)
+            u = self._off_cell(self.y + J @ value) / np.sqrt(self.v)
+            self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
+            if np.max(np.abs(value - before)[:size] / scale[:size]) < 1e-5:
+                break
+        return np.asarray(value[:size])
+
+    def covariance(self, states: bool) -> tuple[FloatArray, FloatArray]:
+        """Covariance of the unknowns, consider or with states, whichever is wider, and the
+        information of the data alone."""
+        J, prior = self._system(states)
+        size = len(self.unknowns.owner)
+        N, _ = self.normal(self.J)
+        information = N.toarray()
+        own = prior[:size]
+        factor = cho_factor(information + np.diag(own))
+        middle = self._considered() + np.diag(own)
+        half = cho_solve(factor, middle)
+        C = cho_solve(factor, half.T)
+        C = 0.5 * (C + C.T)
+        if J.shape[1] > size and size <= MOST_PARAMETERS:
+            full, _ = self.normal(J)
+            solve = _factored(full, prior, 1.0 / np.sqrt(prior))
+            unit = np.zeros((len(prior), size))
+            unit[np.arange(size), np.arange(size)] = 1.0
+            with_states = solve(unit)[:size]
+            wider = np.sqrt(np.maximum(np.diag(with_states) / np.diag(C), 1.0))
+            C *= np.outer(wider, wider)
+        return np.asarray(C), information
+
+    def _considered(self) -> FloatArray:
+        """J' M (V + U S U') M J (P, P): what errors of looks, and those that last for seconds, do
+        to the right-hand side. In parts of the looks, for memory."""
+        size = len(self.unknowns.owner)
+        b = self.budget
+        short, long = self._blocks(BLOCK_SECONDS), self._blocks(DRIFT_SECONDS)
+        lasting = [
+            (self.a[:, 0], b.attitude, short),
+            (self.a[:, 1], b.attitude, short),
+            (self.a[:, 3], b.heave, short),
+            (self.a[:, 2], b.heading, long),
+            (self.g[:, 0], b.position, long),
+            (self.g[:, 1], b.position, long),
+        ]
+        total = np.zeros((size, size))
+        sums = [csr_array((size, count)) for _, _, (_, count) in lasting]
+        weight = self.in_cell @ self.w
+        for start in range(0, len(self.w), ROWS_AT_ONCE):
+            rows = slice(start, start + ROWS_AT_ONCE)
+            R = self._eliminated(rows, weight)
+            total += (R.T @ (diags_array(self.v[rows]) @ R)).toarray()
+            n = np.arange(R.shape[0])
+            for k, (partial, deviation, (block, count)) in enumerate(lasting):
+                U = csr_array((deviation * partial[rows], (n, block[rows])), shape=(len(n), count))
+                sums[k] = sums[k] + (R.T @ U).tocsr()
+        for B in sums:
+            total += (B @ B.T).toarray()
+        return total
+
+    def _eliminated(self, rows: slice, weight: FloatArray) -> csr_array:
+        """Rows of M J (n, P): weighted partials less the mean of their cell."""
+        first, last = self.cell[rows][0], self.cell[rows][-1] + 1
+        near = slice(*np.searchsorted(self.cell, [first, last]).tolist())
+        WJ = (diags_array(self.w[near]) @ self.J[near]).tocsr()
+        cell = self.cell[near] - first
+        sums = csr_array(
+            (np.ones(len(cell)), (cell, np.arange(len(cell)))), shape=(last - first, len(cell))
+        )
+        mean = (diags_array(1.0 / weight[first:last]) @ (sums @ WJ)).tocsr()
+        own = slice(rows.start - near.start, rows.start - near.start + len(self.w[rows]))
+        return (WJ[own] - diags_array(self.w[rows]) @ mean[cell[own]]).tocsr()
+
+
+def _factored(
+    N: csc_array, prior: FloatArray, scale: FloatArray
+) -> Callable[[FloatArray], FloatArray]:
+    """Solves (N + diag(prior)) x = b, in units of the priors."""
+    S = diags_array(scale)
+    A = (S @ (N + diags_array(prior)) @ S).tocsc()
+    lu = splu(
+        A, permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options={'SymmetricMode': True}
+    )
+
+    def solve(b: FloatArray) -> FloatArray:
+        scaled = (b.T * scale).T
+        return np.asarray((lu.solve(scaled).T * scale).T)
+
+    return solve
+
+
+def described(adjustment: Adjustment, names: Sequence[str]) -> dict[str, Any]:
+    """The parameters and what could not be told, as adjustment.json has them."""
+
+    def label(k: int) -> tuple[str, str]:
+        owner = int(adjustment.owner[k])
+        return names[owner] if owner >= 0 else '', UNITS[adjustment.kind[k]]
+
+    known, scale = adjustment.known_share(), SCALE[adjustment.kind]
+    parameters = [
+        {
+            'line': label(k)[0],
+            'name': label(k)[1],
+            'value': float(adjustment.value[k] * scale[k]),
+            'std': float(adjustment.std[k] * scale[k]),
+            'prior_std': float(adjustment.prior_std[k] * scale[k]),
+            'told': float(known[k]),
+        }
+        for k in range(len(scale))
+    ]
+    combinations = []
+    for vector, share in adjustment.not_known():
+        largest = np.argsort(-np.abs(vector), kind='stable')[:6]
+        words = [
+            f'{vector[k]:+.2f} {" ".join(filter(None, reversed(label(k))))}'
+            for k in largest.tolist()
+            if abs(vector[k]) > 0.05
+        ]
+        combinations.append({'combination': ' '.join(words), 'share': share})
+    return {'parameters': parameters, 'not_told': combinations}

@@ -1,0 +1,295 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The jobs of a survey: a line or a tile each, with what they keep for the next.
+
+What a job makes is a file below ``.work`` in the folder of the survey, with a signature of all
+that it was made from beside it; one with the same signature is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from attrs import asdict, evolve, frozen
+import numpy as np
+
+from sonar_imm import __version__
+from sonar_imm.acoustics.sounding import ErrorBudget
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.files import whole
+
+from ..offline.run_folder import fingerprint, finite
+from ..recordings.export.points import read_points
+from ..recordings.sources import BagError
+from .grid import grid_of_looks, HALO, Soundings
+from .line import budget_of, joined_lines, Line, line_of
+from .looks import Looks, looks_of
+
+TILE = 64
+"""Cells along the side of a tile."""
+LONGEST_SECONDS = 1800.0
+"""A longer line has more than one tide."""
+_STORED = dict.fromkeys(('D', 'Y', 'noise', 'speed', 'port'), 'f4') | {'s': 'i1', 'label': 'u1'}
+
+
+@frozen(kw_only=True)
+class Options:
+    """What is asked for. resolution: cell in m, 0: by depth. epsg: 0 for none. origin (3,): map
+    coordinates of the origin of the navigation. fixed: names of lines whose tide is known."""
+
+    resolution: float = 0.0
+    adjusted: bool = False
+    fixed: tuple[str, ...] = ()
+    epsg: int = 0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@frozen(kw_only=True)
+class Source:
+    """The table of a line. name: as the products say; folder: where it is."""
+
+    name: str
+    folder: Path
+    table: Path
+    run: Mapping[str, Any]
+
+
+@frozen(kw_only=True)
+class Tile:
+    """A tile of 64 x 64 cells of `cell` metres, by column i and row j of such tiles."""
+
+    cell: float
+    i: int
+    j: int
+
+    @property
+    def name(self) -> str:
+        return f'L{self.cell:g}_{self.i}_{self.j}'
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """First column and row, columns and rows of its cells."""
+        return self.i * TILE, self.j * TILE, TILE, TILE
+
+
+@frozen(kw_only=True)
+class Unit:
+    """A line, or half an hour of one: what has corrections of its own. number: its place in the
+    order of names; file: its soundings; signature: of their content."""
+
+    name: str
+    line: str
+    number: int
+    file: Path
+    signature: str
+    soundings: int
+    depth: float
+
+
+# -- jobs of lines -------------------------------------------------------------------------------
+
+
+def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]:
+    """Read a line and keep its soundings at `place` (a path without ending), in pieces of half an
+    hour; gives what survey.json says of it. Nothing is read again when size and time, or the
+    content, are those of before. Raises `BagError`."""
+    stat = source.table.stat()
+    budget, sound_speed = budget_of(source.run)
+    wanted = {
+        'version': __version__,
+        'origin': list(options.origin),
+        'budget': [*asdict(budget).values(), sound_speed],
+    }
+    known = kept(place.with_suffix('.json'))
+    info: dict[str, Any] = {'size': stat.st_size, 'mtime_ns': stat.st_mtime_ns}
+    if known is not None and known['wanted'] == wanted and known['info']['size'] == info['size']:
+        if known['info']['mtime_ns'] == info['mtime_ns']:
+            return dict(known['info'])
+        if known['info']['sha256'] == fingerprint(source.table)['bag_sha256']:
+            return dict(known['info'])
+    points = read_points(source.table).moved(options.origin)
+    if not len(points):
+        raise BagError(f'{source.table} has no soundings')
+    used = ('x', 'y', 'z', 'vertical_uncertainty', 'range', 'beam_angle', 'side')
+    if not all(np.isfinite(points[name]).all() for name in used):
+        raise BagError(f'{source.table} has soundings that are not finite')
+    line = line_of(points, budget, sound_speed)
+    seconds = (line.stamp_ns[-1] - line.stamp_ns[0]) * 1e-9
+    count = max(1, math.ceil(seconds / LONGEST_SECONDS))
+    edges = line.stamp_ns[0] + (np.arange(1, count) * seconds / count * 1e9).astype(np.int64)
+    for k, rows in enumerate(
+        np.split(np.arange(len(line)), np.searchsorted(line.stamp_ns, edges))
+    ):
+        _store(place.with_name(f'{place.name}-{k}.npz'), line.chosen(rows))
+    info |= {
+        'sha256': fingerprint(source.table)['bag_sha256'],
+        'soundings': len(line),
+        'pieces': count,
+        'depth': float(np.median(-line.z)),
+        'bounds': [*line.xy.min(axis=0).tolist(), *line.xy.max(axis=0).tolist()],
+    }
+    write_json(place.with_suffix('.json'), {'wanted': wanted, 'info': info})
+    return info
+
+
+def line_statistics(unit: Unit, corrections: FloatArray, cell: float, place: Path) -> None:
+    """Keep the looks of a unit at corrected places."""
+    signature = signed(unit.signature, corrections, cell)
+    if kept(place.with_suffix('.json')) == signature:
+        return
+    looks = looks_of(_load(unit.file).corrected(corrections), cell).numbered(unit.number)
+    _save(place, {k: v for k, v in asdict(looks, recurse=False).items() if k != 'cell'})
+    write_json(place.with_suffix('.json'), signature)
+
+
+def tile_line(
+    unit: Unit, corrections: FloatArray, tiles: Sequence[Tile], place: Path
+) -> dict[str, tuple[int, int]]:
+    """Keep the corrected soundings of a unit sorted by tile: first row and end of each tile's."""
+    signature = signed(unit.signature, corrections, [tile.name for tile in tiles])
+    known = kept(place.with_suffix('.json'))
+    if known is not None and known['signature'] == signature:
+        return {name: (a, b) for name, (a, b) in known['rows'].items()}
+    line = _load(unit.file).corrected(corrections)
+    of_tile = np.full(len(line), len(tiles))
+    for cell in sorted({tile.cell for tile in tiles}):
+        index = np.floor(line.xy / (cell * TILE)).astype(np.int64)
+        number = {(tile.i, tile.j): k for k, tile in enumerate(tiles) if tile.cell == cell}
+        found, inverse = np.unique(index, axis=0, return_inverse=True)
+        numbers = np.array([number.get((i, j), len(tiles)) for i, j in found.tolist()])
+        of_tile = np.minimum(of_tile, numbers[inverse.ravel()])
+    order = np.argsort(of_tile, kind='stable')
+    line, of_tile = line.chosen(order), of_tile[order]
+    with whole(place) as unfinished, unfinished.open('wb') as file:
+        np.save(file, _table(line))
+    rows = {}
+    for k in np.unique(of_tile[of_tile < len(tiles)]).tolist():
+        rows[tiles[k].name] = tuple(np.searchsorted(of_tile, [k, k + 1]).tolist())
+    write_json(
+        place.with_suffix('.json'),
+        {'signature': signature, 'rows': rows, 'sound_speed': line.sound_speed},
+    )
+    return rows
+
+
+# -- jobs of tiles -------------------------------------------------------------------------------
+
+
+@frozen(kw_only=True)
+class TileJob:
+    """What a tile is made from. parts: of each unit that is near, its number, file and the rows to
+    read; covariance (L, 6, L, 6) of their corrections, or None; place: without ending."""
+
+    tile: Tile
+    parts: Sequence[tuple[int, Path, Sequence[tuple[int, int]]]]
+    signature: str
+    budget: ErrorBudget
+    covariance: FloatArray | None
+    crossing_rms: float
+    place: Path
+
+
+def make_tile(job: TileJob) -> None:
+    """Keep the nodes of a tile."""
+    if kept(job.place.with_suffix('.json')) == job.signature:
+        return
+    lines, numbers = [], []
+    low = (np.array(job.tile.box[:2]) - HALO) * job.tile.cell
+    high = (np.array(job.tile.box[:2]) + TILE + HALO) * job.tile.cell
+    for k, (_, source, ranges) in enumerate(job.parts):
+        table = np.load(source, mmap_mode='r')
+        rows = np.concatenate([np.array(table[a:b]) for a, b in ranges])
+        rows = rows[np.all((rows['xy'] >= low) & (rows['xy'] < high), axis=1)]
+        rows = rows[np.lexsort((rows['xy'][:, 1], rows['xy'][:, 0], rows['stamp_ns']))]
+        sound_speed = json.loads(source.with_suffix('.json').read_text())['sound_speed']
+        lines.append(_line(rows, sound_speed))
+        numbers.append(np.full(len(rows), k))
+    soundings = Soundings(joined_lines(lines), np.concatenate(numbers))
+    nodes = grid_of_looks(
+        soundings, job.tile.cell, job.tile.box, job.budget, job.covariance, job.crossing_rms
+    )
+    number = np.array([part[0] for part in job.parts])
+    nodes = evolve(nodes, seen_line=number[nodes.seen_line])
+    _save(job.place, asdict(nodes, recurse=False))
+    write_json(job.place.with_suffix('.json'), job.signature)
+
+
+# -- files below .work ---------------------------------------------------------------------------
+
+
+def _table(line: Line) -> np.ndarray:
+    """A line as a structured array."""
+    fields: list[Any] = [('stamp_ns', 'i8'), ('xy', 'f8', (2,)), ('z', 'f8')]
+    fields += [(k, kind, (2,)) if k == 'port' else (k, kind) for k, kind in _STORED.items()]
+    table = np.empty(len(line), fields)
+    for name, *_ in fields:
+        table[name] = getattr(line, name)
+    return table
+
+
+def _line(table: np.ndarray, sound_speed: float) -> Line:
+    columns: dict[str, Any] = {
+        name: np.ascontiguousarray(table[name]).astype(
+            np.int64 if name in ('stamp_ns', 'label') else np.float64
+        )
+        for name in table.dtype.names or ()
+    }
+    return Line(**columns, sound_speed=sound_speed)
+
+
+def _store(path: Path, line: Line) -> None:
+    _save(path, {'table': _table(line), 'sound_speed': line.sound_speed})
+
+
+def _save(path: Path, arrays: Mapping[str, Any]) -> None:
+    with whole(path) as unfinished, unfinished.open('wb') as file:
+        np.savez(file, **arrays)
+
+
+def _load(path: Path) -> Line:
+    with np.load(path) as kept:
+        return _line(kept['table'], float(kept['sound_speed']))
+
+
+def kept_looks(path: Path, cell: float) -> Looks:
+    with np.load(path) as kept:
+        return Looks(cell, **{name: kept[name] for name in kept.files})
+
+
+def signed(*parts: Any) -> str:
+    """A text that differs when any part does."""
+    digest = hashlib.sha256()
+    for part in parts:
+        content = part.tobytes() if isinstance(part, np.ndarray) else json.dumps(part).encode()
+        digest.update(str(len(content)).encode() + b':' + content)
+    return digest.hexdigest()
+
+
+def kept(path: Path) -> Any:
+    """What a JSON file says, None where there is none that can be read."""
+    try:
+        return json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return None
+
+
+def write_json(path: Path, content: Any) -> None:
+    with whole(path) as unfinished:
+        unfinished.write_text(json.dumps(finite(content), indent=1) + '\n', encoding='utf-8')

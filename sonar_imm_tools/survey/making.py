@@ -1,0 +1,435 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One chart of many lines: which lines there are, which jobs they take, and in which order.
+
+A job is a line or a tile, see `jobs`. The statistics of lines and the products of tiles are put
+together in this process, in the order of names and numbers: which process did what, and when it
+ended, changes no byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from attrs import asdict, evolve, frozen
+import numpy as np
+
+from sonar_imm import __version__
+from sonar_imm.acoustics.sounding import ErrorBudget
+from sonar_imm.estimation.arrays import FloatArray
+
+from ..offline.jobs import Run
+from ..offline.run_folder import PARQUET, RUN, SOUNDINGS
+from ..recordings.sources import BagError
+from .adjustment import adjust, Adjustment, crossing, misties, robust_rms
+from .chart import MOST_CELLS
+from .grid import HALO, Nodes
+from .jobs import (
+    import_line,
+    kept,
+    kept_looks,
+    line_statistics,
+    make_tile,
+    Options,
+    signed,
+    Source,
+    TILE,
+    Tile,
+    tile_line,
+    TileJob,
+    Unit,
+)
+from .line import budget_of
+from .looks import joined, Looks
+
+WORK, SURVEY = '.work', 'survey.json'
+_STATED = ('soundings', 'size', 'mtime_ns', 'sha256', 'bounds')
+"""What survey.json says of a line."""
+FINEST, COARSEST = 0.25, 16.0
+LEAST_SOUNDINGS = 5.0
+STATISTICS_CELL = 2.0
+
+
+# -- which lines there are -----------------------------------------------------------------------
+
+
+def sources_of(runs: Path) -> list[Source]:
+    """The lines below a folder, sorted by name. Raises `BagError` for none, or when they state
+    different coordinate systems."""
+    if not runs.is_dir():
+        raise BagError(f'{runs} is no folder')
+    found: dict[Path, Path] = {}
+    for name in (SOUNDINGS, PARQUET[SOUNDINGS]):  # the later one is read
+        found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
+    if not found:
+        raise BagError(f'{runs} holds no line: there is no {SOUNDINGS} or {PARQUET[SOUNDINGS]}')
+    last = [folder.name for folder in found]
+    sources = []
+    for folder, table in found.items():
+        below = folder.relative_to(runs).as_posix()
+        unique = last.count(folder.name) == 1 and below != '.'
+        name = folder.name if unique else runs.resolve().name if below == '.' else below
+        sources.append(Source(name=name, folder=folder, table=table, run=_run_of(folder)))
+    return sorted(sources, key=lambda source: source.name)
+
+
+def _run_of(folder: Path) -> dict[str, Any]:
+    """What run.json says, which may be absent."""
+    try:
+        run = json.loads((folder / RUN).read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return {}
+    return run if isinstance(run, dict) else {}
+
+
+def epsg_of(sources: Sequence[Source], given: int) -> int:
+    """The coordinate system of all, 0 for none. Raises `BagError` where two disagree."""
+    known = [(given, 'the command')] if given else []
+    known += [(int(s.run['epsg']), s.name) for s in sources if s.run.get('epsg')]
+    for number, name in known[1:]:
+        if number != known[0][0]:
+            raise BagError(
+                f'{known[0][1]} is in EPSG {known[0][0]} and {name} in EPSG {number}: a chart has '
+                'one coordinate system'
+            )
+    return known[0][0] if known else 0
+
+
+# -- which tiles there are ----------------------------------------------------------------------
+
+
+def plan_tiles(looks: Looks, resolution: float) -> list[Tile]:
+    """The tiles that hold soundings, sorted by cell, column and row; resolution 0: cells by depth.
+
+    A tile, from 16 m cells on, is divided in four while the shoalest tenth of its depths asks for
+    finer cells, a twentieth of the depth, and half of them would still hold five soundings.
+    """
+    centre = looks.cell * (np.column_stack([looks.ix, looks.iy]) + 0.5)
+    if resolution > 0.0:
+        # A cell of the statistics may lie in several tiles; those without soundings fall away.
+        corners = 0.5 * looks.cell * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        places = (centre[:, None] + corners * (1.0 - 1e-9)).reshape(-1, 2)
+        found = np.unique(np.floor(places / (resolution * TILE)).astype(np.int64), axis=0)
+        return [Tile(cell=resolution, i=i, j=j) for i, j in found.tolist()]
+    tiles: list[Tile] = []
+
+    def divide(rows: np.ndarray, cell: float) -> None:
+        index = np.floor(centre[rows] / (cell * TILE)).astype(np.int64)
+        found, inverse = np.unique(index, axis=0, return_inverse=True)
+        for k, (i, j) in enumerate(found.tolist()):
+            inside = rows[inverse.ravel() == k]
+            finer = cell > FINEST and 0.5 * cell * TILE >= looks.cell
+            if finer and _wanted_cell(looks.chosen(inside)) < cell:
+                divide(inside, 0.5 * cell)
+            else:
+                tiles.append(Tile(cell=cell, i=i, j=j))
+
+    divide(np.arange(len(looks)), COARSEST)
+    return sorted(tiles, key=lambda tile: (tile.cell, tile.i, tile.j))
+
+
+def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
+    """West, north, finest cell, rows and columns of the chart of tiles. Raises `BagError` for too
+    many cells."""
+    cell = min(tile.cell for tile in tiles)
+    corners = np.array([[t.i, t.j, t.i + 1, t.j + 1] for t in tiles]) * TILE
+    corners = corners * np.array([[t.cell] for t in tiles])
+    low, high = corners[:, :2].min(axis=0).tolist(), corners[:, 2:].max(axis=0).tolist()
+    columns, rows = (round((b - a) / cell) for a, b in zip(low, high))
+    if rows * columns > MOST_CELLS:
+        raise BagError(
+            f'a chart of {rows} by {columns} cells is too large; choose larger cells with '
+            '--resolution'
+        )
+    return low[0], high[1], cell, rows, columns
+
+
+def _wanted_cell(looks: Looks) -> float:
+    """The cell that depths and soundings of some looks ask for, m."""
+    shoal = max(float(np.quantile(-looks.z, 0.1)), 1e-6)
+    by_depth = 2.0 ** math.floor(math.log2(0.05 * shoal))
+    _, cell = np.unique(np.column_stack([looks.ix, looks.iy]), axis=0, return_inverse=True)
+    density = float(np.median(np.bincount(cell.ravel(), looks.count))) / looks.cell**2
+    by_count = 2.0 ** math.ceil(0.5 * math.log2(LEAST_SOUNDINGS / (density * math.pi * 0.75**2)))
+    return min(max(by_depth, by_count, FINEST), COARSEST)
+
+
+# -- the survey ----------------------------------------------------------------------------------
+
+
+@frozen(kw_only=True)
+class Progress:
+    """What hears of stages: `begin(what, total)` gives what hears of each that is done."""
+
+    begin: Callable[[str, int], Callable[[int], None]]
+    say: Callable[[str], None]
+    warn: Callable[[str], None]
+
+
+@frozen(kw_only=True)
+class Survey:
+    """What came of the jobs, for `products`. lines: as survey.json has them; tiles: in order, with
+    the file of each; before, after: differences of lines where they cross."""
+
+    options: Options
+    epsg: int
+    lines: list[dict[str, Any]]
+    units: Sequence[Unit]
+    tiles: Mapping[Tile, Path]
+    adjustment: Adjustment | None
+    rms_before: float
+    before: Mapping[tuple[int, int], FloatArray]
+    after: Mapping[tuple[int, int], FloatArray]
+    crossing_cells: int
+    warnings: Sequence[str]
+
+    def nodes(self) -> Iterator[tuple[Tile, Nodes]]:
+        """The tiles with their nodes, in order; those without any are left out."""
+        for tile, file in self.tiles.items():
+            with np.load(file) as kept:
+                nodes = Nodes(**{name: kept[name] for name in kept.files})
+            if len(nodes.z):
+                yield tile, nodes
+
+
+def make(
+    sources: Sequence[Source], out: Path, options: Options, run: Run, progress: Progress
+) -> Survey:
+    """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
+    work = out / WORK
+    units, lines, budget = _imported(sources, work, options, run, progress)
+    warnings: list[str] = []
+    depth = float(np.median([unit.depth for unit in units]))
+    coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
+    cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
+
+    def statistics(corrections: FloatArray) -> list[Looks]:
+        places = [work / 'looks' / f'{unit.file.stem}.npz' for unit in units]
+        calls = [(unit, corrections[unit.number], cell, p) for unit, p in zip(units, places)]
+        _all(run, line_statistics, calls, progress, 'statistics', units)
+        return [kept_looks(place, cell) for place in places]
+
+    none = np.zeros((len(units), 6))
+    looks = joined(statistics(none))
+    before = {(a, b): d for a, b, d in misties(looks)}
+    shared, g, of_cell, cells = crossing(looks)
+    heights = shared.heights(g)
+    weight = 1.0 / shared.variances(g)
+    mean = np.bincount(of_cell, weight * heights, cells) / np.bincount(of_cell, weight, cells)
+    rms = robust_rms(heights - mean[of_cell]) if cells else 0.0
+    found, after = None, {}
+    if options.adjusted:
+        fixed = [unit.number for unit in units if unit.line in options.fixed]
+        try:
+            found = adjust(
+                statistics,
+                len(units),
+                budget,
+                fixed=fixed,
+                note=lambda k, left: progress.say(f'round {k}: misties {left:.3f} m rms'),
+            )
+        except ValueError as error:
+            raise BagError(f'the lines cannot be adjusted: {error}') from None
+        warnings += _warnings_of(found)
+        looks = joined(statistics(found.corrections))
+        after = {(a, b): d for a, b, d in misties(looks)}
+    tiles = plan_tiles(looks, options.resolution)
+    extent_of(tiles)
+    corrections = none if found is None else found.corrections
+    files = _tiled(units, tiles, corrections, found, budget, rms, work, run, progress)
+    for sentence in warnings:
+        progress.warn(sentence)
+    return Survey(
+        options=options,
+        epsg=options.epsg,
+        lines=lines,
+        units=units,
+        tiles=files,
+        adjustment=found,
+        rms_before=rms,
+        before=before,
+        after=after,
+        crossing_cells=cells,
+        warnings=warnings,
+    )
+
+
+def _imported(
+    sources: Sequence[Source], work: Path, options: Options, run: Run, progress: Progress
+) -> tuple[list[Unit], list[dict[str, Any]], ErrorBudget]:
+    places = [
+        work / 'lines' / hashlib.sha256(source.name.encode()).hexdigest()[:16]
+        for source in sources
+    ]
+    for folder in ('lines', 'looks', 'soundings', 'tiles'):
+        (work / folder).mkdir(parents=True, exist_ok=True)
+    calls = [(source, place, options) for source, place in zip(sources, places)]
+    infos: list[dict[str, Any]] = [{} for _ in sources]
+    failures = [''] * len(sources)
+    advance = progress.begin('lines', len(sources))
+    for k, info, failure in run(import_line, calls):
+        infos[k], failures[k] = info or {}, failure
+        advance(1)
+    units: list[Unit] = []
+    lines, budgets = [], []
+    for source, place, info, failure in zip(sources, places, infos, failures):
+        if failure:
+            progress.warn(f'{source.name}: {failure}')
+        lines.append(
+            {
+                'name': source.name,
+                'folder': str(source.folder),
+                **{key: info.get(key) for key in _STATED},
+                'failure': failure,
+            }
+        )
+        made_with = (kept(place.with_suffix('.json')) or {}).get('wanted')
+        for piece in range(info.get('pieces', 0)):
+            several = f'#{piece + 1}' if info['pieces'] > 1 else ''
+            units.append(
+                Unit(
+                    name=source.name + several,
+                    line=source.name,
+                    number=len(units),
+                    file=place.with_name(f'{place.name}-{piece}.npz'),
+                    signature=signed(info['sha256'], piece, made_with),
+                    soundings=info['soundings'],
+                    depth=info['depth'],
+                )
+            )
+            budgets.append(budget_of(source.run)[0])
+    if not units:
+        raise BagError(f'no line can be read; the first: {failures[0]}')
+    if unknown := set(options.fixed) - {unit.line for unit in units}:
+        raise BagError(f'there is no line {sorted(unknown)[0]} to fix')
+    widest = {
+        name: max(getattr(budget, name) for budget in budgets) for name in asdict(budgets[0])
+    }
+    return units, lines, ErrorBudget(**widest)
+
+
+def _tiled(
+    units: Sequence[Unit],
+    tiles: Sequence[Tile],
+    corrections: FloatArray,
+    found: Adjustment | None,
+    budget: ErrorBudget,
+    rms: float,
+    work: Path,
+    run: Run,
+    progress: Progress,
+) -> dict[Tile, Path]:
+    """The files of the tiles that hold soundings."""
+    places = [work / 'soundings' / f'{unit.file.stem}.npy' for unit in units]
+    calls = [(unit, corrections[unit.number], tiles, place) for unit, place in zip(units, places)]
+    rows = _all(run, tile_line, calls, progress, 'sorting', units)
+    seen = set().union(*rows)
+    near = _neighbours(tiles)
+    tiles = [tile for tile in tiles if tile.name in seen]
+    # What is not known of the mean speed of a line is among the corrections then.
+    own = budget if found is None else evolve(budget, sound_speed=0.0)
+    jobs = []
+    for tile in tiles:
+        parts = []
+        for unit, place, ranges in zip(units, places, rows):
+            if mine := [ranges[name] for name in near[tile.name] if name in ranges]:
+                parts.append((unit.number, place, mine))
+        numbers = [part[0] for part in parts]
+        covariance = None if found is None else found.of_lines(numbers)
+        jobs.append(
+            TileJob(
+                tile=tile,
+                parts=parts,
+                signature=signed(
+                    __version__,
+                    tile.name,
+                    [units[k].signature for k in numbers],
+                    [part[2] for part in parts],
+                    corrections[numbers],
+                    asdict(own),
+                    covariance,
+                    0.0 if found is not None else rms,
+                ),
+                budget=own,
+                covariance=covariance,
+                crossing_rms=0.0 if found is not None else rms,
+                place=work / 'tiles' / f'{tile.name}.npz',
+            )
+        )
+    _all(run, make_tile, [(job,) for job in jobs], progress, 'tiles', tiles)
+    return {job.tile: job.place for job in jobs}
+
+
+def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
+    """Of each tile the names of those that its nodes need, itself among them, in order."""
+    low = (
+        np.array([[tile.i, tile.j] for tile in tiles])
+        * TILE
+        * np.array([[tile.cell] for tile in tiles])
+    )
+    side = np.array([tile.cell * TILE for tile in tiles])[:, None]
+    names = [tile.name for tile in tiles]
+    found = {}
+    for k, tile in enumerate(tiles):
+        halo = HALO * tile.cell
+        meets = np.all((low < low[k] + side[k] + halo) & (low + side > low[k] - halo), axis=1)
+        found[tile.name] = [names[n] for n in np.flatnonzero(meets)]
+    return found
+
+
+def _warnings_of(found: Adjustment) -> list[str]:
+    warnings = []
+    if found.groups > 1:
+        warnings.append(
+            f'the lines are {found.groups} groups that do not overlap: levels between groups are '
+            'those of the priors alone'
+        )
+    speed = found.kind == 4
+    value, std = found.value[speed], found.std[speed]
+    mean, error = float(value.mean()), float(np.sqrt(np.mean(np.square(std))))
+    if abs(mean) > max(3.0 * error, 1.0):
+        warnings.append(
+            f'all lines ask for {mean:+.1f} m/s of sound speed; that is right for the water below '
+            'the array only: where the speed at the array is wrong too, beam angles are as well'
+        )
+    return warnings
+
+
+def _all(
+    run: Run,
+    work: Callable[..., Any],
+    calls: Sequence[tuple[Any, ...]],
+    progress: Progress,
+    what: str,
+    named: Sequence[Any],
+) -> list[Any]:
+    """What came of all calls, in their order. Raises `BagError` naming the first that failed."""
+    results: list[Any] = [None] * len(calls)
+    failures: dict[int, str] = {}
+    advance = progress.begin(what, len(calls))
+    for k, result, failure in run(work, calls):
+        results[k] = result
+        if failure:
+            failures[k] = failure
+        advance(1)
+    if failures:
+        k = min(failures)
+        raise BagError(f'{what}: {named[k].name}: {failures[k]}; --resume makes what is missing')
+    return results

@@ -1,0 +1,326 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm survey``: from folders of soundings to products that other programs read."""
+
+import csv
+import json
+import os
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.export.points import read_points
+from sonar_imm_tools.survey import jobs, making
+from sonar_imm_tools.survey.looks import joined
+from sonar_imm_tools.survey.making import plan_tiles
+
+rasterio = pytest.importorskip('rasterio')
+pytest.importorskip('pyarrow')
+
+SMALL = ('lines=3', 'cross_lines=1', 'spacing=25', 'length=80', 'ping_interval=0.7', 'ghost=false')
+PRODUCTS = (
+    'survey.tif',
+    'provenance.parquet',
+    'coverage.geojson',
+    'adjustment.json',
+    'crossings.csv',
+    'report.html',
+)
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope='module')
+def lines(tmp_path_factory):
+    out = tmp_path_factory.mktemp('survey') / 'runs'
+    settings = [word for setting in SMALL for word in ('--set', setting)]
+    assert run('simulate', 'survey', out, '--soundings', *settings) == 0
+    return out
+
+
+@pytest.fixture(scope='module')
+def made(lines, tmp_path_factory):
+    out = tmp_path_factory.mktemp('made') / 'chart'
+    assert run('survey', lines, out, '--adjust') == 0
+    return out
+
+
+def read(path):
+    with rasterio.open(path) as file:
+        return dict(zip(file.descriptions, file.read().astype(float))), file.transform, file
+
+
+def products(out):
+    files = [out / name for name in PRODUCTS] + sorted((out / 'tiles').iterdir())
+    return {str(file.relative_to(out)): file.read_bytes() for file in files}
+
+
+def test_the_chart_lies_on_the_true_floor(lines, made):
+    bands, transform, file = read(made / 'survey.tif')
+    assert file.crs is None and np.isnan(file.nodata)
+    truth = np.load(lines / 'truth.npz')
+    rows, columns = np.nonzero(np.isfinite(bands['depth']))
+    x = transform.c + (columns + 0.5) * transform.a - truth['ext'][0]
+    y = transform.f + (rows + 0.5) * transform.e - truth['ext'][1]
+    inside = (x > 0) & (y > 0) & (x < truth['ext'][2] - 1) & (y < truth['ext'][3] - 1)
+    rows, columns = rows[inside], columns[inside]
+    z = truth['truth_z'][x[inside].astype(int), y[inside].astype(int)]
+    error = -bands['depth'][rows, columns] - z
+    assert len(z) > 2000 and np.median(np.abs(error - np.median(error))) < 0.08
+    assert np.mean(np.abs(error) < 2.0 * bands['uncertainty'][rows, columns]) > 0.93
+    # Fish stay visible as what competes.
+    assert np.nanmax(bands['hypotheses']) >= 2 and np.nanmax(bands['lines']) == 4
+
+
+def test_tiles_are_the_chart(made):
+    whole, transform, _ = read(made / 'survey.tif')
+    survey = json.loads((made / 'survey.json').read_text())
+    assert sorted(path.stem for path in (made / 'tiles').iterdir()) == sorted(
+        tile['name'] for tile in survey['tiles']
+    )
+    for tile in survey['tiles']:
+        bands, own, _ = read(made / 'tiles' / f'{tile["name"]}.tif')
+        assert own.c == tile['i'] * 64 * tile['cell'] and own.a == tile['cell']
+        times = round(tile['cell'] / transform.a)
+        top = round((transform.f - own.f) / transform.a)
+        left = round((own.c - transform.c) / transform.a)
+        repeated = np.kron(bands['depth'], np.ones((times, times)))
+        there = whole['depth'][top : top + 64 * times, left : left + 64 * times]
+        assert np.array_equal(there, repeated, equal_nan=True)
+        seen = np.isfinite(bands['depth'])
+        assert set(bands['cell'][seen]) == {tile['cell']}
+
+
+def test_the_other_files_say_what_they_should(lines, made):
+    import pyarrow.parquet
+
+    adjustment = json.loads((made / 'adjustment.json').read_text())
+    names = {(row['line'], row['name']): row for row in adjustment['parameters']}
+    assert len(names) == 3 + 3 * 4
+    roll = names['', 'roll_deg']
+    assert roll['value'] == pytest.approx(1.0, abs=0.1) and roll['told'] > 0.99
+    assert roll['prior_std'] == pytest.approx(2.0)
+    assert adjustment['crossings']['rms_after'] < 0.3 * adjustment['crossings']['rms_before']
+    assert adjustment['not_told'][0]['share'] > 0.99
+    words = ' '.join(entry['combination'] for entry in adjustment['not_told'])
+    assert words.count('offset_m') == 4  # the level, and nothing else of tides
+    with (made / 'crossings.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6 and all(int(row['cells']) > 20 for row in rows)
+    assert all(float(row['rms_after']) < float(row['rms_before']) for row in rows)
+    table = pyarrow.parquet.read_table(made / 'provenance.parquet').to_pydict()
+    assert list(table) == ['x', 'y', 'cell', 'line', 'count', 'residual']
+    assert set(table['line']) == {f'line_{k:03d}' for k in range(4)}
+    bands, _, _ = read(made / 'survey.tif')
+    places = set(zip(table['x'], table['y']))
+    assert len(places) <= np.isfinite(bands['depth']).sum()
+    survey = json.loads((made / 'survey.json').read_text())
+    first = survey['lines'][0]
+    points = read_points(lines / 'line_000' / 'soundings.csv')
+    assert first['soundings'] == len(points) and first['failure'] == ''
+    assert first['bounds'][0] == pytest.approx(points['x'].min())
+    assert survey['crs'] == {'epsg': None} and survey['options']['adjust'] is True
+    coverage = json.loads((made / 'coverage.geojson').read_text())
+    assert 'local' in coverage['name'] and coverage['features']
+
+
+def test_the_page_shows_chart_misties_and_what_is_not_known(made):
+    page = (made / 'report.html').read_text(encoding='utf-8')
+    for words in ('<h2>Depth', '<h2>Uncertainty', '<h2>Competing depths', '<h2>Misties'):
+        assert words in page
+    assert page.count('Plotly.newPlot(') >= 4 and 'What could not be told' in page
+    assert '4 lines with' in page and 'roll_deg' in page and 'offset_m line_000' in page
+    assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
+
+
+def test_the_same_bytes_with_two_processes(lines, made, tmp_path):
+    assert run('survey', lines, tmp_path / 'two', '--adjust', '--jobs', 2) == 0
+    assert products(tmp_path / 'two') == products(made)
+
+
+def test_the_same_bytes_on_a_cluster(lines, made, tmp_path):
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=None,
+        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+        silence_logs='CRITICAL',
+    ) as there:
+        address = ('--scheduler', there.scheduler_address)
+        assert run('survey', lines, tmp_path / 'out', '--adjust', *address) == 0
+    assert products(tmp_path / 'out') == products(made)
+
+
+def test_names_of_lines_move_no_depth(lines, made, tmp_path):
+    shutil.copytree(lines, tmp_path / 'runs')
+    for k, name in enumerate(('d', 'b', 'c', 'a')):
+        (tmp_path / 'runs' / f'line_{k:03d}').rename(tmp_path / 'runs' / name)
+    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--adjust') == 0
+    other, before = read(tmp_path / 'out' / 'survey.tif')[0], read(made / 'survey.tif')[0]
+    apart = np.abs(other['depth'] - before['depth'])
+    assert np.nanquantile(apart, 0.999) < 1e-3
+
+
+def test_resume_makes_only_what_changed(lines, tmp_path, monkeypatch):
+    runs, out = tmp_path / 'runs', tmp_path / 'out'
+    shutil.copytree(lines, runs)
+    assert run('survey', runs, out) == 0
+    before = products(out)
+    reads = []
+
+    def noted(path):
+        reads.append(path.parent.name)
+        return read_points(path)
+
+    monkeypatch.setattr(jobs, 'read_points', noted)
+    os.utime(runs / 'line_000' / 'soundings.csv')  # another time, the same content
+    assert run('survey', runs, out, '--resume') == 0
+    assert reads == [] and products(out) == before
+    tiles = {path: path.stat().st_mtime_ns for path in (out / '.work' / 'tiles').glob('*.npz')}
+    table = runs / 'line_003' / 'soundings.csv'
+    table.write_text('\n'.join(table.read_text().splitlines()[:200]) + '\n')
+    assert run('survey', runs, out, '--resume') == 0
+    assert reads == ['line_003']
+    again = {path: path.stat().st_mtime_ns for path in (out / '.work' / 'tiles').glob('*.npz')}
+    assert again != tiles
+    # The same as one made at once.
+    assert run('survey', runs, tmp_path / 'anew') == 0
+    assert products(tmp_path / 'anew') == products(out)
+    assert run('survey', runs, out, '--resume', '--adjust') == 2
+    assert run('survey', runs, out, '--overwrite', '--adjust') == 0
+
+
+def test_a_survey_that_was_interrupted_is_taken_up_again(lines, tmp_path, made, monkeypatch):
+    """A power cut while tiles are made."""
+    real, count = making.make_tile, []
+
+    def dies(job):
+        count.append(job)
+        if len(count) == 2:
+            raise KeyboardInterrupt
+        return real(job)
+
+    monkeypatch.setattr(making, 'make_tile', dies)
+    assert run('survey', lines, tmp_path / 'out', '--adjust') == 130
+    assert not (tmp_path / 'out' / 'survey.json').exists()
+    monkeypatch.setattr(making, 'make_tile', real)
+    assert run('survey', lines, tmp_path / 'out', '--adjust', '--resume') == 0
+    assert products(tmp_path / 'out') == products(made)
+
+
+def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
+    shutil.copytree(lines, tmp_path / 'runs')
+    (tmp_path / 'runs' / 'line_001' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
+    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 1
+    error = capsys.readouterr().err
+    assert 'line_001: ' in error and 'no column' in error and 'Traceback' not in error
+    survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
+    failures = {line['name']: line['failure'] for line in survey['lines']}
+    assert 'no column' in failures['line_001'] and failures['line_000'] == ''
+    bands, transform, _ = read(tmp_path / 'out' / 'survey.tif')
+    assert transform.a == 2.0 and np.isfinite(bands['depth']).any()
+    assert not (tmp_path / 'out' / 'tiles').exists()  # with auto only
+    adjustment = json.loads((tmp_path / 'out' / 'adjustment.json').read_text())
+    # Without --adjust the misties are part of the uncertainty.
+    assert np.nanmin(bands['uncertainty']) > adjustment['crossings']['rms_before']
+
+
+def test_parquet_and_a_coordinate_system(lines, tmp_path):
+    import pyarrow
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    folder = tmp_path / 'runs' / 'deep' / 'line'
+    folder.mkdir(parents=True)
+    table = pyarrow.csv.read_csv(lines / 'line_000' / 'soundings.csv')
+    pyarrow.parquet.write_table(table, folder / 'soundings.parquet')
+    (folder / 'run.json').write_text(json.dumps({'epsg': 32632}))
+    place = ('--origin', '500000,6000000,1.5', '--resolution', 2)
+    assert run('survey', tmp_path / 'runs', tmp_path / 'out', *place) == 0
+    bands, transform, file = read(tmp_path / 'out' / 'survey.tif')
+    assert file.crs.to_epsg() == 32632 and 499_000 < transform.c < 501_000
+    coverage = json.loads((tmp_path / 'out' / 'coverage.geojson').read_text())
+    east, north = coverage['features'][0]['geometry']['coordinates'][0][0]
+    assert east == pytest.approx(9.0, abs=0.01) and north == pytest.approx(54.15, abs=0.05)
+    assert run('survey', tmp_path / 'runs', tmp_path / 'b', '--crs', 32633) == 2
+
+
+@pytest.mark.parametrize(
+    'change, options, words',
+    [
+        ('none', (), 'holds no line'),
+        ('missing', (), 'is no folder'),
+        ('crs', (), 'line_000 is in EPSG 32632 and line_001 in EPSG 32633'),
+        ('apart', ('--adjust',), 'no two lines overlap'),
+        ('', ('--resolution', '0.001'), 'too large'),
+        ('', ('--fix', 'other'), 'no line other'),
+        ('', ('--crs', '1'), 'EPSG number 1'),
+        ('', ('--resolution', 'fine'), 'neither auto'),
+        ('', ('--resume', '--overwrite'), 'exclude'),
+        ('', ('--jobs', '2', '--scheduler', 'tcp://a:1'), 'exclude'),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
+    lines, tmp_path, capsys, change, options, words
+):
+    runs, out = tmp_path / 'runs', tmp_path / 'out'
+    if change != 'missing':
+        runs.mkdir()
+    if change not in ('none', 'missing'):
+        for k in (0, 1):
+            shutil.copytree(lines / f'line_{k:03d}', runs / f'line_{k:03d}')
+            if change == 'crs':
+                run_json = json.dumps({'epsg': 32632 + k})
+                (runs / f'line_{k:03d}' / 'run.json').write_text(run_json)
+    if change == 'apart':
+        shutil.rmtree(runs / 'line_001')
+    assert run('survey', runs, out, *options) in (1, 2)
+    error = capsys.readouterr().err
+    assert words in error and 'Traceback' not in error
+    assert not out.exists()
+
+
+def test_a_folder_that_is_there_stays(lines, tmp_path, capsys):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'mine.txt').write_text('mine')
+    assert run('survey', lines, out) == 2 and 'is there already' in capsys.readouterr().err
+    assert run('survey', lines, out, '--resume') == 2
+    assert 'no survey' in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ['mine.txt']
+    assert run('survey', lines, out, '--overwrite', '--resolution', 4) == 0
+    assert (out / 'mine.txt').read_text() == 'mine'
+
+
+def test_cells_follow_depth():
+    from helpers import survey_vectors as vectors
+
+    from sonar_imm_tools.survey.looks import looks_of
+
+    looks = joined([looks_of(line, 2.0) for line in vectors.lines(vectors.scene())])
+    assert {tile.cell for tile in plan_tiles(looks, 0.0)} <= {0.5, 1.0, 2.0}
+    from attrs import evolve
+
+    deep = evolve(looks, z=10.0 * looks.z)
+    assert min(tile.cell for tile in plan_tiles(deep, 0.0)) >= 4.0
+    covered = {(tile.cell, tile.i, tile.j) for tile in plan_tiles(looks, 0.0)}
+    assert len(covered) == len(plan_tiles(looks, 0.0))

@@ -1,0 +1,114 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulated surveys: what is known without the formulas that they test."""
+
+import numpy as np
+import pytest
+
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.export.points import read_points
+from sonar_imm_tools.simulation.survey import budget, scenario, simulate
+from sonar_imm_tools.survey.line import line_of
+
+EXACT = {
+    'lines': 1,
+    'cross_lines': 0,
+    'length': 60.0,
+    'noise': 0.0,
+    'nav_errors': 0.0,
+    'roll_bias_deg': 0.0,
+    'tide_std': 0.0,
+    'sound_speed_error': 0.0,
+    'outliers': 0.0,
+    'fish': False,
+    'ghost': False,
+    'terrain': 'slope',
+    'slope': 0.1,
+}
+
+
+def off_the_floor(scene, line):
+    return line.z - scene.floor.at(line.xy[:, 0], line.xy[:, 1])
+
+
+def test_without_errors_soundings_lie_on_the_floor():
+    scene = simulate(scenario('survey', EXACT), 1)
+    line = line_of(scene.points[0], budget())
+    assert np.abs(off_the_floor(scene, line)).max() < 1e-4
+    assert line.speed == pytest.approx(2.0, abs=0.3)
+    east = np.abs(line.port - [0.0, 1.0]).max()
+    assert east < 0.05  # it yaws by .8 deg
+
+
+@pytest.mark.parametrize(
+    'name, value, sign, left',
+    [
+        ('roll_bias_deg', 1.0, 1.0, 0.02),
+        ('pitch', 1.0, 1.0, 0.012),
+        ('heading', 2.0, 1.0, 0.03),
+        ('latency', 0.5, 1.0, 0.02),
+        ('tide_std', 0.5, 1.0, 1e-4),
+        ('sound_speed_error', 4.0, 1.0, 0.12),
+    ],
+)
+def test_true_corrections_put_soundings_back_on_the_floor(name, value, sign, left):
+    """Each correction, its sign and both sides, against poses and rays that know no partials."""
+    scene = simulate(scenario('survey', {**EXACT, name: value}), 1)
+    line = line_of(scene.points[0], budget())
+    before = np.abs(off_the_floor(scene, line)).max()
+    after = np.abs(off_the_floor(scene, line.corrected(scene.corrections[0]))).max()
+    assert after < left < before / 3.0, (before, after)
+    wrong = np.abs(off_the_floor(scene, line.corrected(-scene.corrections[0]))).max()
+    assert wrong > 1.5 * before
+
+
+def test_the_same_seed_is_the_same_survey():
+    config = scenario('survey', {'lines': 2, 'cross_lines': 1, 'length': 60.0})
+    one, again, other = simulate(config, 3), simulate(config, 3), simulate(config, 4)
+    for first, second in zip(one.points, again.points):
+        assert first['z'].tobytes() == second['z'].tobytes()
+    assert one.points[0]['z'].tobytes() != other.points[0]['z'].tobytes()
+    assert one.fish[1].sum() > 50 and (one.bad[1] >= one.fish[1]).all()
+    assert 0.005 < np.concatenate(one.bad[:1]).mean() < 0.1
+
+
+def test_the_command_writes_lines_and_truth(tmp_path, capsys):
+    small = ['--set', 'lines=2', '--set', 'cross_lines=0', '--set', 'length=40']
+    out = tmp_path / 'survey'
+    assert main(['simulate', 'survey', str(out), '--soundings', *small]) == 0
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ['line_000', 'line_001', 'truth.npz']
+    scene = simulate(scenario('survey', {'lines': 2, 'cross_lines': 0, 'length': 40.0}), 0)
+    read = read_points(out / 'line_001' / 'soundings.csv')
+    assert read['x'].tolist() == scene.points[1]['x'].tolist()
+    truth = np.load(out / 'truth.npz')
+    assert truth['corrections'].tolist() == scene.corrections.tolist()
+    assert len(truth['bad']) == sum(map(len, scene.points))
+    x0, y0, nx, ny = truth['ext']
+    assert truth['truth_z'].shape == (nx, ny)
+    assert truth['truth_z'][5, 7] == pytest.approx(
+        scene.floor.at(np.array([x0 + 5.5]), np.array([y0 + 7.5]))[0], abs=1e-4
+    )
+    capsys.readouterr()
+    for arguments, words in (
+        ([str(out), '--soundings'], 'is there already'),
+        ([str(tmp_path / 'b')], 'say --soundings'),
+        ([str(tmp_path / 'b'), '--soundings', '--set', 'lines=0'], 'lines'),
+    ):
+        assert main(['simulate', 'survey', *arguments]) == 2
+        error = capsys.readouterr().err
+        assert words in error and 'Traceback' not in error
+    assert not (tmp_path / 'b').exists()
+    assert main(['simulate', 'diver', str(tmp_path / 'b'), '--soundings']) == 2
