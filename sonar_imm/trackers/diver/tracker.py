@@ -209,6 +209,15 @@ class DiverTracker:
     def warnings(self) -> list[str]:
         """What of the input cannot be true or used, in sentences for the user."""
         state, advice = self._stream.state, 'check var_toa, var_bearing and toa_std'
+        unstated = [
+            name
+            for name in ('receiver_position_std', 'receiver_clock_std', 'sound_speed_std')
+            if not getattr(self.config, name)
+        ]
+        if self.config.dimensions == 2:
+            unstated.insert(0, 'target_z (or dimensions: 3)')
+        if unstated:
+            advice += ', or state what is not exact: ' + ', '.join(unstated)
         return [
             *self._georeferencer.warnings(),
             *state.fixes.warnings(self.config.fix_bias_std > 0.0),

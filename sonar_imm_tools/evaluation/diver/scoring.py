@@ -16,6 +16,7 @@
 
 `score` gives one nested dict of plain numbers, which is `metrics.json`:
 
+depth                the error of z and the NEES of x, y, z, where both run and truth have a depth
 position, velocity   RMSE, median and 95 % point of the error of confirmed tracks
 raw_fix              the same for the raw fixes, which a tracker has to beat
 lag                  the shift of truth with the smallest error: late stamps, a towed tag
@@ -101,6 +102,7 @@ def score(
     if fixes is not None and len(fixes):
         metrics['raw_fix'] = error_summary(match(fixes, truth, cutoff=cutoff).distance)
     metrics['consistency'].update(truth_consistency(matching))
+    metrics.update(depth_summary(matching, truth))
     metrics['tracks'] = track_summary(matching)
     metrics['gospa'] = gospa_summary(matching, truth, cutoff)
     metrics['lag'] = best_lag(matching, truth)
@@ -135,6 +137,9 @@ def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
         track_state=np.ones(n, np.int64),
         state=state,
         covariance=covariance,
+        place=np.full((n, 3), np.nan),
+        place_covariance=np.full((n, 3, 3), np.nan),
+        z=np.full(n, np.nan),
         model_names=(),
         probabilities=np.empty((n, 0)),
         nis=np.full(n, np.nan),
@@ -170,6 +175,20 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
         result['nees_state'] = _summary(state, far_state, 4)
         result['singular_state_covariances'] = known - len(state)
     return result
+
+
+def depth_summary(matching: Matching, truth: Truth) -> dict[str, Any]:
+    """The error of depth and the NEES of the three coordinates; nothing where the run estimates no
+    depth or the truth has none."""
+    series = matching.series
+    z = truth.heights(series.stamp_ns[matching.row])[matching.target, np.arange(len(matching.row))]
+    error = series.place[matching.row] - np.column_stack([matching.truth[:, :2], z])
+    known = np.isfinite(error).all(axis=1)
+    if not known.any():
+        return {}
+    whole = usable_nees(error[known], series.place_covariance[matching.row[known]])
+    down = np.abs(error[known, 2])
+    return {'depth': {**error_summary(down), 'nees_3d': chi2_summary(whole, 3)}}
 
 
 def _coverage(position: FloatArray, level: float) -> float:

@@ -33,13 +33,18 @@ STATES = ('px', 'py', 'vx', 'vy')
 class Series(Rows):
     """Rows of tracks, in metres and m/s; velocities and their covariance are NaN where unknown.
 
-    nis: NaN without a hit; nis_dof: its degrees of freedom, NaN where unknown.
+    place, place_covariance: x, y, z and their covariance, NaN where depth is not estimated; z: of
+    the point that is drawn, which of truth is its height. nis: NaN without a hit; nis_dof: its
+    degrees of freedom, NaN where unknown.
     """
 
     track_id: IntArray = column('track_id', dtype=np.int64, default=0)
     track_state: IntArray = column('track_state', dtype=np.int64, default=1)
     state: FloatArray = column('px', 'py', 'vx?', 'vy?')
     covariance: FloatArray = covariance_of(*STATES)
+    place: FloatArray = column('px', 'py', 'pz?')
+    place_covariance: FloatArray = covariance_of('px', 'py', 'pz')
+    z: FloatArray = column('z?')
     model_names: tuple[str, ...]
     probabilities: FloatArray = column('prob_*')
     nis: FloatArray = column('nis?')

@@ -65,6 +65,8 @@ METRICS = (
     error('position', 'position error', card='Position error, RMS'),
     error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes'),
     error('velocity', 'velocity error', 'mps', card='Velocity error, RMS', remark=''),
+    error('depth', 'depth error', remark=''),
+    chi2('depth.nees_3d', 'NEES, three coordinates'),
     chi2('consistency.nees_position', 'NEES, position', card='NEES of the position'),
     chi2('consistency.nees_state', 'NEES, whole state'),
     chi2('consistency.nis', 'NIS', card='NIS of the hits'),

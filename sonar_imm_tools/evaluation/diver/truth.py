@@ -32,11 +32,13 @@ from .series import Series
 
 @frozen(eq=False)
 class TruthPath:
-    """One true target: stamp_ns (n,) strictly increasing; state (n, 4), unknown velocity NaN."""
+    """One true target: stamp_ns (n,) strictly increasing; state (n, 4), unknown velocity NaN;
+    z (n,), None where it is not known: 0 throughout is a height that nobody filled in."""
 
     track_id: int
     stamp_ns: IntArray
     state: FloatArray
+    z: FloatArray | None = None
 
     def at(self, stamp_ns: IntArray, *, max_gap: float) -> FloatArray:
         """(m, 4) state at `stamp_ns`; NaN outside the path and inside gaps over `max_gap` s."""
@@ -71,7 +73,10 @@ class Truth:
         not finite are left out.
         """
         good = series.pick(np.isfinite(series.state[:, :2]).all(axis=1))
-        paths = (TruthPath(target, rows.stamp_ns, rows.state) for target, rows in good.by_track())
+        paths = (
+            TruthPath(target, rows.stamp_ns, rows.state, rows.z if rows.z.any() else None)
+            for target, rows in good.by_track()
+        )
         return cls(tuple(paths), max_gap)
 
     def __len__(self) -> int:
@@ -90,3 +95,12 @@ class Truth:
         return np.concatenate(
             [empty, *[path.at(stamp_ns, max_gap=self.max_gap)[None] for path in self.paths]]
         )
+
+    def heights(self, stamp_ns: IntArray) -> FloatArray:
+        """(paths, m) z at `stamp_ns`, NaN where unknown."""
+        out = np.full((len(self.paths), len(stamp_ns)), np.nan)
+        for row, path in zip(out, self.paths):
+            if path.z is not None:
+                upright = evolve(path, state=path.z[:, None].astype(np.float64))
+                row[:] = upright.at(stamp_ns, max_gap=self.max_gap)[:, 0]
+        return out

@@ -16,6 +16,7 @@
 
 import json
 
+from attrs import evolve
 from helpers.dive_scenes import (
     covariance,
     estimate_at,
@@ -224,3 +225,38 @@ def test_an_empty_run_gives_numbers_json_can_hold(truth):
     metrics = scored([], truth, fixes=fix_series([]))
     assert metrics['tracks_confirmed'] == 0
     json.dumps(finite(metrics), allow_nan=False)
+
+
+def in_depth(estimates, truth, *, spread=1.0, depth=25.0):
+    """The same run with z estimated at a standard deviation of 2 m, and truth at a depth."""
+    rng = np.random.default_rng(3)
+    deep, there = [], []
+    for estimate, true in zip(estimates, truth):
+        n = len(estimate)
+        z = -depth + spread * 2.0 * rng.normal(size=n)
+        covariance = np.zeros((n, 5, 5))
+        covariance[:, :4, :4], covariance[:, 4, 4] = estimate.covariance, 4.0
+        deep.append(
+            evolve(
+                estimate,
+                state_names=(*estimate.state_names, 'pz'),
+                state=np.column_stack([estimate.state, z]),
+                covariance=covariance,
+            )
+        )
+        xyz = np.array(true.xyz)
+        xyz[:, 2] = -depth
+        there.append(evolve(true, xyz=xyz))
+    return deep, there
+
+
+def test_depth_is_scored_where_both_have_it():
+    estimates, truth, _ = single_run(count=1000)
+    assert 'depth' not in scored(estimates, truth)
+    deep, there = in_depth(estimates, truth)
+    found = scored(deep, there)['depth']
+    assert found['rmse_m'] == pytest.approx(2.0, rel=0.1) and found['nees_3d']['believable']
+    assert found['nees_3d']['dof'] == 3 and found['n'] == 1000
+    assert 'depth' not in scored(estimates, there) and 'depth' not in scored(deep, truth)
+    wrong = scored(*in_depth(estimates, truth, spread=3.0))['depth']
+    assert wrong['rmse_m'] == pytest.approx(6.0, rel=0.1) and not wrong['nees_3d']['believable']

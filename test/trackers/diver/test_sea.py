@@ -185,6 +185,17 @@ def test_covariances_of_fixes_that_cannot_be_true_are_named():
     assert run_fixes(0.25, 0.5, 1.0, fix_bias_std=1.0).warnings() == []
 
 
+def test_arrivals_that_miss_name_what_was_not_stated():
+    made = simulate(scenario('at_depth', {'duration': 75.0}), 0)
+    for config, named in (({}, 'dimensions: 3'), ({'sound_speed_std': 1.0}, 'dimensions: 3')):
+        tracker = DiverTracker(DiverConfig(max_tracks=1, model_set='heading_speed', **config))
+        for scan in made.measurements:
+            tracker.process(scan.measurement)
+        (warning,) = tracker.warnings()
+        assert named in warning and 'receiver_position_std' in warning
+        assert ('sound_speed_std' in warning) == (not config)
+
+
 def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
     """A diver who turns by up to 170 degrees: innovations of nine sigmas, true covariances."""
     tracker, farthest = DiverTracker(DiverConfig(max_tracks=1)), 0.0
