@@ -30,7 +30,7 @@ from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.evaluation.tuning import prepared, tune
 
-ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float]] = {
+ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | None]] = {
     'diver, covariances 4 times too small': (
         'diver',
         'random_heading',
@@ -55,13 +55,13 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float]] = {
         'range_std',
         0.45,
     ),
-    'fathometer, drift a quarter': (
+    'fathometer, walk taken for 0.4 m': (
         'fathometer',
         'drift_traces',
         {'records': '60'},
         {'depth_std': '0.4', 'particles': '2000'},
         'depth_std',
-        0.1,
+        None,
     ),
     'bathymetry, rough patch': (
         'bathymetry',
@@ -69,10 +69,13 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float]] = {
         {'pings': '2', 'patch_std': '0.5'},
         {'sigmas': '0.01,0.1'},
         'sigmas',
-        0.5,
+        None,
     ),
 }
-"""System, scene, its settings, parameters to begin with, what is fitted, and what is true."""
+"""System, scene, its settings, parameters to begin with, what is fitted, and what is true:
+None where the scene has no such number. Reflectors of the drift move by .01 m from record to record,
+by the tilt of the array and by .03 m of its depth; the heights of the rough patch are white, with
+a standard deviation of .5 m, and the floor beside it is flat."""
 
 
 def main(seed: int = 1, rows: Sequence[str] = tuple(ROWS)) -> Parts:
