@@ -74,8 +74,8 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | Non
 }
 """System, scene, its settings, parameters to begin with, what is fitted, and what is true:
 None where the scene has no such number. Reflectors of the drift move by .01 m from record to
-record, by the tilt of the array and by .03 m of its depth; the heights of the rough patch are white, with
-a standard deviation of .5 m, and the floor beside it is flat."""
+record, by the tilt of the array and by .03 m of its depth; the heights of the rough patch are
+white, with a standard deviation of .5 m, and the floor beside it is flat."""
 
 
 def main(seed: int = 1, rows: Sequence[str] = tuple(ROWS)) -> Parts:
