@@ -53,6 +53,7 @@ COMMANDS = {
     'echo': 'Show the estimates of running nodes as a live table.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
+    'tune': 'Fit parameters to your own recordings, or say what they cannot tell.',
     'bench': 'Measure speed against other libraries, in one run.',
     'warm': 'Compile the kernels of the trackers now, not at the first start.',
     'demo': 'Live node, offline tracker, scores and one report on the shipped bags.',

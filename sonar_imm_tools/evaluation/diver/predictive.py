@@ -1,0 +1,163 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the diver tracker predicts of each fix, for `evaluation.tuning`.
+
+A scan of m fixes, of which false ones and new divers come with density l = clutter_density +
+birth_density over the area A in which fixes lie at all, has
+
+    log p = m log l - l A + sum_t log(1 - r p + r p f / l)
+
+over the tracks: r the probability that a track is a diver, p that he is seen, f the density of the
+fix that is his under the whole mixture, 0 where he has none. So a missed diver costs
+log(1 - r p), a refused fix log l, and losing a track never pays. r begins at birth_density / l
+and follows from the same terms. Where fixes come singly, r is 1 and nobody is missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import Any
+
+from attrs import evolve
+import numpy as np
+
+from sonar_imm.estimation import imm_kernels
+from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.diver.baselines import BASELINE_NOISE
+from sonar_imm.trackers.diver.config import BASELINES, DiverConfig
+from sonar_imm.trackers.diver.scan import Positions
+from sonar_imm.trackers.diver.state import DiverState
+from sonar_imm.trackers.diver.tracker import Association, DiverTracker
+
+from ..tuning import Scores, Tunable
+
+
+def for_tuning(config: DiverConfig) -> DiverConfig:
+    """One copy: the scale is what is fitted."""
+    return evolve(config, covariance_scales=(1.0,))
+
+
+def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
+    """Raises `ConfigError` where there are arrival times."""
+    if any(isinstance(item, Arrivals) for item in measurements):
+        raise ConfigError(
+            'tune takes fixes; what this recording holds are arrival times, whose likelihood the '
+            'tracker does not keep'
+        )
+    scale, least = config.covariance_scale, min(1.0, config.covariance_scale)
+    found = [Tunable(name='covariance_scale', start=scale, least=least)]
+    if config.model_set in BASELINES:
+        noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
+        for place, value in enumerate(noise):
+            found.append(Tunable(name='acceleration_noise', start=value, place=place))
+        if len(noise) > 1:
+            stay = config.baseline_stay_probability
+            found.append(Tunable(name='baseline_stay_probability', start=stay, kind='logit'))
+        found.append(_of(config, 'velocity_std', usual=False))
+    else:
+        found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
+        if config.model_set.startswith(('families', 'heading_speed')):
+            found.append(_of(config, 'speed_mean', std=0.7))
+            found.append(_of(config, 'speed_std', std=0.7, usual=False))
+            found.append(_of(config, 'speed_noise', usual=False))
+            found.append(_of(config, 'lateral_noise', std=1.0, usual=False))
+            for name in ('hover_enter', 'hover_stay'):
+                found.append(_of(config, name, kind='logit', usual=False))
+        else:
+            found.append(_of(config, 'velocity_noise'))
+        if config.model_set == 'families':
+            found.append(_of(config, 'brisk_speed_noise', usual=False))
+            found.append(_of(config, 'family_switch_rate', usual=False))
+    scans = any(isinstance(item, Fixes) and len(item) != 1 for item in measurements)
+    found.append(_of(config, 'detection_probability', kind='logit', usual=scans))
+    found.append(_of(config, 'clutter_density', usual=scans))
+    found.append(_of(config, 'birth_density', usual=False))
+    edge = (0.0, 1.0)
+    return [t for t in found if t.start > 0.0 and not (t.kind == 'logit' and t.start in edge)]
+
+
+def _of(config: DiverConfig, name: str, **settings: Any) -> Tunable:
+    return Tunable(name=name, start=getattr(config, name), **settings)
+
+
+class Scored(DiverTracker):
+    """The tracker, with what it predicted. scores: by stamp."""
+
+    def __init__(self, config: DiverConfig, measurements: Sequence[Any] = ()):
+        self.scores: Scores = {}
+        self.existence: dict[int, float] = {}
+        self.area = area_of(measurements)
+        self._seen: list[Positions] = []
+        super().__init__(config)
+
+    def _step(self, before: DiverState, stamp_ns: int, items: Any) -> DiverState:
+        self._seen, self.scores[stamp_ns] = [], (0.0, 0)
+        return super()._step(before, stamp_ns, items)
+
+    def _associate(self, now: DiverState, fixes: Positions) -> Association:
+        association = super()._associate(now, fixes)
+        # A track that begins anew at a fix is asked once more: that is no prediction of it.
+        if not any(fixes is group for group in self._seen):
+            self._seen.append(fixes)
+            score, count = self.scores[now.stamp_ns]
+            gained, measured = self._score(now, fixes, association)
+            self.scores[now.stamp_ns] = score + gained, count + measured
+        return association
+
+    def _score(self, now: DiverState, fixes: Positions, found: Association) -> tuple[float, int]:
+        config = fixes.config
+        p, m = config.detection_probability, len(fixes.z)
+        density = config.clutter_density + config.birth_density
+        log_f = np.full(len(now.x), -np.inf)
+        if len(found.tracks):
+            if found.densities is not None:
+                whole = found.densities.whole
+            else:
+                H = self._layout(now.instruments).H
+                expected = found.expected
+                whole = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
+            log_f[found.tracks] = whole[found.tracks, found.detection]
+        score = m * math.log(density)
+        nameless = fixes.whole and fixes.target_id is None
+        if nameless:
+            score -= density * self.area
+        known = config.max_tracks == 1
+        decay = 1.0
+        for track, track_id in enumerate(now.life.track_id.tolist()):
+            hit = np.isfinite(log_f[track])
+            ratio = math.exp(min(log_f[track] - math.log(density), 600.0)) if hit else 0.0
+            if not nameless or now.target_id[track] != NOBODY:
+                if hit:
+                    score += math.log(1.0 - p + p * ratio)
+                continue
+            r = 1.0 if known else self.existence.get(track_id, config.birth_density / density)
+            r *= decay
+            total = 1.0 - r * p + r * p * ratio
+            score += math.log(total)
+            self.existence[track_id] = r * (1.0 - p + p * ratio) / total
+        # A fix that nothing came before cannot be predicted.
+        return score, m if len(now.x) else 0
+
+
+def area_of(measurements: Sequence[Any]) -> float:
+    """m^2 of the rectangle in which the fixes of scans lie; 1 where there are none."""
+    places = [item.position[:, :2] for item in measurements if isinstance(item, Fixes)]
+    places += [item.position[None, :2] for item in measurements if isinstance(item, Fix)]
+    places = [place for place in places if len(place)]
+    if not places:
+        return 1.0
+    return float(max(np.prod(np.ptp(np.concatenate(places), axis=0)), 1.0))

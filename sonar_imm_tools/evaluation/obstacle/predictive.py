@@ -1,0 +1,95 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the obstacle tracker predicts of each ping, for `evaluation.tuning`: the sum of
+`evaluation.diver.predictive`, in range and bearing over the sector that the sonar sees, of tracks
+as far as they are in the beam. A new track is an obstacle with probability 1/2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.estimation import imm_kernels
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Detections
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.state import PingState
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+from ..tuning import Scores, Tunable
+
+NEW = 0.5
+"""Probability that a track that begins is an obstacle."""
+
+
+def for_tuning(config: ObstacleConfig) -> ObstacleConfig:
+    """Nothing costs time beside the filter itself."""
+    return config
+
+
+def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunable]:
+    """Standard deviations only where some detections come without a variance."""
+    pings = [item for item in measurements if isinstance(item, Detections)]
+    found = []
+    if any(np.isnan(ping.var_range).any() for ping in pings):
+        found.append(Tunable(name='range_std', start=config.range_std))
+    if any(np.isnan(ping.var_bearing).any() for ping in pings):
+        found.append(Tunable(name='bearing_std_deg', start=config.bearing_std_deg))
+    p = config.detection_probability
+    found.append(Tunable(name='detection_probability', start=p, kind='logit'))
+    found.append(Tunable(name='clutter_density', start=config.clutter_density))
+    for name in ('sway_std', 'max_speed', 'speed_noise', 'position_noise', 'yaw_noise_deg'):
+        if (start := getattr(config, name)) > 0.0:
+            found.append(Tunable(name=name, start=start, usual=False))
+    return found
+
+
+class Scored(ObstacleTracker):
+    """The tracker, with what it predicted. scores: by stamp."""
+
+    def __init__(self, config: ObstacleConfig, measurements: Sequence[Any] = ()):
+        self.scores: Scores = {}
+        self.existence: dict[int, float] = {}
+        self.area = config.max_range * math.radians(config.horizontal_fov_deg)
+        super().__init__(config)
+
+    def _associate(
+        self, now: PingState, z: FloatArray, R: FloatArray
+    ) -> tuple[np.ndarray, FloatArray]:
+        chosen, h = super()._associate(now, z, R)
+        config = self.config
+        score = len(z) * math.log(config.clutter_density) - config.clutter_density * self.area
+        if len(h):
+            log_f = np.full(len(h), -np.inf)
+            hit = np.flatnonzero(chosen >= 0)
+            if len(hit):
+                _, C = self.filter.expected(now.mixture, now.sonar)
+                fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, math.inf)
+                log_f[hit] = fit[hit, chosen[hit]]
+            in_beam, _ = self.filter.outlook(now.mixture, now.sonar)
+            for track, track_id in enumerate(now.life.track_id.tolist()):
+                p = config.detection_probability * float(np.clip(in_beam[track], 0.01, 1.0))
+                gap = log_f[track] - math.log(config.clutter_density)
+                ratio = math.exp(min(gap, 600.0)) if np.isfinite(gap) else 0.0
+                r = self.existence.get(track_id, NEW)
+                total = 1.0 - r * p + r * p * ratio
+                score += math.log(total)
+                self.existence[track_id] = r * (1.0 - p + p * ratio) / total
+        self.scores[now.stamp_ns] = score, len(z) if len(h) else 0
+        return chosen, h

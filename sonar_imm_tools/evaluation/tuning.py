@@ -1,0 +1,533 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters by the likelihood of a user's own recordings: what they say of each, or that they say
+nothing.
+
+    maximise   sum_k log p(measurement k | those before it; parameters) + log prior
+
+Each system has a module `evaluation.<system>.predictive` with
+
+- ``tunables(config, measurements) -> list[Tunable]``: what can be fitted, and where it starts;
+- ``Scored``: its tracker, which notes the log predictive density of every stamp in ``scores``;
+- ``for_tuning(config)``: the config without what costs time and changes no prediction.
+
+The coordinates are logarithms of positive numbers and logits of probabilities. The prior is normal
+around what is configured, so that the data have to say something before a parameter moves.
+Nelder-Mead finds the maximum from two starts, central differences its curvature. A parameter is
+``told`` when its standard error is small and it is not at a bound, else ``flat``: then it stays as
+it was, and those that are told are fitted once more. What the fit is worth is asked on the half of
+each recording that it has not seen, both ways round.
+
+The sums are exact (`math.fsum`), so that neither the order of recordings nor the number of
+processes changes a byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+from importlib import import_module
+import itertools
+import math
+from typing import Any
+
+from attrs import evolve, frozen
+import numpy as np
+
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.intake import Intake
+from sonar_imm.measurements import Rejection
+from sonar_imm.parameters import Config, ConfigError, did_you_mean
+from sonar_imm.trackers import SYSTEMS
+
+from ..offline.batch import Job
+from ..offline.jobs import processes
+from ..recordings.measurements import measurements_of
+from ..recordings.reader import BagReader
+from ..recordings.topics import fitting_topics
+
+FEWEST = 20
+"""Measurements below which nothing is fitted."""
+TOLD = 0.35
+"""Standard error, of a logarithm or logit, up to which a parameter is told."""
+STEP = 0.15
+"""Of central differences."""
+EVALUATIONS = 40
+"""Most evaluations of a fit, for each parameter."""
+PRECISION = 0.02
+"""Of coordinates and of the log likelihood, at which Nelder-Mead stops."""
+WHOLE, FIRST, SECOND = 'whole', 'first', 'second'
+
+Scores = dict[int, tuple[float, int]]
+"""Log predictive density, and the number of measurements, by stamp."""
+
+
+@frozen(kw_only=True)
+class Tunable:
+    """A parameter that can be fitted: `start` is the value that it has, or that stands for an
+    automatic one. place: of an element, where the parameter is a list. kind: ``log`` or ``logit``.
+    std: of the prior, in that coordinate. least: a bound beside those of the parameter. usual:
+    whether it is fitted without being asked for. step: of the differences."""
+
+    name: str
+    start: float
+    kind: str = 'log'
+    std: float = 1.5
+    least: float = 1e-12
+    place: int | None = None
+    usual: bool = True
+    step: float = STEP
+
+    @property
+    def label(self) -> str:
+        return self.name if self.place is None else f'{self.name}[{self.place}]'
+
+    def coordinate(self, value: float) -> float:
+        return math.log(value / (1.0 - value)) if self.kind == 'logit' else math.log(value)
+
+    def value(self, coordinate: float) -> float:
+        if self.kind == 'logit':
+            return 1.0 / (1.0 + math.exp(-coordinate))
+        return math.exp(coordinate)
+
+    def bounds(self, config: Config) -> tuple[float, float]:
+        """Of the coordinate: four standard deviations, and what is possible."""
+        spec = next(spec for spec in config.specs() if spec.name == self.name)
+        edge = (1e-6, 1.0 - 1e-6) if self.kind == 'logit' else (1e-12, 1e12)
+        low = min(max(edge[0], self.least, spec.low or 0.0), self.start)
+        high = max(min(edge[1], edge[1] if spec.high is None else spec.high), self.start)
+        u = self.coordinate(self.start)
+        return (
+            max(u - 4.0 * self.std, self.coordinate(low)),
+            min(u + 4.0 * self.std, self.coordinate(high)),
+        )
+
+
+@frozen(eq=False)
+class Recording:
+    """One instrument of a recording: its config, and its measurements in the order of stamps."""
+
+    system: str
+    config: Config
+    frame_id: str
+    measurements: tuple[Any, ...]
+
+    @classmethod
+    def read(cls, job: Job) -> Recording:
+        """What `job` would track. Raises `BagError` and `ConfigError`."""
+        options = job.options
+        with BagReader(job.bag) as reader:
+            chosen = fitting_topics(reader, job.system, options.topics)
+            settings = {**job.config.as_dict(), 'use_tf_static': options.use_tf_static}
+            topics = {name: e.name for name, e in chosen.items() if e.wanted(settings)}
+            config = job.config.for_inputs(frozenset(topics.values()))
+            heard = measurements_of(
+                reader,
+                job.system,
+                topics,
+                world_frame=options.world_frame,
+                order='stamp',
+                settings=config.as_dict(),
+                detector=options.detector,
+            )
+            found = tuple(
+                item.measurement
+                for item in heard
+                if item.measurement is not None and not isinstance(item.measurement, Rejection)
+            )
+        module = _predictive(job.system)
+        return cls(job.system, module.for_tuning(config), options.frame_id, found)
+
+    def scores(self, values: Mapping[str, Any], until: float = math.inf) -> Scores:
+        """What a tracker with these parameters predicts, stamp by stamp, up to `until`."""
+        tracker = _predictive(self.system).Scored(evolve(self.config, **values), self.measurements)
+        intake = Intake(tracker, self.frame_id)
+        for measurement in self.measurements:
+            if measurement.stamp_ns > until:
+                break
+            try:
+                admitted = intake.admit(measurement)
+            except Rejection:
+                continue
+            if admitted is not None:
+                tracker.process(admitted)
+        found: Scores = tracker.scores
+        return found
+
+
+def _predictive(system: str) -> Any:
+    return import_module(f'{SYSTEMS[system].judge}.predictive')
+
+
+_read: dict[str, Recording] = {}
+
+
+def _recording(job: Job) -> Recording:
+    """A recording, read once in each process."""
+    key = f'{job.bag.resolve()}\n{job!r}'
+    if key not in _read:
+        _read[key] = Recording.read(job)
+    return _read[key]
+
+
+def values_of(tunables: Sequence[Tunable], u: FloatArray, config: Config) -> dict[str, Any]:
+    """The parameters at coordinates u (p,)."""
+    values: dict[str, Any] = {}
+    lists: dict[str, dict[int, float]] = {}
+    for tunable, coordinate in zip(tunables, u.tolist()):
+        value = tunable.value(coordinate)
+        if tunable.place is None:
+            values[tunable.name] = value
+        else:
+            lists.setdefault(tunable.name, {})[tunable.place] = value
+    for name, elements in lists.items():
+        whole = list(usual_list(tunables, name, config))
+        for place, value in elements.items():
+            whole[place] = value
+        values[name] = tuple(whole)
+    return values
+
+
+def usual_list(tunables: Sequence[Tunable], name: str, config: Config) -> Sequence[float]:
+    """The list `name` before it is fitted: of the config, or what an empty one stands for."""
+    configured = getattr(config, name)
+    return configured or [t.start for t in tunables if t.name == name]
+
+
+@frozen
+class Fitting:
+    """What a process needs to evaluate the posterior. split: the stamp
+    that divides each recording into halves."""
+
+    jobs: tuple[Job, ...]
+    tunables: tuple[Tunable, ...]
+    split: tuple[int, ...]
+
+    def scores(self, u: FloatArray | None, part: str = WHOLE) -> tuple[float, int]:
+        """Sum of log predictive densities of a part, given all before it, and of how many
+        measurements; u None: at what is configured."""
+        terms, count = [], 0
+        for job, split in zip(self.jobs, self.split):
+            recording = _recording(job)
+            values = {} if u is None else values_of(self.tunables, u, recording.config)
+            found = recording.scores(values, split if part == FIRST else math.inf)
+            for stamp_ns, (score, measured) in found.items():
+                if part == WHOLE or (stamp_ns <= split) == (part == FIRST):
+                    terms.append(score)
+                    count += measured
+        return math.fsum(terms), count
+
+    def posterior(self, u: FloatArray, part: str = WHOLE) -> float:
+        start = [t.coordinate(t.start) for t in self.tunables]
+        std = [t.std for t in self.tunables]
+        prior = -0.5 * float(np.square((u - start) / std).sum())
+        return self.scores(u, part)[0] + prior
+
+
+def maximise(
+    fitting: Fitting, start: FloatArray, part: str, advance: Callable[[int], None] | None = None
+) -> tuple[FloatArray, float, int]:
+    """Where the posterior is largest, how large it is, and after how many evaluations."""
+    from scipy.optimize import minimize
+
+    config = _recording(fitting.jobs[0]).config
+    bounds = np.array([t.bounds(config) for t in fitting.tunables])
+    start = np.clip(start, *bounds.T)
+    simplex = np.tile(start, (len(start) + 1, 1))
+    for k, tunable in enumerate(fitting.tunables):
+        step = 0.5 * tunable.std
+        simplex[k + 1, k] += step if start[k] + step <= bounds[k, 1] else -step
+
+    def cost(u: FloatArray) -> float:
+        if advance is not None:
+            advance(1)
+        value = fitting.posterior(u, part)
+        return -value if math.isfinite(value) else 1e12
+
+    found = minimize(
+        cost,
+        start,
+        method='Nelder-Mead',
+        bounds=bounds,
+        options={
+            'initial_simplex': np.clip(simplex, *bounds.T),
+            'xatol': PRECISION,
+            'fatol': PRECISION,
+            'maxfev': EVALUATIONS * len(start),
+        },
+    )
+    return np.asarray(found.x), -float(found.fun), int(found.nfev)
+
+
+def errors(
+    fitting: Fitting, best: FloatArray, evaluate: Callable[[list[FloatArray]], list[float]]
+) -> FloatArray:
+    """Standard errors (p,) of the coordinates, from the curvature at `best`; infinite where it has
+    none."""
+    p = len(best)
+    step = np.diag([t.step for t in fitting.tunables])
+    pairs = list(itertools.combinations(range(p), 2))
+    points = [best]
+    for k in range(p):
+        points += [best + step[k], best - step[k]]
+    for i, j in pairs:
+        points += [
+            best + step[i] + step[j],
+            best + step[i] - step[j],
+            best - step[i] + step[j],
+            best - step[i] - step[j],
+        ]
+    f = evaluate(points)
+    H = np.empty((p, p))
+    for k in range(p):
+        H[k, k] = -(f[1 + 2 * k] - 2.0 * f[0] + f[2 + 2 * k]) / step[k, k] ** 2
+    for row, (i, j) in enumerate(pairs):
+        a, b, c, d = f[1 + 2 * p + 4 * row : 5 + 2 * p + 4 * row]
+        H[i, j] = H[j, i] = -(a - b - c + d) / (4.0 * step[i, i] * step[j, j])
+    values = np.linalg.eigvalsh(H)
+    if values[0] > 0.0:
+        return np.sqrt(np.diag(np.linalg.inv(H)))
+    return np.full(p, np.inf)
+
+
+@frozen(kw_only=True)
+class Row:
+    """What was found of a parameter. low, high: two standard errors to either side; None where the
+    likelihood has no curvature, or is largest at a bound."""
+
+    name: str
+    before: float
+    after: float
+    low: float | None
+    high: float | None
+    verdict: str
+    reason: str
+
+
+@frozen(kw_only=True)
+class Tuned:
+    """The result. values: of the parameters that are told; empty when nothing is gained."""
+
+    system: str
+    measurements: int
+    log_likelihood_before: float
+    log_likelihood_after: float
+    held_out_gain: float
+    evaluations: int
+    parameters: tuple[Row, ...]
+    values: dict[str, Any]
+
+
+def rounded(value: float) -> float:
+    """To six digits, as it is written."""
+    return float(f'{value:.6g}')
+
+
+def prepared(jobs: Sequence[Job], names: Sequence[str]) -> tuple[Fitting, int]:
+    """What is to be fitted, and how many measurements there are. Raises `ConfigError` for what
+    cannot be fitted, or not from so little."""
+    jobs = tuple(sorted(jobs, key=lambda job: (str(job.bag), job.instrument)))
+    recordings = [_recording(job) for job in jobs]
+    first = recordings[0]
+    every = _predictive(first.system).tunables(first.config, first.measurements)
+    known = {t.name for t in every}
+    for name in names:
+        if name not in known:
+            specs = [spec.name for spec in first.config.specs()]
+            if name not in specs:
+                raise ConfigError(f"unknown parameter '{name}'{did_you_mean(name, known)}")
+            raise ConfigError(
+                f"parameter '{name}' cannot be fitted to this recording; these can: "
+                + ', '.join(sorted(known))
+            )
+    tunables = tuple(t for t in every if (t.name in names if names else t.usual))
+    for tunable in tunables:
+        if len({str(getattr(each.config, tunable.name)) for each in recordings}) > 1:
+            raise ConfigError(
+                f'the recordings have different {tunable.name}: --params or --set gives them one'
+            )
+    split, count = [], 0
+    for recording in recordings:
+        found = recording.scores({})
+        stamps = sorted(found)
+        total = sum(measured for _, measured in found.values())
+        so_far = np.cumsum([found[stamp][1] for stamp in stamps])
+        half = int(np.searchsorted(so_far, 0.5 * total)) if stamps else 0
+        split.append(stamps[min(half, len(stamps) - 2)] if len(stamps) > 1 else 0)
+        count += total if len(stamps) > 1 else 0
+    if count < FEWEST:
+        raise ConfigError(
+            f'too little to fit: {count} measurements with something before them to predict them '
+            f'from, {FEWEST} are needed'
+        )
+    return Fitting(jobs, tunables, tuple(split)), count
+
+
+def most_evaluations(parameters: int) -> int:
+    """How many evaluations `tune` takes at most."""
+    return EVALUATIONS * parameters * 5 + 1 + 2 * parameters**2
+
+
+def tune(
+    fitting: Fitting,
+    measurements: int,
+    *,
+    processes_used: int = 1,
+    advance: Callable[[int], None] = lambda count: None,
+) -> Tuned:
+    """Fit the parameters; `advance` hears of evaluations."""
+    with _mapping(processes_used, advance) as together:
+        return _tune(fitting, measurements, together)
+
+
+Together = Callable[..., list[Any]]
+
+
+def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
+    tunables = fitting.tunables
+    config = _recording(fitting.jobs[0]).config
+    start = np.array([t.coordinate(t.start) for t in tunables])
+    std = np.array([t.std for t in tunables])
+    starts = [(fitting, start, WHOLE), (fitting, start + std, WHOLE)]
+    fits = together(maximise, starts)
+    best, _, _ = max(fits, key=lambda found: found[1])
+    used = sum(found[2] for found in fits)
+
+    bounds = np.array([t.bounds(config) for t in tunables])
+    at_bound = np.minimum(best - bounds[:, 0], bounds[:, 1] - best) < 0.05
+    se = np.full(len(best), np.inf)
+    if not at_bound.all():
+        free = np.flatnonzero(~at_bound)
+
+        def evaluate(points: list[FloatArray]) -> list[float]:
+            wide = []
+            for point in points:
+                whole = best.copy()
+                whole[free] = point
+                wide.append((fitting, whole, WHOLE))
+            return together(_posterior, wide)
+
+        part = evolve(fitting, tunables=tuple(tunables[k] for k in free))
+        se[free] = errors(part, best[free], evaluate)
+        used += 1 + 2 * len(free) ** 2
+    told = (se <= TOLD) & ~at_bound
+
+    before, _ = fitting.scores(None)
+    after, gain, values = before, 0.0, {}
+    final = best
+    if told.any():
+        again = evolve(fitting, tunables=tuple(t for t, yes in zip(tunables, told) if yes))
+        begin = [(again, start[told], FIRST), (again, start[told], SECOND)]
+        if not told.all():
+            begin.append((again, best[told], WHOLE))
+        fits = together(maximise, begin)
+        used += sum(found[2] for found in fits)
+        final = best.copy()
+        if not told.all():
+            final[told] = fits[2][0]
+        chosen = np.array(
+            [t.coordinate(rounded(t.value(u))) for t, u, yes in zip(tunables, final, told) if yes]
+        )
+        halves = together(
+            _score,
+            [
+                (again, fits[0][0], SECOND),
+                (again, None, SECOND),
+                (again, fits[1][0], FIRST),
+                (again, None, FIRST),
+                (again, chosen, WHOLE),
+            ],
+        )
+        used += 5
+        gain = math.fsum([halves[0], -halves[1], halves[2], -halves[3]]) / measurements
+        after = halves[4]
+        if gain > 0.0:
+            values = _as_written(values_of(again.tunables, chosen, config))
+    rows = []
+    for k, tunable in enumerate(tunables):
+        place = final[k]
+        low = high = None
+        if np.isfinite(se[k]):
+            low = rounded(tunable.value(max(place - 2.0 * se[k], bounds[k, 0])))
+            high = rounded(tunable.value(min(place + 2.0 * se[k], bounds[k, 1])))
+        reason = ''
+        if at_bound[k]:
+            reason = f'the likelihood goes on rising beyond {tunable.value(best[k]):.4g}'
+        elif not told[k]:
+            reason = 'cannot be told from this recording'
+        value = rounded(tunable.value(place)) if told[k] else tunable.start
+        rows.append(
+            Row(
+                name=tunable.label,
+                before=tunable.start,
+                after=value,
+                low=low,
+                high=high,
+                verdict='told' if told[k] else 'flat',
+                reason=reason,
+            )
+        )
+    return Tuned(
+        system=fitting.jobs[0].system,
+        measurements=measurements,
+        log_likelihood_before=before,
+        log_likelihood_after=after,
+        held_out_gain=gain,
+        evaluations=used,
+        parameters=tuple(rows),
+        values=values,
+    )
+
+
+def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: [rounded(v) for v in value] if isinstance(value, tuple) else rounded(value)
+        for name, value in values.items()
+    }
+
+
+def _posterior(
+    fitting: Fitting, u: FloatArray, part: str, advance: Callable[[int], None] | None = None
+) -> float:
+    if advance is not None:
+        advance(1)
+    return fitting.posterior(u, part)
+
+
+def _score(
+    fitting: Fitting, u: FloatArray | None, part: str, advance: Callable[[int], None] | None = None
+) -> float:
+    if advance is not None:
+        advance(1)
+    return fitting.scores(u, part)[0]
+
+
+@contextlib.contextmanager
+def _mapping(count: int, advance: Callable[[int], None]) -> Iterator[Together]:
+    """Calls of a function with each of some arguments, here or in `count` processes."""
+    if count == 1:
+        yield lambda work, calls: [work(*call, advance) for call in calls]
+        return
+    with processes(count) as pool:
+
+        def together(work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
+            futures = [pool.submit(work, *call) for call in calls]
+            results = []
+            for future in futures:
+                results.append(future.result())
+                advance(results[-1][2] if work is maximise else 1)
+            return results
+
+        yield together
