@@ -31,6 +31,7 @@ from helpers.source import (
     module_name,
     MODULES,
     ROOT,
+    tree_of,
 )
 import pytest
 
@@ -216,7 +217,7 @@ def test_no_function_takes_many_positional_arguments() -> None:
     found = {
         f'{module_name(path)}:{name}'
         for path in MODULES
-        for name, count in positional_arguments(path.read_text(encoding='utf-8'))
+        for name, count in positional_arguments(tree_of(path))
         if count > MOST_ARGUMENTS
     }
     assert found == set(MANY_ARGUMENTS), 'too many arguments, or listed without need'
@@ -227,7 +228,7 @@ def test_the_argument_check_sees_every_kind_of_function() -> None:
         'def f(a, /, b, *c, d=1):\n    return lambda x, y, z: 0\n'
         'class C:\n    async def g(self, a, b, c):\n        pass\n'
     )
-    assert sorted(positional_arguments(source)) == [('<lambda>', 3), ('f', 2), ('g', 4)]
+    assert sorted(positional_arguments(ast.parse(source))) == [('<lambda>', 3), ('f', 2), ('g', 4)]
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -287,8 +288,7 @@ def test_only_the_record_lists_the_systems() -> None:
 
     listing = set()
     for path in MODULES:
-        tree = ast.parse(path.read_text(encoding='utf-8'))
-        words = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        words = {node.value for node in ast.walk(tree_of(path)) if isinstance(node, ast.Constant)}
         if len(words & set(SYSTEMS)) > 1:
             listing.add(module_name(path))
     assert listing == {'sonar_imm.trackers'}
@@ -362,11 +362,11 @@ def distribution(requirement: str) -> str:
     return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
 
 
-def positional_arguments(source: str) -> list[tuple[str, int]]:
-    """Name of every function in the source, and how many arguments it takes by position."""
+def positional_arguments(tree: ast.Module) -> list[tuple[str, int]]:
+    """Name of every function in the module, and how many arguments it takes by position."""
     kinds = ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda
     return [
         (getattr(node, 'name', '<lambda>'), len(node.args.posonlyargs) + len(node.args.args))
-        for node in ast.walk(ast.parse(source))
+        for node in ast.walk(tree)
         if isinstance(node, kinds)
     ]

@@ -17,7 +17,7 @@
 import ast
 from collections import defaultdict
 
-from helpers.source import imported_names, module_name, MODULES, ROOT
+from helpers.source import imports, module_name, MODULES, ROOT, tree_of
 
 ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
 
@@ -37,15 +37,10 @@ LIBRARY = {
 """Public functions that this package does not call itself: what they are there for."""
 
 
-def sources():
-    users = [*MODULES, *(ROOT / 'benchmarks').rglob('*.py')]
-    return {path: path.read_text(encoding='utf-8') for path in users}
-
-
-def uses(path, source, tree):
+def uses(path, tree):
     """(function that uses it or None, dotted name used) of every name and attribute."""
     names = {}
-    for name in imported_names(source, path):
+    for name in imports(path):
         names[name.rpartition('.')[2]] = name
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)):
@@ -67,9 +62,9 @@ def unused():
     """Public functions of the mathematical rooms that nothing but themselves and other unused ones
     call."""
     users, public = defaultdict(set), set()
-    for path, source in sources().items():
-        tree = ast.parse(source)
-        for owner, name in uses(path, source, tree):
+    for path in [*MODULES, *(ROOT / 'benchmarks').rglob('*.py')]:
+        tree = tree_of(path)
+        for owner, name in uses(path, tree):
             if owner != name:
                 users[name].add(owner)
         if module_name(path).startswith(ROOMS):

@@ -80,6 +80,7 @@ def distance2(fix, truth):
 # -- statistics ----------------------------------------------------------------------------------
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('kind', ['active', 'passive', 'bearings'])
 def test_errors_are_what_the_covariance_and_the_bound_say(kind):
     runs, n, sigma_bearing = 300, 6, np.radians(0.3)

@@ -98,6 +98,7 @@ def test_mean_and_covariance_are_those_of_the_draws(levelled, covariance):
     assert 2.8 < nees.mean() < 3.4
 
 
+@pytest.mark.statistics
 def test_along_the_line_of_sight_the_bend_counts():
     """To first order alone a sonar good to .1 m in range would claim it of the place."""
     found, _ = draws(4000, np.random.default_rng(2))

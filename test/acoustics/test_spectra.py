@@ -109,6 +109,7 @@ def test_spectra_of_nothing():
         SlidingAverage(3, 4)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('window, overlap', [('hann', 0.5), ('rectangular', 0.5), ('hann', 0.75)])
 def test_the_taper_of_noise_is_that_of_correlated_noise(window, overlap):
     """Two unrelated noises, correlated by averaged cross-spectra, many times over."""

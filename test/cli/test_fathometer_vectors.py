@@ -117,6 +117,7 @@ def flat(csdm):
     return csdm.astype(np.complex64).reshape(len(csdm), -1).view(np.float32)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('line', LINES)
 def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
     """With what the converter tells the tracker. 4 to 6 s a line: its records are the test."""

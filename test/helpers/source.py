@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -75,15 +76,23 @@ def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
     return next(filter(None, map(visit, sorted(graph))), None)
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """The module as it is parsed, once for all tests of a process."""
+    return ast.parse(path.read_text(encoding='utf-8'))
+
+
+@cache
 def imports(path: Path) -> list[str]:
-    return imported_names(path.read_text(encoding='utf-8'), path)
+    """Every name the module imports, made absolute, at the top or inside a function."""
+    return imported_names(tree_of(path), path)
 
 
-def imported_names(source: str, path: Path) -> list[str]:
-    """Every name the source imports, made absolute, at the top or inside a function."""
+def imported_names(tree: ast.Module, path: Path) -> list[str]:
+    """Every name that the module at `path` imports, made absolute."""
     package = module_name(path) if path.name == '__init__.py' else module_name(path.parent)
     names = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -40,13 +40,13 @@ from sonar_imm_tools.recordings.own_files import write_own_parameters
 def test_no_message_breaks_a_tracker(system):
     tally = Tally()
 
-    @settings(max_examples=2000 // BATCH, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=1000 // BATCH, suppress_health_check=list(HealthCheck))
     @given(batch=batches(system))
     def search(batch):
         run(system, batch, tally)
 
     search()
-    assert tally.cases >= 2000
+    assert tally.cases >= 1000
     # Most get past the reader, or nothing behind it would be tried.
     assert tally.read > 0.5 * tally.cases and len(tally.refused) >= 5 and tally.counted
 

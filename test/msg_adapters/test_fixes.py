@@ -163,7 +163,7 @@ NASTY = (
     frame_id=st.sampled_from(['map', '', 'x_ned']),
     world=st.sampled_from(['enu', 'ned']),
 )
-@settings(max_examples=3_000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=1_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, frame_id, world):
     x, y, z, a, b, c, d = (NASTY[value % len(NASTY)] for value in values)
     message = pose(

@@ -70,7 +70,7 @@ def topics(system, make_bench):
     module = import_module(f'sonar_imm.nodes.{system}')
     node = bench.add(getattr(module, f'{system.capitalize()}Node')(context=bench.context))
     heard = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.spin_until(lambda: heard)
+    bench.spin_until(lambda: heard and node._hears)  # inputs are heard once kernels are compiled
     published = node.get_publisher_names_and_types_by_node(system, '/')
     subscribed = node.get_subscriber_names_and_types_by_node(system, '/')
     found = {name: types[0] for name, types in published + subscribed}

@@ -89,6 +89,7 @@ def test_arrivals_are_transmitter_diver_receiver():
         np.testing.assert_array_equal(one.measurement.rx, RECEIVERS)
 
 
+@pytest.mark.statistics
 def test_misses_clutter_and_outliers_come_as_often_as_asked():
     missed = simulate(scenario('table1', {'detection_probability': 0.7, 'duration': 2000.0}), 5)
     assert len(missed.measurements) == pytest.approx(0.7 * 2001, abs=80)

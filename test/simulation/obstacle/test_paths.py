@@ -51,6 +51,7 @@ def test_a_mover_moves_as_its_velocity_says_and_is_seen():
     assert np.mean(seen) > 0.5
 
 
+@pytest.mark.statistics
 def test_a_swinging_obstacle_goes_in_smooth_waves():
     moved = []
     for seed in range(20):

@@ -173,6 +173,7 @@ def test_a_wrong_sound_speed_scales_all_ranges_of_a_run_alike():
     assert abs(np.mean(scales)) < 4.0 * 0.02 / np.sqrt(60)
 
 
+@pytest.mark.statistics
 def test_echoes_from_elsewhere_and_misses_come_as_often_as_told():
     lost = wild = n = 0
     for seed in range(12):

@@ -223,7 +223,7 @@ def many_receivers(turn, elevation=False, scale=1.0, passive=False, seconds=40, 
 def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
     """Eight receivers are more than subsets are tried of: heavy tails. Turned by pi, the diver
     crosses the direction in which their bearings jump from pi to -pi."""
-    depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive}
+    depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive, 'seconds': 25}
     plain, divers, _ = many_receivers(0.0, **depth)
     other, turned, _ = many_receivers(np.pi, **depth)
     for item, two, diver in zip(plain[5:], other[5:], turned[5:]):
@@ -247,6 +247,7 @@ def test_elevations_show_the_depth():
     assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(P[-1, 2, 2])
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('passive', [False, True])
 @pytest.mark.parametrize('scale', [1.01, 4.0])
 def test_the_scale_of_arrival_times_is_learnt(scale, passive):

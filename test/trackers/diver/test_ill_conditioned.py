@@ -62,7 +62,7 @@ def least_eigenvalue(covariance):
 def test_covariances_stay_positive_definite(model_set):
     """Before, a correlation had an eigenvalue of -.16 for `cv`."""
     repairs = 0
-    for seed in range(12):
+    for seed in range(6):
         tracker = DiverTracker(config(model_set, seed))
         for fix in sharp_fixes(seed):
             for estimate in tracker.process(fix):
@@ -79,7 +79,7 @@ def test_covariances_stay_positive_definite(model_set):
 
 def test_smoothing_keeps_them_and_counts_its_own():
     counted = []
-    for seed in range(12):
+    for seed in range(6):
         tracker = SmoothingDiverTracker(config('cv_ct', seed))
         for fix in sharp_fixes(seed):
             tracker.process(fix)

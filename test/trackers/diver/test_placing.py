@@ -367,6 +367,7 @@ def test_levelled_positions_do_not_turn_with_the_vessel():
     assert estimate.state[0, :2] == pytest.approx([30.0, 0.0], abs=0.05)
 
 
+@pytest.mark.statistics
 def test_the_tracker_is_consistent_with_all_errors_drawn():
     """A diver that rests is seen by a transceiver on a vessel that circles it: NEES."""
     rng = np.random.default_rng(5)

@@ -170,7 +170,7 @@ def test_crossing_in_clutter_is_better_softly():
 
 
 def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
-    scene = simulate(scenario('crossing', {'duration': 30.0}), seed=1)
+    scene = simulate(scenario('crossing', {'duration': 12.0}), seed=1)
     config = DiverConfig(association='jipda', **scenario('crossing').instruments())
     tracker = SmoothingDiverTracker(config)
     forward = run(tracker, [item.measurement for item in scene.measurements])

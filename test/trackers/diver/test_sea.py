@@ -73,6 +73,7 @@ def test_where_nothing_is_said_of_the_depth_it_stays_as_wide_as_the_water():
         assert estimate.covariance[0, 2, 2] >= 0.9 * 30.0**2 / 12.0
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('errors', ['mixed', 'consider', 'estimate'])
 def test_misplaced_instruments_are_in_the_covariance(errors):
     named = {'model_set': 'heading_speed'}
@@ -117,6 +118,7 @@ def test_receivers_that_come_later_bring_their_prior():
     np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
 
+@pytest.mark.statistics
 def test_lasting_errors_of_fixes_are_in_the_covariance():
     scene = {'duration': 200.0}
     white = judged('lasting_errors', scene, {})

@@ -32,8 +32,17 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 
-@pytest.mark.parametrize('model_set', MODEL_SETS)
-@pytest.mark.parametrize('adaptation', ADAPTATIONS)
+@pytest.mark.parametrize(
+    'model_set, adaptation',
+    [
+        *((model_set, DiverConfig().adaptation) for model_set in MODEL_SETS),
+        *(
+            (model_set, kind)
+            for model_set in ('heading_speed', 'families')
+            for kind in ADAPTATIONS
+        ),
+    ],
+)
 def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
     scene = simulate(scenario('zigzag'), seed=3)
     tracker = SYSTEMS['diver'].build(
@@ -113,10 +122,10 @@ def test_consistency_where_the_models_hold():
     assert low < np.mean(squared) < high
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(st.randoms(use_true_random=False))
 def test_shuffled_input_gives_the_same_bits(random):
-    scene = simulate(scenario('irregular', {'duration': 25.0, 'clutter': 1.0}), seed=8)
+    scene = simulate(scenario('irregular', {'duration': 15.0, 'clutter': 1.0}), seed=8)
     ordered = sorted((item.measurement for item in scene.measurements), key=lambda m: m.stamp_ns)
     shuffled = sorted(ordered, key=lambda m: m.stamp_ns + random.uniform(0.0, 9.0) * SECOND)
     expected, late = (run(DiverTracker(DiverConfig()), items) for items in (ordered, shuffled))

@@ -117,6 +117,7 @@ def kalman(seen, layers, depth_std, std, memory):
     return np.array(found)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('heave', ['independent', 'memory'])
 @pytest.mark.parametrize(('seed', 'depth_std'), [(1, 0.1), (2, 0.3)])
 def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, depth_std):

@@ -69,6 +69,7 @@ def score(found, vectors):
     return np.mean(right), np.mean(distance)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('given', [True, False])
 def test_the_simulated_drift_is_followed(vectors, given):
     tracker, found = run(traces(vectors, range(300), given=given), particles=5000)
@@ -152,6 +153,7 @@ def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
     assert np.median(variance) == pytest.approx(expected * 1.3e-3**2, rel=0.1)
 
 
+@pytest.mark.statistics
 def test_what_came_later_corrects_an_estimate(vectors):
     options = {'particles': 3000, 'seed': 4}
     now = score(run(traces(vectors, range(80, 280)), **options)[1], vectors)

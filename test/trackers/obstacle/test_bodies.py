@@ -168,5 +168,6 @@ def test_tracks_of_images_are_as_good_as_they_say(image_runs):
     assert 0.84 < cover
 
 
+@pytest.mark.statistics
 def test_no_track_of_images_is_far_too_sure(image_runs):
     assert np.quantile(image_runs[:, 3], 0.9) < 3.0

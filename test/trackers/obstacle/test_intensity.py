@@ -113,6 +113,7 @@ def test_it_is_off_by_default_and_for_the_gaussian_sum_only():
         ObstacleConfig(method='seafloor', vertical_beam_width_deg=15.0)
 
 
+@pytest.mark.statistics
 def test_a_nodding_sonar_knows_the_height_sooner_in_the_whole_tracker():
     from benchmarks.obstacle_intensity import CALM, NODDING, run
 

@@ -151,6 +151,7 @@ def test_the_offset_is_found(approaches):
     assert np.all(approaches['rolling'][:, 3] < 0.1)
 
 
+@pytest.mark.statistics
 def test_the_offset_is_as_good_as_it_says(approaches):
     every = np.concatenate(list(approaches.values()))
     squared = every[:, 0] ** 2 / every[:, 1]
