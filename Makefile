@@ -31,8 +31,9 @@ endif
 
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
-# Which parts of `make reliability`, empty for all, and where they go.
+# Which parts of `make reliability`, empty for all, where they go, and how much of each (1: 40 minutes).
 PARTS ?=
+SHARE ?= 1
 RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
@@ -91,8 +92,8 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
 	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS)
 
-reliability: venv ## hours: all that may go wrong, long form; goes on where it was broken off (PARTS='soak flood' RELIABILITY=folder)
-	CASES=$(CASES) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
+reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
+	CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .

@@ -14,7 +14,7 @@
 
 """What the hardest messages cost: CPU time and memory of one message of each kind.
 
-    python -m benchmarks.bounds --out docs/results/bounds.json
+    python -m benchmarks.bounds --out FILE
     python -m benchmarks.bounds --only arrivals_wild_tag
 
 Each case runs in a process of its own, after the tracker is warm: a message at the limit of what
@@ -26,13 +26,14 @@ the peak memory of the process grew.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 import resource
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.study import in_fresh_process, Parts, study
+from benchmarks.study import in_fresh_process, known, Parts, study
 from msg_adapters.arrivals import MAX_PAIRS
 from msg_adapters.detections import MAX_DETECTIONS
 from msg_adapters.inputs import inputs_of
@@ -207,9 +208,11 @@ def measured(name: str) -> dict[str, float]:
     return in_fresh_process(cost, name)
 
 
-def main(only: Sequence[str] | None = None) -> Parts:
+def main(only: Sequence[str] | None = None, out: Path | None = None) -> Parts:
+    yield (table := known(out))
     for name in only or CASES:
-        yield {name: measured(name)}
+        if name not in table:
+            yield {name: measured(name)}
 
 
 if __name__ == '__main__':

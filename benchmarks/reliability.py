@@ -12,33 +12,41 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What was tried to break the package, in one file, and the tables of docs/reliability.md.
+"""What was tried to break the package, in one run, one file and the tables of docs/reliability.md.
 
-    python -m benchmarks.reliability FOLDER --run             every part that is not done, hours
+    python -m benchmarks.reliability FOLDER --run             every part that is not done
     python -m benchmarks.reliability FOLDER --run soak flood  these parts only
-    python -m benchmarks.reliability FOLDER    takes the parts in FOLDER in, writes file and page
+    python -m benchmarks.reliability FOLDER    file and page of the parts in FOLDER
     python -m benchmarks.reliability           writes the tables of the page anew
     python -m benchmarks.reliability --check   whether the page says what the file says
 
 A part is a JSON file in FOLDER that a program writes row by row (`PROGRAMS`). What was broken off
 goes on: rows that are there and good are not measured again, those that fell short are. To measure
-all anew, take another folder. File and page are written after each part; a row that is not in
-FOLDER stays as it was. Ends with 1 when something fell short.
+all anew, take another folder. File and page are of one folder and are written when all of its
+parts are there; how long each part took, and of which commit it is, lies beside them. Ends with 1
+when something fell short.
+
+``SONAR_IMM_SHARE`` is how much is tried: 1 takes 40 minutes on a quiet machine of two cores, 4 is
+four times as many signals, kills, hours at sea and damaged files. Less than 1 only shows that all
+programs run, each fault on one node: file and page are written into FOLDER then.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from datetime import date
 import json
 import os
 from pathlib import Path
 import re
 import subprocess
 import sys
+import time
 from typing import Any
 
 from benchmarks.study import known, write_json
+from sonar_imm import __version__
 from sonar_imm.trackers import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,16 +54,19 @@ RESULT = ROOT / 'docs' / 'results' / 'reliability.json'
 PAGE = ROOT / 'docs' / 'reliability.md'
 CASES = os.environ.get('CASES', '100000')
 """Hostile messages for each system."""
+SHARE = float(os.environ.get('SONAR_IMM_SHARE', '1.0'))
+HOURS, LIVE_HOURS = 8.0 * SHARE, 1.0 * SHARE
 _TEST = ('-m', 'pytest', '-m', 'system', '-p', 'no:cacheprovider')
 _SOAK = ('-m', 'benchmarks.soak')
 PROGRAMS: dict[str, tuple[str, ...]] = {
+    'bounds': ('-m', 'benchmarks.bounds', '--out', '{}/bounds.json'),
     'faults': (*_TEST, 'test/system/faults/test_faults.py'),
     'signals': (*_TEST, 'test/system/faults/test_signals.py'),
     'restart': (*_TEST, 'test/system/faults/test_restart.py'),
     'damage': (*_TEST, 'test/system/faults/test_damage.py'),
     'flood': (*_TEST, 'test/system/faults/test_flood.py'),
-    'soak': (*_SOAK, '--out', '{}/soak.json'),
-    'soak_live': (*_SOAK, '--live', '--hours', '1', '--out', '{}/soak_live.json'),
+    'soak': (*_SOAK, '--hours', str(HOURS), '--out', '{}/soak.json'),
+    'soak_live': (*_SOAK, '--live', '--hours', str(LIVE_HOURS), '--out', '{}/soak_live.json'),
     'metamorphic': ('-m', 'pytest', '-n', '0', 'test/trackers/test_metamorphic.py'),
     'hostile': ('-m', 'helpers.hostile', '--cases', CASES, '--json', '{}/hostile.json'),
 }
@@ -67,10 +78,12 @@ FLAT = 1.0
 """MB per hour: memory that grows faster is no longer called flat."""
 SLOWER = 2.0
 """Times by which the 99th percentile of the last tenth may be above that of the first."""
+LONGEST = 30.0
+"""CPU seconds that one message may take."""
 _BLOCK = re.compile(r'(<!-- reliability: (\w+) -->\n).*?(<!-- /reliability -->)', re.DOTALL)
 
 Part = Any
-"""Rows as a list, or by system."""
+"""Rows as a list, or by system (of 'bounds': by kind of message)."""
 Row = Mapping[str, Any]
 
 
@@ -86,6 +99,10 @@ def _worst(kind: str) -> Callable[[Row], str]:
     return lambda row: '' if row.get(kind) is None else f'{row[kind]:.1g}'
 
 
+def _of_tolerance(row: Row) -> str:
+    return f'{row["share"]:.1g}' if row['share'] else 'equal'
+
+
 SOAK: dict[str, Callable[[Row], str]] = {
     'system': _plain('system'),
     'hours': _plain('hours', 'g'),
@@ -97,7 +114,27 @@ SOAK: dict[str, Callable[[Row], str]] = {
     'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
     'not counted': _plain('uncounted', '.0f'),
 }
+MESSAGES = {
+    'fixes': '`fixes`: 10,000 of one scan, at random',
+    'fixes_softly': 'the same, `association: jipda`',
+    'arrivals_wild_tag': '`arrivals`: a tag, 1000 receivers, times that fit nothing',
+    'arrivals_many_divers': '`arrivals`: echoes of 50 divers at 20 receivers',
+    'detections': '`detections`: 10,000 echoes all over the beam',
+    'snapshot': '`snapshot`: 20,000 bins of 8 staves',
+    'pressure': '`pressure`: 200,000 samples of 32 hydrophones',
+    'csdm': '`csdm`: 2000 frequencies of 32 hydrophones',
+    'trace': '`trace`: 50,000 depths',
+}
+"""What the messages of `benchmarks.bounds` are."""
 COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
+    'bounds': {
+        'message': lambda row: MESSAGES[row['system']],
+        'MB': _plain('size_mb', '.2f'),
+        'CPU s': _plain('cpu_s', '.2f'),
+        'memory MB': _plain('memory_mb', '.0f'),
+        'CPU s per MB': _plain('cpu_s_per_mb', '.2g'),
+        'memory, bytes per byte': _plain('memory_per_byte', '.0f'),
+    },
     'restart': {
         'node': _plain('system'),
         'killed': _plain('tried'),
@@ -140,7 +177,7 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
         'system': _plain('system'),
         'with': _plain('how'),
         'scene': _plain('moved'),
-        'tolerance': _plain('tolerance', 'g'),
+        'states, of the tolerance': _of_tolerance,
         **{kind: _worst(kind) for kind in ('places', 'states', 'covariances', 'probabilities')},
     },
 }
@@ -169,9 +206,29 @@ def table_of(name: str, part: Part) -> list[list[str]]:
         body = [[system, *(cells.get((system, k), '') for k in kinds)] for system in SYSTEMS]
         return [['node', *kinds], *body]
     if name == 'metamorphic':
-        rows.sort(key=lambda row: (row['system'], row['how']))
+        rows = _hardest(rows)
     columns = COLUMNS[name]
     return [[*columns], *([text(row) for text in columns.values()] for row in rows)]
+
+
+def _hardest(rows: list[Row]) -> list[Row]:
+    """Of each system and way to track the scene nearest to its tolerance, and its worst
+    differences of all scenes."""
+    kinds = ('places', 'states', 'covariances', 'probabilities')
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row['system'], row['how']), []).append(row)
+    found: list[Row] = []
+    for _, group in sorted(groups.items()):
+        hardest = max(group, key=lambda row: row['states'] / (row['tolerance'] or 1.0))
+        moved = hardest['moved'] if hardest['states'] or len(group) == 1 else 'all of them'
+        worst = {
+            kind: max((row[kind] for row in group if row.get(kind) is not None), default=None)
+            for kind in kinds
+        }
+        share = hardest['states'] / (hardest['tolerance'] or 1.0)
+        found.append({**hardest, **worst, 'moved': moved, 'share': share})
+    return found
 
 
 def _recovery(row: Row) -> str:
@@ -191,12 +248,17 @@ def short_of(parts: Mapping[str, Part]) -> list[str]:
     """What fell short of the promises, in sentences."""
     missing = [f'{name}: not measured' for name in PARTS if name not in parts]
     found = [shortfall(name, row) for name in PARTS for row in rows_of(parts.get(name, ()))]
-    return missing + [sentence for sentence in found if sentence]
+    commits = {commit for of in parts.get('run', {}).values() for commit in of['commits']}
+    several = [f'parts are of {len(commits)} versions: take another folder'] * (len(commits) > 1)
+    return missing + [sentence for sentence in found if sentence] + several
 
 
 def shortfall(name: str, row: Row) -> str:
     """What is wrong with a row of a part, in a sentence; '' for nothing."""
     system = row.get('system')
+    if name == 'bounds':
+        sentence = f'{system}: {row["cpu_s"]:.1f} s of a message that was read or refused'
+        return sentence if row['refused'] or row['cpu_s'] > LONGEST else ''
     if name == 'faults':
         late = row['recovered'] is None or row['recovered'] > row['limit']
         sentence = f'{row["fault"]}, {system}: recovered {row["recovered"]}'
@@ -254,33 +316,52 @@ def run(name: str, folder: Path) -> None:
     environment = dict(os.environ, SONAR_IMM_FIGURES=str(folder))
     environment['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
     words = [word.replace('{}', str(folder)) for word in PROGRAMS[name]]
+    start = time.monotonic()
     code = subprocess.run([sys.executable, *words], cwd=ROOT, env=environment).returncode
+    note(name, folder, time.monotonic() - start)
     if code:
         print(f'{name}: ended with exit code {code}', flush=True)
 
 
-def _merged(old: Part, new: Part) -> Part:
-    """The rows of `old`, those that `new` has replaced by it, and what is new after them."""
-    if isinstance(new, Mapping):
-        both = {**(old or {}), **new}
-        return {system: both[system] for system in SYSTEMS if system in both}
-    rows = {_key(row): row for row in [*(old or []), *new]}
-    return list(rows.values())
+def note(name: str, folder: Path, seconds: float) -> None:
+    """Add to the file of the folder how long a part took, when, and of which commit it is."""
+    runs = known(folder / 'run.json')
+    before = runs.get(name, {'seconds': 0.0, 'commits': []})
+    words = ['git', '-C', str(ROOT), 'describe', '--always', '--dirty']
+    done = subprocess.run(words, capture_output=True, text=True)
+    runs[name] = {
+        'seconds': before['seconds'] + round(seconds, 1),
+        'date': f'{date.today():%Y-%m-%d}',
+        'share': SHARE,
+        'processors': os.cpu_count(),
+        'commits': sorted({*before['commits'], done.stdout.strip() or __version__}),
+    }
+    write_json(folder / 'run.json', runs)
 
 
-def _key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a row is about."""
-    return tuple(row.get(name) for name in ('system', 'fault', 'signal', 'what', 'how', 'moved'))
+def parts_of(folder: Path) -> dict[str, Part]:
+    """What is in a folder, and under ``run`` how it came there."""
+    files = {name: folder / f'{name}.json' for name in ('run', *PARTS)}
+    return {
+        name: json.loads(file.read_text(encoding='utf-8'))
+        for name, file in files.items()
+        if file.is_file()
+    }
 
 
-def take_in(folder: Path, parts: dict[str, Part]) -> None:
-    """Write file and page with the parts of `folder`."""
-    for name in PARTS:
-        if (file := folder / f'{name}.json').is_file():
-            parts[name] = _merged(parts.get(name), json.loads(file.read_text(encoding='utf-8')))
-    write_json(RESULT, parts)
-    page = PAGE.read_text(encoding='utf-8')
-    PAGE.write_text(page_of(page, parts), encoding='utf-8')
+def _about(run: Mapping[str, Row]) -> str:
+    """The run in a sentence, and how many minutes each part took."""
+    seconds = {name: of['seconds'] for name, of in run.items()}
+    (last, *_) = sorted((of['date'] for of in run.values()), reverse=True)
+    processors = max(of['processors'] for of in run.values())
+    commits = sorted({commit for of in run.values() for commit in of['commits']})
+    shares = sorted({of['share'] for of in run.values()})
+    each = ', '.join(f'`{name}` {seconds[name] / 60.0:.1f}' for name in PARTS if name in seconds)
+    return (
+        f'One run of {last}, {sum(seconds.values()) / 60.0:.0f} minutes on {processors} '
+        f'processors, of {" and ".join(f"`{commit}`" for commit in commits)}, `SHARE` '
+        f'{" and ".join(f"{share:g}" for share in shares)}; minutes of each part: {each}.'
+    )
 
 
 def page_of(text: str, parts: Mapping[str, Part]) -> str:
@@ -288,8 +369,12 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
 
     def table(found: re.Match[str]) -> str:
         name = found.group(2)
+        if name not in parts and name == 'run':
+            return f'{found.group(1)}Measured part by part, of several versions.\n{found.group(3)}'
         if name not in parts:
             return f'{found.group(1)}Not measured yet.\n{found.group(3)}'
+        if name == 'run':
+            return f'{found.group(1)}{_about(parts[name])}\n{found.group(3)}'
         head, *body = table_of(name, parts[name])
         lines = [head, ['---'] * len(head), *body]
         text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
@@ -316,8 +401,12 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in () if given.run is None else given.run or PARTS:
         run(name, folder)
-        take_in(folder, parts)
-    take_in(folder, parts)
+    parts = parts_of(folder)
+    if set(PARTS) <= parts.keys():
+        whole = all(of['share'] >= 1.0 for of in parts.get('run', {}).values())
+        write_json(RESULT if whole else folder / RESULT.name, parts)
+        written = PAGE if whole else folder / PAGE.name
+        written.write_text(page_of(page, parts), encoding='utf-8')
     problems = short_of(parts)
     print('\n'.join(problems) or 'all promises kept')
     sys.exit(bool(problems))

@@ -29,6 +29,8 @@ from .headers import Make, make_header, stamp_ns
 from .inputs.topic import InputTopic
 
 MOST_TRANSFORMS = 10_000
+LONGEST_NAME = 1000
+"""Characters of the name of a frame, since frames are remembered."""
 FARTHEST = 1e8
 """Most metres between two frames on each axis."""
 
@@ -75,6 +77,8 @@ def _pose(stamped: Any) -> tuple[str, tuple[str, Pose]]:
     )
     if not parent or not child or parent == child:
         raise Rejection('no_frame', f"a transform from '{parent}' to '{child}' says nothing")
+    if max(len(parent), len(child)) > LONGEST_NAME:
+        raise Rejection('too_large', f'a frame has a name of more than {LONGEST_NAME} characters')
     shift, turn = stamped.transform.translation, stamped.transform.rotation
     position = np.array([shift.x, shift.y, shift.z], np.float64)
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], np.float64)

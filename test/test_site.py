@@ -136,6 +136,6 @@ def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
     assert made.captioned(text, '') == (
         '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
     )
-    text = '<!-- numbers: bounds.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
+    text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
     shown = made.captioned(text, '../')
-    assert '<!--' not in shown and '[bounds.json](../results/bounds.json)' in shown
+    assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown

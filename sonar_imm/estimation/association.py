@@ -206,14 +206,30 @@ class TrackRules:
             )
 
 
+def new_ids(
+    next_id: int, count: int, living: NDArray[np.uint32]
+) -> tuple[NDArray[np.uint32], int]:
+    """Identities (count,) from `next_id` on, and the next one after them.
+
+    They are unsigned numbers of 32 bits, 0 is none. After the last one, weeks away where every
+    ping is full of clutter, they begin with 1 again, without those of the `living` (T,).
+    """
+    last = int(np.iinfo(np.uint32).max)
+    if next_id + count <= last and not (len(living) and living.max() >= next_id):
+        return np.arange(next_id, next_id + count, dtype=np.uint32), next_id + count
+    ids = (next_id - 1 + np.arange(count + len(living))) % last + 1
+    ids = ids[~np.isin(ids, living)][:count]
+    return ids.astype(np.uint32), int(ids[-1]) % last + 1 if count else next_id
+
+
 @frozen(eq=False)
 class Tracks:
     """Hits, misses and status of T tracks. An immutable value: `scan` and `born` return the next
     one.
 
-    track_id: (T,) increasing, never used again; status: (T,) TrackStatus; age: (T,) scans; seen:
-    (T, confirm_window) True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,);
-    next_id: of the next track.
+    track_id: (T,) increasing and not used again, but for `new_ids`; status: (T,) TrackStatus;
+    age: (T,) scans; seen: (T, confirm_window) True for hits, newest last; misses: (T,)
+    in a row; last_hit_ns: (T,); next_id: of the next track.
     """
 
     track_id: NDArray[np.uint32]
@@ -245,7 +261,7 @@ class Tracks:
         seen = np.zeros((len(self) + count, window), np.bool_)
         seen[: len(self)] = _window(self.seen, window)
         seen[len(self) :, -1] = True
-        track_id = np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
+        track_id, next_id = new_ids(self.next_id, count, self.track_id)
         status = np.full(count, CONFIRMED if rules.confirm_hits == 1 else TENTATIVE, np.uint8)
         return Tracks(
             np.concatenate([self.track_id, track_id]),
@@ -254,7 +270,7 @@ class Tracks:
             seen,
             np.concatenate([self.misses, np.zeros(count, np.int64)]),
             np.concatenate([self.last_hit_ns, np.full(count, stamp_ns, np.int64)]),
-            self.next_id + count,
+            next_id,
         )
 
     def scan(

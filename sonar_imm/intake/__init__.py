@@ -25,6 +25,7 @@ count what they refuse, and so a tracker without an `Intake` does not mix frames
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 from attrs import evolve
@@ -206,7 +207,9 @@ class RepeatFilter:
         )
 
     def _came(self, content: bytes, stamp_ns: int) -> bool:
-        """Whether that content came with another stamp, not long ago; remembers it."""
+        """Whether that content came with another stamp, not long ago; remembers it, by a digest
+        since a scan may have thousands of positions."""
+        content = hashlib.blake2b(content, digest_size=16).digest()
         first = self._first.get(content)
         if first is not None and 0 < abs(stamp_ns - first) <= self._limit_ns:
             return True

@@ -40,6 +40,8 @@ _HERMITIAN = 1e-3
 """Largest asymmetry of a matrix, against the powers of the two hydrophones."""
 _LOUDEST = 1e12
 """No sample is larger, in any unit; the power spectra of larger ones overflow single precision."""
+_MOST_POWER = float(np.finfo(np.float32).max)
+"""No power is larger: sums of doubles that are would overflow."""
 
 
 def _depth(value: Any) -> float | None:
@@ -160,7 +162,7 @@ class CrossSpectra:
         self._check_size()
         self._check_frequencies()
         power = np.einsum('fmm->fm', self.csdm).real
-        power = np.where(np.isfinite(power), power, np.nan).astype(np.float64)
+        power = np.where(np.abs(power) <= _MOST_POWER, power, np.nan).astype(np.float64)
         alive = _alive(power, 'cross-spectra')
         inner = self.csdm[:, alive][:, :, alive]
         finite = np.isfinite(inner).all(axis=(1, 2))
@@ -210,9 +212,10 @@ class CrossSpectra:
             with np.errstate(over='ignore', invalid='ignore'):  # far above one, maybe infinite
                 normalised = R / r[:, :, None] / r[:, None, :]
                 asymmetry = np.abs(normalised - normalised.conj().swapaxes(1, 2)).max()
+                coherence = np.abs(normalised).max()
             if asymmetry > _HERMITIAN:
                 raise Rejection('not_hermitian', 'the cross-spectral matrices are not Hermitian')
-            if not np.abs(normalised).max() <= 1.0 + _HERMITIAN:
+            if not coherence <= 1.0 + _HERMITIAN:
                 raise Rejection(
                     'not_positive',
                     'the cross-spectra claim a coherence between hydrophones above one',

@@ -27,6 +27,7 @@ import json
 from pathlib import Path
 from typing import Any
 import zipfile
+import zlib
 
 from attrs import frozen
 import numpy as np
@@ -35,7 +36,7 @@ from .. import __version__
 from ..files import whole
 from ..parameters import Config, ConfigError
 from . import System, Tracker
-from .state_values import Decoder, Encoder, restore, StateError
+from .state_values import Decoder, Encoder, restore, StateError, UNFIT
 
 FORMAT = 1
 _MAGIC = b'sonar_imm state '
@@ -117,7 +118,7 @@ def read_state(path: Path) -> Saved:
             state=decoder.decode(header['state']),
             extras=decoder.decode(header['extras']),
         )
-    except (KeyError, TypeError, ValueError, RecursionError, zipfile.BadZipFile) as error:
+    except (*UNFIT, EOFError, zipfile.BadZipFile, zlib.error) as error:
         if isinstance(error, StateError):
             raise
         raise StateError(f'it does not fit this version ({error})') from None

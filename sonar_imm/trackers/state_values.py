@@ -41,6 +41,19 @@ _NUMBERS = 'biufc'
 _SKIPPED = object()
 
 
+UNFIT = (
+    ArithmeticError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
+"""What a file that says something else than a tracker would have written raises."""
+
+
 class StateError(ValueError):
     """A state that cannot be used; one sentence."""
 
@@ -62,11 +75,14 @@ def restore(tracker: Any, state: dict[str, Any]) -> None:
     """Put a state into a tracker of the same parameters that was just built or reset.
 
     Raises `StateError` when it is the state of another tracker; the tracker is of no use then."""
-    if set(state) != set(tracker.STATE):
+    if not isinstance(state, dict) or set(state) != set(tracker.STATE):
         raise StateError('it belongs to another tracker, or to another version')
-    for name, value in state.items():
-        setattr(tracker, name, put(getattr(tracker, name), value))
-    getattr(tracker, 'restored', lambda: None)()
+    try:
+        for name, value in state.items():
+            setattr(tracker, name, put(getattr(tracker, name), value))
+        getattr(tracker, 'restored', lambda: None)()
+    except UNFIT as error:
+        raise StateError(f'it does not fit this version ({error})') from None
 
 
 def freeze(value: Any) -> Any:
@@ -220,7 +236,7 @@ class Decoder:
             self._values: list[Any] = []
             for value in values:
                 self._values.append(self.decode(value))
-        except (TypeError, ValueError, AttributeError, ImportError) as error:
+        except UNFIT as error:
             raise StateError(f'it does not fit this version ({error})') from None
 
     def decode(self, value: Any) -> Any:
@@ -229,7 +245,7 @@ class Decoder:
             return value
         try:
             return self._decode(*value)
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
+        except UNFIT as error:
             raise StateError(f'it does not fit this version ({error})') from None
 
     def _decode(self, kind: str, *parts: Any) -> Any:

@@ -92,13 +92,15 @@ def _click_option(
         return pairs_option(flag, name, metavar=spec.metavar, help=text)
     needed = default is attrs.NOTHING
     shown = None if needed or spec.parse or default in (None, '', ()) else default
+    if spec.many and shown:
+        shown = list(shown)
     return click.option(
         flag,
         name,
         type=_click_type(spec),
-        default=list(shown) if spec.many and shown else shown,
+        # None is a default like another since click 8.3, and what has one is never missing
+        **({'required': True} if needed else {'default': shown}),
         show_default=shown is not None,
-        required=needed,
         multiple=spec.many,
         metavar=spec.metavar or None,
         callback=_parsed(spec.parse) if spec.parse else None,

@@ -190,3 +190,21 @@ def read_npz(path: Path) -> dict[str, NDArray]:
         raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
     except (ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile):
         raise BagError(f'{path} is damaged, or holds more than plain arrays') from None
+
+
+def numbers_of(path: Path, name: str, array: NDArray) -> NDArray:
+    """The array `name` of an archive, where it holds numbers. Raises `BagError`."""
+    if array.dtype.kind not in 'biufc':
+        raise BagError(f"{path}: the array '{name}' holds no numbers")
+    return array
+
+
+def stamps_of(path: Path, seconds: NDArray, count: int, what: str) -> list[int]:
+    """Nanoseconds of the stamps of `count` messages, `what` names them. Raises `BagError` for
+    those that a message cannot hold."""
+    values = numbers_of(path, 'stamp', seconds).ravel()
+    if len(values) != count or not (np.abs(values) < 2.0**31).all():
+        raise BagError(
+            f'{path}: {count} {what} need as many finite stamps, in seconds before 2038'
+        )
+    return [round(float(stamp) * 1e9) for stamp in values.real]

@@ -49,7 +49,7 @@ class State:
     status: Status
     now_ns: int
     rate: float
-    jumped: bool = False
+    jumped: bool
 
 
 class Playback:

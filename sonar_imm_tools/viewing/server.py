@@ -177,7 +177,6 @@ class _Listener(ServerListener):
         with self._lock:
             if not self._waiting or self._playback is None:
                 return
-            self._waiting = False
         state = self._playback.change(play=True)
         if self.tell:
             self.tell(state)

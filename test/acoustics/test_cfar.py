@@ -23,6 +23,7 @@ from sonar_imm.acoustics.cfar import (
     false_alarm_probability,
     noise_level,
     quiet_level,
+    roughness,
     tail_factor,
     threshold_factor,
 )
@@ -178,3 +179,13 @@ def test_silence_and_one_huge_cell_are_survived():
     power = np.random.default_rng(7).exponential(size=(60, 40))
     power[30, 20] = 1e76
     assert quiet_level(power, beams=25, training=16, guard=4)[0][50, 20] < 3.0
+
+
+def test_roughness_is_the_variance_of_what_is_known():
+    rng = np.random.default_rng(8)
+    logarithm = rng.normal(2.0, 0.7, size=(300, 40))
+    unknown = logarithm.copy()
+    unknown[:, ::3] = np.nan
+    alone = np.delete(logarithm, np.s_[::3], axis=1)
+    assert_allclose(roughness(unknown), roughness(alone), rtol=1e-9)
+    assert_allclose(roughness(alone), 0.49, atol=0.1)

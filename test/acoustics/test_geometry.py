@@ -238,6 +238,14 @@ def test_slerp_against_scipy():
         )
 
 
+def test_slerp_of_many_is_that_of_each_pair():
+    rng = np.random.default_rng(5)
+    q0, q1, fraction = rng.normal(size=(60, 4)), rng.normal(size=(60, 4)), rng.uniform(-1, 2, 60)
+    q1[:5] = q0[:5]
+    each = [geometry.slerp(*pair) for pair in zip(q0, q1, fraction)]
+    assert_allclose(geometry.slerp(q0, q1, fraction), each, **EXACT)
+
+
 def test_slerp_goes_on_at_the_same_rate():
     q0, q1 = Rotation.from_euler('z', [[0.0], [10.0]], degrees=True).as_quat()
     on = geometry.euler_angles(geometry.rotation_of_quaternion(geometry.slerp(q0, q1, 1.5)))

@@ -76,6 +76,13 @@ def test_both_laws_integrate_to_one(staves):
     assert total(gaussian_log_density, gaussian) == pytest.approx(1.0, abs=1e-8)
 
 
+@pytest.mark.parametrize('constant', [laplace.log_constant, laplace.gaussian_log_constant])
+def test_in_another_unit_both_laws_are_densities_too(constant):
+    # Snapshots 3 times as large: |Gamma| is 9^P times, the volume around each too.
+    change = constant(8, 5.0 + 8 * math.log(9.0)) - constant(8, 5.0)
+    assert change == pytest.approx(-8 * math.log(9.0))
+
+
 def test_extreme_values_stay_finite_and_ordered():
     q = np.geomspace(1e-300, 1e15, 2000)
     for staves in (2, 3, 8, 33, 64):

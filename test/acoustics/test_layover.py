@@ -178,3 +178,13 @@ def test_the_error_of_the_array_is_measured(share, least):
 
 def circular(rng, *shape):
     return rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5)
+
+
+def test_of_staves_close_to_each_other_only_directions_that_are_there_are_fitted():
+    rng = np.random.default_rng(6)
+    iq = np.exp(1j * np.outer(rng.uniform(1.7, np.pi, 20), np.arange(8)))  # beyond end fire
+    iq += 0.1 * rng.normal(size=(20, 8))
+    power, one, _ = layover.residuals(iq, 0.25)
+    phase = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
+    beams = np.abs(iq @ np.exp(-1j * np.outer(np.arange(8), phase))) ** 2 / 8.0
+    np.testing.assert_allclose(one, power - beams.max(axis=1), rtol=1e-4)

@@ -25,6 +25,16 @@ if not (ROOT / 'docs' / 'reliability.md').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
 GOOD = {
+    'bounds': {
+        'trace': {
+            'size_mb': 1.6,
+            'cpu_s': 0.4,
+            'memory_mb': 154.0,
+            'cpu_s_per_mb': 0.23,
+            'memory_per_byte': 96.0,
+            'refused': 0.0,
+        }
+    },
     'faults': [
         {
             'fault': 'a burst',
@@ -89,6 +99,8 @@ def test_what_is_good_falls_short_of_nothing():
 @pytest.mark.parametrize(
     'part, row, change',
     [
+        ('bounds', 'trace', {'cpu_s': 31.0}),
+        ('bounds', 'trace', {'refused': 1.0}),
         ('faults', 0, {'recovered': None}),
         ('faults', 0, {'recovered': 4}),
         ('faults', 0, {'traceback': True}),
@@ -134,7 +146,9 @@ sys.exit(3)
         reliability, 'PROGRAMS', {'signals': ('-c', program, '{}/signals.json', '{}/notes')}
     )
     monkeypatch.setattr(reliability, 'PARTS', ('signals',))
-    page = '<!-- reliability: signals -->\n<!-- /reliability -->\n'
+    page = ''.join(
+        f'<!-- reliability: {name} -->\n<!-- /reliability -->\n' for name in ('run', 'signals')
+    )
     reliability.PAGE.write_text(page, encoding='utf-8')
     return tmp_path / 'parts'
 
@@ -162,17 +176,43 @@ def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys)
     assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
 
 
-def test_rows_that_are_not_measured_again_stay(toy, monkeypatch):
+def test_the_page_is_of_one_folder_and_says_how_long_it_took(toy, monkeypatch, capsys):
     old = [{'system': 'obstacle', 'signal': 'SIGINT', 'tried': 9, 'clean': 9, 'why': []}]
-    old += [{'system': 'diver', 'signal': 'SIGINT', 'tried': 9, 'clean': 8, 'why': ['no']}]
     reliability.RESULT.write_text(json.dumps({'signals': old}))
+    assert run(monkeypatch, toy) == 1  # no part is there: file and page stay
+    assert json.loads(reliability.RESULT.read_text()) == {'signals': old}
     assert run(monkeypatch, toy, '--run') == 0
-    rows = json.loads(reliability.RESULT.read_text())['signals']
-    assert {(row['system'], row['signal'], row['tried']) for row in rows} == {
-        ('diver', 'SIGINT', 2),
-        ('diver', 'SIGHUP', 2),
-        ('obstacle', 'SIGINT', 9),
-    }
+    result = json.loads(reliability.RESULT.read_text())
+    assert [row['system'] for row in result['signals']] == ['diver', 'diver']
+    assert result['run']['signals']['seconds'] > 0.0
+    page = reliability.PAGE.read_text()
+    assert 'One run of 20' in page and '; minutes of each part: `signals` 0.0.' in page
+    capsys.readouterr()
+    result['run']['signals']['commits'] = ['a', 'b']
+    (toy / 'run.json').write_text(json.dumps(result['run']))
+    assert run(monkeypatch, toy) == 1
+    assert 'parts are of 2 versions' in capsys.readouterr().out
+
+
+def test_a_try_of_the_machinery_leaves_the_page_alone(toy, monkeypatch):
+    monkeypatch.setattr(reliability, 'SHARE', 0.1)
+    before = reliability.PAGE.read_text()
+    assert run(monkeypatch, toy, '--run') == 0
+    assert reliability.PAGE.read_text() == before and not reliability.RESULT.exists()
+    assert '`SHARE` 0.1; minutes of each part' in (toy / 'page.md').read_text()
+
+
+def test_of_moved_scenes_the_hardest_is_shown_with_the_worst_of_all():
+    some = {'system': 'diver', 'how': 'gnn', 'probabilities': None}
+    scenes = [
+        {**some, 'moved': 'later', 'tolerance': 0.0, 'states': 0.0, 'places': 3e-9},
+        {**some, 'moved': 'turned', 'tolerance': 1e-5, 'states': 1e-9, 'places': 1e-9},
+        {**some, 'moved': 'mirrored', 'tolerance': 1e-7, 'states': 5e-10, 'places': 2e-9},
+    ]
+    _, row = reliability.table_of('metamorphic', scenes)
+    assert row == ['diver', 'gnn', 'mirrored', '0.005', '3e-09', '1e-09', '', '']
+    _, row = reliability.table_of('metamorphic', scenes[:1])
+    assert row[2:4] == ['later', 'equal']
 
 
 def test_every_part_has_a_program_and_a_table():

@@ -100,6 +100,7 @@ def test_help_loads_no_heavy_module():
         (['convert', 'fixes', 'nowhere.csv', 'b'], 'nowhere.csv'),
         (['convert', 'fixes', 'a', 'b', '--origin', '5'], "'5' is not of the form LAT,LON"),
         (['convert', 'fixes', 'a', 'b', '--time-offset', 'x'], 'not a number of seconds'),
+        (['convert', 'arrivals', 'a', 'b'], "Missing option '--receivers'"),
         (['check', 'dvier'], "'dvier'"),
     ],
 )

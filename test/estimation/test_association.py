@@ -16,6 +16,7 @@
 
 import itertools
 
+from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -30,6 +31,7 @@ from sonar_imm.estimation.association import (
     association_cost,
     choose,
     gate_threshold,
+    new_ids,
     TrackRules,
     Tracks,
     TrackStatus,
@@ -283,3 +285,18 @@ def test_rules_by_which_no_track_could_live_are_refused(rules):
 
 def test_the_strictest_rules_are_allowed():
     assert TrackRules(1, 1, 1, 0).delete_misses == 1
+
+
+def test_identities_after_the_last_of_32_bits_are_those_that_no_track_has():
+    """A track of number 0 would be none, and one more than a column can hold ended the tracker."""
+    last = 2**32 - 1
+    tracks = Tracks.none(RULES).born(3, 0, RULES)
+    tracks = evolve(tracks, next_id=last - 1).born(3, 0, RULES)
+    assert tracks.track_id.tolist() == [1, 2, 3, last - 1, last, 4]
+    tracks = tracks.only(tracks.track_id != 2).born(2, 0, RULES)
+    assert tracks.track_id.tolist() == [1, 3, last - 1, last, 4, 5, 6]
+    assert (tracks.next_id, tracks.track_id.dtype) == (7, np.uint32)
+    around = new_ids(last, 4, np.array([last, 2], np.uint32))
+    assert (around[0].tolist(), around[1]) == ([1, 3, 4, 5], 6)
+    assert new_ids(last, 1, tracks.track_id[:1])[1] == 1
+    assert new_ids(last, 0, tracks.track_id)[1] == last

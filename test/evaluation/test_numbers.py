@@ -23,6 +23,7 @@ from sonar_imm_tools.evaluation.numbers import (
     chi2,
     chi2_summary,
     coverage_sentence,
+    each,
     error,
     error_summary,
     lines,
@@ -73,3 +74,10 @@ def test_mixed_degrees_of_freedom_share_bounds_around_one():
     assert summary['mean'] == pytest.approx(6.0 / 5.0) and summary['low'] < 1.0 < summary['high']
     assert bounds_remark(summary).startswith('per degree of freedom: 1 expected')
     assert bounds_remark(nis_summary(np.array([2.0]), np.array([2.0]))).startswith('2 expected')
+
+
+def test_the_lines_of_each_number_are_labelled_in_words():
+    found = lines(
+        each('height', ['mean_error', 'rmse']), {'height': {'mean_error': 0.25, 'rmse': 2}}
+    )
+    assert found == (('mean error', '0.25'), ('rmse', '2'))

@@ -14,6 +14,9 @@
 
 """What /tf_static says: the place of a sonar on its vehicle, and measurements in another frame."""
 
+from collections import deque
+
+import attrs
 from attrs import evolve
 import numpy as np
 import pytest
@@ -23,14 +26,19 @@ from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import (
     Altitude,
+    Arrivals,
     Fix,
+    Fixes,
     Navigation,
+    NOBODY,
     Rejection,
     Snapshot,
     StaticTransforms,
 )
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.trackers.state_values import frozen_state
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
@@ -173,3 +181,59 @@ def test_an_array_keeps_to_its_first_frame():
     assert intake.admit(first) is first
     with pytest.raises(Rejection, match="'hull' is not the frame 'array'"):
         intake.admit(evolve(snapshot, frame_id='hull'))
+
+
+def wandering(k, rng):
+    """What comes in a second when every sensor has another name, and all it sees too."""
+    stamp_ns, place = k * 10**9, np.append(rng.normal(scale=50.0, size=2), -5.0)
+    rx = np.column_stack([rng.normal(scale=80.0, size=(4, 2)), np.full(4, -3.0)])
+    pose = Pose(np.zeros(3), np.eye(3))
+    yield StaticTransforms(poses={f'sonar_{k}': ('map', pose)})
+    yield evolve(fix('map', place[0]), stamp_ns=stamp_ns, target_id=k, sensor=f'usbl_{k}')
+    yield evolve(fix(f'sonar_{k}', place[1]), stamp_ns=stamp_ns)
+    yield Fixes(
+        stamp_ns=stamp_ns,
+        frame_id=f'sonar_{k}',
+        sensor=f'sonar_{k}',
+        position=place + rng.normal(size=(3, 3)),
+        target_id=[k, 10**6 + k, NOBODY],
+    )
+    for passive in (False, True):
+        yield Arrivals(
+            stamp_ns=stamp_ns,
+            frame_id='map',
+            tx_id=np.full(4, k),
+            rx_id=4 * k + np.arange(4),
+            tx=np.full((4, 3), np.nan) if passive else rx[[0, 0, 0, 0]],
+            rx=rx,
+            toa=(1.0 + (not passive)) * np.linalg.norm(rx - place, axis=1) / 1500.0,
+            var_toa=np.full(4, 1e-7),
+            bearing=np.full(4, np.nan),
+            var_bearing=np.full(4, np.nan),
+        )
+
+
+def entries(value):
+    """How many values a frozen state has, an array being one."""
+    if hasattr(value, 'attributes'):
+        value = value.attributes
+    if attrs.has(type(value)):
+        value = attrs.asdict(value, recurse=False)
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, (list, tuple, deque)):
+        return 1
+    return sum(map(entries, value))
+
+
+def test_a_tracker_does_not_grow_with_names_that_wander():
+    parameters = {'fix_bias_std': 0.5, 'max_coast': 2.0, 'history': 0.0}
+    intake = Intake(DiverTracker(DiverConfig(model_set='heading_speed', **parameters)))
+    rng, sizes = np.random.default_rng(1), []
+    for k in range(1, 61):
+        for item in wandering(k, rng):
+            admitted = intake.admit(item)
+            if admitted is not None:
+                intake.tracker.process(admitted)
+        sizes.append(entries(frozen_state(intake.tracker)))
+    assert max(sizes[30:]) <= max(sizes[:30])

@@ -14,6 +14,8 @@
 
 """Repeated polls are left out, and nothing else."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -115,3 +117,11 @@ def test_zero_lets_everything_pass_and_memory_is_bounded():
     for k in range(10_500):
         repeats.fresh(fix(1, x=float(k)))
     assert len(repeats._first) == 10_000
+
+
+def test_what_is_remembered_of_a_scan_is_as_short_as_of_a_position():
+    repeats = RepeatFilter(5.0)
+    for k in range(1, 100):
+        assert passes(repeats, scan(k, *(k + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
+    assert not passes(repeats, scan(101, *(99 + 1e-3 * np.arange(1000)), frame_id='f' * 1000))
+    assert len(pickle.dumps(repeats)) < 10_000

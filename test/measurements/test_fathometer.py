@@ -100,10 +100,28 @@ def test_cross_spectra_of_any_loudness_are_taken():
         assert CrossSpectra(stamp_ns=1, **fields).alive.all()
 
 
+def boundless(R, rows, columns):
+    """Doubles of which two have no finite sum, at both places of a pair."""
+    R = R.astype(np.complex128)
+    R[:, rows, columns] = 1e308 * (1 + 1j * np.not_equal(rows, columns))
+    R[:, columns, rows] = R[:, rows, columns].conj()
+    return R
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_hydrophone_whose_powers_have_no_sum_is_dead():
+    fields = spectra()
+    fields['csdm'] = boundless(fields['csdm'], 3, 3)
+    record = CrossSpectra(stamp_ns=1, **fields)
+    assert np.flatnonzero(~record.alive).tolist() == [3] and record.usable.all()
+
+
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize(
     'change, reason',
     [
+        (lambda R: boundless(R, *np.diag_indices(M)), 'nan'),
+        (lambda R: boundless(R, 0, 1), 'not_hermitian'),
         (lambda R: lopsided(R), 'not_hermitian'),
         (lambda R: overflowing(R), 'not_positive'),
         (lambda R: overcoherent(R), 'not_positive'),

@@ -60,6 +60,8 @@ def test_one_transform_alone_is_read_and_a_leading_slash_dropped():
         (lambda one: setattr(one.transform.translation, 'y', 1e9), 'out_of_range'),
         (lambda one: setattr(one.header, 'frame_id', ''), 'no_frame'),
         (lambda one: setattr(one, 'child_frame_id', 'base_link'), 'no_frame'),
+        (lambda one: setattr(one, 'child_frame_id', 'f' * 1001), 'too_large'),
+        (lambda one: setattr(one.header, 'frame_id', 'f' * 1001), 'too_large'),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_its_reason(spoil, code):

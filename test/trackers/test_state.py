@@ -152,6 +152,8 @@ def rewrite(path, change):
         lambda header: header['arrays'].append(['<f8', [1 << 40], 'C', True, 0]),
         lambda header: header['arrays'].append(['<f8', [-1], 'C', True, 0]),
         lambda header: header['arrays'].append(['<f8', [1], 'C', True, -8]),
+        lambda header: header['arrays'].append(['<f8', [2**70], 'C', True, 0]),
+        lambda header: header['arrays'].append(['<f8', [1], 'C', True, 2**70]),
         lambda header: header['values'].append(['same', 10**6]),
     ],
 )
@@ -164,6 +166,16 @@ def test_a_file_that_says_something_else_is_refused(change, tmp_path):
     rewrite(path, change)
     with pytest.raises(StateError):
         read_state(path)
+
+
+def test_an_attribute_without_a_name_is_refused():
+    run = tracked('diver_table1')
+    state = frozen_state(run.until(5))
+    state['_stream'].attributes[5] = 6
+    with pytest.raises(StateError, match='does not fit'):
+        restore(run.build(), state)
+    with pytest.raises(StateError, match='another tracker'):
+        restore(run.build(), 5)
 
 
 def test_a_state_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):

@@ -85,6 +85,7 @@ def test_it_plays_in_order_and_never_early():
         assert when - begin >= (stamp - FIRST) / 1e9 - 1e-3
     assert played.states[-1].status is Status.ENDED and played.states[-1].now_ns == TIMES[-1]
     assert played.times == sorted(played.times) and played.times[-1] <= TIMES[-1]
+    assert len(played.times) < 2 * len(TIMES)  # it waits for the next one, and does not poll
 
 
 def test_a_higher_rate_shortens_it():
@@ -94,6 +95,17 @@ def test_a_higher_rate_shortens_it():
         played.wait(lambda: played.states)
         assert time.monotonic() - begin < 0.38 / 2  # at rate 1 it takes .38 s
     assert played.stamps == TIMES
+
+
+def test_at_any_rate_messages_are_on_time():
+    late = []
+    for _ in range(5):  # a busy machine may be late with some
+        with Played(rate=10.0) as played:
+            begin = time.monotonic()
+            played.playback.change(play=True)
+            played.wait(lambda: played.states)
+        late.append(max(when - begin - (t - FIRST) / 1e10 for t, when in played.heard))
+    assert min(late) < 0.02
 
 
 def test_a_pause_holds_the_time():

@@ -17,6 +17,7 @@
 import contextlib
 import json
 import threading
+import time
 
 import pytest
 
@@ -30,7 +31,7 @@ from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
 from sonar_imm_tools.resources import shared_file  # noqa: E402
 from sonar_imm_tools.viewing.material import Channel, opened  # noqa: E402
 from sonar_imm_tools.viewing.playback import Playback  # noqa: E402
-from sonar_imm_tools.viewing.server import ViewServer  # noqa: E402
+from sonar_imm_tools.viewing.server import SETTLE, ViewServer  # noqa: E402
 
 BAG = 'bags/obstacle_movers'
 PLAYING, PAUSED, ENDED = 0, 1, 3
@@ -91,6 +92,30 @@ def test_the_viewer_drives_the_playing():
         viewer.wait(lambda: viewer.states[-1][0] == ENDED and len(viewer.messages) > 100)
         assert viewer.states[1][0] == PLAYING and viewer.states[1][4] == 'on'
         assert all(log_ns > middle for _, log_ns, _ in viewer.messages[2:])
+
+
+class Asked(Playback):
+    """A playback that notes what it was asked for."""
+
+    def change(self, **wishes):
+        self.wishes = [*getattr(self, 'wishes', ()), wishes]
+        return super().change(**wishes)
+
+
+@pytest.mark.parametrize('autostart, leaves', [(True, False), (True, True), (False, False)])
+def test_it_plays_by_itself_for_who_stays_and_where_that_was_wanted(autostart, leaves):
+    with opened(shared_file(BAG)) as (material, _), contextlib.ExitStack() as stack:
+        playback = Asked(material.first_ns, material.last_ns)
+        server = ViewServer('test', '127.0.0.1', 0, playback, autostart=autostart)
+        viewer = stack.enter_context(Viewer(stack.enter_context(server).url))
+        server.advertise(material.channels.values())
+        viewer.wait(lambda: len(viewer.channels) == len(material.channels))
+        viewer.subscribe('/nav')
+        viewer.wait(lambda: server.watched('/nav'))
+        if leaves:
+            stack.close()
+        time.sleep(1.5 * SETTLE)
+        assert getattr(playback, 'wishes', []) == [{'play': True}] * (autostart and not leaves)
 
 
 def test_live_channels_come_and_go():

@@ -45,6 +45,7 @@ from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray, IntArray
+from ...estimation.association import new_ids
 from ...estimation.set_filter import Members
 from .config import FathometerConfig
 from .response import Lattice, Response
@@ -90,7 +91,8 @@ class Identities:
         if config.scatter_decay and len(depth):
             bottom_id = self._follow_bottom(depth, is_bottom, ids, config)
         new = np.flatnonzero(ids == 0)
-        ids[new] = self.next_id + np.arange(len(new))
+        living = np.array([known.track_id for known in self.reflectors], np.uint32)
+        ids[new], next_id = new_ids(self.next_id, len(new), living)
         seen = [Identified(int(i), float(z), 0) for i, z in zip(ids, depth)]
         missed = [
             known._replace(missed=known.missed + 1)
@@ -99,7 +101,7 @@ class Identities:
         ]
         if config.scatter_decay and len(depth) and not bottom_id:
             bottom_id = _id_of_bottom(ids, is_bottom)
-        return Identities((*seen, *missed), self.next_id + len(new), bottom_id), ids
+        return Identities((*seen, *missed), next_id, bottom_id), ids
 
     def _follow_bottom(
         self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig

@@ -35,7 +35,7 @@ from sonar_imm.acoustics import array
 from sonar_imm.measurements import Rejection, Snapshot
 from sonar_imm.truth import TrueProfile
 
-from ..conversion import ConversionReport, read_npz, Record, write_bag
+from ..conversion import ConversionReport, numbers_of, read_npz, Record, stamps_of, write_bag
 from ..convert_options import SnapshotsOptions
 from ..messages import ros_message
 from ..sources import BagError
@@ -106,7 +106,7 @@ class _Archive:
         for what, candidates in wanted.items():
             found = [name for name in candidates if name in there]
             if found:
-                self._arrays[what] = there[found[0]]
+                self._arrays[what] = numbers_of(self.path, found[0], there[found[0]])
             elif what in names:
                 raise BagError(f"{path} has no array '{names[what]}'; it has {', '.join(there)}")
         self.listed = ', '.join(there)
@@ -165,9 +165,7 @@ def _stamps(content: _Archive, pings: int, ping_rate: float) -> list[int]:
     stamps = content.get('stamp')
     if stamps is None:
         return [FIRST_STAMP_NS + round(ping * 1e9 / ping_rate) for ping in range(pings)]
-    if stamps.size != pings or not np.isfinite(stamps).all():
-        raise BagError(f'{content.path}: {pings} pings need as many finite stamps')
-    return [round(float(stamp) * 1e9) for stamp in stamps.ravel()]
+    return stamps_of(content.path, stamps, pings, 'pings')
 
 
 def _element_spacing(

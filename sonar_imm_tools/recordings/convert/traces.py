@@ -27,7 +27,7 @@ from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.truth import PRESENT, TrueReflectors
 
-from ..conversion import ConversionReport, read_npz, Record, write_bag
+from ..conversion import ConversionReport, numbers_of, read_npz, Record, stamps_of, write_bag
 from ..convert_options import TracesOptions
 from ..csv_table import CsvTable, Row
 from ..messages import ros_message
@@ -36,6 +36,11 @@ from ..truth import records_of
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 Arrays = dict[str, NDArray]
+
+NAMES = {
+    'depth', 'amplitude', 'sigma', 'reference_depth', 'reflector_depth', 'reflector_amplitude',
+}  # fmt: skip
+"""The arrays of an archive that are read, beside its stamps."""
 
 
 def convert_traces(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
@@ -63,6 +68,8 @@ def _from_archive(
     report: ConversionReport, path: Path, rate: float, frame_id: str
 ) -> list[Record]:
     arrays = read_npz(path)
+    for name in arrays.keys() & NAMES:
+        numbers_of(path, name, arrays[name])
     for name in ('depth', 'amplitude'):
         if name not in arrays:
             raise BagError(f"{path} has no array '{name}'; it has {', '.join(arrays)}")
@@ -98,10 +105,7 @@ def _from_archive(
 def _stamps(arrays: Arrays, path: Path, count: int, rate: float) -> list[int]:
     if 'stamp' not in arrays:
         return [FIRST_STAMP_NS + round(k * 1e9 / rate) for k in range(count)]
-    stamps = arrays['stamp'].ravel()
-    if len(stamps) != count or not np.isfinite(stamps).all():
-        raise BagError(f'{path}: {count} traces need as many finite stamps')
-    return [round(float(stamp) * 1e9) for stamp in stamps]
+    return stamps_of(path, arrays['stamp'], count, 'traces')
 
 
 def _rows(arrays: Arrays, path: Path, name: str, shape: tuple[int, ...]) -> NDArray | None:

@@ -175,3 +175,7 @@ def test_the_bright_line_of_the_spectrum_is_the_floor(conjugate):
     image = figure.data[0]
     brightest = np.asarray(image.y)[np.asarray(image.z).argmax(axis=0)]
     assert np.median(np.abs(brightest - np.degrees(truth.angle))) < 2.0
+    low, high = figure.layout.yaxis.range
+    estimated = np.degrees(profile.angle[np.isfinite(profile.angle)])
+    assert -90.0 < low < estimated.min() and estimated.max() < high < 90.0
+    assert high - low < np.ptp(estimated) + 25.0  # the estimates fill the view

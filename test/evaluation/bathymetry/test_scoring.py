@@ -104,6 +104,7 @@ def test_without_truth_the_tracker_speaks_for_itself():
     metrics = score(swath(profile(known=False), profile(known=False, stamp_ns=10**9)))
     assert metrics['pings'] == 2 and metrics['bins'] == 2 * N and metrics['span_s'] == 1.0
     assert metrics['rough_share'] == pytest.approx(0.3)
+    assert metrics['height_std_median_m'] == pytest.approx(0.06)
     assert 'height' not in metrics
     assert 'no truth' in summary_sentence(metrics)
     assert dict(lines(METRICS, metrics))['bins with an echo'] == '100 %'

@@ -14,12 +14,13 @@
 
 """The figures of divers: ellipses, order of models, first view."""
 
-from helpers.dive_scenes import single_run
+from helpers.dive_scenes import covariance, single_run
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver import figures
+from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import fix_series
 from sonar_imm_tools.evaluation.diver.series import series_of
 from sonar_imm_tools.evaluation.diver.truth import Truth
@@ -68,3 +69,19 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
 
 def test_no_points_leave_the_view_open():
     assert figures.view_of(np.empty((0, 2))) == (None, None)
+
+
+def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band():
+    estimates, true_rows, times = single_run(count=60)
+    series = series_of(estimates)
+    series.track_id[:10] = 6  # another track goes before
+    matching = match(series, Truth.from_series(series_of(true_rows)), cutoff=10.0)
+    drawn = figures.error_figure(matching, 7).data
+    lines = [line for line in drawn if line.name == 'error of the track']
+    bands = [line for line in drawn if line.name == 'predicted 95 % band']
+    assert len(lines) == len(bands) == 2
+    for axis, line in enumerate(lines):
+        np.testing.assert_allclose(line.x, times[10:], atol=1e-3)
+        np.testing.assert_allclose(line.y, matching.error[10:, axis], atol=1e-3)
+        half = norm.ppf(0.975) * np.sqrt(covariance()[axis, axis])
+        np.testing.assert_allclose(np.sort(bands[axis].y), np.repeat([-half, half], 50), rtol=1e-3)

@@ -23,7 +23,12 @@ from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
+from sonar_imm_tools.evaluation.fathometer.crossing import (
+    common_shift,
+    crossing_lines,
+    crossing_metrics,
+    summary,
+)
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
 from sonar_imm_tools.recordings.messages import ros_message
@@ -168,6 +173,13 @@ def test_shift_and_spread_of_differences_that_are_known():
     ]
     assert summary(everything)['between_lines_m'] == pytest.approx(0.5, abs=0.02)
     assert common_shift(rows[:1]) == {} and summary([])['judged'] == 0
+
+
+def test_what_lines_differ_by_beyond_what_is_stated_is_a_sentence(lines):
+    for other, differ in (('sn', False), ('deep', True)):
+        metrics = crossed(lines, 'we', other)
+        assert (metrics['between_lines_m'] > 0.0) == differ
+        assert ('more than is stated' in crossing_lines(metrics)[-1]) == differ
 
 
 def test_no_crossing_and_no_places_are_said(lines, capsys):

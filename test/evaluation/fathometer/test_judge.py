@@ -191,3 +191,13 @@ def test_truth_further_away_than_the_gap_is_none(run):
     some = run.read_estimates()
     early, late = records_of(some[:1], some[1:], gap=60.0), records_of(some[:1], some[1:], gap=100)
     assert early[0].true is None and late[0].true is not None
+
+
+def test_the_truth_of_a_record_is_that_of_its_lag_later(run):
+    some = run.read_estimates()
+    later = 1e-9 * (some[1].stamp_ns - some[0].stamp_ns)
+    there = [np.sort(record.found.depth) for record in records_of(some)]
+    shifted = records_of(some, some, lag=later, gap=0.1 * later)
+    assert shifted[-1].true is None
+    for record, depth in zip(shifted[:-1], there[1:], strict=True):
+        np.testing.assert_array_equal(np.sort(record.true.depth), depth)

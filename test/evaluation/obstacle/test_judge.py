@@ -27,7 +27,7 @@ from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
-from sonar_imm_tools.evaluation.obstacle.figures import error_figure
+from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -70,10 +70,29 @@ def straight(track_id, offset, bearing=0.0, count=20):
 
 
 def test_of_true_deviations_nine_in_ten_lie_in_the_shaded_band():
-    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 3.0, 1.0, 2.0, 5.0, 0.1]])]),
+    _, found = score(series_of([estimate(10, [[4, 1, 42.0, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1]])]),
                      (straight(1, 3.0),), cutoff=5.0, gap=60.0)  # fmt: skip
-    (band,) = error_figure(found).layout.shapes
+    figure = error_figure(found)
+    (band,), (points,) = figure.layout.shapes, figure.data
+    # 4 m stated where 3 m are true, at a range of 42 m
+    assert np.ravel(points.x) == pytest.approx([42.0])
+    assert np.ravel(points.y) == pytest.approx(found.series.covariance[:1, 2, 2] ** -0.5)
     assert ndtr(band.y1) - ndtr(band.y0) == pytest.approx(0.9, abs=1e-3)
+
+
+def test_the_image_is_seen_from_above_with_starboard_to_the_right():
+    ping = Detections(stamp_ns=SECOND, range=[20.0, 40.0], bearing=[0.5, -1.0])
+    series = series_of([estimate(10, [[4, 1, 10.0, 0.2, 3.0, 1.0, 2.0, 5.0, 0.1]])])
+    figure = image_figure(series, [ping], (straight(1, 3.0, bearing=0.1),))
+    assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ('x', 1)
+    echoes, path, track = figure.data
+    for drawn, distance, bearing in (
+        (echoes, ping.range, ping.bearing),
+        (path, 60.0 - 2.0 * np.arange(20), 0.1),
+        (track, 10.0, 0.2),
+    ):
+        np.testing.assert_allclose(np.ravel(drawn.x), -distance * np.sin(bearing), atol=0.01)
+        np.testing.assert_allclose(np.ravel(drawn.y), distance * np.cos(bearing), atol=0.01)
 
 
 def test_scores_are_those_done_by_hand():

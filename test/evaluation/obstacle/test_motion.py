@@ -82,6 +82,9 @@ def test_scores_are_those_done_by_hand():
     scores = metrics['velocity']['moving']
     assert scores['rmse_m_s'] == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 4.0))
     assert scores['nees']['mean'] == pytest.approx((1.0 + 4.0) / 2.0)
+    still = path(np.arange(60.0, 0.0, -2.0))
+    alone = motion_metrics(matched(estimates[:1], still), (still,), ObstacleConfig())['velocity']
+    assert alone == {'still': {'n': 1, 'rmse_m_s': pytest.approx(np.sqrt((0.36 + 0.04) / 2.0))}}
     assert metrics['behaviours']['confusion']['moving'] == pytest.approx(
         {'n': 2, 'fixed': 0.05, 'swaying': 0.05, 'moving': 0.9, 'seabed': 0.0}
     )

@@ -30,17 +30,17 @@ import pytest
 
 FOLDER = os.environ.get('SONAR_IMM_FIGURES', '')
 SHARE = float(os.environ.get('SONAR_IMM_SHARE', '1.0'))
-"""Of the tries of the long form, for a machine that has no hours."""
+"""Of the tries of the long form; below 1 every fault is tried on one node only."""
 
 
 def long_form() -> bool:
     """Whether everything is to be tried, not a share of it."""
-    return bool(FOLDER)
+    return bool(FOLDER) and SHARE >= 1.0
 
 
 def count(short: int, long: int) -> int:
     """How often something is tried."""
-    return max(short, round(SHARE * long)) if long_form() else short
+    return max(short, round(SHARE * long)) if FOLDER else short
 
 
 class Figures:

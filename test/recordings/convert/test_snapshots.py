@@ -117,6 +117,11 @@ def test_bad_pings_are_left_out_and_named(convert):
         ({}, {'iq': samples(10), 'range': RANGE}, 'shape'),
         ({}, {'iq': samples(10, 4), 'range': RANGE[:9]}, 'nothing that could be converted'),
         ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1.0, 2.0]}, 'stamps'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [np.inf]}, 'stamps'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1e300]}, 'before 2038'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': np.array(['M8', 's'])}, 'no numbers'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'c': np.array('x')}, "'c' holds no numbers"),
+        ({}, {'iq': samples(10, 4), 'range': RANGE.astype('m8[s]')}, "'range' holds no numbers"),
         (
             {},
             {'iq': samples(10, 4), 'range': RANGE, 'sound_speed': np.ones(3)},

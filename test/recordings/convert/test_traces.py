@@ -91,6 +91,10 @@ def test_bad_traces_are_left_out_by_name(archive):
             'sigma has the shape',
         ),
         ({'depth': DEPTH, 'amplitude': np.zeros((3, 40))}, 'silent'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1e300] * 3}, '3 traces need as many'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [3e9] * 3}, 'before 2038'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': ['a'] * 3}, "'stamp' holds no numbers"),
+        ({'depth': DEPTH, 'amplitude': ONES, 'sigma': 'x'}, "'sigma' holds no numbers"),
     ],
 )
 def test_archives_that_make_no_sense_are_one_sentence(archive, arrays, words):

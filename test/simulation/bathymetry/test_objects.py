@@ -92,3 +92,12 @@ def test_a_wall_is_gated_and_scored():
 def test_what_does_not_go_with_objects(values):
     with pytest.raises(ConfigError):
         scenario('ledge', values)
+
+
+def test_the_second_surface_is_the_strongest_that_is_apart():
+    power = np.array([[9.0, 2.0, 4.0, 8.0], [9.0, 0.0, 0.0, 8.0], [0.0, 0.0, 0.0, 0.0]])
+    height = np.array([[0.0, 3.0, 2.0, 0.1]] * 3)
+    number, main, second = second_of(power, height)
+    assert number.tolist() == [3, 1, 0]
+    assert main[:2].tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(second, [2.0, np.nan, np.nan])

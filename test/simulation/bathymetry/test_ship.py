@@ -18,7 +18,7 @@ import pytest
 from sonar_imm.acoustics import geometry, rays, sounding
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm_tools.simulation.bathymetry.ship import in_outline
+from sonar_imm_tools.simulation.bathymetry.ship import in_outline, Terrain
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, SUMMER
 
 
@@ -78,6 +78,17 @@ def test_under_a_profile_the_points_are_where_rays_end():
     far = np.hypot(*(true.xyz[-1] - ship)[:2])
     launch = rays.launch_table(profile, 5.0, 77.0, 1500.0)
     assert 60.0 < far < 90.0 and launch.value.shape[0] == 78
+
+
+@pytest.mark.parametrize('profile', [[], list(SUMMER)])
+def test_what_is_nearer_than_the_floor_is_no_echo(profile):
+    level = {'roll_deg': 0.0, 'pitch_deg': 0.0, 'yaw_deg': 0.0, 'sonar_mount_rpy_deg': (0.0,) * 3}
+    config = exact(first_range=8.0, sound_speed_profile=profile, pings=1, **level)
+    (true,) = simulate(config, 4).truth
+    echoes = true.range > config.sonar_height + 0.5
+    assert np.isfinite(true.angle[echoes]).all() and true.valid[echoes].any()
+    early = true.range < config.sonar_height - 0.5
+    assert early.sum() > 10 and not true.valid[early].any() and np.isnan(true.angle[early]).all()
 
 
 def test_the_outline_of_the_patch_waves_by_its_length_and_height():
@@ -159,3 +170,15 @@ def test_positions_of_an_array_ahead_of_the_reference():
     axes = sounding.array_axes('port', 0.5, np.eye(3))
     look = sounding.looks(axes, np.array([2.0, 0.0, 0.0]), pose, pose)
     assert look.position == pytest.approx([0.0, 2.0, 0.0])
+
+
+def test_the_floor_is_known_by_places_along_the_track_and_off_it():
+    terrain = Terrain(-9.0, np.radians(30.0), lambda a, off: a + 100.0 * off, lambda a, off: a > 4)
+    ahead, port = (
+        np.array([np.sqrt(3.0), 1.0, 0.0]) / 2.0,
+        np.array([-1.0, np.sqrt(3.0), 0.0]) / 2.0,
+    )
+    places = np.array([5.0 * ahead + 2.0 * port, 3.0 * ahead - 2.0 * port, 3.0 * ahead])
+    z, rough = terrain.at(places + [0.0, 0.0, 7.0], np.array([0.5, 0.5, 0.5]))
+    assert z == pytest.approx([-9.0 + 5.0 + 200.0 + 0.5, -9.0 + 3.0 + 200.0, -9.0 + 3.0])
+    assert rough.tolist() == [True, False, False]

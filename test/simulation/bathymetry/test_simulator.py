@@ -131,6 +131,8 @@ def test_both_sides_have_names_and_one_frame():
     scene = simulate(scenario('two_sides', {'pings': 2}), 1)
     assert [one.namespace for one in scene.measurements] == ['port', 'starboard'] * 2
     assert [true.namespace for true in scene.truth] == ['port', 'starboard'] * 2
+    alone = simulate(scenario('paper', {'pings': 1}), 1)
+    assert {one.namespace for one in (*alone.measurements, *alone.truth)} == {''}
     port, starboard = scene.truth[:2]
     assert (port.xyz[:, 1] > 0.0).all() and (starboard.xyz[:, 1] < 0.0).all()
     assert port.frame_id == starboard.frame_id == scene.frame_id

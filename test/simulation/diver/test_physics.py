@@ -17,6 +17,7 @@
 import numpy as np
 import pytest
 
+from sonar_imm_tools.simulation.diver.sensors import draw_errors
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate, TRANSMITTER
 
 
@@ -167,3 +168,12 @@ def test_positions_are_the_sum_of_the_velocities_at_any_step():
     assert dt.std() > 0.2 and dt.min() > 0.0
     moved = np.diff(track.position[:, :2], axis=0)
     np.testing.assert_allclose(moved, track.velocity[1:] * dt[:, None], atol=1e-8)
+
+
+def test_divers_rise_and_sink_with_the_swell_by_its_height_and_period():
+    config = scenario('table1', {'depth': [4.0, 4.0], 'swell_height': 0.5, 'swell_period': 8.0})
+    times = 0.5 * np.arange(160)
+    (height,) = draw_errors(config, times, np.random.default_rng(3)).height.T
+    assert np.ptp(height) == pytest.approx(1.0, abs=0.05)
+    assert height.mean() == pytest.approx(-4.0, abs=1e-9)
+    np.testing.assert_allclose(height[16:], height[:-16], atol=1e-9)

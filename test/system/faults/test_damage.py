@@ -67,7 +67,7 @@ def damage(folder, kind, rng):
 @pytest.mark.parametrize('kind', KINDS)
 def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
     """What is tracked without a word is what would have been tracked without the damage."""
-    tries, silent, failed, said_so = count(3, 60), [], [], 0
+    tries, silent, failed, said_so = count(3, 12), [], [], 0
     figures.skip_if_measured(tries, what=kind)
     rng = np.random.default_rng(len(kind))
     names = ['diver_table1', 'obstacle_movers'] if long_form() else ['diver_table1']
@@ -101,7 +101,7 @@ def limited(size, *words):
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_path, figures):
-    tries, bad = count(1, 12), []
+    tries, bad = count(1, 4), []
     figures.skip_if_measured(tries, what='full disk')
     rng = np.random.default_rng(3)
     whole = tmp_path / 'whole'

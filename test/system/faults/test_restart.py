@@ -35,7 +35,7 @@ FORGETFUL = ('bathymetry',)
 """No ping needs the one before it: there a state holds what was counted, and no more."""
 AGAIN = 0.25
 """Share of the messages that is sent again; the state has to be younger than that."""
-TURNS = count(1, 10)
+TURNS = count(1, 2)
 CLOSEST = 10.0
 """Seconds between messages at most: what comes more than five minutes late is taken for a clock
 that was set back."""

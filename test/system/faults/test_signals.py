@@ -36,7 +36,7 @@ STARTING = 'while it starts'
 @pytest.mark.parametrize('how', [*ASKING, signal.SIGKILL], ids=lambda how: how.name)
 def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figures):
     """All four nodes at once, each while it works on a burst of messages."""
-    turns, unclean = count(1, 20), []
+    turns, unclean = count(1, 4), []
     figures.skip_if_measured(turns, system=SYSTEMS[-1], signal=how.name)
     rng = np.random.default_rng(int(how))
     for _ in range(turns):
@@ -64,7 +64,7 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
 def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
     """The first moment that is not the interpreter's, and others while modules load and kernels
     get warm, which takes two seconds."""
-    moments, early, unclean = count(3, 20), 0, []
+    moments, early, unclean = count(3, 8), 0, []
     figures.skip_if_measured(moments, system=system, signal=STARTING)
     rng = np.random.default_rng(17 + SYSTEMS.index(system))
     for turn in rng.permutation(moments):

@@ -210,3 +210,11 @@ def test_amplitudes_are_freed_of_spreading_over_the_height_that_is_true():
     for heave, height in ((0.0, 30.0), (0.5, 30.5)):
         found = evolve(reflectors([55.0], [1.0]), heave=heave, heave_std=0.1)
         assert relative_amplitude(found, response, config) == pytest.approx([2.0 * height])
+
+
+def test_identities_beyond_32_bits_are_those_that_no_reflector_has():
+    here = np.array([10.0, 14.0, 18.0]), np.array([1.0, 0.0, 0.0])
+    first, ids = Identities(next_id=2**32 - 2).name(*here, FathometerConfig())
+    again, same = first.name(*here, FathometerConfig())
+    assert ids.tolist() == same.tolist() == [2**32 - 2, 2**32 - 1, 1]
+    assert (first.next_id, again.next_id) == (2, 2)
