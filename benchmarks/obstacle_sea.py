@@ -24,11 +24,7 @@ behaviour at 30 m, v the RMSE of the velocity of each axis there.
 `velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
 while it is followed, begins to move or stops, of those in the beam.
 `movers` has three movers in clutter at once, over their whole way.
-`calibration` compares stated probabilities of a collision with what happened, at 60, 40 and 25 m
-and for as many runs of a fixed, a swaying and a moving obstacle each: `over the beam` draws the
-vertical offset evenly over what the beam shows at the first ping, which is what the tracker
-believes of a new obstacle; `near the sonar` within 5 m. `guess` is the Brier score of who knows
-nothing but how often it happens.
+Forecasts of collisions: `benchmarks.obstacle_calibration`.
 """
 
 from __future__ import annotations
@@ -50,7 +46,7 @@ from benchmarks.obstacle_accuracy import (
 )
 from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
-from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm_tools.simulation.obstacle.scenario import SCENARIOS
@@ -83,15 +79,12 @@ VELOCITY: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
     'stops': ({'obstacle_stops': 20.0}, 20.0, (2.0, 5.0, 10.0)),
 }
 """What differs from a mover, when something happens, s, and how long after it is looked at, s."""
-DRAWN = {'over the beam': 11.5, 'near the sonar': 5.0}
-"""Greatest vertical offset of the obstacles of a calibration, m."""
 METHODS: dict[str, dict[str, Any]] = {
     'fixed': {'behaviours': ('fixed',)},
     'all': {'behaviours': BEHAVIOURS},
 }
 AT = 30.0
-EVERY = (*CASES, 'velocity', 'movers', *(f'calibration, {name}' for name in DRAWN))
-BINS = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
+EVERY = (*CASES, 'velocity', 'movers')
 
 
 def followed(
@@ -214,53 +207,6 @@ def truth_tables(truth: TrueObstacle) -> Iterator[Estimate]:
         yield Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns)
 
 
-def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
-    """Whether the obstacle is ever within the radius and the half height at once from a ping on;
-    what the scene does not reach has passed."""
-    offset = truth.vertical_offset[ping:]
-    level_distance = np.sqrt(np.maximum(truth.range[ping:] ** 2 - offset**2, 0.0))
-    return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
-
-
-def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
-    """Stated probabilities of a collision at 60, 40 and 25 m, by bin, beside what happened."""
-    forecasts: list[tuple[str, float, float, float]] = []
-    config = ObstacleConfig()
-    for kind in ('approach', 'swaying', 'mover'):
-        setting = scenario(
-            kind,
-            {**LEVER, 'vertical_offset': 0.0, 'offset_spread': reach, 'last_range': -30.0},
-        )
-        for seed in range(runs):
-            scene = simulate(setting, 1000 + seed)
-            truth = truths(scene, TrueObstacle)[0]
-            final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
-            for at in (60.0, 40.0, 25.0):
-                seen = first_at(truth, final, at)
-                if seen is not None and np.isfinite(seen[1]['collision_probability']):
-                    ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                    forecasts.append((kind, at, seen[1]['collision_probability'], float(ends)))
-    table: dict[str, dict[str, float]] = {}
-    kinds, ranges, p, hit = (np.array(column) for column in zip(*forecasts))
-    for low, high in zip(BINS, BINS[1:]):
-        rows = (p >= low) & ((p < high) | (high == 1.0))
-        if rows.any():
-            table[f'stated {low:g} to {high:g}'] = {
-                'forecasts': float(rows.sum()),
-                'stated': float(p[rows].mean()),
-                'happened': float(hit[rows].mean()),
-            }
-    for kind in ('approach', 'swaying', 'mover'):
-        for name in ('Brier', 'guess'):
-            table[f'{name}, {kind}'] = {}
-        for at in (60.0, 40.0, 25.0):
-            rows = (kinds == kind) & (ranges == at)
-            often = hit[rows].mean()
-            table[f'Brier, {kind}'][f'{at:.0f} m'] = float(np.mean((p[rows] - hit[rows]) ** 2))
-            table[f'guess, {kind}'][f'{at:.0f} m'] = float(often * (1.0 - often))
-    return table
-
-
 def guarded(rows: list[list[list[float] | None]]) -> dict[str, float]:
     """`summary`, also where every run lost the obstacle at some range."""
     if all(any(row[k] for row in rows) for k in range(len(RANGES))):
@@ -278,10 +224,8 @@ def main(runs: int = 100, first: int = 0, cases: Sequence[str] = EVERY) -> Parts
     for name in cases:
         if name in CASES:
             yield {name: case(name, runs, first)}
-        elif name in ('movers', 'velocity'):
-            yield {name: movers(runs) if name == 'movers' else velocity(runs)}
         else:
-            yield {name: calibration(runs, DRAWN[name.removeprefix('calibration, ')])}
+            yield {name: movers(runs) if name == 'movers' else velocity(runs)}
 
 
 if __name__ == '__main__':

@@ -170,7 +170,8 @@ def write_model_probabilities(
     estimate: Estimate, row: int, make: Make, sums: Sequence[str] = ()
 ) -> Any:
     """Write one row's model probabilities as JointState: name = model, position = probability;
-    behind the models those `sums` of them that the estimate has among its extras.
+    behind the models those `sums` that the estimate has among its extras: sums of the models, or
+    the probabilities of others, whose columns begin with ``prob_``.
 
     JointState is borrowed because every plotting tool shows its values by name.
     """
@@ -179,7 +180,7 @@ def write_model_probabilities(
     return make(
         'sensor_msgs/msg/JointState',
         header=make_header(estimate.stamp_ns, estimate.frame_id, make),
-        name=[*estimate.model_names, *sums],
+        name=[*estimate.model_names, *(name.removeprefix('prob_') for name in sums)],
         position=np.append(np.asarray(estimate.probabilities[row], np.float64), values),
     )
 

@@ -25,9 +25,13 @@ from ..headers import Make
 from ..obstacles import NAMES, write_markers, write_poses
 from .tracks import confirmed_rows, Drawn, Markers, MODELS, models_of_the_oldest, NAMED_SCALARS
 
+BEHAVIOURS = ('prob_fixed', 'prob_swaying', 'prob_moving', 'prob_seabed')
+"""Columns of what an obstacle does, of which an estimate has those that are considered."""
+
 
 class Displays:
-    """Places, markers that show the band of the height, and the models."""
+    """Places, markers that show the band of the height, and the models: above or below, and the
+    behaviours."""
 
     topics: Mapping[str, str] = {
         'obstacles': 'geometry_msgs/msg/PoseArray',
@@ -43,7 +47,7 @@ class Displays:
         if is_wanted('obstacles'):
             yield 'obstacles', write_poses(estimate, rows, make)
         yield from self._markers.of(estimate, rows, make, is_wanted)
-        yield from models_of_the_oldest(estimate, rows, make, is_wanted)
+        yield from models_of_the_oldest(estimate, rows, make, is_wanted, BEHAVIOURS)
 
     def forget(self, make: Make) -> Drawn:
         return self._markers.forget(make)

@@ -19,7 +19,8 @@ state only and of confirmed obstacles (also those that have left the beam):
 
 - ``~/obstacles``: their places in the frame of the navigation, a PoseArray;
 - ``~/markers``: a bar for the 90 % band of the height, a ball at the mean, a label;
-- ``~/model_probabilities``: above and below, of the obstacle that has been tracked longest.
+- ``~/model_probabilities``: above and below, then the behaviours that are considered, of the
+  obstacle that has been tracked longest.
 """
 
 from __future__ import annotations

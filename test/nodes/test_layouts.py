@@ -24,6 +24,7 @@ import pytest
 import yaml
 
 from msg_adapters.displays.diver import FAMILIES
+from msg_adapters.displays.obstacle import BEHAVIOURS
 from msg_adapters.estimates import write_model_probabilities
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.trackers import SYSTEMS
@@ -122,7 +123,7 @@ def check_path(path, topics, estimate):
         if '/' in kind:
             cls = message_class(kind)
     if topic.endswith('/model_probabilities'):
-        drawn = write_model_probabilities(estimate, 0, ros_message, FAMILIES)
+        drawn = write_model_probabilities(estimate, 0, ros_message, (*FAMILIES, *BEHAVIOURS))
         assert drawn.name[int(index)] == path['label']
 
 

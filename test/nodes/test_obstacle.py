@@ -94,6 +94,8 @@ def an_estimate(ids, states, above=0.02):
             'track_state': np.array(states, np.uint8),
             'vertical_offset_lo': np.full(rows, 1.0),
             'vertical_offset_hi': np.full(rows, 4.5),
+            'prob_fixed': 0.01 * np.array(ids),
+            'prob_moving': 1.0 - 0.01 * np.array(ids),
         },
     )
 
@@ -154,7 +156,8 @@ def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(ri
     rig.bench.spin_until(lambda: rig.poses and rig.markers and rig.probabilities)
     assert len(rig.poses[0].poses) == 3 and rig.poses[0].header.frame_id == 'odom'
     assert {marker.id for marker in rig.markers[0].markers} == {9, 3, 5}
-    assert list(rig.probabilities[0].name) == ['above', 'below']
+    assert list(rig.probabilities[0].name) == ['above', 'below', 'fixed', 'moving']
+    assert list(rig.probabilities[0].position) == [0.02, 0.98, 0.03, 0.97]
     rig.node.show([an_estimate([2], [0])])
     rig.bench.spin_until(lambda: len(rig.poses) == 2 and len(rig.markers) == 2)
     assert not rig.poses[1].poses

@@ -30,6 +30,7 @@ from ..shared_parameters import (
 
 METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
+MISSES = ('ignored', 'evidence')
 
 
 @frozen(kw_only=True)
@@ -128,6 +129,9 @@ class ObstacleConfig(
         'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
     outlier_probability: float = live(0.02, '',
         'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
+    misses: str = parameter('ignored', '',
+        'what pings without an echo say of the height of an obstacle, gaussian_sum only: nothing '
+        '(ignored), or that it is less probable in the beam (evidence)', choices=MISSES)
     # -- what is believed of depth and navigation ------------------------------------------------
     max_offset: float = parameter(0.0, 'm',
         'largest vertical offset of a new obstacle; 0: what beam, surface and altitude allow',

@@ -49,6 +49,12 @@ BAND = 0.9
 BEAM_MARGIN = 1.6
 """A new obstacle lies within this many half beams of the axis: an edge is not sharp."""
 
+EDGE = 0.1
+"""Of the half height of the beam, to both sides of its edge: there neither an echo nor a miss is
+surprising."""
+SOFT = 0.05
+"""Of the half height of the beam: standard deviation of the edges that are left."""
+
 
 def put(
     parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
@@ -194,6 +200,25 @@ class DepthSlices:
             *mixture, h, z, R, outlier, self.outlier_density
         )
         return Mixture(*after), nis, int(np.count_nonzero(repaired))
+
+    def seen(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
+        """With what an echo in the ping before, of the sonar `last`, says of the height
+        (`looks`)."""
+        m = kernels.points(mixture.x, *sonar.pose, self.cone)
+        m = geometry.predict(m, sonar.pose, last.pose)
+        other = np.full(len(m), self.config.outlier_probability)
+        vertical, *others = self._beam
+        edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
+        return Mixture(*kernels.looked(*mixture, m, other, 1.0 - other, edge, soft, *others)[:3])
+
+    def missed(self, mixture: Mixture, p: FloatArray, sonar: Sonar) -> tuple[Mixture, FloatArray]:
+        """After a ping without an echo of the targets, which each give one with the probability
+        p (T,) inside the beam; and the probability (T,) beforehand that the beam held them."""
+        m = kernels.points(mixture.x, *sonar.pose, self.cone)
+        vertical, *others = self._beam
+        edge, soft = (1.0 - EDGE) * vertical, SOFT * vertical
+        *after, inside = kernels.looked(*mixture, m, np.ones(len(p)), -p, edge, soft, *others)
+        return Mixture(*after), inside
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""

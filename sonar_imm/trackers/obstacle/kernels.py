@@ -128,6 +128,71 @@ def outlook(
 
 
 @kernel
+def looked(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    m: FloatArray,
+    floor: FloatArray,
+    slope: FloatArray,
+    edge: float,
+    soft: float,
+    horizontal: float,
+    reach: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The density of mixtures (T, K) times `floor + slope B`, matched in mean and covariance
+    component by component, and the mean (T,) of B beforehand (`looks`).
+
+    m (T, K, 3): where the means lie, seen from the sonar; floor, slope (T,); edge and soft, rad:
+    half height of the pattern B and the standard deviation of its edges; horizontal, reach: half
+    width of the sector, rad, and its range, m, which fade out likewise.
+    """
+    T, K, n = x.shape
+    x1, P1, mu1, held = x.copy(), P.copy(), mu.copy(), np.zeros(T)
+    which, end = np.empty((T * K, 2), dtype=np.int64), 0
+    rows, sides = np.empty((4, 2 * T * K)), np.empty((2, T * K))
+    for t in range(T):
+        for j in range(K):
+            if mu[t, j] <= NEGLIGIBLE:
+                continue
+            X, Y, Z = m[t, j, 0], m[t, j, 1], m[t, j, 2]
+            d = math.sqrt(X * X + Y * Y + Z * Z)
+            off = horizontal - math.atan2(abs(Y), X)
+            share = min(max(0.5 + 0.25 * off / soft, 0.0), 1.0)
+            share *= min(max(0.5 + 0.25 * (reach / d - 1.0) / soft, 0.0), 1.0)
+            std = math.sqrt(soft * soft + P[t, j, 2, 2] / (d * d))
+            elevation = math.asin(Z / d)
+            rows[0, 2 * end] = (edge - elevation) / std
+            rows[0, 2 * end + 1] = (-edge - elevation) / std
+            sides[0, end], sides[1, end] = share, 1.0 / (std * d)
+            which[end, 0], which[end, 1] = t, j
+            end += 1
+    gaussians(rows[0, : 2 * end], rows[1, : 2 * end], rows[2, : 2 * end], rows[3, : 2 * end])
+    for k in range(end):
+        t, j, share, rate = which[k, 0], which[k, 1], sides[0, k], sides[1, k]
+        upper, lower = rows[2, 2 * k] / ROOT_2PI, rows[2, 2 * k + 1] / ROOT_2PI
+        inside = share * (rows[3, 2 * k] - rows[3, 2 * k + 1])
+        first = share * rate * (lower - upper)
+        second = share * rate * rate * (rows[0, 2 * k + 1] * lower - rows[0, 2 * k] * upper)
+        held[t] += mu[t, j] * inside
+        weight = floor[t] + slope[t] * inside
+        first *= slope[t] / weight
+        second = slope[t] * second / weight - first * first
+        mu1[t, j] = mu[t, j] * weight
+        for a in range(n):
+            x1[t, j, a] += P[t, j, a, 2] * first
+            for b in range(n):
+                P1[t, j, a, b] += P[t, j, a, 2] * P[t, j, b, 2] * second
+    for t in range(T):
+        total = 0.0
+        for j in range(K):
+            total += mu1[t, j]
+        for j in range(K):
+            mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
+    return x1, P1, mu1, held
+
+
+@kernel
 def matched(x: FloatArray, P: FloatArray, mu: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     """Mean (T, n) and covariance (T, n, n) of the first n states of mixtures (T, K)."""
     T, K, _ = x.shape

@@ -30,12 +30,14 @@ from ..navigation import NavigationBuffer
 from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .intensity import Strengths
+from .looks import Looks
 
 
 class PingState(NamedTuple):
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them; bodies: how far their echoes wander."""
+    each component assumes them; bodies: how far their echoes wander; looks: pings that did not
+    show them, and what that says."""
 
     stamp_ns: int
     sonar: Sonar
@@ -44,6 +46,7 @@ class PingState(NamedTuple):
     nis: FloatArray
     strengths: Strengths
     bodies: Bodies
+    looks: Looks
     repairs: int = 0
     alike: bool = False
 
@@ -56,6 +59,7 @@ class PingState(NamedTuple):
             nis=self.nis[kept],
             strengths=self.strengths.rows(kept),
             bodies=self.bodies.rows(kept),
+            looks=self.looks.rows(kept),
         )
 
     def only(self, kept: np.ndarray) -> PingState:

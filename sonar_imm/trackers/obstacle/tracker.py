@@ -53,6 +53,7 @@ from .bodies import Bodies, considered
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
+from .looks import Looks
 from .navigation import Mount
 from .state import identities, ObstacleState, PingState
 
@@ -267,6 +268,9 @@ class ObstacleTracker:
             )
             now = now._replace(mixture=now.mixture._replace(mu=mu), strengths=strengths)
         hit = chosen >= 0
+        if self.config.misses == 'evidence' and before:
+            looks = now.looks.after(hit, now.mixture, self.filter, sonar, before.sonar)
+            now = now._replace(looks=looks)
         now = self._prune(now, hit)
         if np.count_nonzero(hit) < len(z):
             free = np.ones(len(z), bool)
@@ -283,6 +287,7 @@ class ObstacleTracker:
             stamp_ns=stamp_ns,
             sonar=sonar,
             mixture=mixture,
+            looks=before.looks.advanced(self.filter, before.sonar, sonar, dt),
             repairs=before.repairs + repairs,
         )
         is_finite = ping_kernels.is_finite(mixture.x, mixture.P)
@@ -360,12 +365,14 @@ class ObstacleTracker:
         if not len(z):
             return now
         bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
+        fresh = self.filter.begin(z, R, now.sonar)
         return now._replace(
             life=now.life.born(len(z), now.stamp_ns, self.rules),
-            mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
+            mixture=now.mixture.joined(fresh),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
             strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
             bodies=now.bodies.joined(bodies),
+            looks=now.looks.joined(Looks.first(fresh)),
         )
 
     def _nobody(self, sonar: Sonar) -> PingState:
@@ -380,15 +387,17 @@ class ObstacleTracker:
             nis=np.empty(0),
             strengths=Strengths.unknown(0, K),
             bodies=Bodies.unknown(0),
+            looks=Looks.first(nothing),
         )
 
     def _estimate(self, ping: PingState) -> Estimate:
-        view = self.filter.view(ping.mixture, ping.sonar)
+        mixture = ping.looks.published(ping.mixture)
+        view = self.filter.view(mixture, ping.sonar)
         view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras: dict[str, np.ndarray] = {
             **behaviour_columns(view, self.filter.behaviours),
-            **closest_approach(*view.near, ping.mixture.mu, ping.sonar.course, self.config),
+            **closest_approach(*view.near, mixture.mu, ping.sonar.course, self.config),
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,
             'vertical_offset_lo': view.low,

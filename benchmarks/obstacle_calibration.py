@@ -1,0 +1,187 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Do the stated probabilities of a collision come true, and does the 90 % band hold the truth?
+
+    python -m benchmarks.obstacle_calibration --out docs/results/obstacle_calibration.json
+
+All runs are of the whole tracker, with `misses: ignored` and with `misses: evidence`, and else
+with its defaults, of which `--tracker name=value` replaces some.
+
+`forecasts` compares stated probabilities of a collision with what happened, when the range first
+falls to 60, 45, 30, 20 and 10 m, by five bins: `runs` of a fixed, a swaying and a moving obstacle
+each, per altitude of the vehicle. `within 8 m` draws the vertical offset evenly over 8 m to both
+sides, at altitudes of 6 and 25 m (what would lie in the sea floor is drawn again, by the next
+seed); `over the beam` over what the beam shows at the first ping, and `near the sonar` within 5 m,
+both at 15 m. `error` is the binomial standard error of what happened; forecasts of a run are not
+independent, so that it is rather larger. `lost` is the share of the ranges at which the obstacle
+is not followed: no forecast. `guess` is the Brier score of who knows nothing but how often it
+happens.
+
+`band` is the share of the pings of the last 35 m of range in which the 90 % band of the vertical
+offset holds the truth, over `approaches` fixed obstacles per offset; `worst` that of the tenth of
+the approaches in which it holds least, `width` its mean width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.obstacle_accuracy import config_of, LEVER, nearest, parsed, track
+from benchmarks.obstacle_sea import first_at
+from benchmarks.study import Parts, rms, study, truths
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS, MISSES, ObstacleConfig
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
+
+ALTITUDES = (6.0, 25.0)
+DRAWN = {
+    'within 8 m': (8.0, ALTITUDES),
+    'over the beam': (11.5, (15.0,)),
+    'near the sonar': (5.0, (15.0,)),
+}
+"""Greatest vertical offset of the obstacles, m, and altitudes of the vehicle, m."""
+AT = (60.0, 45.0, 30.0, 20.0, 10.0)
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+KINDS = ('approach', 'swaying', 'mover')
+OFFSETS = (-8.0, -6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0, 8.0)
+LAST = 35.0
+"""m of range over which the band is judged."""
+DEEPEST = 0.2
+"""m above the sea floor: no obstacle lies lower."""
+
+
+def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
+    """Whether the obstacle is ever within the radius and the half height at once from a ping on;
+    what the scene does not reach has passed."""
+    offset = truth.vertical_offset[ping:]
+    level_distance = np.sqrt(np.maximum(truth.range[ping:] ** 2 - offset**2, 0.0))
+    return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
+
+
+def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
+    """Tables of a case of `DRAWN`: what was stated and what happened, and Brier scores."""
+    reach, altitudes = DRAWN[name]
+    config = ObstacleConfig(**values)
+    found: list[tuple[float, float, float]] = []
+    asked, block = 0, 0
+    for kind in KINDS:
+        for altitude in altitudes:
+            changes = {'vertical_offset': 0.0, 'offset_spread': reach, 'last_range': -30.0}
+            setting = scenario(kind, {**LEVER, **changes, 'altitude': altitude})
+            # Seeds of their own: those of other kinds have the same geometry.
+            seed, done = first + 10000 * block, 0
+            block += 1
+            while done < runs:
+                scene = simulate(setting, seed)
+                seed += 1
+                truth = truths(scene, TrueObstacle)[0]
+                if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
+                    continue
+                done += 1
+                final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+                for at in AT:
+                    asked += 1
+                    seen = first_at(truth, final, at)
+                    if seen is not None and np.isfinite(seen[1]['collision_probability']):
+                        ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
+                        found.append((at, seen[1]['collision_probability'], float(ends)))
+    ranges, p, hit = (np.array(column) for column in zip(*found))
+    reliability: dict[str, dict[str, float]] = {}
+    for low, high in zip(BINS, BINS[1:]):
+        rows = (p >= low) & ((p < high) | (high == 1.0))
+        if rows.any():
+            often = float(hit[rows].mean())
+            reliability[f'{low:g} to {high:g}'] = {
+                'forecasts': int(rows.sum()),
+                'stated': float(p[rows].mean()),
+                'happened': often,
+                'error': float(np.sqrt(often * (1.0 - often) / rows.sum())),
+            }
+    brier = {}
+    for at in AT:
+        rows = ranges == at
+        often = hit[rows].mean()
+        brier[f'{at:.0f} m'] = {
+            'forecasts': int(rows.sum()),
+            'Brier': float(np.mean((p[rows] - hit[rows]) ** 2)),
+            'guess': float(often * (1.0 - often)),
+        }
+    return {'reliability': reliability, 'brier': brier, 'lost': 1.0 - len(found) / asked}
+
+
+def band(
+    offset: float, altitude: float, approaches: int, first: int, values: dict[str, Any]
+) -> dict[str, float]:
+    """How much of the last 35 m the 90 % band holds, of obstacles at one offset."""
+    setting = scenario('approach', {**LEVER, 'vertical_offset': offset, 'altitude': altitude})
+    held, widths, errors, followed, pings = [], [], [], 0, 0
+    for seed in range(first, first + approaches):
+        scene = simulate(setting, seed)
+        truth = truths(scene, TrueObstacle)[0]
+        final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+        inside = []
+        for ping in np.flatnonzero(truth.range <= LAST).tolist():
+            pings += 1
+            estimate = final.get(int(truth.stamp_ns[ping]))
+            row = None if estimate is None else nearest(truth, estimate, ping)
+            if estimate is None or row is None:
+                continue
+            low, high = (float(estimate.extras[f'vertical_offset_{e}'][row]) for e in ('lo', 'hi'))
+            true = float(truth.vertical_offset[ping])
+            inside.append(low <= true <= high)
+            widths.append(high - low)
+            errors.append(float(estimate.state[row, 2]) - true)
+        followed += len(inside)
+        if inside:
+            held.append(float(np.mean(inside)))
+    return {
+        'held': float(np.mean(held)),
+        'worst': float(np.mean(sorted(held)[: max(1, len(held) // 10)])),
+        'width': float(np.mean(widths)),
+        'RMSE': rms(errors),
+        'lost': 1.0 - followed / pings,
+    }
+
+
+def main(
+    runs: int = 90,
+    approaches: int = 40,
+    first: int = 1000,
+    cases: Sequence[str] = (*DRAWN, 'band'),
+    tracker: Sequence[str] = (),
+) -> Parts:
+    yield {'runs': runs, 'approaches': approaches, 'first': first}
+    for misses in MISSES:
+        values = {**dict(map(parsed, tracker)), 'misses': misses}
+        for name in cases:
+            if name != 'band':
+                yield {misses: {name: forecasts(name, runs, first, values)}}
+                continue
+            for altitude in ALTITUDES:
+                for offset in OFFSETS:
+                    if offset <= altitude - 0.3 - DEEPEST:
+                        row = band(offset, altitude, approaches, first, values)
+                        yield {misses: {'band': {f'{altitude:g} m': {f'{offset:g} m': row}}}}
+
+
+if __name__ == '__main__':
+    study(
+        main,
+        first={'help': 'first seed'},
+        cases={'choices': (*DRAWN, 'band')},
+        tracker={'help': 'name=value of the tracker'},
+    )
