@@ -77,9 +77,9 @@ Scores = dict[int, tuple[float, int]]
 @frozen(kw_only=True)
 class Tunable:
     """A parameter that can be fitted: `start` is the value that it has, or that stands for an
-    automatic one. place: of an element, where the parameter is a list. kind: ``log`` or ``logit``.
-    std: of the prior, in that coordinate. least: a bound beside those of the parameter. usual:
-    whether it is fitted without being asked for. step: of the differences."""
+    automatic one. place: of an element, where the parameter is the list `whole`. kind: ``log`` or
+    ``logit``. std: of the prior, in that coordinate. least: a bound beside those of the
+    parameter. usual: whether it is fitted without being asked for. step: of the differences."""
 
     name: str
     start: float
@@ -87,6 +87,7 @@ class Tunable:
     std: float = 1.5
     least: float = 1e-12
     place: int | None = None
+    whole: tuple[float, ...] = ()
     usual: bool = True
     step: float = STEP
 
@@ -182,7 +183,7 @@ def _recording(job: Job) -> Recording:
     return _read[key]
 
 
-def values_of(tunables: Sequence[Tunable], u: FloatArray, config: Config) -> dict[str, Any]:
+def values_of(tunables: Sequence[Tunable], u: FloatArray) -> dict[str, Any]:
     """The parameters at coordinates u (p,)."""
     values: dict[str, Any] = {}
     lists: dict[str, dict[int, float]] = {}
@@ -193,17 +194,11 @@ def values_of(tunables: Sequence[Tunable], u: FloatArray, config: Config) -> dic
         else:
             lists.setdefault(tunable.name, {})[tunable.place] = value
     for name, elements in lists.items():
-        whole = list(usual_list(tunables, name, config))
+        whole = next(list(t.whole) for t in tunables if t.name == name)
         for place, value in elements.items():
             whole[place] = value
         values[name] = tuple(whole)
     return values
-
-
-def usual_list(tunables: Sequence[Tunable], name: str, config: Config) -> Sequence[float]:
-    """The list `name` before it is fitted: of the config, or what an empty one stands for."""
-    configured = getattr(config, name)
-    return configured or [t.start for t in tunables if t.name == name]
 
 
 @frozen
@@ -221,7 +216,7 @@ class Fitting:
         terms, count = [], 0
         for job, split in zip(self.jobs, self.split):
             recording = _recording(job)
-            values = {} if u is None else values_of(self.tunables, u, recording.config)
+            values = {} if u is None else values_of(self.tunables, u)
             found = recording.scores(values, split if part == FIRST else math.inf)
             for stamp_ns, (score, measured) in found.items():
                 if part == WHOLE or (stamp_ns <= split) == (part == FIRST):
@@ -454,7 +449,7 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         gain = math.fsum([halves[0], -halves[1], halves[2], -halves[3]]) / measurements
         after = halves[4]
         if gain > 0.0:
-            values = _as_written(values_of(again.tunables, chosen, config))
+            values = _as_written(values_of(again.tunables, chosen))
     rows = []
     for k, tunable in enumerate(tunables):
         place = final[k]

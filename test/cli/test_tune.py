@@ -24,11 +24,14 @@ import pytest
 import yaml
 
 from sonar_imm.measurements import Fix
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.bathymetry import predictive as swaths
 from sonar_imm_tools.evaluation.diver.predictive import Scored
-from sonar_imm_tools.evaluation.tuning import Tunable
+from sonar_imm_tools.evaluation.tuning import Tunable, values_of
 
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'regret_free'
 QUICK = ['--system', 'diver', '--set', 'model_set=cv', '--parameters', 'covariance_scale']
 
 
@@ -86,6 +89,15 @@ def test_bounds_are_those_of_the_parameter() -> None:
     assert stay.value(stay.coordinate(0.9)) == pytest.approx(0.9)
 
 
+def test_an_element_that_is_fitted_leaves_the_others_of_its_list() -> None:
+    """Also where the list was empty, which stands for values of the model set."""
+    config = BathymetryConfig()
+    first, second, _ = swaths.tunables(config, [])
+    assert not config.sigmas and not first.usual and second.label == 'sigmas[1]'
+    changed = values_of([second], np.log([0.3]))
+    assert changed == {'sigmas': (config.sigmas_used[0], pytest.approx(0.3))}
+
+
 def kalman(z: np.ndarray, R: float, noise: float) -> float:
     """Log likelihood of fixes (n, 2) once a second, of one constant velocity."""
     F = np.array([[1.0, 1.0], [0.0, 1.0]])
@@ -102,26 +114,49 @@ def kalman(z: np.ndarray, R: float, noise: float) -> float:
     return total
 
 
+def score_of(
+    z: np.ndarray, R: np.ndarray, seconds: np.ndarray, scale: float, noise: float
+) -> float:
+    """The log likelihood that the tracker gives fixes z (n, 2) with R (n, 2, 2)."""
+    config = DiverConfig(
+        model_set='cv',
+        acceleration_noise=(noise,),
+        covariance_scale=scale,
+        max_tracks=1,
+        clutter_density=1e-12,
+        birth_density=1e-12,
+        gate_probability=0.9999999,
+        longest_step=100.0,
+    )
+    tracker = Scored(config)
+    for second, place, covariance in zip(seconds, z, R):
+        position = np.array([*place, 0.0])
+        fix = Fix(stamp_ns=round(second * 1e9), position=position, covariance=covariance)
+        tracker.process(fix)
+    return math.fsum(value for value, _ in tracker.scores.values())
+
+
+def test_the_score_is_that_of_the_reference_vectors() -> None:
+    """Where the gate refuses no fix: at six and ten times the stated covariances."""
+    with np.load(VECTORS / 'tuned.npz') as given:
+        scales, noises = given['grid_covariance_scale'][2:], given['grid_acceleration_noise']
+        found = [
+            [score_of(given['z'], given['R'], 1.0 + given['t'], s, q) for q in noises]
+            for s in scales
+        ]
+        expected = given['grid_log_likelihood'][2:]
+    first = np.array(found) - found[0][0]  # the first fix has a score that nothing changes
+    np.testing.assert_allclose(first, expected - expected[0, 0], atol=1e-6)
+
+
 def test_the_score_of_one_model_is_the_likelihood_of_a_kalman_filter() -> None:
     rng = np.random.default_rng(3)
     z = np.cumsum(rng.normal(0.3, 0.05, (40, 2)), axis=0) + rng.normal(0.0, 0.5, (40, 2))
 
     def score(scale: float, noise: float) -> float:
-        config = DiverConfig(
-            model_set='cv',
-            acceleration_noise=(noise,),
-            covariance_scale=scale,
-            max_tracks=1,
-            clutter_density=1e-12,
-            birth_density=1e-12,
-            gate_probability=0.9999999,
+        return score_of(
+            z, 0.25 * np.tile(np.eye(2), (40, 1, 1)), 1.0 + np.arange(40), scale, noise
         )
-        tracker = Scored(config)
-        for second, place in enumerate(z, start=1):
-            position = np.array([*place, 0.0])
-            fix = Fix(stamp_ns=second * 10**9, position=position, covariance=0.25 * np.eye(2))
-            tracker.process(fix)
-        return math.fsum(value for value, _ in tracker.scores.values())
 
     for scale, noise in ((2.0, 0.1), (1.0, 0.3)):
         expected = kalman(z, 0.25 * scale, noise) - kalman(z, 0.25, 0.1)

@@ -53,12 +53,14 @@ def for_tuning(config: BathymetryConfig) -> BathymetryConfig:
 
 
 def tunables(config: BathymetryConfig, measurements: Sequence[Any]) -> list[Tunable]:
+    """The noise of the smoothest model only when it is asked for: a flat floor makes it so small
+    that the next floor does not fit."""
     if config.model_set == 'angle_two_rw':
         name, noise = 'sigmas_deg', config.sigmas_deg or DEFAULT_SIGMAS_DEG
     else:
         name, noise = 'sigmas', config.sigmas_used
     found = [
-        Tunable(name=name, start=value, place=place)
+        Tunable(name=name, start=value, place=place, whole=tuple(noise), usual=place > 0)
         for place, value in enumerate(noise)
         if value > 0.0
     ]

@@ -63,7 +63,9 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
     if config.model_set in BASELINES:
         noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
         for place, value in enumerate(noise):
-            found.append(Tunable(name='acceleration_noise', start=value, place=place))
+            found.append(
+                Tunable(name='acceleration_noise', start=value, place=place, whole=tuple(noise))
+            )
         if len(noise) > 1:
             stay = config.baseline_stay_probability
             found.append(Tunable(name='baseline_stay_probability', start=stay, kind='logit'))
