@@ -99,3 +99,29 @@ def test_the_unit_of_samples_changes_no_decorrelation(unit):
         known, rel=1e-4
     )
     assert np.isnan(variances.decorrelation(0.0 * iq, every))
+
+
+def test_loud_stretches_of_the_water_are_no_noise():
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(400, 4, 2)).view(np.complex128)[..., 0]
+    noise *= np.sqrt(rng.exponential(size=(400, 1)))
+    quiet = np.arange(400) < 320
+    assert (variances.quiet_stretches(noise, quiet) == quiet).all()
+    spoilt = noise.copy()
+    spoilt[:60] *= 1e3  # the transmit pulse
+    spoilt[200:205] *= 30.0  # a target
+    kept = variances.quiet_stretches(spoilt, quiet)
+    assert not kept[:60].any() and not kept[200:205].any() and not kept[320:].any()
+    assert kept.sum() > 200
+    level = variances.noise_variance(spoilt, kept)
+    assert level == pytest.approx(variances.noise_variance(noise, quiet), rel=0.15)
+
+
+@pytest.mark.parametrize('staves', [2, 8])
+def test_a_water_column_of_fading_noise_is_kept_whole(staves):
+    rng = np.random.default_rng(4)
+    for bins in (40, 150, 1500):
+        for _ in range(40):
+            noise = rng.normal(size=(bins, staves, 2)).view(np.complex128)[..., 0]
+            noise *= np.sqrt(rng.exponential(size=(bins, 1)))
+            assert variances.quiet_stretches(noise, np.ones(bins, bool)).all()

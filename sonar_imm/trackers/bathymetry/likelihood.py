@@ -463,6 +463,7 @@ def _noise(
     quiet = (ranges < WATER_COLUMN * floor_below) & snapshot.usable
     measured = bool(quiet.sum() >= FEWEST_QUIET_BINS)
     if measured:
+        quiet = variances.quiet_stretches(snapshot.iq, quiet)
         level = variances.noise_variance(snapshot.iq, quiet)
     else:
         level = variances.blind_noise_variance(snapshot.iq)

@@ -93,7 +93,8 @@ class Ping:
 @frozen(eq=False)
 class Look:
     """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
-    noise; layover: None where it is ignored."""
+    noise; layover: None where it is ignored; floor_below: how far below the array the floor is
+    said to be, m."""
 
     ping: Ping
     swath: Swath
@@ -101,6 +102,7 @@ class Look:
     likelihood: PingLikelihood
     loud: BoolArray
     layover: Layover | None
+    floor_below: float
 
     @property
     def config(self) -> BathymetryConfig:
@@ -110,12 +112,15 @@ class Look:
 class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
     of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
-    where layover is ignored."""
+    where layover is ignored; how many bins from the depth of the floor on are usable, and how many
+    of these are passed over."""
 
     bins: int
     silent: int
     decorrelation: float
     array_error: float = math.nan
+    beyond: int = 0
+    beyond_silent: int = 0
 
 
 class Answer(NamedTuple):
@@ -142,7 +147,8 @@ def look(ping: Ping) -> Look:
     likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
     first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
-    return Look(ping, swath, models, likelihood, loud, _layover(ping, swath, likelihood))
+    second = _layover(ping, swath, likelihood)
+    return Look(ping, swath, models, likelihood, loud, second, floor_below)
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
@@ -273,11 +279,14 @@ def summarise(seen: Look, track: Track) -> Answer:
         else math.nan,
         'noise_variance': float(np.median(likelihood.noise)),
     }
+    beyond = usable & (likelihood.ranges >= seen.floor_below)
     loud = LoudBins(
         int(seen.loud.sum()),
         int((seen.loud & ~echo).sum()),
         variances.decorrelation(snapshot.iq, seen.loud & echo),
         math.nan if seen.layover is None else seen.layover.array_error,
+        int(beyond.sum()),
+        int((beyond & ~echo).sum()),
     )
     if seen.layover is not None:
         counts['bins_two'] = int((echo & (seen.layover.existence > GATE)).sum())

@@ -174,7 +174,7 @@ class BathymetryTracker:
     def warnings(self) -> list[str]:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
-        stated = noise_warnings(self._residuals)
+        stated = [*self._silence(), *noise_warnings(self._residuals)]
         if loud < FEWEST_LOUD:
             return stated
         silent = sum(ping.silent for ping in self._loud) / loud
@@ -202,6 +202,18 @@ class BathymetryTracker:
                 'element_spacing_wavelengths'
             )
         return sentences
+
+    def _silence(self) -> list[str]:
+        """What to say when most bins where a floor can be are passed over, loud or not."""
+        beyond = sum(ping.beyond for ping in self._loud)
+        silent = sum(ping.beyond_silent for ping in self._loud)
+        if beyond < FEWEST_LOUD or silent <= 0.5 * beyond:
+            return []
+        return [
+            f'{silent / beyond:.0%} of the bins beyond the depth of the floor were passed over as '
+            'silent: check noise_variance (of the snapshot, the parameter, or the water column, '
+            'which has to be quiet), sonar_height and element_spacing_wavelengths'
+        ]
 
     def process(self, measurement: Any) -> list[Estimate]:
         return [made for ping in self.tasks(measurement) for made in self.take(self.work(ping))]

@@ -153,3 +153,43 @@ def test_a_few_loud_bins_are_no_evidence():
     for count, sentences in ((150, 0), (49, 0), (1, 2)):  # 200 in all are enough
         tracker._loud.append(LoudBins(bins=count, silent=count, decorrelation=0.5))
         assert len(tracker.warnings()) == sentences
+
+
+@pytest.mark.parametrize('staves', [2, 8])
+def test_a_transmit_pulse_in_the_water_column_is_no_noise(staves):
+    scene = {'staves': staves, 'spacing_wavelengths': 0.5, 'last_range': 45.0, 'pings': 2}
+    config = scenario('water_column', scene)
+    heard, health = [], []
+    for pulse in (0.0, 1e3):
+        tracker = BathymetryTracker(BathymetryConfig())
+        for each in simulate(config, 1).measurements:
+            ping = each.measurement
+            iq = ping.iq.copy()
+            iq[:40] += pulse
+            made = tracker.process(evolve(ping, iq=iq))[0]
+            heard.append(made.extras['valid'][ping.range > 16.0].mean())
+            health.append(tracker.health()['noise_variance'])
+        assert not tracker.warnings()
+    assert min(heard) > 0.85
+    assert health[2:] == pytest.approx(health[:2], rel=0.1)
+
+
+def test_most_bins_silent_is_said_whatever_their_power():
+    """Noise that is stated far too high: no bin is loud, and two staves have power alone."""
+    scene = {'staves': 2, 'spacing_wavelengths': 0.5, 'last_range': 45.0, 'pings': 2}
+    config = scenario('paper', {**scene, 'state_noise': False})
+    for noise, sentences in ((1.0, 0), (1e6, 1)):
+        tracker = BathymetryTracker(BathymetryConfig(noise_variance=noise))
+        for each in simulate(config, 1).measurements:
+            tracker.process(each.measurement)
+        found = [each for each in tracker.warnings() if 'passed over as silent' in each]
+        assert len(found) == sentences
+
+
+def test_a_silent_water_column_is_no_reason_to_warn():
+    scene = {'first_range': 1.0, 'last_range': 22.0, 'pings': 2, 'state_noise': False}
+    config = scenario('paper', scene)
+    tracker = BathymetryTracker(BathymetryConfig())
+    for each in simulate(config, 1).measurements:
+        tracker.process(each.measurement)
+    assert tracker.health()['heard_share'] < 0.5 and not tracker.warnings()
