@@ -147,8 +147,9 @@ def _image(chart: Chart, values: FloatArray, thin: int, title: str, colours: str
     figure.add_heatmap(
         x=x, y=y, z=shown, colorscale=colours, zmin=low, zmax=high, colorbar={'title': title}
     )
-    east = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
-    north = {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'}
+    axis = {'zeroline': False, 'tickformat': 'd'}
+    east = {'title': 'east [m]', 'constrain': 'domain', 'nticks': 5, **axis}
+    north = {'title': 'north [m]', 'scaleanchor': 'x', **axis}
     return styled(figure, 560, east, north)
 
 
