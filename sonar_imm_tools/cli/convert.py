@@ -42,12 +42,15 @@ from .common import (
 FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.group()
-def command() -> None:
+@click.group(invoke_without_command=True)
+@click.pass_context
+def command(ctx: click.Context) -> None:
     """Turn recordings in other formats into a rosbag2 bag.
 
     Rows that cannot be used are left out, counted and listed by line.
     """
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
 
 
 def _add_subcommand(kind: str, options: type) -> None:

@@ -56,8 +56,8 @@ if TYPE_CHECKING:
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
     )
 )
-@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
-@click.argument('out_dir', type=click.Path(path_type=Path))
+@click.argument('bags', metavar='BAG...', nargs=-1, type=BAG)
+@click.argument('out_dir', metavar='OUT_DIR', required=False, type=click.Path(path_type=Path))
 @system_option
 @click.option(
     '--params',
@@ -94,7 +94,7 @@ if TYPE_CHECKING:
 @json_option
 def command(
     bags: tuple[Path, ...],
-    out_dir: Path,
+    out_dir: Path | None,
     jobs: int,
     scheduler: str | None,
     parquet: bool,
@@ -113,6 +113,10 @@ def command(
     fails is named and does not stop the others, and the same command again makes only what is
     missing.
     """
+    if out_dir is None:
+        raise click.UsageError("Missing argument 'BAG...'")
+    if not bags:  # of one word only click takes it for the last argument
+        raise click.UsageError(f"Missing argument 'OUT_DIR': where the estimates of {out_dir} go")
     if scheduler is not None and jobs > 1:
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet:

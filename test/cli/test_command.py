@@ -85,6 +85,7 @@ def test_help_loads_no_heavy_module():
         (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
         (['--bad'], '--bad'),
         (['track'], "Missing argument 'BAG...'"),
+        (['track', 'dive.bag'], "Missing argument 'OUT_DIR': where the estimates of dive.bag go"),
         (['track', 'nowhere.bag', 'out'], 'nowhere.bag does not exist'),
         (['info', 'nowhere.bag'], 'nowhere.bag does not exist'),
         (['evaluate', 'nowhere'], 'holds no finished run'),
@@ -111,6 +112,12 @@ def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_
     assert printed.out == ''
     assert len(printed.err.splitlines()) == 1 and printed.err.startswith('sonar-imm: ')
     assert words in printed.err
+
+
+def test_convert_alone_lists_what_it_reads(capsys):
+    assert main(['convert']) == 0
+    printed = capsys.readouterr()
+    assert not printed.err and all(f'\n  {kind} ' in printed.out for kind in ('fixes', 'segy'))
 
 
 def test_a_bug_is_not_hidden(monkeypatch):
