@@ -21,6 +21,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from helpers.fix_bags import COUNT, Ear, write_fixes
 import numpy as np
 import pytest
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64
 
@@ -175,6 +176,7 @@ def test_lockstep_notices_somebody_else_who_publishes(link, start, stepping):
 
     def meddle(count):
         other.publish(PoseWithCovarianceStamped())
+        assert other.wait_for_all_acked(Duration(seconds=10))  # on a busy machine it comes late
 
     with pytest.raises(LinkError, match="something else publishes to the node '/walker'"):
         player.run(meddle)
