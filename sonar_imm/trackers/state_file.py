@@ -36,7 +36,7 @@ from .. import __version__
 from ..files import whole
 from ..parameters import Config, ConfigError
 from . import System, Tracker
-from .state_values import Decoder, Encoder, restore, StateError, UNFIT
+from .state_values import Decoder, Encoder, restore, StateError, understood
 
 FORMAT = 1
 _MAGIC = b'sonar_imm state '
@@ -104,7 +104,7 @@ def read_state(path: Path) -> Saved:
         raise StateError(f'its format is {words[0].decode(errors="replace")}, not {FORMAT}')
     if words[1] != hashlib.sha256(body).hexdigest().encode():
         raise StateError('it is damaged: the checksum does not fit')
-    try:
+    with understood(EOFError, zipfile.BadZipFile, zlib.error):
         with np.load(io.BytesIO(body), allow_pickle=False) as parts:
             header, block = json.loads(parts['header'].tobytes()), parts['block']
         if header['version'] != __version__:
@@ -118,10 +118,6 @@ def read_state(path: Path) -> Saved:
             state=decoder.decode(header['state']),
             extras=decoder.decode(header['extras']),
         )
-    except (*UNFIT, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        if isinstance(error, StateError):
-            raise
-        raise StateError(f'it does not fit this version ({error})') from None
 
 
 def tracker_from(saved: Saved, system: System, config: Config) -> Tracker:

@@ -28,6 +28,8 @@ arrays have number types only.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterator
+import contextlib
 from importlib import import_module
 from types import FunctionType, MethodType
 from typing import Any
@@ -58,6 +60,17 @@ class StateError(ValueError):
     """A state that cannot be used; one sentence."""
 
 
+@contextlib.contextmanager
+def understood(*more: type[Exception]) -> Iterator[None]:
+    """Raises `StateError` in place of what a file raises that does not fit, `more` included."""
+    try:
+        yield
+    except StateError:
+        raise
+    except UNFIT + more as error:
+        raise StateError(f'it does not fit this version ({error})') from None
+
+
 @attrs.frozen
 class FrozenObject:
     """The class and the attributes of an object that changes."""
@@ -77,12 +90,10 @@ def restore(tracker: Any, state: dict[str, Any]) -> None:
     Raises `StateError` when it is the state of another tracker; the tracker is of no use then."""
     if not isinstance(state, dict) or set(state) != set(tracker.STATE):
         raise StateError('it belongs to another tracker, or to another version')
-    try:
+    with understood():
         for name, value in state.items():
             setattr(tracker, name, put(getattr(tracker, name), value))
         getattr(tracker, 'restored', lambda: None)()
-    except UNFIT as error:
-        raise StateError(f'it does not fit this version ({error})') from None
 
 
 def freeze(value: Any) -> Any:
@@ -230,23 +241,19 @@ class Decoder:
         values: list[Any],
         block: np.ndarray,
     ):
-        try:
+        with understood():
             self._classes = [_class_of(*cls) for cls in classes]
             self._arrays = [_array_of(block, *array) for array in arrays]
             self._values: list[Any] = []
             for value in values:
                 self._values.append(self.decode(value))
-        except UNFIT as error:
-            raise StateError(f'it does not fit this version ({error})') from None
 
     def decode(self, value: Any) -> Any:
         """The data that `Encoder.encode` made a JSON value of, objects as `FrozenObject`."""
         if type(value) is not list:
             return value
-        try:
+        with understood():
             return self._decode(*value)
-        except UNFIT as error:
-            raise StateError(f'it does not fit this version ({error})') from None
 
     def _decode(self, kind: str, *parts: Any) -> Any:
         if kind in ('array', 'number'):

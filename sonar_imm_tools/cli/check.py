@@ -27,7 +27,7 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, print_json, say
+from .common import BAG, example, json_option, params_option, print_json, say
 
 if TYPE_CHECKING:
     from .checking import CheckedRecording, PlayedRecording
@@ -38,11 +38,7 @@ if TYPE_CHECKING:
 )
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
 @click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
-@click.option(
-    '--params',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file for the node and the offline run.',
-)
+@params_option('Parameter file for the node and the offline run.')
 @click.option(
     '--limit',
     type=click.FloatRange(min=0.0),

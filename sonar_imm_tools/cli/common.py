@@ -103,6 +103,11 @@ def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )(function)
 
 
+def params_option(help: str) -> Callable[..., Any]:
+    """``--params FILE``."""
+    return click.option('--params', type=click.Path(path_type=Path, dir_okay=False), help=help)
+
+
 def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
     """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
 

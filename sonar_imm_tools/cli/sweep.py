@@ -32,6 +32,7 @@ from .common import (
     json_option,
     load_config,
     load_detector,
+    params_option,
     print_json,
     progress,
     say,
@@ -66,11 +67,7 @@ if TYPE_CHECKING:
     help='Name of the scene; by default the first one of `sonar-imm simulate SYSTEM --list`.',
 )
 @set_option
-@click.option(
-    '--params',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file of the tracker: ROS 2 form or a plain mapping.',
-)
+@params_option('Parameter file of the tracker: ROS 2 form or a plain mapping.')
 @topic_option
 @click.option(
     '--workers',

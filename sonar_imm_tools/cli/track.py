@@ -34,6 +34,7 @@ from .common import (
     json_option,
     load_config,
     load_detector,
+    params_option,
     print_json,
     progress,
     say,
@@ -59,11 +60,7 @@ if TYPE_CHECKING:
 @click.argument('bags', metavar='BAG...', nargs=-1, type=BAG)
 @click.argument('out_dir', metavar='OUT_DIR', required=False, type=click.Path(path_type=Path))
 @system_option
-@click.option(
-    '--params',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file: ROS 2 form or a plain mapping.',
-)
+@params_option('Parameter file: ROS 2 form or a plain mapping.')
 @set_option
 @topic_option
 @click.option(

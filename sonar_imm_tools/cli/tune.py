@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
 from pathlib import Path
 import time
 from typing import Any
@@ -26,8 +26,11 @@ import click
 
 from .common import (
     BAG,
+    compiling,
     example,
     json_option,
+    params_option,
+    plain_lines,
     print_json,
     progress,
     say,
@@ -58,11 +61,7 @@ from .track import Plan, say_parameters
     type=click.Path(path_type=Path, dir_okay=False),
     help='Write the parameters here, for `track --params` and the nodes.',
 )
-@click.option(
-    '--params',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file to begin with: ROS 2 form or a plain mapping.',
-)
+@params_option('Parameter file to begin with: ROS 2 form or a plain mapping.')
 @set_option
 @topic_option
 @click.option(
@@ -92,6 +91,7 @@ def command(
     --set or the recording's own parameters.yaml), so that `track --params` needs no other.
     """
     from ..evaluation.tuning import most_evaluations, prepared, tune
+    from ..recordings.own_files import write_ros_parameters
 
     plan = Plan(**options)
     for bag in bags:
@@ -100,7 +100,10 @@ def command(
     if len({job.system for job in runs}) > 1:
         raise click.UsageError('the recordings fit different trackers: say --system')
     names = [name.strip() for name in (parameters or '').split(',') if name.strip()]
-    fitting, measurements = prepared(runs, names)
+    with contextlib.ExitStack() as stack:
+        if not as_json:
+            stack.enter_context(compiling(plain_lines()))
+        fitting, measurements = prepared(runs, names)
     begin = time.perf_counter()
     fitting.scores(None)
     most = most_evaluations(len(fitting.tunables))
@@ -112,7 +115,9 @@ def command(
     with progress('tuning', most, quiet=as_json) as advance:
         found = tune(fitting, measurements, processes_used=jobs, advance=advance)
     if out is not None and found.values:
-        _write(out, _begun_with(plan, bags[0], runs[0].system), found.values)
+        stated = _begun_with(plan, bags[0], runs[0].system)
+        head = f'# Fitted by sonar-imm tune: {", ".join(found.values)}.\n'
+        write_ros_parameters(out, {'/**': {**stated, **found.values}}, head)
     if as_json:
         content = asdict(found)
         del content['values'], content['measurements']
@@ -151,15 +156,3 @@ def _begun_with(plan: Plan, bag: Path, system: str) -> dict[str, Any]:
     text = path.read_text(encoding='utf-8') if path else ''
     stated = parameters_from_yaml(text, node_name=system)
     return {**stated, **typed_overrides(SYSTEMS[system].config_type(), plan.overrides)}
-
-
-def _write(out: Path, begun_with: Mapping[str, Any], told: Mapping[str, Any]) -> None:
-    """A ROS 2 parameter file: what was told beside what the fit began with."""
-    import yaml
-
-    from sonar_imm.files import whole
-
-    tree = {'/**': {'ros__parameters': {**begun_with, **told}}}
-    head = f'# Fitted by sonar-imm tune: {", ".join(told)}.\n'
-    with whole(out) as unfinished:
-        unfinished.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')

@@ -25,7 +25,15 @@ import click
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 
-from .common import compiling, example, load_config, plain_lines, say, set_option
+from .common import (
+    compiling,
+    example,
+    load_config,
+    params_option,
+    plain_lines,
+    say,
+    set_option,
+)
 
 
 @click.command(
@@ -34,11 +42,7 @@ from .common import compiling, example, load_config, plain_lines, say, set_optio
     )
 )
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option(
-    '--params',
-    type=click.Path(path_type=Path, dir_okay=False),
-    help='ROS 2 parameter file of the tracker; with exactly one system.',
-)
+@params_option('ROS 2 parameter file of the tracker; with exactly one system.')
 @set_option
 @click.option(
     '--jobs',

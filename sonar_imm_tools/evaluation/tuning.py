@@ -54,9 +54,8 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..offline.batch import Job
 from ..offline.jobs import processes
-from ..recordings.measurements import measurements_of
+from ..offline.tracking import OfflineRun
 from ..recordings.reader import BagReader
-from ..recordings.topics import fitting_topics
 
 FEWEST = 20
 """Measurements below which nothing is fitted."""
@@ -128,28 +127,13 @@ class Recording:
     @classmethod
     def read(cls, job: Job) -> Recording:
         """What `job` would track. Raises `BagError` and `ConfigError`."""
-        options = job.options
+        options = evolve(job.options, order='stamp', smooth=False)
         with BagReader(job.bag) as reader:
-            chosen = fitting_topics(reader, job.system, options.topics)
-            settings = {**job.config.as_dict(), 'use_tf_static': options.use_tf_static}
-            topics = {name: e.name for name, e in chosen.items() if e.wanted(settings)}
-            config = job.config.for_inputs(frozenset(topics.values()))
-            heard = measurements_of(
-                reader,
-                job.system,
-                topics,
-                world_frame=options.world_frame,
-                order='stamp',
-                settings=config.as_dict(),
-                detector=options.detector,
-            )
-            found = tuple(
-                item.measurement
-                for item in heard
-                if item.measurement is not None and not isinstance(item.measurement, Rejection)
-            )
-        module = _predictive(job.system)
-        return cls(job.system, module.for_tuning(config), options.frame_id, found)
+            run = OfflineRun(reader, SYSTEMS[job.system], job.config, options)
+            heard = [item.measurement for item in run.read()]
+        found = tuple(item for item in heard if not isinstance(item, Rejection))
+        config = _predictive(job.system).for_tuning(run.tracker.config)
+        return cls(job.system, config, options.frame_id, found)
 
     def scores(self, values: Mapping[str, Any], until: float = math.inf) -> Scores:
         """What a tracker with these parameters predicts, stamp by stamp, up to `until`."""

@@ -41,7 +41,7 @@ from sonar_imm.parameters import Config
 from sonar_imm.trackers import System
 
 from .. import SECOND
-from ..recordings.measurements import measurements_of
+from ..recordings.measurements import Heard, measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.topics import fitting_topics
 from .jobs import processes
@@ -211,7 +211,9 @@ class OfflineRun:
         made: list[Estimate] = self.tracker.take(found)
         return made
 
-    def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
+    def read(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Heard]:
+        """What the messages hold, in order: measurements and refusals. `advance` hears of each
+        message."""
         for item in measurements_of(
             self.bag,
             self.system.name,
@@ -223,8 +225,11 @@ class OfflineRun:
         ):
             self.messages += 1
             advance(1)
-            if item.measurement is None:
-                continue
+            if item.measurement is not None:
+                yield item
+
+    def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
+        for item in self.read(advance):
             try:
                 if isinstance(item.measurement, Rejection):
                     raise item.measurement

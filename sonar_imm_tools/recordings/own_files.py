@@ -60,6 +60,18 @@ def unusual(known: Mapping[str, Any], tracker: type[Config]) -> dict[str, Any]:
 def write_own_parameters(bag: Path, nodes: Mapping[str, Mapping[str, Any]]) -> Path | None:
     """Write parameters by the names of their nodes as a ROS 2 parameter file into the folder of a
     recording; without any nothing is written."""
+    if not any(nodes.values()):
+        return None
+    path = bag / PARAMETERS
+    write_ros_parameters(path, nodes, _HEADS[PARAMETERS])
+    return path
+
+
+def write_ros_parameters(
+    path: Path, nodes: Mapping[str, Mapping[str, Any]], head: str = ''
+) -> None:
+    """Write parameters by the names of their nodes as a ROS 2 parameter file, after the comment
+    `head`; nodes without any are left out."""
     tree = {
         name: {
             'ros__parameters': {
@@ -69,11 +81,8 @@ def write_own_parameters(bag: Path, nodes: Mapping[str, Mapping[str, Any]]) -> P
         for name, values in nodes.items()
         if values
     }
-    if not tree:
-        return None
-    path = bag / PARAMETERS
-    path.write_text(_HEADS[PARAMETERS] + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')
-    return path
+    with whole(path) as unfinished:
+        unfinished.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')
 
 
 def own_limit(bag: Path) -> float | None:

@@ -17,6 +17,7 @@
 import json
 from pathlib import Path
 
+from helpers.clusters import small_cluster
 from helpers.dive_bags import write_dive
 from helpers.source import ROOT
 import pytest
@@ -197,17 +198,9 @@ def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
 
 
 def test_bags_on_a_cluster(tmp_path, capsys):
-    distributed = pytest.importorskip('distributed')
     bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('ab')]
     assert track(*bags, tmp_path / 'here') == 0
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        dashboard_address=None,
-        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-        silence_logs='CRITICAL',
-    ) as there:
+    with small_cluster(silence_logs='CRITICAL') as there:
         address = ('--scheduler', there.scheduler_address)
         assert track(*bags, tmp_path / 'missing', tmp_path / 'there', *address) == 1
         assert 'missing does not exist' in capsys.readouterr().err

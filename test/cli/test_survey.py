@@ -20,6 +20,7 @@ import os
 import re
 import shutil
 
+from helpers.clusters import small_cluster
 import numpy as np
 import pytest
 
@@ -156,15 +157,7 @@ def test_the_same_bytes_with_two_processes(lines, made, tmp_path):
 
 
 def test_the_same_bytes_on_a_cluster(lines, made, tmp_path):
-    distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        dashboard_address=None,
-        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-        silence_logs='CRITICAL',
-    ) as there:
+    with small_cluster(silence_logs='CRITICAL') as there:
         address = ('--scheduler', there.scheduler_address)
         assert run('survey', lines, tmp_path / 'out', '--adjust', *address) == 0
     assert products(tmp_path / 'out') == products(made)

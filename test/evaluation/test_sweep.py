@@ -24,6 +24,7 @@ from pathlib import Path
 import socket
 
 from attrs import evolve
+from helpers.clusters import small_cluster
 import numpy as np
 import pytest
 
@@ -138,15 +139,7 @@ def test_processes_make_the_same_files_as_one_process(diver, tmp_path):
 
 
 def test_a_cluster_is_found_by_its_address(diver):
-    distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        protocol='tcp',
-        dashboard_address=None,
-        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-    ) as there:
+    with small_cluster(protocol='tcp') as there:
         lost = evolve(diver, options=InputOptions(topics={'/nowhere': 'fix'}))
         notes = []
         (found,) = sweeps.run_on_cluster(diver, [5], there.scheduler_address, notes.append)
