@@ -50,6 +50,7 @@ EXTRAS = {
         'mkdocs-material>=9.5',
         'mkdocstrings[python]>=0.26',
     ],
+    'nmea': ['pyais>=2.7', 'pynmea2>=1.18'],
     'parquet': ['pyarrow>=14'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
@@ -57,7 +58,9 @@ EXTRAS = {
         'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
+        'pyais>=2.7',
         'pyarrow>=14',
+        'pynmea2>=1.18',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',

@@ -143,6 +143,28 @@ class RelativeOptions:
 
 
 @frozen(kw_only=True)
+class NmeaOptions:
+    """Log of NMEA 0183 sentences and AIS messages to /fixes, /nav_fix and /heading. Needs pyais
+    and pynmea2.
+
+    Fixes are the targets of AIS (by MMSI), TLL and TTM; the vessel's own GGA, RMC, GLL, GNS, HDT
+    and THS are its navigation, or the fixes where there are no targets. Times stand before a
+    sentence, in its tag block, or are the vessel's clock with the date of ZDA or RMC.
+    """
+
+    EXAMPLES: ClassVar = ('harbour.nmea harbour.bag', 'gps.log buoy.bag --date 2024-05-31')
+    date: str = option('', 'DATE', 'Date of the first line (UTC), where no sentence says it.')
+    own: str = option('auto', '',
+        'What the positions of the receiver itself are; auto: of the vessel, where there are '
+        'targets, else the fixes.', choices=('auto', 'vessel', 'fixes'))
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
 class ArrivalsOptions:
     """CSV of arrival times to /arrivals, one message per ping.
 
@@ -323,6 +345,7 @@ class TracesOptions:
 OPTIONS: dict[str, type] = {
     'fixes': FixesOptions,
     'relative': RelativeOptions,
+    'nmea': NmeaOptions,
     'arrivals': ArrivalsOptions,
     'truth': TruthOptions,
     'autoferry': AutoferryOptions,

@@ -30,6 +30,7 @@ from .autoferry import convert_autoferry
 from .fixes import convert_fixes
 from .images import convert_images
 from .interferometer import convert_interferometer
+from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
 from .snapshots import convert_snapshots
@@ -42,6 +43,7 @@ __all__ = [
     'convert_fixes',
     'convert_images',
     'convert_interferometer',
+    'convert_nmea',
     'convert_relative',
     'convert_segy',
     'convert_snapshots',
@@ -55,6 +57,7 @@ __all__ = [
 KINDS: dict[str, Callable[..., ConversionReport]] = {
     'fixes': convert_fixes,
     'relative': convert_relative,
+    'nmea': convert_nmea,
     'arrivals': convert_arrivals,
     'truth': convert_truth,
     'autoferry': convert_autoferry,

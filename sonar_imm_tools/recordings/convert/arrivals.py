@@ -44,7 +44,7 @@ from sonar_imm.measurements import Arrivals, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import ArrivalsOptions
-from ..csv_table import BadRow, CsvOptions, CsvTable, Row
+from ..csv_table import BadRow, CsvOptions, CsvTable, Row, Table
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
 from ..sources import BagError
@@ -177,7 +177,7 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     )
 
 
-def _names_tags(table: CsvTable) -> bool:
+def _names_tags(table: Table) -> bool:
     """Whether a column says which tag was heard, and not which receiver has heard it."""
     return table.has('tag') and table.index['tag'] != table.index.get('receiver')
 
