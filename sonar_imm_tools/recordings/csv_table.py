@@ -49,7 +49,7 @@ LOOKED_AT = 1000
 USUAL_NAMES = {
     'stamp': (
         'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
-        'epoch unix_time'
+        'epoch unix_time date_and_time device_time'
     ),
     'date': 'utc_date gps_date date_utc day',
     'x': 'east easting px pos_x position_x utm_e utm_x e',
@@ -84,9 +84,9 @@ USUAL_NAMES = {
     'vy': 'v_north vn vel_y velocity_y',
     'id': 'track_id target target_id tag diver name',
     'valid': 'position_valid is_valid fix_valid validity',
-    'tag': 'tag_id transmitter transmitter_id tx tx_id',
+    'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
     'ping': 'ping_id ping_number',
-    'receiver': 'rx rx_id receiver_id hydro hydrophone station name id',
+    'receiver': 'rx rx_id receiver_id hydro hydrophone serial_number station name id',
     'transmitter': 'tx tx_id transmitter_id source name id',
     'arrival': 'arrival_time time_of_arrival detection_time',
     'toa': 'travel_time delay tof time_of_flight',

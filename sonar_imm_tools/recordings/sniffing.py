@@ -27,10 +27,7 @@ from .csv_table import CsvTable
 from .reader import BagReader
 from .sources import BagError, SUFFIXES
 from .topics import made_topics
-from .track_files import kind_of_text
-
-START = 4096
-"""Bytes by which a file is told from others."""
+from .track_files import kind_of_text, START
 
 NO_READER = {
     'ek80': 'a raw file of a Simrad EK60 or EK80',

@@ -25,6 +25,8 @@ from xml.etree import ElementTree
 from .csv_table import CsvOptions, CsvTable, Table
 from .sources import BagError
 
+START = 4096
+"""Bytes by which a file is told from others."""
 LARGEST_JSON = 200_000_000
 """Bytes of a GeoJSON file, which is read as a whole."""
 PLACE = ('stamp', 'latitude', 'longitude', 'height', 'id')
@@ -68,7 +70,7 @@ def kind_of_text(path: Path) -> str:
     cannot be read."""
     try:
         with path.open('rb') as file:
-            start = file.read(4096)
+            start = file.read(START)
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
     text = start.removeprefix(b'\xef\xbb\xbf').lstrip()
@@ -84,6 +86,11 @@ def kind_of_text(path: Path) -> str:
 def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
     """Positions of a GPX or KML file; what has no time has an empty one."""
     names: list[str] = []
+    with path.open('rb') as file:
+        if b'<!' in file.read(START).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
+            raise BagError(
+                f'{path} declares entities, which {kind.upper()} has not and which may multiply'
+            )
     try:
         for event, element in ElementTree.iterparse(path, events=('start', 'end')):
             tag = element.tag.rpartition('}')[2]
@@ -106,7 +113,8 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
 
 
 def _text(element: ElementTree.Element, tag: str) -> str:
-    return next((part.text or '' for part in element if part.tag.endswith(f'}}{tag}')), '').strip()
+    found = (part.text or '' for part in element if part.tag.rpartition('}')[2] == tag)
+    return next(found, '').strip()
 
 
 def _gpx_point(point: ElementTree.Element, name: str) -> dict[str, str]:

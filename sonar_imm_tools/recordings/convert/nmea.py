@@ -108,6 +108,9 @@ def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> Conversion
     if log.unread:
         counts = sorted(log.unread.items(), key=lambda item: -item[1])
         report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts[:12])
+    if not rows:
+        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
+        raise BagError(f'{path} holds no position of a target{first}')
     table = TrackFile(path, None, rows, 'a log of NMEA sentences')
     fixes = FixesOptions(
         truth=how.truth,
@@ -251,22 +254,22 @@ def _take_own(log: _Log, sentence: Any) -> None:
     height = 0.0
     if kind == 'GGA':
         height = float(sentence.altitude or 0.0) + float(sentence.geo_sep or 0.0)
-    log.place = float(sentence.latitude), float(sentence.longitude)
-    if log.own and log.own[-1].stamp_ns == stamp_ns:
-        return  # GGA and RMC of one moment
     covariance = None
     if log.std > 0.0:
         covariance = np.diag([log.std**2, log.std**2, 4.0 * log.std**2])
-    log.own.append(
-        VesselFix(
-            stamp_ns=stamp_ns,
-            latitude=log.place[0],
-            longitude=log.place[1],
-            height=height,
-            covariance=covariance,
-            frame_id='gps',
-        )
+    fix = VesselFix(
+        stamp_ns=stamp_ns,
+        latitude=float(sentence.latitude),
+        longitude=float(sentence.longitude),
+        height=height,
+        covariance=covariance,
+        frame_id='gps',
     )
+    log.place = fix.latitude, fix.longitude
+    if not log.own or log.own[-1].stamp_ns != stamp_ns:
+        log.own.append(fix)
+    elif kind == 'GGA':  # of several of one moment the one with a height
+        log.own[-1] = fix
 
 
 def _take_heading(log: _Log, degrees: float) -> None:
