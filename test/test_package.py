@@ -71,10 +71,13 @@ PEERS = {
     'sonar_imm_tools.viewing.rerun_file': {'rerun'},
     'sonar_imm_tools.viewing.server': {'foxglove'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},
+    'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
+    'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
     'sonar_imm_tools.recordings.export.horizons': {'rasterio'},
     'sonar_imm_tools.recordings.export.picks': {'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
+    'sonar_imm_tools.recordings.export.tracks': {'pyarrow'},
     'sonar_imm_tools.survey.chart': {'rasterio'},
     'sonar_imm_tools.survey.products': {'pyarrow', 'rasterio'},
 }
@@ -160,7 +163,9 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'segyio'}
+    without_key = {
+        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'segyio', 'soundfile')
+    }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 

@@ -39,6 +39,7 @@ from .common import (
     say,
     typed_overrides,
 )
+from .info import track_line
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -57,7 +58,7 @@ class Convert(click.Group):
 
             guess = sniff(Path(args[0]))
             taken = f'{args[0]} is taken for {guess.why}: convert {guess.kind}'
-            click.echo(visible(f'{taken}, for the {guess.system} tracker'), err=True)
+            click.echo(visible(taken), err=True)
             args = [guess.kind, *(args if len(args) > 1 else (*args, _beside(args[0])))]
         return super().resolve_command(ctx, args)
 
@@ -194,6 +195,8 @@ def _convert(
     kind: str, source: Path, out_bag: Path, as_json: bool, options: dict[str, Any]
 ) -> None:
     from ..recordings.convert import KINDS
+    from ..recordings.reader import BagReader
+    from ..recordings.topics import fitting_systems
 
     report = KINDS[kind](source, out_bag, **options)
     if as_json:
@@ -218,6 +221,9 @@ def _convert(
     if report.bad_rows:
         why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
         say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))
+    with BagReader(report.path) as bag:
+        for system in fitting_systems(bag)[:1]:
+            say(f'to track it: {track_line(str(report.path), system, {})}')
 
 
 for _kind, _options in OPTIONS.items():

@@ -95,8 +95,8 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
-    if kind in TRACK_FORMATS and record['system'] in ('diver', 'obstacle'):
-        _export_tracks(run, record, out, kind, epsg, origin, as_json)
+    if kind in TRACK_FORMATS and record['system'] != 'fathometer':
+        _export_tracks(run, out, kind, epsg, origin, as_json)
         return
     if kind in HORIZON_FORMATS + TRACK_FORMATS:
         _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
@@ -126,14 +126,13 @@ def command(
 
 def _export_tracks(
     run: Path,
-    record: dict[str, Any],
     out: Path,
     kind: str,
     epsg: int | None,
     origin: tuple[float, float, float],
     as_json: bool,
 ) -> None:
-    """Tracks of a run of divers or obstacles; record: its run.json."""
+    """Tracks of a run of divers or obstacles."""
     import numpy as np
 
     from ..offline.run_folder import RunFolder
@@ -147,7 +146,7 @@ def _export_tracks(
         def degrees(places: Any) -> Any:
             return degrees_of(places + np.array(origin[:2]), number)
 
-    tracks = tracks_of(RunFolder(run).read_estimates(), record['system'], degrees)
+    tracks = tracks_of(RunFolder(run).read_estimates(), degrees)
     with whole(out) as unfinished:
         left_out = write_tracks(unfinished, tracks, kind, run.name)
     result = {'out': str(out), 'rows': len(tracks), 'left_out': left_out}

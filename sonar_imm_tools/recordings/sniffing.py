@@ -22,6 +22,8 @@ import zipfile
 from attrs import frozen
 import numpy as np
 
+from sonar_imm.trackers import SYSTEMS
+
 from .convert.snapshots import NAMES as SNAPSHOT_NAMES
 from .csv_table import CsvTable
 from .reader import BagReader
@@ -40,11 +42,10 @@ NO_READER = {
 
 @frozen
 class Guess:
-    """kind: of conversion; why: what the file looks like; system: the tracker it serves."""
+    """kind: of conversion; why: what the file looks like."""
 
     kind: str
     why: str
-    system: str
 
 
 def sniff(path: Path) -> Guess:
@@ -59,11 +60,11 @@ def sniff(path: Path) -> Guess:
     if not start:
         raise BagError(f'{path} is empty')
     if start[:4] == b'RIFF' and start[8:12] == b'WAVE' or start[:4] in (b'fLaC', b'RF64'):
-        return Guess('hydrophones', 'sound of hydrophones', 'fathometer')
+        return Guess('hydrophones', 'sound of hydrophones')
     if start[:2] == b'PK':
         return _of_archive(path)
     if _is_segy(start):
-        return Guess('segy', 'traces in SEG-Y', 'fathometer')
+        return Guess('segy', 'traces in SEG-Y')
     if unread := _unread(start):
         raise BagError(
             f'{path} is {NO_READER[unread]}, which has no reader here; programs that read it '
@@ -71,20 +72,18 @@ def sniff(path: Path) -> Guess:
         )
     if kind := kind_of_text(path):
         if kind == 'json':
-            return Guess('autoferry', 'scans in JSON', 'diver')
-        return Guess('fixes', f'a {kind.upper()} file of positions', 'diver')
+            return Guess('autoferry', 'scans in JSON')
+        return Guess('fixes', f'a {kind.upper()} file of positions')
     if _is_nmea(start):
-        return Guess('nmea', 'NMEA 0183 or AIS sentences', 'diver')
+        return Guess('nmea', 'NMEA 0183 or AIS sentences')
     return _of_table(CsvTable(path))
 
 
 def _of_bag(path: Path) -> Guess:
     with BagReader(path) as bag:
-        found = made_topics(bag, 'obstacle')
+        found = [topic for system in SYSTEMS for topic in made_topics(bag, system)]
     if found:
-        return Guess(
-            'images', f'a recording with images of a sonar on {next(iter(found))}', 'obstacle'
-        )
+        return Guess('images', f'a recording with images of a sonar on {found[0]}')
     raise BagError(
         f'{path} is a recording already: sonar-imm info {path} shows which tracker takes it; '
         'amplitude and phase of an interferometer need sonar-imm convert interferometer'
@@ -97,9 +96,9 @@ def _of_archive(path: Path) -> Guess:
     except (OSError, zipfile.BadZipFile):
         raise BagError(f'{path} is a damaged archive') from None
     if names & set(SNAPSHOT_NAMES['iq']):
-        return Guess('snapshots', 'a numpy archive with samples of an array', 'bathymetry')
+        return Guess('snapshots', 'a numpy archive with samples of an array')
     if {'depth', 'amplitude'} <= names:
-        return Guess('traces', 'a numpy archive with traces', 'fathometer')
+        return Guess('traces', 'a numpy archive with traces')
     raise BagError(
         f'{path} is an archive of {", ".join(sorted(names)[:10]) or "nothing"}; of numpy archives '
         'those are taken with the array iq (sonar-imm convert snapshots, --name iq=ARRAY for '
@@ -138,18 +137,18 @@ def _of_table(table: CsvTable) -> Guess:
     columns = ', '.join(table.headers[:12])
     why = f'a table with the columns {columns}'
     if table.has('receiver', 'toa') or table.has('receiver', 'ping', 'arrival'):
-        return Guess('arrivals', why, 'diver')
+        return Guess('arrivals', why)
     if table.has('receiver', 'tag', 'stamp') and _names_tags(table):
-        return Guess('detections', f'{why}: which receiver heard which tag', 'diver')
+        return Guess('detections', f'{why}: which receiver heard which tag')
     if table.has('stamp', 'depth', 'amplitude'):
-        return Guess('traces', why, 'fathometer')
+        return Guess('traces', why)
     if table.has('stamp') and (
         table.has('vessel_x', 'vessel_y') or table.has('vessel_latitude', 'vessel_longitude')
     ):
-        return Guess('relative', f'{why}: positions from a vessel', 'diver')
+        return Guess('relative', f'{why}: positions from a vessel')
     places = (('x', 'y'), ('latitude', 'longitude'), ('range', 'bearing'))
     if table.has('stamp') and any(table.has(*pair) for pair in places):
-        return Guess('fixes', why, 'diver')
+        return Guess('fixes', why)
     missing = 'a time' if not table.has('stamp') else 'a position'
     flag = 'stamp' if missing == 'a time' else 'x'
     raise BagError(

@@ -20,9 +20,7 @@ from pathlib import Path
 
 from helpers.dive_scenes import legs
 import numpy as np
-import pyais
 import pytest
-import soundfile
 
 from msg_adapters.fixes import write_fix
 from msg_adapters.geodetic import write_geodetic
@@ -31,6 +29,9 @@ from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
+
+pyais = pytest.importorskip('pyais')
+soundfile = pytest.importorskip('soundfile')
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 BEGIN = 1_717_149_600
@@ -115,7 +116,7 @@ def test_from_sound_to_reflectors(tmp_path, capsys):
     assert main(['convert', str(name), str(tmp_path / 'bag'), *options]) == 0
     with BagReader(tmp_path / 'bag') as bag:
         found = [item.measurement.pressure for item in measurements_of(bag, 'fathometer')]
-    # Each record of the recording has a scale of its own, within 2e-4.
+        # Each record of the recording has a scale of its own, within 2e-4.
         assert np.concatenate(found) == pytest.approx(pressure, rel=3e-4, abs=1e-3 * scale)
     parameters = ['--params', str(BAGS / 'fathometer_pressure' / 'parameters.yaml')]
     parameters += ['--set', 'particles=200']

@@ -72,13 +72,13 @@ class Tracks:
         return found
 
 
-def tracks_of(estimates: Sequence[Estimate], system: str, degrees: Degrees | None) -> Tracks:
+def tracks_of(estimates: Sequence[Estimate], degrees: Degrees | None) -> Tracks:
     """The rows of all confirmed and coasting tracks of a run.
 
     degrees: for estimates that do not say themselves where they lie on Earth. Raises `BagError`
     where there is nothing to export.
     """
-    parts = [_rows(estimate, system) for estimate in estimates if len(estimate)]
+    parts = [_rows(estimate) for estimate in estimates if len(estimate)]
     parts = [part for part in parts if len(part['stamp_ns'])]
     if not parts:
         raise BagError('there are no confirmed tracks to export')
@@ -97,14 +97,14 @@ def tracks_of(estimates: Sequence[Estimate], system: str, degrees: Degrees | Non
     return Tracks(columns)
 
 
-def _rows(estimate: Estimate, system: str) -> dict[str, NDArray[Any]]:
+def _rows(estimate: Estimate) -> dict[str, NDArray[Any]]:
     """The columns of one estimate. Raises `BagError` for one of another system."""
     given = estimate.columns()
     if 'track_state' not in given or 'px' not in given:
         raise BagError('these estimates hold no tracks: only divers and obstacles have them')
     kept = np.asarray(given['track_state']) > 0
     # The place of an obstacle has a covariance of its own; a diver's is part of the state.
-    prefix = 'place_cov_{}_{}' if system == 'obstacle' else 'cov_p{}_p{}'
+    prefix = 'place_cov_{}_{}' if 'place_cov_x_x' in given else 'cov_p{}_p{}'
     xx, xy, yy = (
         np.asarray(given[prefix.format(*pair)], float)[kept] for pair in ('xx', 'xy', 'yy')
     )

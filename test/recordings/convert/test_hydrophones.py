@@ -16,12 +16,13 @@
 
 import numpy as np
 import pytest
-import soundfile
 
 from sonar_imm_tools.recordings.convert import convert_hydrophones
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+
+soundfile = pytest.importorskip('soundfile')
 
 RATE, BEGIN_NS = 4000, 1_717_149_600 * 10**9
 

@@ -20,15 +20,16 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-import pyais
 import pymap3d
-import pynmea2
 import pytest
 
 from sonar_imm_tools.recordings.convert import convert_nmea
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+
+pyais = pytest.importorskip('pyais')
+pynmea2 = pytest.importorskip('pynmea2')
 
 BEGIN = datetime(2024, 5, 31, 23, 59, 50, tzinfo=timezone.utc)
 PLACE = 54.0, 10.0
