@@ -110,12 +110,17 @@ setup(
     maintainer_email='maintainers@example.org',  # see package.xml
     license='Apache-2.0',
     classifiers=[
+        'Development Status :: 4 - Beta',
         'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: Apache Software License',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.14',
+        'Topic :: Scientific/Engineering :: GIS',
         'Topic :: Scientific/Engineering',
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10',
     packages=find_packages(include=[f'{top}{rest}' for top in PACKAGES for rest in ('', '.*')]),
     package_data={
         f'{PACKAGE}.acoustics': ['*.npz'],

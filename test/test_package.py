@@ -34,6 +34,7 @@ from helpers.source import (
     tree_of,
 )
 import pytest
+import yaml
 
 import msg_adapters
 import sonar_imm
@@ -181,6 +182,13 @@ def test_every_import_is_declared(
     for path in MODULES:
         used = {name.split('.')[0] for name in imports(path)}
         assert used - declared <= PEERS.get(module_name(path), set()), path
+
+
+def test_the_citation_names_this_version() -> None:
+    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    assert cited['version'] == sonar_imm.__version__
+    dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert dated and dated.groups() == (cited['version'], str(cited['date-released']))
 
 
 def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:
