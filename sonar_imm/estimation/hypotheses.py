@@ -224,6 +224,8 @@ class Hypotheses(NamedTuple):
 
     def only(self, kept: IndexArray | BoolArray) -> Hypotheses:
         """With the rows `kept`, a mask (T,) or their numbers."""
+        if not len(self.cluster):
+            return self
         return self._replace(member=self.member[:, kept])
 
     def with_alone(self, count: int) -> Hypotheses:
@@ -372,7 +374,7 @@ def settled(
     sizes = [len(weight) for weight, _, _ in parts]
     weight, shown, members = (np.concatenate(each) for each in zip(*parts))
     after = Hypotheses(np.repeat(np.arange(len(parts)), sizes), weight, shown, members)
-    kept = after.member.any(axis=0)
+    kept = np.asarray(after.member.any(axis=0))
     return after.only(kept), kept
 
 
@@ -437,8 +439,8 @@ def _groups(now: Hypotheses, touched: BoolArray) -> list[list[int]]:
     at, row = np.nonzero(now.member)
     of_row[row] = now.cluster[at]
     first: dict[int, int] = {}
-    for row, detection in zip(*(part.tolist() for part in np.nonzero(touched))):
-        own = root(int(of_row[row]))
+    for track, detection in zip(*(part.tolist() for part in np.nonzero(touched))):
+        own = root(int(of_row[track]))
         leader[own] = root(first.setdefault(detection, own))
     groups: dict[int, list[int]] = {}
     for number in range(count):

@@ -201,9 +201,7 @@ def judge(
     was = now.life.status != TENTATIVE
     confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
     alive = ~(now.existence < ENDS)
-    seen = np.where(looked, COASTING, now.life.status)
-    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
-    status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
+    status = status_of(now.life.status, confirmed, hit, looked)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
     nameless = [group for group in fixes if group.target_id is None]
@@ -211,6 +209,15 @@ def judge(
     scans = [names.patience(group.config.detection_probability) for group in nameless]
     patience = np.where(was, max([SCANS_CONFIRMED, *scans]), SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)
+
+
+def status_of(
+    before: StatusArray, confirmed: BoolArray, hit: BoolArray, looked: BoolArray
+) -> StatusArray:
+    """The status (T,) of tracks, of which some are `confirmed`."""
+    seen = np.where(looked, COASTING, before)
+    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
+    return np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
 
 
 def coalescence(

@@ -51,7 +51,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, families, fix_kernels, jipda, names, pings
+from . import births, families, fix_kernels, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -70,7 +70,8 @@ class Association(NamedTuple):
     """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
     (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
     may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
-    where these and not the pairs update the tracks; densities: of all pairs, of `families`."""
+    where these and not the pairs update the tracks; densities: of all pairs, of `families`;
+    counted (T,): tracks whose innovations tell how consistent fixes are, None for all."""
 
     tracks: IndexArray
     detection: IntArray
@@ -80,6 +81,7 @@ class Association(NamedTuple):
     existence: FloatArray | None = None
     weights: jipda.JointWeights | None = None
     densities: families.Densities | None = None
+    counted: BoolArray | None = None
 
 
 class DiverTracker:
@@ -105,6 +107,7 @@ class DiverTracker:
     def _settle(self, config: DiverConfig) -> None:
         """What follows from the parameters, once and not in every scan."""
         self.config = config
+        self._keeps_hypotheses = config.association == 'kbest'
         self.rules = track_rules(config)
         self._layout = lru_cache(maxsize=16)(self._layout_of)
 
@@ -123,7 +126,12 @@ class DiverTracker:
         self._georeferencer = Georeferencer(self.config, self.counts)
 
     def _nobody(self, life: Tracks) -> DiverState:
-        return DiverState.of_nobody(life, self.models, self._chain.fresh(0))
+        nobody = DiverState.of_nobody(life, self.models, self._chain.fresh(0))
+        return nobody._replace(history=np.empty((0, self._window), np.int64))
+
+    @property
+    def _window(self) -> int:
+        return kbest.WINDOW if self._keeps_hypotheses else 0
 
     @property
     def origin(self) -> Origin | None:
@@ -188,6 +196,8 @@ class DiverTracker:
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
+        if self._keeps_hypotheses:
+            now = kbest.shown(now)
         hit = now.nis_dof > 0
         return {
             'tracks': len(now.life),
@@ -243,6 +253,9 @@ class DiverTracker:
         now, step = self._predict(before, stamp_ns)
         found: list[Birth] = []
         for fixes in scan.fixes:
+            if self._keeps_hypotheses:
+                now = self._branch(now, fixes)
+                continue
             association = self._associate(now, fixes)
             now, again = self._reacquire(now, fixes, association)
             if again:
@@ -250,6 +263,8 @@ class DiverTracker:
             now = self._update(now, fixes, association)
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
+        if scan.pings and self._keeps_hypotheses:
+            now = kbest.decided(now)
         for ping in scan.pings:
             now, free = pings.associate_and_update(
                 now, ping, self.config, scan.factor, self.models
@@ -286,6 +301,7 @@ class DiverTracker:
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
             existence=before.existence * math.exp(-dt / self.config.survival_time),
+            came_from=np.arange(count),
             repairs=before.repairs + last.repairs,
         )
         return now, last._replace(dt=dt)
@@ -317,12 +333,7 @@ class DiverTracker:
             return Association(
                 tracks, likeliest, expected, now.score, free, existence, weights, densities
             )
-        if densities is None:
-            threshold = gate_threshold(config.gate_probability, 2)
-            fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
-        else:
-            believed = densities.whole > families.bound(config)
-            fit = np.where(believed, densities.whole, -np.inf)
+        fit = _fit(now, fixes, expected, H, densities)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
@@ -332,6 +343,41 @@ class DiverTracker:
         free = np.ones(len(fixes.z), bool)
         free[chosen[tracks]] = False
         return Association(tracks, chosen[tracks], expected, score, free, densities=densities)
+
+    def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
+        """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
+        layout, mixing = self._layout(now.instruments), self.models.mixing
+        expected, densities = fix_kernels.expected(now.x, layout.H), None
+        if mixing is not None:
+            densities = families.densities(now, expected, layout, fixes.z, fixes.R)
+            believed = densities.whole > families.bound(fixes.config)
+            hit = np.asarray(believed.any(axis=1))
+            left = np.asarray(~believed.any(axis=0))
+            now, again = families.reacquired(
+                now, fixes, hit, left, densities.whole, self.models, self._chain, layout
+            )
+            if again:
+                expected = fix_kernels.expected(now.x, layout.H)
+                densities = families.densities(now, expected, layout, fixes.z, fixes.R)
+        fit = _fit(now, fixes, expected, layout.H, densities)
+        excluded = (now.target_id != NOBODY) & (fixes.target_id is None)
+        if self.config.named_tracks == 'share':
+            excluded = np.zeros(len(excluded), bool)
+        found = kbest.branched(now, fixes, fit, excluded, mixing is not None)
+        if densities is not None:
+            densities = families.Densities(*(part[found.source] for part in densities))
+        association = Association(
+            found.tracks,
+            found.detection,
+            expected[found.source],
+            found.state.score,
+            np.zeros(len(fixes.z), bool),
+            densities=densities,
+            counted=found.counted,
+        )
+        now = self._update(found.state, fixes, association)
+        now = self._with_tracks(now, kbest.births(fixes, found))
+        return now._replace(hypotheses=found.hypotheses)
 
     def _reacquire(
         self, now: DiverState, fixes: Positions, association: Association
@@ -356,6 +402,8 @@ class DiverTracker:
             mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
             z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
+            if association.counted is not None:
+                tentative |= ~association.counted
             scale = np.ones(len(tracks))
             if self.models.mixing is not None:
                 scale = families.scale(now.mu[tracks], self.models)
@@ -384,6 +432,9 @@ class DiverTracker:
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
         )
         if self.config.estimate_covariance_scale:
+            if association.counted is not None:
+                counts = association.counted[tracks]
+                tracks, detection = tracks[counts], detection[counts]
             now = self._with_scale(now, fixes, tracks, detection)
         return now
 
@@ -401,25 +452,47 @@ class DiverTracker:
         """What the hits say of the transitions, and of the stated variances of arrivals where no
         fix says the same."""
         hit = now.nis_dof > 0
-        learnt = self._chain.learn(
-            before.learnt,
-            step.transition,
-            self.models.by_model(before.mu),
-            self.models.by_model(now.mu),
-            step.dt,
-            np.flatnonzero(hit),
-        )
+        if self._keeps_hypotheses:
+            learnt = self._learnt_by_rows(before, now, step)
+        else:
+            learnt = self._chain.learn(
+                before.learnt,
+                step.transition,
+                self.models.by_model(before.mu),
+                self.models.by_model(now.mu),
+                step.dt,
+                np.flatnonzero(hit),
+            )
         nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
             arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
         return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
 
+    def _learnt_by_rows(self, before: DiverState, now: DiverState, step: Step) -> FloatArray:
+        """As in `_learn`, where rows came from others."""
+        old = np.flatnonzero(now.came_from >= 0)
+        source, learnt = now.came_from[old], now.learnt.copy()
+        if len(old):
+            transition = step.transition
+            learnt[old] = self._chain.learn(
+                before.learnt[source],
+                transition if len(transition) == 1 else transition[source],
+                self.models.by_model(before.mu[source]),
+                self.models.by_model(now.mu[old]),
+                step.dt,
+                np.flatnonzero(now.nis_dof[old] > 0),
+            )
+        return learnt
+
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:
         """End the tracks that are over, broken, there twice, or too many."""
         config, before = self.config, now
         if scan.names or now.last_named:
             now = names.remembered(now, scan.names, config.max_coast)
+        if self._keeps_hypotheses:
+            looked = scan.complete & (now.target_id == NOBODY)
+            return kbest.pruned(now, now.nis_dof > 0, looked, self.rules, config)
         alive = fix_kernels.finite(now.x, now.P)
         if not alive.all():
             now = now._replace(broken=now.broken + int((~alive).sum()))
@@ -458,8 +531,10 @@ class DiverTracker:
         where somebody says that a diver is."""
         config = self.config
         if found:
-            room = max(0, 10 + 5 * config.max_tracks - len(now.life))
+            room = max(0, kbest.most_tracks(config) - len(now.life))
             now = self._with_tracks(now, births.each_name_once(found)[:room])
+        if starts and self._keeps_hypotheses:
+            now = kbest.decided(now)
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
@@ -474,6 +549,8 @@ class DiverTracker:
             return now
         layout = self._layout(now.instruments)
         x, P, mu = births.new_tracks(found, self.models, layout, self.config)
+        if self._keeps_hypotheses:
+            now = now._replace(hypotheses=now.hypotheses.with_alone(count))
         return now.with_rows(
             now.life.born(count, now.stamp_ns, self.rules),
             {
@@ -491,10 +568,14 @@ class DiverTracker:
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
                 'refused': np.full((count, 6), np.nan),
+                'history': np.zeros((count, self._window), np.int64),
+                'came_from': np.full(count, -1),
             },
         )
 
     def _estimate(self, state: DiverState) -> Estimate:
+        if self._keeps_hypotheses:
+            state = kbest.shown(state)
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = state.positions(self.models.E)
@@ -525,6 +606,21 @@ class DiverTracker:
             probabilities=self.models.by_model(state.mu),
             extras=extras,
         )
+
+
+def _fit(
+    now: DiverState,
+    fixes: Positions,
+    expected: FloatArray,
+    H: FloatArray,
+    densities: families.Densities | None,
+) -> FloatArray:
+    """The log density (T, D) of each fix under each track, -inf where it cannot be its own."""
+    if densities is not None:
+        believed = densities.whole > families.bound(fixes.config)
+        return np.where(believed, densities.whole, -np.inf)
+    threshold = gate_threshold(fixes.config.gate_probability, 2)
+    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
 
 
 def _considered_update(
