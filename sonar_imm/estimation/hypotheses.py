@@ -52,7 +52,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .jit import kernel
 
-SPAN = math.log(1e6)
+SPAN = math.log(1e4)
 """Hypotheses less probable than the best of their cluster by this (logarithm) are dropped."""
 
 CANDIDATES = 12
@@ -280,56 +280,91 @@ def paired(
     touched = inside | reserved
     none = np.log1p(-existence * missed)
     some = np.log(np.maximum(existence * hit, 1e-300)) - none
-    cluster, weight, shown, used, codes = [], [], [], [], []
     place = np.full(D, -1, np.int64)
-    for number, group in enumerate(_groups(before, touched)):
+    groups = _groups(before, touched)
+    quiet = [group[0] for group in groups if len(group) == 1]
+    asked = _touched_clusters(before, touched)
+    quiet = [number for number in quiet if not asked[number]]
+    parts = [_missed(before, np.isin(before.cluster, quiet), none, D)] if quiet else []
+    first = int(before.cluster.max(initial=-1)) + 1
+    branching = [group for group in groups if len(group) > 1 or asked[group[0]]]
+    for number, group in enumerate(branching, start=first):
         log_weight, was_shown, member = _joined(before, group, most)
         rows = np.flatnonzero(member.any(axis=0))
+        own = np.flatnonzero(touched[rows].any(axis=0))
+        place[own] = number
         columns, column = np.unique(track_id[rows], return_inverse=True)
         row_of = np.full((len(member), len(columns)), -1, np.int64)
         for row, at in zip(rows.tolist(), column.tolist()):
             row_of[member[:, row], at] = row
         there = row_of >= 0
         prior = log_weight + np.where(there, none[row_of], 0.0).sum(axis=1)
-        own = np.flatnonzero(touched[rows].any(axis=0))
-        place[own] = number
         gain = np.where(there[..., None], (ratio[:, own] + some[:, None])[row_of], -np.inf)
         claims = there[..., None] & reserved[:, own][row_of]
         gain = np.where(claims.any(axis=1, keepdims=True) & ~claims, -np.inf, gain)
-        limit = max(most, 1)
         parent, choice, value = k_best(
-            np.ascontiguousarray(prior), np.ascontiguousarray(gain), limit, SPAN, MOST_WORK
+            np.ascontiguousarray(prior), np.ascontiguousarray(gain), most, SPAN, MOST_WORK
         )
-        value -= np.logaddexp.reduce(value)
-        at, who = np.nonzero(choice >= 0)
         taken = np.zeros((len(parent), D), bool)
-        taken[at, own[choice[at, who]]] = True
+        taken_by, who = np.nonzero(choice >= 0)
+        taken[taken_by, own[choice[taken_by, who]]] = True
         chosen = np.full(choice.shape, -1, np.int64)
-        chosen[at, who] = own[choice[at, who]]
-        row = row_of[parent]
-        codes.append(np.where(row >= 0, row * (D + 1) + chosen + 1, -1))
-        cluster.append(np.full(len(parent), number))
-        weight.append(value)
-        shown.append(was_shown[parent])
-        used.append(taken)
-    code = np.unique(np.concatenate([np.empty(0, np.int64), *(each.ravel() for each in codes)]))
+        chosen[taken_by, who] = own[choice[taken_by, who]]
+        code = np.where(there[parent], row_of[parent] * (D + 1) + chosen + 1, -1)
+        value = value - np.logaddexp.reduce(value)
+        parts.append(_Branches(np.full(len(value), number), value, was_shown[parent], taken, code))
+    return _gathered(parts, place, D)
+
+
+class _Branches(NamedTuple):
+    """Hypotheses after a scan: what `Paired` and `Hypotheses` say of them, and their rows (n, k)
+    as codes of source and detection, -1 for none."""
+
+    cluster: IntArray
+    log_weight: FloatArray
+    shown: BoolArray
+    used: BoolArray
+    code: IntArray
+
+
+def _touched_clusters(now: Hypotheses, touched: BoolArray) -> BoolArray:
+    """Which clusters a detection is near to."""
+    out = np.zeros(int(now.cluster.max(initial=-1)) + 1, bool)
+    out[now.cluster[now.member[:, touched.any(axis=1)].any(axis=1)]] = True
+    return out
+
+
+def _missed(now: Hypotheses, which: BoolArray, none: FloatArray, D: int) -> _Branches:
+    """The hypotheses of clusters near which there is no detection."""
+    member, cluster = now.member[which], now.cluster[which]
+    log_weight = now.log_weight[which] + member @ none
+    total = np.full(int(cluster.max()) + 1, -np.inf)
+    np.logaddexp.at(total, cluster, log_weight)
+    code = np.full((len(member), int(member.sum(axis=1).max(initial=0))), -1, np.int64)
+    at, row = np.nonzero(member)
+    first = np.cumsum(member.sum(axis=1)) - member.sum(axis=1)
+    code[at, np.arange(len(at)) - first[at]] = row * (D + 1)
+    used = np.zeros((len(member), D), bool)
+    return _Branches(cluster, log_weight - total[cluster], now.shown[which], used, code)
+
+
+def _gathered(parts: list[_Branches], place: IntArray, D: int) -> Paired:
+    """All of them as one."""
+    if not parts:
+        nothing, empty = np.empty(0, np.int64), np.empty((0, D), bool)
+        return Paired(nothing, nothing, Hypotheses.none(), empty, np.zeros(D), place)
+    code = np.unique(np.concatenate([part.code.ravel() for part in parts]))
     code = code[code >= 0]
-    member = np.zeros((sum(map(len, codes)), len(code)), bool)
+    cluster, log_weight, shown, used = (np.concatenate(each) for each in list(zip(*parts))[:4])
+    member = np.zeros((len(cluster), len(code)), bool)
     first = 0
-    for each in codes:
-        at, who = np.nonzero(each >= 0)
-        member[first + at, np.searchsorted(code, each[at, who])] = True
-        first += len(each)
-    after = Hypotheses(
-        np.concatenate([np.empty(0, np.int64), *cluster]),
-        np.concatenate([np.empty(0), *weight]),
-        np.concatenate([np.empty(0, bool), *shown]),
-        member,
-    )
-    all_used = np.concatenate([np.empty((0, D), bool), *used])
-    return Paired(
-        code // (D + 1), code % (D + 1) - 1, after, all_used, after.weight @ all_used, place
-    )
+    for part in parts:
+        at, who = np.nonzero(part.code >= 0)
+        member[first + at, np.searchsorted(code, part.code[at, who])] = True
+        first += len(part.code)
+    after = Hypotheses(cluster, log_weight, shown, member)
+    source, detection = code // (D + 1), code % (D + 1) - 1
+    return Paired(source, detection, after, used, after.weight @ used, place)
 
 
 def with_births(found: Paired, free: IndexArray) -> Hypotheses:
@@ -364,8 +399,12 @@ def settled(
             rows.sort(key=lambda row: -marginal[row])
             member[:, rows[0]] = member[:, rows].any(axis=1)
             member[:, rows[1:]] = False
-    parts: list[tuple[FloatArray, BoolArray, BoolArray]] = []
-    for number in np.unique(now.cluster):
+    size = np.bincount(now.cluster, minlength=1)
+    simple = (size[now.cluster] == 1) & (member.sum(axis=1) == 1)
+    parts: list[tuple[FloatArray, BoolArray, BoolArray]] = [
+        (np.zeros(1), np.ones(1, bool), row[None]) for row in member[simple]
+    ]
+    for number in np.unique(now.cluster[~simple]):
         own = np.flatnonzero(now.cluster == number)
         parts += _apart(*_distinct(now.log_weight[own], now.shown[own], member[own], most))
     if not parts:
@@ -384,12 +423,11 @@ def _distinct(
     """The different ones of the hypotheses of a cluster, best first, at most so many, and which is
     shown."""
     if len(member) > 1:
-        member, where = np.unique(member, axis=0, return_inverse=True)
-        where = where.ravel()
-        total = np.full(len(member), -np.inf)
-        np.logaddexp.at(total, where, log_weight)
-        was = np.zeros(len(member), bool)
-        np.logical_or.at(was, where, shown)
+        first: dict[bytes, int] = {}
+        of = [first.setdefault(row.tobytes(), k) for k, row in enumerate(np.packbits(member, 1))]
+        total, was = np.full(len(member), -np.inf), np.zeros(len(member), bool)
+        np.logaddexp.at(total, of, log_weight)
+        np.logical_or.at(was, of, shown)
         order = np.argsort(-total, kind='stable')[:most]
         order = order[total[order] >= total[order[0]] - SPAN]
         log_weight, shown, member = total[order], was[order], member[order]

@@ -78,7 +78,7 @@ def test_k_best_with_no_work_left_still_has_the_best_of_each_hypothesis():
     assert value == pytest.approx(sorted(best, reverse=True))
 
 
-def test_a_thousand_tracks_in_a_knot_cost_a_bounded_time():
+def test_many_tracks_in_a_knot_cost_a_bounded_time():
     """The work is bounded, not only the number of events."""
     rng = np.random.default_rng(1)
     gain = rng.normal(size=(2, 60, 60))
@@ -132,7 +132,7 @@ def test_two_tracks_and_two_detections_by_hand():
     }
     total = sum(by_hand.values())
     assert {key[1] for key in found} == set(by_hand)
-    assert {key[0] for key in found} == {0}
+    assert len({key[0] for key in found}) == 1
     for (_, event), weight in found.items():
         assert weight == pytest.approx(by_hand[event] / total, abs=1e-12)
 
@@ -140,9 +140,10 @@ def test_two_tracks_and_two_detections_by_hand():
 def test_tracks_that_share_no_detection_stay_apart():
     before, ids = two_tracks()
     found = pair(before, ids, [[1.0, -np.inf], [-np.inf, 2.0]])
-    assert set(found.hypotheses.cluster.tolist()) == {0, 1}
-    assert found.place.tolist() == [0, 1]
-    assert np.bincount(found.hypotheses.cluster, found.hypotheses.weight) == pytest.approx([1, 1])
+    clusters = sorted(set(found.hypotheses.cluster.tolist()))
+    assert len(clusters) == 2 and found.place.tolist() == clusters
+    sums = np.bincount(found.hypotheses.cluster, found.hypotheses.weight)
+    assert sums[clusters] == pytest.approx([1, 1])
 
 
 def test_a_reserved_detection_goes_to_its_row_or_to_none():
