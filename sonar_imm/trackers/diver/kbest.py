@@ -35,6 +35,7 @@ from attrs import evolve
 import numpy as np
 
 from ...estimation import hypotheses
+from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import TENTATIVE, TrackRules
 from ...estimation.hypotheses import Hypotheses
@@ -44,7 +45,8 @@ from .births import Birth
 from .config import DiverConfig
 from .fix_kernels import finite
 from .scan import Positions
-from .state import DiverState
+from .state import DiverState, Step
+from .state_space import ModelSet
 
 WINDOW = 6
 """Last detections that two rows of a track have in common when they are taken for one."""
@@ -151,6 +153,25 @@ def births(fixes: Positions, found: Branched) -> list[Birth]:
         Birth(fixes.z[d], fixes.R[d], existence=float(r), target_id=int(name[d]))
         for d, r in zip(found.free.tolist(), new)
     ]
+
+
+def learnt(
+    before: DiverState, now: DiverState, step: Step, models: ModelSet, chain: AdaptiveChain
+) -> FloatArray:
+    """What the hits of this scan say of the transitions of each row, by the row it came from."""
+    old = np.flatnonzero(now.came_from >= 0)
+    source, after = now.came_from[old], now.learnt.copy()
+    if len(old):
+        transition = step.transition
+        after[old] = chain.learn(
+            before.learnt[source],
+            transition if len(transition) == 1 else transition[source],
+            models.by_model(before.mu[source]),
+            models.by_model(now.mu[old]),
+            step.dt,
+            np.flatnonzero(now.nis_dof[old] > 0),
+        )
+    return after
 
 
 def taken(now: DiverState, rows: IndexArray) -> DiverState:

@@ -426,7 +426,7 @@ class DiverTracker:
             predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
             after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
         else:
-            after = _considered_update(now, fixes, tracks, detection, h, layout)
+            after = considered_update(now, fixes, tracks, detection, h, layout)
         x, P, mu, nis, nis_dof, repairs = after
         now = now._replace(
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
@@ -453,7 +453,7 @@ class DiverTracker:
         fix says the same."""
         hit = now.nis_dof > 0
         if self._keeps_hypotheses:
-            learnt = self._learnt_by_rows(before, now, step)
+            learnt = kbest.learnt(before, now, step, self.models, self._chain)
         else:
             learnt = self._chain.learn(
                 before.learnt,
@@ -468,22 +468,6 @@ class DiverTracker:
             sure = hit & (now.life.status != TENTATIVE)
             arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
         return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
-
-    def _learnt_by_rows(self, before: DiverState, now: DiverState, step: Step) -> FloatArray:
-        """As in `_learn`, where rows came from others."""
-        old = np.flatnonzero(now.came_from >= 0)
-        source, learnt = now.came_from[old], now.learnt.copy()
-        if len(old):
-            transition = step.transition
-            learnt[old] = self._chain.learn(
-                before.learnt[source],
-                transition if len(transition) == 1 else transition[source],
-                self.models.by_model(before.mu[source]),
-                self.models.by_model(now.mu[old]),
-                step.dt,
-                np.flatnonzero(now.nis_dof[old] > 0),
-            )
-        return learnt
 
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:
         """End the tracks that are over, broken, there twice, or too many."""
@@ -621,24 +605,3 @@ def _fit(
         return np.where(believed, densities.whole, -np.inf)
     threshold = gate_threshold(fixes.config.gate_probability, 2)
     return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
-
-
-def _considered_update(
-    now: DiverState,
-    fixes: Positions,
-    tracks: IndexArray,
-    detection: IntArray,
-    h: FloatArray,
-    layout: Layout,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
-    """As `fix_kernels.update`, where the state holds constants that are only considered."""
-    x, P, mu, nis, nis_dof = (part.copy() for part in (now.x, now.P, now.mu, now.nis, now.nis_dof))
-    innovation = fixes.z[detection][:, None, :] - h[tracks]
-    x1, P1, mu1, nis1, ok = consider_models(
-        x[tracks], P[tracks], mu[tracks], innovation, layout.H[0], fixes.R[detection], layout.mask
-    )
-    repairs = sum(add_jitter_all(covariance) for covariance in P1)
-    x[tracks], P[tracks], mu[tracks] = x1, P1, mu1
-    nis[tracks] += np.where(ok, nis1, 0.0)
-    nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
-    return x, P, mu, nis, nis_dof, repairs
