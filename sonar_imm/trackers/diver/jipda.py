@@ -79,6 +79,24 @@ class JointWeights(NamedTuple):
         return hit, self.beta[hit].argmax(axis=1) if len(hit) else hit
 
 
+class Association(NamedTuple):
+    """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
+    (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
+    may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
+    where these and not the pairs update the tracks; densities: of all pairs, of `families`;
+    counted (T,): tracks whose innovations tell how consistent fixes are, None for all."""
+
+    tracks: IndexArray
+    detection: IntArray
+    expected: FloatArray
+    score: FloatArray
+    free: BoolArray
+    existence: FloatArray | None = None
+    weights: JointWeights | None = None
+    densities: families.Densities | None = None
+    counted: BoolArray | None = None
+
+
 def joint_weights(
     now: DiverState,
     fixes: Positions,

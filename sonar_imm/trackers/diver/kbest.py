@@ -36,17 +36,16 @@ import numpy as np
 
 from ...estimation import hypotheses
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import TENTATIVE, TrackRules
 from ...estimation.hypotheses import Hypotheses
 from ...measurements import NOBODY
-from . import jipda
-from .births import Birth
+from . import families, jipda
 from .config import DiverConfig
-from .fix_kernels import finite
+from .fix_kernels import expected, finite
 from .scan import Positions
 from .state import DiverState, Step
-from .state_space import ModelSet
+from .state_space import Layout, ModelSet
 
 WINDOW = 6
 """Last detections that two rows of a track have in common when they are taken for one."""
@@ -66,34 +65,43 @@ kept."""
 
 
 class Branched(NamedTuple):
-    """Rows after they were paired with fixes: the state, not yet updated; source (T,): the row
-    that each was; tracks and detection (t,): pairs; counted (T,): rows that are shown; free (B,)
-    and hypotheses: where tracks begin, and what holds once they have."""
+    """Rows after they were paired with fixes: the state, not yet updated; the association that
+    updates them and says where tracks begin; hypotheses: what holds once they have."""
 
     state: DiverState
-    source: IndexArray
-    tracks: IndexArray
-    detection: IntArray
-    counted: BoolArray
-    free: IndexArray
-    claimed: FloatArray
+    association: jipda.Association
     hypotheses: Hypotheses
 
 
 def branched(
-    now: DiverState, fixes: Positions, fit: FloatArray, excluded: BoolArray, gates: bool
+    now: DiverState, fixes: Positions, models: ModelSet, chain: AdaptiveChain, layout: Layout
 ) -> Branched:
-    """Pair all hypotheses with `fixes`; fit (T, D): log density, -inf outside the gate; excluded
-    (T,): rows that take no part; gates: whether a fix with a name may be refused."""
+    """Pair all hypotheses with `fixes`."""
     config, D = fixes.config, len(fixes.z)
-    ratio = fit - math.log(config.clutter_density + config.birth_density)
+    h, densities = expected(now.x, layout.H), None
+    if models.mixing is not None:
+        densities = families.densities(now, h, layout, fixes.z, fixes.R)
+        believed = densities.whole > families.bound(config)
+        # A track that nothing can be of is lost where two fixes agree that nobody takes.
+        hit, left = np.asarray(believed.any(axis=1)), np.asarray(~believed.any(axis=0))
+        now, again = families.reacquired(
+            now, fixes, hit, left, densities.whole, models, chain, layout
+        )
+        if again:
+            h = expected(now.x, layout.H)
+            densities = families.densities(now, h, layout, fixes.z, fixes.R)
+    excluded = np.zeros(len(h), bool)
+    if config.named_tracks == 'alone' and fixes.target_id is None:
+        excluded = now.target_id != NOBODY
+    ratio = families.fit(now, fixes, h, layout.H, densities)
+    ratio = ratio - math.log(config.clutter_density + config.birth_density)
     ratio[excluded] = -np.inf
     reserved = np.zeros(ratio.shape, bool)
     if fixes.target_id is not None:
         reserved = now.target_id[:, None] == fixes.target_id[None]
         open_ = (now.target_id == NOBODY)[:, None] & (config.named_tracks == 'share')
         ratio = np.where(reserved | open_, ratio, -np.inf)
-        if not gates:
+        if densities is None:
             ratio = np.where(reserved, np.maximum(ratio, TAKEN), ratio)
     existence = jipda.known_existence(now.existence, now.life.status)
     p = config.detection_probability
@@ -130,29 +138,24 @@ def branched(
         held = target_id[:, None] == fixes.target_id[None]
         used = found.used | (found.hypotheses.member @ held)
         found = found._replace(used=used, claimed=found.hypotheses.weight @ used)
-    free = np.flatnonzero(found.claimed < CLAIMED)
-    free = free[: max(0, most_tracks(config) - len(np.unique(now.life.track_id)))]
+    room = max(0, most_tracks(config) - len(np.unique(now.life.track_id)))
+    begins = np.flatnonzero(found.claimed < CLAIMED)[:room]
+    free = np.zeros(D, bool)
+    free[begins] = True
     tracks = np.flatnonzero(hit)
-    return Branched(
-        after,
-        source,
+    if densities is not None:
+        densities = families.Densities(*(part[source] for part in densities))
+    association = jipda.Association(
         tracks,
         detection[tracks],
-        shown_rows(found.hypotheses),
+        h[source],
+        after.score,
         free,
-        found.claimed[free],
-        hypotheses.with_births(found, free),
+        existence=jipda.birth_existence(config, np.zeros(D)),
+        densities=densities,
+        counted=shown_rows(found.hypotheses),
     )
-
-
-def births(fixes: Positions, found: Branched) -> list[Birth]:
-    """A track for each of the fixes that may be of a new diver."""
-    new = jipda.birth_existence(fixes.config, np.zeros(len(found.free)))
-    name = np.full(len(fixes.z), NOBODY) if fixes.target_id is None else fixes.target_id
-    return [
-        Birth(fixes.z[d], fixes.R[d], existence=float(r), target_id=int(name[d]))
-        for d, r in zip(found.free.tolist(), new)
-    ]
+    return Branched(after, association, hypotheses.with_births(found, begins))
 
 
 def learnt(

@@ -33,7 +33,7 @@ from collections.abc import Collection, Sequence
 from functools import lru_cache, partial
 import math
 from operator import itemgetter
-from typing import cast, NamedTuple
+from typing import cast
 
 from attrs import evolve
 import numpy as np
@@ -42,10 +42,8 @@ from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
-from ...estimation.consider import consider_models
-from ...estimation.small_matrices import add_jitter_all
+from ...estimation.arrays import FloatArray, IndexArray, IntArray
+from ...estimation.association import assign_fits, TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
@@ -55,6 +53,7 @@ from . import births, families, fix_kernels, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
+from .jipda import Association
 from .models import build_models
 from .scan import Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
@@ -64,24 +63,6 @@ __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 SCORE_MEMORY = 0.9
 """Share of its score a track keeps from scan to scan."""
-
-
-class Association(NamedTuple):
-    """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
-    (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
-    may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
-    where these and not the pairs update the tracks; densities: of all pairs, of `families`;
-    counted (T,): tracks whose innovations tell how consistent fixes are, None for all."""
-
-    tracks: IndexArray
-    detection: IntArray
-    expected: FloatArray
-    score: FloatArray
-    free: BoolArray
-    existence: FloatArray | None = None
-    weights: jipda.JointWeights | None = None
-    densities: families.Densities | None = None
-    counted: BoolArray | None = None
 
 
 class DiverTracker:
@@ -333,7 +314,7 @@ class DiverTracker:
             return Association(
                 tracks, likeliest, expected, now.score, free, existence, weights, densities
             )
-        fit = _fit(now, fixes, expected, H, densities)
+        fit = families.fit(now, fixes, expected, H, densities)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
@@ -346,38 +327,11 @@ class DiverTracker:
 
     def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
         """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
-        layout, mixing = self._layout(now.instruments), self.models.mixing
-        expected, densities = fix_kernels.expected(now.x, layout.H), None
-        if mixing is not None:
-            densities = families.densities(now, expected, layout, fixes.z, fixes.R)
-            believed = densities.whole > families.bound(fixes.config)
-            hit = np.asarray(believed.any(axis=1))
-            left = np.asarray(~believed.any(axis=0))
-            now, again = families.reacquired(
-                now, fixes, hit, left, densities.whole, self.models, self._chain, layout
-            )
-            if again:
-                expected = fix_kernels.expected(now.x, layout.H)
-                densities = families.densities(now, expected, layout, fixes.z, fixes.R)
-        fit = _fit(now, fixes, expected, layout.H, densities)
-        excluded = (now.target_id != NOBODY) & (fixes.target_id is None)
-        if self.config.named_tracks == 'share':
-            excluded = np.zeros(len(excluded), bool)
-        found = kbest.branched(now, fixes, fit, excluded, mixing is not None)
-        if densities is not None:
-            densities = families.Densities(*(part[found.source] for part in densities))
-        association = Association(
-            found.tracks,
-            found.detection,
-            expected[found.source],
-            found.state.score,
-            np.zeros(len(fixes.z), bool),
-            densities=densities,
-            counted=found.counted,
-        )
-        now = self._update(found.state, fixes, association)
-        now = self._with_tracks(now, kbest.births(fixes, found))
-        return now._replace(hypotheses=found.hypotheses)
+        layout = self._layout(now.instruments)
+        found = kbest.branched(now, fixes, self.models, self._chain, layout)
+        now = self._update(found.state, fixes, found.association)
+        new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
+        return self._with_tracks(now, new)._replace(hypotheses=found.hypotheses)
 
     def _reacquire(
         self, now: DiverState, fixes: Positions, association: Association
@@ -426,7 +380,7 @@ class DiverTracker:
             predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
             after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
         else:
-            after = considered_update(now, fixes, tracks, detection, h, layout)
+            after = families.considered_update(now, fixes, tracks, detection, h, layout)
         x, P, mu, nis, nis_dof, repairs = after
         now = now._replace(
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
@@ -590,18 +544,3 @@ class DiverTracker:
             probabilities=self.models.by_model(state.mu),
             extras=extras,
         )
-
-
-def _fit(
-    now: DiverState,
-    fixes: Positions,
-    expected: FloatArray,
-    H: FloatArray,
-    densities: families.Densities | None,
-) -> FloatArray:
-    """The log density (T, D) of each fix under each track, -inf where it cannot be its own."""
-    if densities is not None:
-        believed = densities.whole > families.bound(fixes.config)
-        return np.where(believed, densities.whole, -np.inf)
-    threshold = gate_threshold(fixes.config.gate_probability, 2)
-    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
