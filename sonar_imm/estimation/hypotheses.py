@@ -36,8 +36,8 @@ undetected targets is kept constant.
 The most probable events of all hypotheses of a cluster together are found without the others
 (`k_best`; Murty 1968, Cox and Hingorani 1996). What grows is cut back (`settled`): hypotheses
 beyond a number, or less probable than a share of the best; rows of a track whose last detections
-are the same, whose states are nearly the same too, become one; a track that has the same row in
-all hypotheses of its cluster is a cluster of its own.
+are the same, whose states are nearly the same too, become one; tracks that compete for none of
+their last detections, or have the same row in all hypotheses, are clusters of their own.
 
 All arrays are float64, int64 or bool and C-contiguous.
 """
@@ -386,7 +386,9 @@ def settled(
 ) -> tuple[Hypotheses, BoolArray]:
     """What goes on to the next scan, and which rows (T,) that holds.
 
-    key (T, w): rows of one track whose keys are the same become the most probable of them; alive
+    key (T, w): numbers of the last detections of a row, and what else tells it from others, 0 for
+    none. Rows of one track whose keys are the same become the most probable of them; tracks whose
+    rows have no number in common do not depend on each other, and are clusters of their own. alive
     (T,): the others are out of all hypotheses; most: hypotheses of a cluster.
     """
     member = now.member & alive[None]
@@ -406,7 +408,11 @@ def settled(
     ]
     for number in np.unique(now.cluster[~simple]):
         own = np.flatnonzero(now.cluster == number)
-        parts += _apart(*_distinct(now.log_weight[own], now.shown[own], member[own], most))
+        rows = np.flatnonzero(member[own].any(axis=0))
+        for linked in _linked(track_id, key, rows):
+            kept = np.zeros_like(member[own])
+            kept[:, linked] = member[np.ix_(own, linked)]
+            parts += _apart(*_distinct(now.log_weight[own], now.shown[own], kept, most))
     if not parts:
         empty = Hypotheses.none()
         return empty, np.zeros(len(track_id), bool)
@@ -415,6 +421,28 @@ def settled(
     after = Hypotheses(np.repeat(np.arange(len(parts)), sizes), weight, shown, members)
     kept = np.asarray(after.member.any(axis=0))
     return after.only(kept), kept
+
+
+def _linked(track_id: IntArray, key: IntArray, rows: IndexArray) -> list[IndexArray]:
+    """The `rows` of a cluster, those of tracks together that have a number of their keys in
+    common: the others do not depend on each other any more."""
+    leader: dict[int, int] = {}
+
+    def root(track: int) -> int:
+        while leader[track] != track:
+            track = leader[track]
+        return track
+
+    first: dict[int, int] = {}
+    tracks = track_id[rows].tolist()
+    for track, numbers in zip(tracks, key[rows].tolist()):
+        leader.setdefault(track, track)
+        for number in set(numbers) - {0}:
+            leader[root(track)] = root(first.setdefault(number, track))
+    groups: dict[int, list[int]] = {}
+    for track, row in zip(tracks, rows.tolist()):
+        groups.setdefault(root(track), []).append(row)
+    return [np.array(group) for group in groups.values()]
 
 
 def _distinct(

@@ -190,7 +190,11 @@ def test_no_more_hypotheses_than_wanted_and_their_weights_sum_to_one():
     found = pair(before, ids, rng.normal(size=(2, 6)))
     T = len(found.source)
     after, kept = settled(
-        found.hypotheses, ids[found.source], np.arange(T)[:, None], np.ones(T, bool), 5
+        found.hypotheses,
+        ids[found.source],
+        np.column_stack([np.arange(T) + 1, np.full(T, 99)]),
+        np.ones(T, bool),
+        5,
     )
     assert len(after.weight) == 5
     assert after.weight.sum() == pytest.approx(1.0)

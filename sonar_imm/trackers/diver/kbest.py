@@ -48,7 +48,8 @@ from .state import DiverState, Step
 from .state_space import Layout, ModelSet
 
 WINDOW = 6
-"""Last detections that two rows of a track have in common when they are taken for one."""
+"""Last detections that two rows of a track have in common when they are taken for one, and for
+which tracks that competed depend on each other."""
 
 NOBODY_THERE = 1e-4
 """Existence below which a row is left out of its hypotheses."""
@@ -66,11 +67,13 @@ kept."""
 
 class Branched(NamedTuple):
     """Rows after they were paired with fixes: the state, not yet updated; the association that
-    updates them and says where tracks begin; hypotheses: what holds once they have."""
+    updates them and says where tracks begin; hypotheses: what holds once they have; first_serial:
+    that of the fix before these."""
 
     state: DiverState
     association: jipda.Association
     hypotheses: Hypotheses
+    first_serial: int
 
 
 def branched(
@@ -155,7 +158,16 @@ def branched(
         densities=densities,
         counted=shown_rows(found.hypotheses),
     )
-    return Branched(after, association, hypotheses.with_births(found, begins))
+    return Branched(after, association, hypotheses.with_births(found, begins), now.serial)
+
+
+def begun(now: DiverState, found: Branched) -> DiverState:
+    """With the hypotheses of `found`, after the tracks that begin there are the last rows."""
+    begins = np.flatnonzero(found.association.free)
+    history = now.history.copy()
+    if len(begins):
+        history[-len(begins) :, -1] = found.first_serial + begins + 1
+    return now._replace(history=history, hypotheses=found.hypotheses)
 
 
 def learnt(
@@ -245,7 +257,8 @@ def pruned(
     alive &= kept & ~(by_existence & over)
     alive &= ~_too_many(now, status, existence, config.max_tracks)
     ids = now.life.track_id.astype(np.int64)
-    key = np.column_stack([now.history, now.target_id])
+    name = np.where(now.target_id == NOBODY, 0, -2 - now.target_id)
+    key = np.column_stack([now.history, name])
     most, room = config.hypotheses, ROWS_OF_A_TRACK * most_tracks(config)
     after, rows = hypotheses.settled(now.hypotheses, ids, key, alive, most)
     while most > 1 and int(rows.sum()) > room:

@@ -331,7 +331,8 @@ class DiverTracker:
         found = kbest.branched(now, fixes, self.models, self._chain, layout)
         now = self._update(found.state, fixes, found.association)
         new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
-        return self._with_tracks(now, new)._replace(hypotheses=found.hypotheses)
+        now = self._with_tracks(now, new)
+        return kbest.begun(now, found)
 
     def _reacquire(
         self, now: DiverState, fixes: Positions, association: Association
