@@ -213,10 +213,8 @@ def shown_rows(now: Hypotheses) -> BoolArray:
 
 
 def shown(now: DiverState) -> DiverState:
-    """One row of each track that is in the hypotheses shown; existence: of the track in all of
-    them."""
-    existence = _of_tracks(now, now.existence)
-    return now._replace(existence=existence).only(shown_rows(now.hypotheses))
+    """One row of each track that is in the hypotheses shown; existence: see `presence`."""
+    return now._replace(existence=presence(now)).only(shown_rows(now.hypotheses))
 
 
 def decided(now: DiverState) -> DiverState:
@@ -229,6 +227,18 @@ def _of_tracks(now: DiverState, value: FloatArray) -> FloatArray:
     """The expected `value` (T,) of the track of each row, 0 where it is not there."""
     _, which = np.unique(now.life.track_id, return_inverse=True)
     return np.asarray(np.bincount(which, now.hypotheses.marginal() * value)[which])
+
+
+def presence(now: DiverState) -> FloatArray:
+    """The probability (T,) that a diver is where a row is: in all hypotheses that have its track,
+    or, where that is more, in all that give its last fix to any track. Who a diver is may stay
+    open long after it is sure that there is one."""
+    share = now.hypotheses.marginal() * now.existence
+    _, last = np.unique(now.history[:, -1:], return_inverse=True)
+    there = np.bincount(last.ravel(), share)[last.ravel()]
+    known = now.history[:, -1:].any(axis=1)
+    own = _of_tracks(now, now.existence)
+    return np.asarray(np.where(known, np.fmax(there, own), own))
 
 
 def most_tracks(config: DiverConfig) -> int:
@@ -246,11 +256,9 @@ def pruned(
     life, kept = now.life.scan(hit, now.stamp_ns, rules, looked=looked & ~by_existence)
     status = now.life.status.copy()
     status[kept] = life.status
-    existence, evidence = _of_tracks(now, now.existence), _of_tracks(now, now.evidence)
-    there = _of_tracks(now, np.ones(len(status)))
-    evidence = evidence / np.where(there > 0.0, there, 1.0)
+    existence, present = _of_tracks(now, now.existence), presence(now)
     was = now.life.status != TENTATIVE
-    firm = was | (existence > jipda.CONFIRMS) & (evidence >= jipda.EVIDENCE)
+    firm = was | (present > jipda.CONFIRMS) & (now.evidence >= jipda.EVIDENCE)
     judged = jipda.status_of(now.life.status, firm, hit, looked)
     status = np.where(by_existence, judged, status)
     over = (existence < jipda.ENDS) | (now.existence < NOBODY_THERE)
