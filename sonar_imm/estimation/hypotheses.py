@@ -408,8 +408,8 @@ def settled(
     ]
     for number in np.unique(now.cluster[~simple]):
         own = np.flatnonzero(now.cluster == number)
-        rows = np.flatnonzero(member[own].any(axis=0))
-        for linked in _linked(track_id, key, rows):
+        held = np.flatnonzero(member[own].any(axis=0))
+        for linked in _linked(track_id, key, held):
             kept = np.zeros_like(member[own])
             kept[:, linked] = member[np.ix_(own, linked)]
             parts += _apart(*_distinct(now.log_weight[own], now.shown[own], kept, most))

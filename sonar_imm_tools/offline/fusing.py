@@ -263,6 +263,7 @@ def _estimate(stamp_ns: int, like: Estimate, rows: list[dict[str, Any]]) -> Esti
         state_names=names,
         state=state,
         covariance=np.array([row['covariance'] for row in rows]).reshape(-1, n, n),
+        probabilities=np.empty((count, 0)),
         extras={
             'track_id': column('track_id', np.uint32),
             'track_state': column('track_state', np.uint8),
