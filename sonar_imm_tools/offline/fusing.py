@@ -34,12 +34,14 @@ the covariance as fast as divers turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from attrs import evolve
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate, PLACES
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import NOBODY
@@ -309,8 +311,11 @@ def write_fused(
     estimates = [run.read_estimates() for run in runs]
     _require_one_frame(runs, records, estimates)
     fuser = Fuser(noise)
-    written = folder.write_estimates(fused(estimates[0], estimates[1], fuser, max_age), 'diver')
+    made = fused(estimates[0], estimates[1], fuser, max_age)
     origin = {'origin': records[0]['origin']} if 'origin' in records[0] else {}
+    if origin:
+        made = _on_earth(made, Origin(**origin['origin']))
+    written = folder.write_estimates(made, 'diver')
     record = run_record(
         bag=records[0]['bag'],
         system='diver',
@@ -330,6 +335,14 @@ def write_fused(
     )
     folder.write_json(RUN, record)
     return record
+
+
+def _on_earth(estimates: Iterable[Estimate], origin: Origin) -> Iterator[Estimate]:
+    """Estimates with the columns latitude and longitude."""
+    for each in estimates:
+        place = origin.geodetic(np.asarray(each.xyz, np.float64))
+        columns = {'latitude': place[:, 0], 'longitude': place[:, 1]}
+        yield evolve(each, extras={**each.extras, **columns})
 
 
 def _require_one_frame(

@@ -245,3 +245,22 @@ def test_what_does_not_fit_is_said(runs: Path, capsys: pytest.CaptureFixture[str
     assert main(['fuse', a, str(other), str(runs / 'x')]) == 2
     assert 'not of divers' in capsys.readouterr().err
     assert not (runs / 'x').exists()
+
+
+def test_a_run_with_a_place_on_earth_keeps_it(tmp_path: Path) -> None:
+    for name, seed in (('a', 1), ('b', 2)):
+        bag = tmp_path / f'{name}.bag'
+        wanted = ['--scenario', 'geodetic', '--seed', str(seed), '--set', 'duration=15']
+        assert main(['simulate', 'diver', str(bag), *wanted]) == 0
+        place = ['--set', 'origin_latitude=43.3', '--set', 'origin_longitude=5.35']
+        assert (
+            main(['track', str(bag), str(tmp_path / name), '--set', 'model_set=cv', *place]) == 0
+        )
+    a, b, out = (str(tmp_path / name) for name in ('a', 'b', 'out'))
+    assert main(['fuse', a, b, out]) == 0
+    header = (tmp_path / 'out' / 'estimate.csv').read_text().splitlines()[0]
+    assert header.endswith('first_weight,latitude,longitude')
+    record = json.loads((tmp_path / 'b' / 'run.json').read_text())
+    record['origin']['latitude'] += 0.1
+    (tmp_path / 'b' / 'run.json').write_text(json.dumps(record))
+    assert main(['fuse', a, b, str(tmp_path / 'x')]) == 2
