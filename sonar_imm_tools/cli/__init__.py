@@ -46,6 +46,7 @@ COMMANDS = {
     'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
+    'fuse': 'Fuse the diver tracks of two nodes into one run.',
     'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
     'view': 'Show a recording, a run or running nodes in Foxglove.',

@@ -64,7 +64,7 @@ def note(system, how, moved, tolerance, told):
 # -- divers ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('association', ['gnn', 'jipda'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
 @pytest.mark.parametrize('name', MOTIONS)
 def test_divers(name, association):
     motion = MOTIONS[name]

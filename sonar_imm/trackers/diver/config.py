@@ -40,7 +40,7 @@ BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate')
-ASSOCIATIONS = ('gnn', 'jipda')
+ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 NAMED_TRACKS = ('share', 'alone')
 VESSELS = ('moving', 'fixed')
 RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
@@ -212,13 +212,19 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     # -- association -----------------------------------------------------------------------------
     association: str = parameter('gnn', '',
-        'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits) or '
+        'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
         'jipda (all pairings weighed, tracks confirmed by their probability of existence, for '
-        'divers that cross in clutter)', choices=ASSOCIATIONS)
+        'divers that cross in clutter) or kbest (the most probable histories of pairings kept, '
+        'until later scans and names tell which was right, for divers side by side)',
+        choices=ASSOCIATIONS)
+    hypotheses: int = parameter(30, '',
+        'kbest: largest number of histories of pairings that are kept of divers near each other',
+        range=(1, 1000))
     birth_density: float = live(1.2e-5, '1/m^2',
-        'jipda: number of new divers expected in a scan, per square metre', range=(1e-12, 1.0))
+        'jipda and kbest: number of new divers expected in a scan, per square metre',
+        range=(1e-12, 1.0))
     survival_time: float = live(500.0, 's',
-        'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
+        'jipda and kbest: time for which a diver is expected to stay', range=(1.0, 1e7))
 
     # -- names -----------------------------------------------------------------------------------
     tags: tuple[str, ...] = parameter((), '',

@@ -45,7 +45,7 @@ import numpy as np
 from ...estimation import imm_kernels, jipda, markov
 from ...estimation.adaptation import AdaptiveChain, Chain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import TENTATIVE
+from ...estimation.association import gate_threshold, TENTATIVE
 from ...estimation.consider import consider_models
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import NOBODY
@@ -235,6 +235,21 @@ def bound(config: DiverConfig) -> float:
     return math.log(config.clutter_density) + math.log1p(-p) - math.log(p)
 
 
+def fit(
+    now: DiverState,
+    fixes: Positions,
+    expected: FloatArray,
+    H: FloatArray,
+    found: Densities | None,
+) -> FloatArray:
+    """The log density (T, D) of each fix under each track, -inf where it cannot be its own: by the
+    densities found, or by the gate of sets that have none."""
+    if found is not None:
+        return np.where(found.whole > bound(fixes.config), found.whole, -np.inf)
+    threshold = gate_threshold(fixes.config.gate_probability, 2)
+    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+
+
 def update(
     now: DiverState,
     fixes: Positions,
@@ -268,6 +283,27 @@ def update(
     nis[hit] += np.square(now.white[hit]).sum(axis=1)
     nis_dof[hit] += np.uint16(2)
     return *whole, nis, nis_dof, repairs
+
+
+def considered_update(
+    now: DiverState,
+    fixes: Positions,
+    tracks: IndexArray,
+    detection: IntArray,
+    h: FloatArray,
+    layout: Layout,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
+    """As `fix_kernels.update`, where the state holds constants that are only considered."""
+    x, P, mu, nis, nis_dof = (part.copy() for part in (now.x, now.P, now.mu, now.nis, now.nis_dof))
+    innovation = fixes.z[detection][:, None, :] - h[tracks]
+    x1, P1, mu1, nis1, ok = consider_models(
+        x[tracks], P[tracks], mu[tracks], innovation, layout.H[0], fixes.R[detection], layout.mask
+    )
+    repairs = sum(add_jitter_all(covariance) for covariance in P1)
+    x[tracks], P[tracks], mu[tracks] = x1, P1, mu1
+    nis[tracks] += np.where(ok, nis1, 0.0)
+    nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
+    return x, P, mu, nis, nis_dof, repairs
 
 
 def update_jointly(

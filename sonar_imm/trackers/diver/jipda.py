@@ -79,6 +79,24 @@ class JointWeights(NamedTuple):
         return hit, self.beta[hit].argmax(axis=1) if len(hit) else hit
 
 
+class Association(NamedTuple):
+    """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
+    (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
+    may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
+    where these and not the pairs update the tracks; densities: of all pairs, of `families`;
+    counted (T,): tracks whose innovations tell how consistent fixes are, None for all."""
+
+    tracks: IndexArray
+    detection: IntArray
+    expected: FloatArray
+    score: FloatArray
+    free: BoolArray
+    existence: FloatArray | None = None
+    weights: JointWeights | None = None
+    densities: families.Densities | None = None
+    counted: BoolArray | None = None
+
+
 def joint_weights(
     now: DiverState,
     fixes: Positions,
@@ -201,9 +219,7 @@ def judge(
     was = now.life.status != TENTATIVE
     confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
     alive = ~(now.existence < ENDS)
-    seen = np.where(looked, COASTING, now.life.status)
-    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
-    status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
+    status = status_of(now.life.status, confirmed, hit, looked)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
     nameless = [group for group in fixes if group.target_id is None]
@@ -211,6 +227,15 @@ def judge(
     scans = [names.patience(group.config.detection_probability) for group in nameless]
     patience = np.where(was, max([SCANS_CONFIRMED, *scans]), SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)
+
+
+def status_of(
+    before: StatusArray, confirmed: BoolArray, hit: BoolArray, looked: BoolArray
+) -> StatusArray:
+    """The status (T,) of tracks, of which some are `confirmed`."""
+    seen = np.where(looked, COASTING, before)
+    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
+    return np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
 
 
 def coalescence(

@@ -26,6 +26,8 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
+from ...parameters import ConfigError
+from .config import DiverConfig
 from .state import cross, DiverState
 from .tracker import DiverTracker
 
@@ -78,6 +80,11 @@ class SmoothingDiverTracker(DiverTracker):
 
     For recordings: memory grows with their length, 10 kB a diver and scan.
     """
+
+    def __init__(self, config: DiverConfig):
+        if config.association == 'kbest':
+            raise ConfigError('association kbest keeps several pasts of a track: no smoother')
+        super().__init__(config)
 
     def reset(self) -> None:
         super().reset()

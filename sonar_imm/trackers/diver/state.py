@@ -25,9 +25,10 @@ import numpy as np
 
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
+from ...estimation.hypotheses import Hypotheses
 from . import family_kernels
 from .family_kernels import Mixing
 from .state_space import Instruments, ModelSet, Motion
@@ -74,6 +75,8 @@ ROWS = (
     'near_to',
     'near_for',
     'refused',
+    'history',
+    'came_from',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -169,7 +172,9 @@ class DiverState(NamedTuple):
     target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
     track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
-    believed, NaN since it took another (`families`); scale (2, 2): for
+    believed, NaN since it took another (`families`); history (T, w): the numbers of its last
+    fixes, came_from (T,): which row it was before this scan, -1 for none, hypotheses: which rows
+    belong together, and serial: of the last fix (`kbest`; nothing elsewhere); scale (2, 2): for
     fixes and for arrivals the sum of squared residuals in units of their stated variance, and
     their number; fixes, arrivals: what innovations say of the stated covariances of either;
     last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
@@ -193,10 +198,14 @@ class DiverState(NamedTuple):
     near_to: IntArray
     near_for: IntArray
     refused: FloatArray
+    history: IntArray
+    came_from: IntArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
     instruments: Instruments = Instruments()
+    hypotheses: Hypotheses = Hypotheses.none()
+    serial: int = 0
     last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
     not_started: int = 0
@@ -223,6 +232,8 @@ class DiverState(NamedTuple):
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
             refused=np.empty((0, 6)),
+            history=np.empty((0, 0), np.int64),
+            came_from=np.empty(0, np.int64),
             scale=np.zeros((2, 2)),
         )
 
@@ -235,8 +246,11 @@ class DiverState(NamedTuple):
         """The tracks where `kept` (T,) is True; `life` is that of those."""
         if kept.all():
             return self._replace(life=life)
-        index = np.flatnonzero(kept)
-        parts: dict[str, Any] = {name: getattr(self, name).take(index, axis=0) for name in ROWS}
+        return self.at(np.flatnonzero(kept), life)._replace(hypotheses=self.hypotheses.only(kept))
+
+    def at(self, rows: IndexArray, life: Tracks) -> DiverState:
+        """The rows of those numbers; `life` is that of them. Hypotheses are left as they are."""
+        parts: dict[str, Any] = {name: getattr(self, name).take(rows, axis=0) for name in ROWS}
         return self._replace(life=life, **parts)
 
     def only(self, kept: BoolArray) -> DiverState:

@@ -33,7 +33,7 @@ from collections.abc import Collection, Sequence
 from functools import lru_cache, partial
 import math
 from operator import itemgetter
-from typing import cast, NamedTuple
+from typing import cast
 
 from attrs import evolve
 import numpy as np
@@ -42,19 +42,18 @@ from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
-from ...estimation.consider import consider_models
-from ...estimation.small_matrices import add_jitter_all
+from ...estimation.arrays import FloatArray, IndexArray, IntArray
+from ...estimation.association import assign_fits, TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, families, fix_kernels, jipda, names, pings
+from . import births, families, fix_kernels, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
+from .jipda import Association
 from .models import build_models
 from .scan import Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
@@ -64,22 +63,6 @@ __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 SCORE_MEMORY = 0.9
 """Share of its score a track keeps from scan to scan."""
-
-
-class Association(NamedTuple):
-    """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
-    (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
-    may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
-    where these and not the pairs update the tracks; densities: of all pairs, of `families`."""
-
-    tracks: IndexArray
-    detection: IntArray
-    expected: FloatArray
-    score: FloatArray
-    free: BoolArray
-    existence: FloatArray | None = None
-    weights: jipda.JointWeights | None = None
-    densities: families.Densities | None = None
 
 
 class DiverTracker:
@@ -105,6 +88,7 @@ class DiverTracker:
     def _settle(self, config: DiverConfig) -> None:
         """What follows from the parameters, once and not in every scan."""
         self.config = config
+        self._keeps_hypotheses = config.association == 'kbest'
         self.rules = track_rules(config)
         self._layout = lru_cache(maxsize=16)(self._layout_of)
 
@@ -123,7 +107,12 @@ class DiverTracker:
         self._georeferencer = Georeferencer(self.config, self.counts)
 
     def _nobody(self, life: Tracks) -> DiverState:
-        return DiverState.of_nobody(life, self.models, self._chain.fresh(0))
+        nobody = DiverState.of_nobody(life, self.models, self._chain.fresh(0))
+        return nobody._replace(history=np.empty((0, self._window), np.int64))
+
+    @property
+    def _window(self) -> int:
+        return kbest.WINDOW if self._keeps_hypotheses else 0
 
     @property
     def origin(self) -> Origin | None:
@@ -188,6 +177,8 @@ class DiverTracker:
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
+        if self._keeps_hypotheses:
+            now = kbest.shown(now)
         hit = now.nis_dof > 0
         return {
             'tracks': len(now.life),
@@ -243,6 +234,9 @@ class DiverTracker:
         now, step = self._predict(before, stamp_ns)
         found: list[Birth] = []
         for fixes in scan.fixes:
+            if self._keeps_hypotheses:
+                now = self._branch(now, fixes)
+                continue
             association = self._associate(now, fixes)
             now, again = self._reacquire(now, fixes, association)
             if again:
@@ -250,6 +244,8 @@ class DiverTracker:
             now = self._update(now, fixes, association)
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
+        if scan.pings and self._keeps_hypotheses:
+            now = kbest.decided(now)
         for ping in scan.pings:
             now, free = pings.associate_and_update(
                 now, ping, self.config, scan.factor, self.models
@@ -286,6 +282,7 @@ class DiverTracker:
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
             existence=before.existence * math.exp(-dt / self.config.survival_time),
+            came_from=np.arange(count),
             repairs=before.repairs + last.repairs,
         )
         return now, last._replace(dt=dt)
@@ -317,12 +314,7 @@ class DiverTracker:
             return Association(
                 tracks, likeliest, expected, now.score, free, existence, weights, densities
             )
-        if densities is None:
-            threshold = gate_threshold(config.gate_probability, 2)
-            fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
-        else:
-            believed = densities.whole > families.bound(config)
-            fit = np.where(believed, densities.whole, -np.inf)
+        fit = families.fit(now, fixes, expected, H, densities)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
@@ -332,6 +324,15 @@ class DiverTracker:
         free = np.ones(len(fixes.z), bool)
         free[chosen[tracks]] = False
         return Association(tracks, chosen[tracks], expected, score, free, densities=densities)
+
+    def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
+        """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
+        layout = self._layout(now.instruments)
+        found = kbest.branched(now, fixes, self.models, self._chain, layout)
+        now = self._update(found.state, fixes, found.association)
+        new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
+        now = self._with_tracks(now, new)
+        return kbest.begun(now, found)
 
     def _reacquire(
         self, now: DiverState, fixes: Positions, association: Association
@@ -356,6 +357,8 @@ class DiverTracker:
             mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
             z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
+            if association.counted is not None:
+                tentative |= ~association.counted
             scale = np.ones(len(tracks))
             if self.models.mixing is not None:
                 scale = families.scale(now.mu[tracks], self.models)
@@ -378,12 +381,15 @@ class DiverTracker:
             predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
             after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
         else:
-            after = _considered_update(now, fixes, tracks, detection, h, layout)
+            after = families.considered_update(now, fixes, tracks, detection, h, layout)
         x, P, mu, nis, nis_dof, repairs = after
         now = now._replace(
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
         )
         if self.config.estimate_covariance_scale:
+            if association.counted is not None:
+                counts = association.counted[tracks]
+                tracks, detection = tracks[counts], detection[counts]
             now = self._with_scale(now, fixes, tracks, detection)
         return now
 
@@ -401,14 +407,17 @@ class DiverTracker:
         """What the hits say of the transitions, and of the stated variances of arrivals where no
         fix says the same."""
         hit = now.nis_dof > 0
-        learnt = self._chain.learn(
-            before.learnt,
-            step.transition,
-            self.models.by_model(before.mu),
-            self.models.by_model(now.mu),
-            step.dt,
-            np.flatnonzero(hit),
-        )
+        if self._keeps_hypotheses:
+            learnt = kbest.learnt(before, now, step, self.models, self._chain)
+        else:
+            learnt = self._chain.learn(
+                before.learnt,
+                step.transition,
+                self.models.by_model(before.mu),
+                self.models.by_model(now.mu),
+                step.dt,
+                np.flatnonzero(hit),
+            )
         nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
@@ -420,6 +429,9 @@ class DiverTracker:
         config, before = self.config, now
         if scan.names or now.last_named:
             now = names.remembered(now, scan.names, config.max_coast)
+        if self._keeps_hypotheses:
+            looked = scan.complete & (now.target_id == NOBODY)
+            return kbest.pruned(now, now.nis_dof > 0, looked, self.rules, config)
         alive = fix_kernels.finite(now.x, now.P)
         if not alive.all():
             now = now._replace(broken=now.broken + int((~alive).sum()))
@@ -458,8 +470,10 @@ class DiverTracker:
         where somebody says that a diver is."""
         config = self.config
         if found:
-            room = max(0, 10 + 5 * config.max_tracks - len(now.life))
+            room = max(0, kbest.most_tracks(config) - len(now.life))
             now = self._with_tracks(now, births.each_name_once(found)[:room])
+        if starts and self._keeps_hypotheses:
+            now = kbest.decided(now)
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
@@ -474,6 +488,8 @@ class DiverTracker:
             return now
         layout = self._layout(now.instruments)
         x, P, mu = births.new_tracks(found, self.models, layout, self.config)
+        if self._keeps_hypotheses:
+            now = now._replace(hypotheses=now.hypotheses.with_alone(count))
         return now.with_rows(
             now.life.born(count, now.stamp_ns, self.rules),
             {
@@ -491,10 +507,14 @@ class DiverTracker:
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
                 'refused': np.full((count, 6), np.nan),
+                'history': np.zeros((count, self._window), np.int64),
+                'came_from': np.full(count, -1),
             },
         )
 
     def _estimate(self, state: DiverState) -> Estimate:
+        if self._keeps_hypotheses:
+            state = kbest.shown(state)
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = state.positions(self.models.E)
@@ -525,24 +545,3 @@ class DiverTracker:
             probabilities=self.models.by_model(state.mu),
             extras=extras,
         )
-
-
-def _considered_update(
-    now: DiverState,
-    fixes: Positions,
-    tracks: IndexArray,
-    detection: IntArray,
-    h: FloatArray,
-    layout: Layout,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
-    """As `fix_kernels.update`, where the state holds constants that are only considered."""
-    x, P, mu, nis, nis_dof = (part.copy() for part in (now.x, now.P, now.mu, now.nis, now.nis_dof))
-    innovation = fixes.z[detection][:, None, :] - h[tracks]
-    x1, P1, mu1, nis1, ok = consider_models(
-        x[tracks], P[tracks], mu[tracks], innovation, layout.H[0], fixes.R[detection], layout.mask
-    )
-    repairs = sum(add_jitter_all(covariance) for covariance in P1)
-    x[tracks], P[tracks], mu[tracks] = x1, P1, mu1
-    nis[tracks] += np.where(ok, nis1, 0.0)
-    nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
-    return x, P, mu, nis, nis_dof, repairs

@@ -52,7 +52,14 @@ def run(measurements, **options):
 
 
 @pytest.mark.parametrize(
-    'options', [{}, {'association': 'jipda'}, {'dimensions': 3}, {'max_tracks': 1}]
+    'options',
+    [
+        {},
+        {'association': 'jipda'},
+        {'association': 'kbest'},
+        {'dimensions': 3},
+        {'max_tracks': 1},
+    ],
 )
 def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(options):
     tracker, first = run([start(1, 5.0, 7.0, sigma=2.0)], **options)
