@@ -58,6 +58,7 @@ EXTRAS = {
         'hypothesis',
         'laspy[lazrs]>=2.5',
         'pyarrow>=14',
+        'pyogrio>=0.8',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',

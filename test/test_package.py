@@ -160,7 +160,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'segyio'}
+    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'pyogrio', 'segyio'}
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 

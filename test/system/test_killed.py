@@ -116,7 +116,9 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
     pytest.importorskip('pyarrow')
     lines = tmp_path / 'lines'
     small = [f'--set={name}' for name in ('lines=3', 'length=60', 'ghost=false', 'spacing=20')]
-    subprocess.run(command('simulate', 'survey', lines, '--soundings', *small), cwd=ROOT, check=True)
+    simulate = command('simulate', 'survey', lines, '--soundings', *small)
+    subprocess.run(simulate, cwd=ROOT, check=True)
+    first = None
     for work in (None, 'lines/*.npz', 'looks/*.npz', 'tiles/*.npz'):
         out = tmp_path / f'out{len(list(tmp_path.iterdir()))}'
         arguments = command('survey', lines, out, '--adjust', '--jobs', 2)
@@ -134,7 +136,7 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
             for path in sorted(out.rglob('*'))
             if path.is_file() and '.work' not in path.parts and path.name != 'survey.json'
         }
-        first = found if work is None else first
+        first = first or found
         assert found == first and Path('survey.tif') in found
 
 
@@ -143,7 +145,5 @@ def _workers(command_id):
     task = Path(f'/proc/{command_id}/task/{command_id}/children')
     children = [int(word) for word in task.read_text().split()]
     return [
-        child
-        for child in children
-        if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()
+        child for child in children if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()
     ]
