@@ -27,7 +27,7 @@ import pytest
 from msg_adapters.soundings import write_soundings
 from sonar_imm.soundings import COLUMNS, Soundings
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.export.points import read_points
+from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import jobs, making
 from sonar_imm_tools.survey.looks import joined
@@ -274,6 +274,19 @@ def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
     assert np.nanmin(bands['uncertainty']) > adjustment['crossings']['rms_before']
 
 
+def test_groups_that_do_not_overlap_are_adjusted_with_a_warning(lines, tmp_path, capsys):
+    for k, (source, east) in enumerate([(0, 0.0), (1, 0.0), (0, 5000.0), (1, 5000.0)]):
+        points = read_points(lines / f'line_{source:03d}' / 'soundings.csv')
+        folder = tmp_path / 'runs' / f'line_{k}'
+        folder.mkdir(parents=True)
+        write_table(folder / 'soundings.csv', points.moved((east, 0.0, 0.0)))
+    out = tmp_path / 'out'
+    assert run('survey', tmp_path / 'runs', out, '--adjust', '--resolution', 4) == 0
+    (sentence,) = json.loads((out / 'survey.json').read_text())['warnings']
+    assert sentence in capsys.readouterr().err
+    assert '2 groups that do not overlap' in sentence and 'priors alone' in sentence
+
+
 def test_parquet_and_a_coordinate_system(lines, tmp_path):
     import pyarrow
     import pyarrow.csv
@@ -338,6 +351,8 @@ def record(line, bag, *topics):
         ('missing', (), 'is no folder'),
         ('crs', (), 'line_000 is in EPSG 32632 and line_001 in EPSG 32633'),
         ('apart', ('--adjust',), 'no two lines overlap'),
+        ('broken', (), 'no line can be read; the first: '),
+        ('', ('--scheduler', 'nonsense'), 'no dask scheduler at nonsense'),
         ('', ('--resolution', '0.001'), 'too large'),
         ('', ('--fix', 'other'), 'no line other'),
         ('', ('--crs', '1'), 'EPSG number 1'),
@@ -358,6 +373,9 @@ def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
             if change == 'crs':
                 run_json = json.dumps({'epsg': 32632 + k})
                 (runs / f'line_{k:03d}' / 'run.json').write_text(run_json)
+    if change == 'broken':
+        for k in (0, 1):
+            (runs / f'line_{k:03d}' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
     if change == 'apart':
         shutil.rmtree(runs / 'line_001')
     assert run('survey', runs, out, *options) in (1, 2)
