@@ -14,7 +14,7 @@
 
 """What a survey of many lines costs: CPU by stage, and how much memory workers need.
 
-    nice python -m benchmarks.survey_scale --lines 1000
+    nice python -m benchmarks.survey_scale --lines 1000 --length 200
 
 Groups of fifty lines beside each other on a slope, each group the same soundings moved aside, so
 that lines overlap their neighbours throughout; then `sonar-imm survey --adjust` as the command
@@ -47,7 +47,7 @@ GROUP, SPACING = 50, 40.0
 TICKS = os.sysconf('SC_CLK_TCK')
 
 
-def main(lines: int = 1000, length: float = 200.0, jobs: int = 2) -> Parts:
+def main(lines: int = 200, length: float = 100.0, jobs: int = 2) -> Parts:
     with tempfile.TemporaryDirectory() as folder:
         soundings = write_lines(Path(folder) / 'lines', lines, length)
         yield {'lines': lines, 'soundings': soundings, 'jobs': jobs}
@@ -140,6 +140,8 @@ class Watch:
             total -= count
             if what == 'lines' and total < left:
                 self._is_early = False
+            if what == 'statistics' and total == 0:
+                self.begin('adjustment', 0)  # what the command does between two rounds
 
         return advance
 
