@@ -61,6 +61,7 @@ EXTRAS = {
         'pyais>=2.7',
         'pyarrow>=14',
         'pynmea2>=1.18',
+        'pyogrio>=0.8',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',

@@ -165,7 +165,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
-        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'segyio', 'soundfile')
+        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'segyio', 'soundfile')
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 

@@ -52,6 +52,7 @@ COMMANDS = {
     'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',
     'echo': 'Show the estimates of running nodes as a live table.',
+    'chart': 'Make a chart of the soundings of running nodes, for RViz.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
     'tune': 'Fit parameters to your own recordings, or say what they cannot tell.',

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import attrs
 import click
@@ -36,10 +36,14 @@ from .common import (
     load_detector,
     pairs_option,
     print_json,
+    progress,
     say,
     typed_overrides,
 )
 from .info import track_line
+
+if TYPE_CHECKING:
+    from ..recordings.conversion import ConversionReport
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -81,28 +85,38 @@ def command(ctx: click.Context) -> None:
     """Turn recordings in other formats into a rosbag2 bag: convert [KIND] IN OUT.
 
     Without KIND it is found out from the content of the file, and said. Rows that cannot be used
-    are left out, counted and listed by line.
+    are left out, counted and listed by line. With KIND and a folder of several, each becomes a bag
+    of its name in the folder OUT_BAG.
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 
 
 def _add_subcommand(kind: str, options: type) -> None:
-    def run(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
+    def run(source: Path, out_bag: Path, jobs: int, as_json: bool, **values: Any) -> None:
         chosen = _collected(options, values)
-        if kind == 'images':
-            chosen['parameters'] = _detector(source, chosen.get('parameters', {}))
-        _convert(kind, source, out_bag, as_json, chosen)
+        several = _sources(kind, source)
+        if several is not None:
+            _convert_all(kind, several, out_bag, chosen, jobs, as_json)
+            return
+        report = convert_file(kind, source, out_bag, chosen)
+        print_json(_described(report)) if as_json else _print(report)
 
     examples = (f'sonar-imm convert {kind} {line}' for line in options.EXAMPLES)  # type: ignore[attr-defined]
     subcommand = click.Command(
         kind, callback=run, help=inspect.getdoc(options), epilog=example(*examples)
     )
-    source_type = BAG if kind in FROM_BAGS else FILE
-    click.argument('source', metavar='IN', type=source_type)(subcommand)
+    click.argument('source', metavar='IN', type=BAG)(subcommand)
     click.argument('out_bag', type=BAG)(subcommand)
     for decorate in _click_options(options):
         decorate(subcommand)
+    click.option(
+        '--jobs',
+        type=click.IntRange(min=1),
+        default=1,
+        show_default=True,
+        help='Processes, for a folder of several.',
+    )(subcommand)
     json_option(subcommand)
     command.add_command(subcommand)
 
@@ -191,29 +205,88 @@ def _detector(source: Path, overrides: dict[str, str]) -> dict[str, Any]:
     return own | typed_overrides(DetectorConfig, overrides)
 
 
-def _convert(
-    kind: str, source: Path, out_bag: Path, as_json: bool, options: dict[str, Any]
-) -> None:
+def _sources(kind: str, source: Path) -> list[Path] | None:
+    """What lies in a folder of several recordings, by path; None for a single one."""
+    if not source.is_dir():
+        return None
+    inside = sorted(path for path in source.iterdir() if not path.name.startswith('.'))
+    if kind not in FROM_BAGS:
+        return [path for path in inside if path.is_file()]
+    from ..recordings.sources import is_recording
+
+    return None if is_recording(source) else [path for path in inside if is_recording(path)]
+
+
+def convert_file(
+    kind: str, source: Path, out_bag: Path, options: dict[str, Any]
+) -> ConversionReport:
+    """Convert a recording. Raises `BagError`."""
     from ..recordings.convert import KINDS
+
+    if kind == 'images':
+        options = {**options, 'parameters': _detector(source, options.get('parameters', {}))}
+    return KINDS[kind](source, out_bag, **options)
+
+
+def _convert_all(
+    kind: str, sources: list[Path], out: Path, options: dict[str, Any], jobs: int, as_json: bool
+) -> None:
+    """Convert all into the folder `out`; ends with 1 when one failed."""
+    from ..offline.jobs import workers
+    from ..recordings.sources import BagError
+
+    if not sources:
+        raise BagError('the folder holds nothing to convert')
+    bags = [out / (path.name if path.is_dir() else path.stem) for path in sources]
+    for bag in bags:
+        if bags.count(bag) > 1:
+            raise click.UsageError(f'two recordings would be converted into {bag}')
+    content: list[dict[str, Any]] = [{} for _ in sources]
+    calls = [(kind, source, bag, options) for source, bag in zip(sources, bags)]
+    with (
+        progress('recordings', len(sources), quiet=as_json) as advance,
+        workers(min(jobs, len(sources))) as run,
+    ):
+        for k, report, failure in run(convert_file, calls):
+            if failure:
+                click.echo(f'{sources[k]}: {failure}', err=True)
+            content[k] = {'source': str(sources[k]), 'failure': failure}
+            if report is not None:
+                content[k] |= _described(report)
+            advance(1)
+    failed = sum(bool(entry['failure']) for entry in content)
+    if as_json:
+        print_json({'bags': content})
+    else:
+        for entry in content:
+            if not entry['failure']:
+                say(f'{entry["bag"]}: {_what(entry["messages"])}, from {entry["rows"]} rows')
+        say(f'{len(sources) - failed} bags in {out}' + (f', {failed} failed' if failed else ''))
+    if failed:
+        raise click.exceptions.Exit(1)
+
+
+def _described(report: ConversionReport) -> dict[str, Any]:
+    return {
+        'bag': str(report.path),
+        'messages': report.messages,
+        'rows': report.rows,
+        'bad_rows': report.bad_rows,
+        'reasons': dict(report.reasons),
+        'problems': report.problems,
+        'notes': report.notes,
+    }
+
+
+def _what(messages: dict[str, int]) -> str:
+    return ', '.join(f'{count} on {topic}' for topic, count in sorted(messages.items()))
+
+
+def _print(report: ConversionReport) -> None:
     from ..recordings.reader import BagReader
     from ..recordings.topics import fitting_systems
 
-    report = KINDS[kind](source, out_bag, **options)
-    if as_json:
-        print_json(
-            {
-                'bag': str(report.path),
-                'messages': report.messages,
-                'rows': report.rows,
-                'bad_rows': report.bad_rows,
-                'reasons': dict(report.reasons),
-                'problems': report.problems,
-                'notes': report.notes,
-            }
-        )
-        return
-    what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
-    say(f'{report.path}: {what}, from {report.rows} rows')
+    say(f'{report.path}: {_what(report.messages)}, from {report.rows} rows')
     for key, value in report.notes.items():
         say(f'  note: {key}: {value}')
     for problem in report.problems:

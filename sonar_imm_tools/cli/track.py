@@ -48,6 +48,19 @@ if TYPE_CHECKING:
     from ..recordings.reader import BagReader
 
 
+def _shard(
+    _ctx: click.Context, _param: click.Parameter, value: str | None
+) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    numbers = value.split('/')
+    if len(numbers) == 2 and all(number.isdecimal() for number in numbers):
+        share, count = map(int, numbers)
+        if 1 <= share <= count:
+            return share, count
+    raise click.BadParameter(f"'{value}' is not of the form I/N with 1 <= I <= N")
+
+
 @click.command(
     epilog=example(
         'sonar-imm track dive.bag out',
@@ -55,6 +68,8 @@ if TYPE_CHECKING:
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
         'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
+        'sonar-imm track /survey/*.bag /survey/out '
+        '--shard $SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT',
     )
 )
 @click.argument('bags', metavar='BAG...', nargs=-1, type=BAG)
@@ -85,6 +100,13 @@ if TYPE_CHECKING:
     help='Do the runs on the cluster of this dask scheduler instead; its workers need the same '
     'sonar_imm, and reach BAG and OUT_DIR by the same paths.',
 )
+@click.option(
+    '--shard',
+    metavar='I/N',
+    callback=_shard,
+    help='Only the I-th share of N of the bags, in the order of their paths: every N-th from the '
+    'I-th, as one of N commands that know nothing of each other, such as a Slurm array.',
+)
 @click.option('--parquet', is_flag=True, help='Write the tables as Parquet too (needs pyarrow).')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
@@ -94,6 +116,7 @@ def command(
     out_dir: Path | None,
     jobs: int,
     scheduler: str | None,
+    shard: tuple[int, int] | None,
     parquet: bool,
     as_json: bool,
     **options: Any,
@@ -108,7 +131,7 @@ def command(
     tracked, each into a folder of OUT_DIR named after its namespace; --topic chooses one. Of
     several bags each gets a folder of its name. Then OUT_DIR also gets `summary.json`; a run that
     fails is named and does not stop the others, and the same command again makes only what is
-    missing.
+    missing. With --shard I/N the list is `summary-I-of-N.json`.
     """
     if out_dir is None:
         raise click.UsageError("Missing argument 'BAG...'")
@@ -120,8 +143,10 @@ def command(
         from ..offline.run_folder import require_parquet
 
         require_parquet()
+    from ..offline.run_folder import SHARD_SUMMARY, SUMMARY
+
     plan = Plan(parquet=parquet, **options)
-    if len(bags) == 1:
+    if len(bags) == 1 and shard is None:
         runs = plan.jobs(bags[0], out_dir, lambda sentence: say(sentence, quiet=as_json))
         say_parameters(bags[0], plan, quiet=as_json)
         if len(runs) == 1 and scheduler is None:
@@ -130,8 +155,9 @@ def command(
             return
         failures: list[Outcome] = []
     else:
-        runs, failures = _of_all(plan, bags, out_dir)
-    _track_all(runs, failures, out_dir, jobs, scheduler, as_json)
+        runs, failures = _of_all(plan, bags, out_dir, shard or (1, 1))
+    summary = SUMMARY if shard is None else SHARD_SUMMARY.format(*shard)
+    _track_all(runs, failures, out_dir, summary, jobs, scheduler, as_json)
 
 
 @frozen(kw_only=True)
@@ -205,20 +231,25 @@ def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
         say(f'using the parameters of the recording, {own}', quiet=quiet)
 
 
-def _of_all(plan: Plan, bags: Sequence[Path], out_dir: Path) -> tuple[list[Job], list[Outcome]]:
-    """The runs that `bags` take, in their order, and what cannot be a run."""
+def _of_all(
+    plan: Plan, bags: Sequence[Path], out_dir: Path, shard: tuple[int, int]
+) -> tuple[list[Job], list[Outcome]]:
+    """The runs that a share of `bags` takes, in the order of their paths, and what cannot be a
+    run."""
     from sonar_imm.parameters import ConfigError
 
     from ..offline.batch import Outcome
     from ..recordings.reader import BagError
 
+    bags = sorted(bags)
     folders = [out_dir / bag.name.removesuffix('.bag').removesuffix('.mcap') for bag in bags]
     for folder in folders:
         if folders.count(folder) > 1:
             raise click.UsageError(f'two bags would be tracked into {folder}')
     runs: list[Job] = []
     failures = []
-    for bag, folder in zip(bags, folders):
+    share, count = shard
+    for bag, folder in list(zip(bags, folders))[share - 1 :: count]:
         try:
             runs += plan.jobs(bag, folder)
         except (BagError, ConfigError) as error:
@@ -230,6 +261,7 @@ def _track_all(
     runs: Sequence[Job],
     failures: Sequence[Outcome],
     out_dir: Path,
+    summary: str,
     jobs: int,
     scheduler: str | None,
     as_json: bool,
@@ -257,9 +289,9 @@ def _track_all(
             outcomes.append(outcome)
             advance(1)
     content = summary_of(
-        out_dir, sorted(outcomes, key=lambda item: (str(item.bag), item.instrument))
+        out_dir, sorted(outcomes, key=lambda item: (str(item.bag), item.instrument)), summary
     )
-    write_summary(out_dir, content)
+    write_summary(out_dir, content, summary)
     print_json(content) if as_json else _print_summary(content, out_dir)
     if any(outcome.failure for outcome in outcomes):
         raise click.exceptions.Exit(1)

@@ -198,12 +198,12 @@ def _open_report(source: Path) -> None:
     import webbrowser
 
     from ..offline.batch import run_folders
-    from ..offline.run_folder import REPORT, RUN, SUMMARY
+    from ..offline.run_folder import REPORT, RUN, summaries
     from .evaluate import evaluate_run
     from .track import Plan, track_one
 
     run = source
-    if (source / RUN).is_file() or (source / SUMMARY).is_file():
+    if (source / RUN).is_file() or summaries(source):
         folders = run_folders(source)
     else:
         run = Path(tempfile.mkdtemp(prefix='sonar_imm_')) / 'run'

@@ -16,7 +16,7 @@
 
 A job is one tracker over the topics of one instrument in one recording; it writes one run folder.
 Jobs know nothing of one another: where they run and in which order they end changes no byte. The
-folder around them has ``summary.json``, by which the runs are found again.
+folder around them has ``summary.json``, or one for each shard, by which the runs are found again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.reader import BagError, BagReader
 from .jobs import as_they_end, cluster, processes, sentence_of
-from .run_folder import finite, PARQUET, RUN, run_record, RunFolder, SUMMARY
+from .run_folder import finite, PARQUET, RUN, run_record, RunFolder, summaries, SUMMARY
 from .tracking import InputOptions, OfflineRun, write_run
 
 TRACKED, KEPT, FAILED = 'tracked', 'kept', 'failed'
@@ -171,7 +171,7 @@ def run_jobs(
         with cluster(address, note) as client:
             for number, outcome, failure in as_they_end(client, run_job, [(job,) for job in jobs]):
                 yield _seen(outcome) if outcome else failed(jobs[number], failure)
-    elif min(count, len(jobs)) == 1:
+    elif min(count, len(jobs)) <= 1:
         yield from map(run_job, jobs)
     else:
         with processes(min(count, len(jobs))) as pool:
@@ -192,14 +192,14 @@ def _seen(outcome: Outcome) -> Outcome:
 # -- what is told of them ------------------------------------------------------------------------
 
 
-def summary_of(out: Path, outcomes: Iterable[Outcome]) -> dict[str, Any]:
-    """The content of summary.json: of each run where it is and what came of it. Earlier runs that
-    are in `out` still stay in it."""
+def summary_of(out: Path, outcomes: Iterable[Outcome], name: str = SUMMARY) -> dict[str, Any]:
+    """The content of summary.json, or of a shard's: of each run where it is and what came of it.
+    Earlier runs in it that are in `out` still stay in it."""
     fresh = [_entry(out, outcome) for outcome in outcomes]
     folders = {entry['folder'] for entry in fresh}
     kept = [
         entry
-        for entry in (_entries(out / SUMMARY) if (out / SUMMARY).is_file() else [])
+        for entry in (_entries(out / name) if (out / name).is_file() else [])
         if entry['folder'] not in folders and (out / entry['folder'] / RUN).is_file()
     ]
     return {'runs': kept + fresh}
@@ -225,22 +225,23 @@ def _entry(out: Path, outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def write_summary(out: Path, content: Mapping[str, Any]) -> None:
-    """Write summary.json."""
-    RunFolder(out).write_json(SUMMARY, dict(content))
+def write_summary(out: Path, content: Mapping[str, Any], name: str = SUMMARY) -> None:
+    """Write summary.json, or a shard's."""
+    RunFolder(out).write_json(name, dict(content))
 
 
 def run_folders(out: Path) -> list[Path]:
-    """The folders of the finished runs at `out`: itself, or those of its summary.
+    """The folders of the finished runs at `out`: itself, or those of its summaries.
 
     Raises `BagError` when there is no run.
     """
-    if (out / RUN).is_file() or not (out / SUMMARY).is_file():
+    lists = summaries(out)
+    if (out / RUN).is_file() or not lists:
         return [out]
-    found = [out / entry['folder'] for entry in _entries(out / SUMMARY)]
-    found = [folder for folder in found if (folder / RUN).is_file()]
+    named = dict.fromkeys(out / entry['folder'] for path in lists for entry in _entries(path))
+    found = [folder for folder in named if (folder / RUN).is_file()]
     if not found:
-        raise BagError(f'{out} holds no finished run: all that {SUMMARY} names failed')
+        raise BagError(f'{out} holds no finished run: all that {lists[0].name} names failed')
     return found
 
 

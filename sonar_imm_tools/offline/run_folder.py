@@ -70,7 +70,7 @@ BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
 )
 PARQUET = {CSV: 'estimate.parquet', SOUNDINGS: 'soundings.parquet'}
 """The same tables as Parquet."""
-SUMMARY = 'summary.json'
+SUMMARY, SHARD_SUMMARY = 'summary.json', 'summary-{}-of-{}.json'
 """In a folder of several runs, which are below it: where they are, see `batch`."""
 _RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
 """All that belongs to a run; without the first one there is no finished run."""
@@ -284,9 +284,10 @@ class RunFolder:
     def read_run(self) -> dict[str, Any]:
         """The content of run.json. Raises `BagError` when the folder holds no finished run."""
         path = self.path / RUN
-        if not path.is_file() and (self.path / SUMMARY).is_file():
+        if not path.is_file() and (lists := summaries(self.path)):
             raise BagError(
-                f'{self.path} holds several runs, which {SUMMARY} lists; name the folder of one'
+                f'{self.path} holds several runs, which {lists[0].name} lists; name the folder of '
+                'one'
             )
         if not path.is_file():
             raise BagError(
@@ -303,6 +304,12 @@ class RunFolder:
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
         return _read_estimates(self.path / BAG)
+
+
+def summaries(folder: Path) -> list[Path]:
+    """The lists of runs in a folder: of a command for all recordings, and of its shards."""
+    whole = [folder / SUMMARY] if (folder / SUMMARY).is_file() else []
+    return whole + sorted(folder.glob(SHARD_SUMMARY.format('*', '*')))
 
 
 def _check_run(run: Any) -> None:

@@ -278,6 +278,15 @@ class ScanSource:
         self._scan.close()
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a recording lies at `path`, by names alone."""
+    if not path.is_dir():
+        return path.suffix in SUFFIXES
+    return (path / 'metadata.yaml').is_file() or any(
+        file.suffix in SUFFIXES and file.is_file() for file in path.iterdir()
+    )
+
+
 def open_sources(path: Path) -> tuple[list[Source], list[str]]:
     """Open what lies at `path`: a bag directory, a storage file or a ROS 1 bag.
 

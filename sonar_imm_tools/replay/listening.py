@@ -62,10 +62,12 @@ class ReceivedTable:
 
 
 class TableListener:
-    """Hears `topics`, or, when there are none, every topic that ends in ``/estimate``."""
+    """Hears `topics`, or, when there are none, every topic that ends in ``/estimate``, or in
+    another `last` part."""
 
-    def __init__(self, link: Link, topics: tuple[str, ...] = ()):
+    def __init__(self, link: Link, topics: tuple[str, ...] = (), last: str = 'estimate'):
         self._link = link
+        self._last = last
         self._wanted = tuple(f'/{name.lstrip("/")}' for name in topics)
         self._received: deque[ReceivedTable] = deque()
         self._subscriptions: dict[str, object] = {}
@@ -96,7 +98,7 @@ class TableListener:
     def _look(self) -> None:
         """Subscribe to what is there now and was not."""
         for name, types in self._link.node.get_topic_names_and_types():
-            wanted = name in self._wanted if self._wanted else _is_estimate(name, types)
+            wanted = name in self._wanted if self._wanted else self._is_meant(name, types)
             if not wanted or name in self._subscriptions:
                 continue
             if TABLE not in types:
@@ -134,17 +136,16 @@ class TableListener:
             hint = ''.join(did_you_mean(name, names) for name in self._wanted[:1])
             return f'nobody publishes {missing} {waited}{hint}; is ROS_DOMAIN_ID the same?'
         return (
-            f'no topic that ends in /estimate was found {waited}; is a node running, and '
+            f'no topic that ends in /{self._last} was found {waited}; is a node running, and '
             'ROS_DOMAIN_ID the same?'
         )
 
     def _publishers(self, name: str) -> int:
         return int(self._link.node.count_publishers(name))
 
-
-def _is_estimate(name: str, types: list[str]) -> bool:
-    parts = name.split('/')
-    return parts[-1] == 'estimate' and 'truth' not in parts and TABLE in types
+    def _is_meant(self, name: str, types: list[str]) -> bool:
+        parts = name.split('/')
+        return parts[-1] == self._last and 'truth' not in parts and TABLE in types
 
 
 class Relay:

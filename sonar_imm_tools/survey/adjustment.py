@@ -21,7 +21,9 @@ with two lines or more say anything. The prior holds the totals, not the steps o
 alone knows the common level.
 
 Errors of attitude and heave last for seconds. As *error states*, roll and heave in blocks of ten
-seconds, they are unknowns of the estimate, in one sparse factorization. Beside it stands the
+seconds, they are unknowns of the estimate, in one sparse factorization. So is one number for the
+water: layers lie at a depth, so that the mean speed of sound over the column changes with the
+depth; along a line that goes with its gradients, and was taken for heading. Beside it stands the
 *consider* covariance of the estimate without states,
 
     C = N^-1 (J' M V M J + J' M U S U' M J + P) N^-1,
@@ -54,6 +56,9 @@ ROUNDS = 3
 BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
 DRIFT_SECONDS = 60.0
 """How long errors of heading and position last, which are considered only."""
+LAYERS_STD = 5.0
+"""By how much the mean speed of sound over the column changes where the depth doubles, m/s: layers
+lie at a depth, not at a share of it."""
 SECOND_ORDER = 0.04
 """Share of a correction of sound speed that its partial misses, where the water has layers."""
 MOST_UNKNOWNS = 20_000
@@ -282,6 +287,7 @@ class _Equations:
         sound_speed: float,
     ):
         self.looks, self.g, self.unknowns, self.budget = looks, g, unknowns, budget
+        self.sound_speed = sound_speed
         self.a = partials(looks.basis, g, sound_speed)
         self.J = self._jacobian()
         rows = np.arange(len(looks))
@@ -328,14 +334,19 @@ class _Equations:
         return N.tocsc(), np.asarray(rhs)
 
     def states(self, seconds: float) -> tuple[csr_array, FloatArray]:
-        """Columns (m, S) of roll and heave in blocks of each line, and the prior information."""
-        block, count = self._blocks(seconds)
-        rows = np.arange(len(block))
-        shape = len(block), count
-        roll = csr_array((self.a[:, 0], (rows, block)), shape=shape)
-        heave = csr_array((np.ones(len(block)), (rows, block)), shape=shape)
-        prior = np.repeat([self.budget.attitude, self.budget.heave], count)
-        return hstack([roll, heave]).tocsr(), 1.0 / np.square(np.maximum(prior, 1e-9))
+        """Columns (m, S) of the speed of sound by depth, and of roll and heave in blocks of each
+        line (0: without), and the prior information."""
+        depth = 2.0 * self.looks.basis[:, 8] - self.sound_speed * self.looks.basis[:, 1]
+        deeper = depth / np.median(depth) - 1.0
+        columns = [csr_array((self.a[:, 4] * deeper)[:, None])]
+        count = 0
+        if seconds:
+            block, count = self._blocks(seconds)
+            rows = np.arange(len(block))
+            for partial in (self.a[:, 0], self.a[:, 3]):
+                columns.append(csr_array((partial, (rows, block)), shape=(len(block), count)))
+        deviations = [LAYERS_STD, *[self.budget.attitude] * count, *[self.budget.heave] * count]
+        return hstack(columns).tocsr(), 1.0 / np.square(np.maximum(deviations, 1e-9))
 
     def _blocks(self, seconds: float) -> tuple[IntArray, int]:
         key = self.looks.line * (1 << 40) + np.floor(self.looks.time / seconds).astype(np.int64)
@@ -354,10 +365,9 @@ class _Equations:
     def _system(self, states: bool) -> tuple[csr_array, FloatArray]:
         """Columns of all unknowns, states last, and their prior information."""
         prior = 1.0 / np.square(self.unknowns.prior_std)
-        seconds = self._affordable() if states else 0.0
-        if not seconds:
+        if not states:
             return self.J, prior
-        columns, information = self.states(seconds)
+        columns, information = self.states(self._affordable())
         return hstack([self.J, columns]).tocsr(), np.concatenate([prior, information])
 
     def solve(self, states: bool) -> FloatArray:

@@ -39,6 +39,9 @@ from .looks import gradients, looks_of, MAD, medians, runs_of
 
 REACH = 0.75
 """Cells from a node to the furthest sounding that it uses."""
+FEW, FAR = 5, 1.5
+"""A node with fewer soundings than this in reach, one or more, uses those within so many cells:
+an outlier that is alone has no other depth beside it."""
 HALO = 6
 """Cells around a tile whose soundings its nodes need."""
 LEAST_GAP = 0.25
@@ -178,18 +181,36 @@ def _pairs(
     x0, y0, columns, rows = box
     index = np.floor(xy / cell).astype(np.int64)
     inside = xy / cell - index - 0.5
-    which, keys, places = [], [], []
-    for shift_x in (-1, 0, 1):
-        for shift_y in (-1, 0, 1):
-            d = inside - np.array([shift_x, shift_y], np.float64)
-            column, row = index[:, 0] + shift_x - x0, index[:, 1] + shift_y - y0
-            near = (np.square(d).sum(axis=1) <= REACH**2) & (column >= 0) & (column < columns)
-            near &= (row >= 0) & (row < rows)
-            picked = np.flatnonzero(near)
-            which.append(picked)
-            keys.append(column[picked] * rows + row[picked])
-            places.append(d[picked] * cell)
-    return np.concatenate(which), np.concatenate(keys), np.concatenate(places)
+    column, row = index[:, 0] - x0, index[:, 1] - y0
+
+    def ring(
+        wide: int, least: float, most: float, wanted: BoolArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Pairs between so many cells, of the nodes that are wanted (columns * rows,)."""
+        which, keys, places = [], [], []
+        for shift_x in range(-wide, wide + 1):
+            for shift_y in range(-wide, wide + 1):
+                d = inside - np.array([shift_x, shift_y], np.float64)
+                squared = np.square(d).sum(axis=1)
+                i, j = column + shift_x, row + shift_y
+                near = (squared > least) & (squared <= most)
+                near &= (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+                picked = np.flatnonzero(near)
+                key = i[picked] * rows + j[picked]
+                picked, key = picked[wanted[key]], key[wanted[key]]
+                which.append(picked)
+                keys.append(key)
+                places.append(d[picked] * cell)
+        return np.concatenate(which), np.concatenate(keys), np.concatenate(places)
+
+    first = ring(1, -1.0, REACH**2, np.ones(columns * rows, bool))
+    count = np.bincount(first[1], minlength=columns * rows)
+    few = (count > 0) & (count < FEW)
+    if not few.any():
+        return first
+    second = ring(2, REACH**2, FAR**2, few)
+    which, keys, places = (np.concatenate(pair) for pair in zip(first, second))
+    return which, keys, places
 
 
 def _hypotheses(

@@ -63,7 +63,7 @@ class Options:
 
 @frozen(kw_only=True)
 class Source:
-    """The table of a line. name: as the products say; folder: where it is."""
+    """The table of a line, or its recording. name: as the products say; folder: where it is."""
 
     name: str
     folder: Path
@@ -110,7 +110,7 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     """Read a line and keep its soundings at `place` (a path without ending), in pieces of half an
     hour; gives what survey.json says of it. Nothing is read again when size and time, or the
     content, are those of before. Raises `BagError`."""
-    stat = source.table.stat()
+    size, mtime_ns = _stat(source.table)
     budget, sound_speed = budget_of(source.run)
     wanted = {
         'version': __version__,
@@ -118,7 +118,7 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
         'budget': [*asdict(budget).values(), sound_speed],
     }
     known = kept(place.with_suffix('.json'))
-    info: dict[str, Any] = {'size': stat.st_size, 'mtime_ns': stat.st_mtime_ns}
+    info: dict[str, Any] = {'size': size, 'mtime_ns': mtime_ns}
     if known is not None and known['wanted'] == wanted and known['info']['size'] == info['size']:
         if known['info']['mtime_ns'] == info['mtime_ns']:
             return dict(known['info'])
@@ -256,6 +256,13 @@ def _line(table: np.ndarray, sound_speed: float) -> Line:
 
 def _store(path: Path, line: Line) -> None:
     _save(path, {'table': _table(line), 'sound_speed': line.sound_speed})
+
+
+def _stat(path: Path) -> tuple[int, int]:
+    """Size and time of a file, or of all files of a bag."""
+    files = [path] if path.is_file() else [item for item in path.rglob('*') if item.is_file()]
+    stats = [file.stat() for file in files]
+    return sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
 
 
 def _save(path: Path, arrays: Mapping[str, Any]) -> None:

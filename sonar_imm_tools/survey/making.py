@@ -37,7 +37,9 @@ from sonar_imm.estimation.arrays import FloatArray
 
 from ..offline.jobs import Run
 from ..offline.run_folder import PARQUET, RUN, SOUNDINGS
-from ..recordings.sources import BagError
+from ..recordings.export.points import TOPIC, topics_of_soundings
+from ..recordings.reader import BagReader
+from ..recordings.sources import BagError, is_recording
 from .adjustment import adjust, Adjustment, crossing, misties, robust_rms
 from .chart import MOST_CELLS
 from .grid import HALO, Nodes
@@ -71,23 +73,46 @@ STATISTICS_CELL = 2.0
 
 
 def sources_of(runs: Path) -> list[Source]:
-    """The lines below a folder, sorted by name. Raises `BagError` for none, or when they state
-    different coordinate systems."""
+    """The lines below a folder, sorted by name: folders with a table of soundings, and recordings
+    of `~/soundings` that are not of such a folder. Raises `BagError` for none."""
     if not runs.is_dir():
         raise BagError(f'{runs} is no folder')
     found: dict[Path, Path] = {}
     for name in (SOUNDINGS, PARQUET[SOUNDINGS]):  # the later one is read
         found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
+    for place in _recordings(runs):
+        if place not in found and place.parent not in found and _has_soundings(place):
+            found[place] = place
     if not found:
-        raise BagError(f'{runs} holds no line: there is no {SOUNDINGS} or {PARQUET[SOUNDINGS]}')
-    last = [folder.name for folder in found]
+        raise BagError(
+            f'{runs} holds no line: there is no {SOUNDINGS} or {PARQUET[SOUNDINGS]}, and no '
+            f'recording with a topic {TOPIC}; sonar-imm track makes them'
+        )
+    names = [folder.stem if folder.is_file() else folder.name for folder in found]
     sources = []
-    for folder, table in found.items():
+    for last, (folder, table) in zip(names, found.items()):
         below = folder.relative_to(runs).as_posix()
-        unique = last.count(folder.name) == 1 and below != '.'
-        name = folder.name if unique else runs.resolve().name if below == '.' else below
+        unique = names.count(last) == 1 and below != '.'
+        name = last if unique else runs.resolve().name if below == '.' else below
         sources.append(Source(name=name, folder=folder, table=table, run=_run_of(folder)))
     return sorted(sources, key=lambda source: source.name)
+
+
+def _recordings(runs: Path) -> list[Path]:
+    """Bags below a folder, and files of bags that lie alone."""
+    bags = {path.parent for path in runs.rglob('metadata.yaml')}
+    files = (path for path in runs.rglob('*') if is_recording(path) and path.is_file())
+    alone = {path for path in files if path.parent not in bags}
+    return sorted(path for path in bags | alone if WORK not in path.parts)
+
+
+def _has_soundings(recording: Path) -> bool:
+    """Whether a recording is a line; one that cannot be opened may be."""
+    try:
+        with BagReader(recording) as reader:
+            return bool(topics_of_soundings(reader))
+    except BagError:
+        return True
 
 
 def _run_of(folder: Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ import numpy as np
 from sonar_imm import __version__
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.files import whole
+from sonar_imm.parameters import ConfigError
 
 from ..offline.run_folder import REPORT
 from ..recordings.sources import BagError
@@ -86,7 +87,7 @@ def folder_of(
     write_json(file, wanted)
     try:
         yield
-    except BagError:
+    except (BagError, ConfigError):
         if not (there and resume):
             _remove(out)
             with contextlib.suppress(OSError):

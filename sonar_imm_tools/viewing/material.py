@@ -35,7 +35,7 @@ from msg_adapters.displays import displays_of
 from msg_adapters.estimates import read_estimate
 
 from ..offline.batch import run_folders
-from ..offline.run_folder import BAG, RUN, RunFolder, SUMMARY
+from ..offline.run_folder import BAG, RUN, RunFolder, summaries
 from ..recordings.messages import cdr_of, message_definition, ros_message
 from ..recordings.reader import BagError, BagReader
 
@@ -190,7 +190,7 @@ class Material:
 
 def _runs(source: Path) -> list[Path]:
     """The folders of the runs at `source`, none when it is a recording."""
-    if (source / RUN).is_file() or (source / SUMMARY).is_file():
+    if (source / RUN).is_file() or summaries(source):
         return run_folders(source)
     return []
 

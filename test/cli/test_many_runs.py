@@ -222,3 +222,75 @@ def test_the_tracker_with_the_best_evidence_is_chosen():
     ):
         with BagReader(ROOT / 'bags' / name) as reader:
             assert fitting_systems(reader)[0] == system
+
+
+def test_shards_share_the_bags_out(tmp_path, capsys):
+    """As a Slurm array does: each command has the same bags, in any order, and makes its share."""
+    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abcde')]
+    out = tmp_path / 'out'
+    assert track(*bags[::-1], out, '--shard', '1/2') == 0
+    assert sorted(path.name for path in out.iterdir()) == ['a', 'c', 'e', 'summary-1-of-2.json']
+    assert track(*bags, out, '--shard', '2/2', '--jobs', '2') == 0
+    assert not (out / 'summary.json').exists()
+    runs = json.loads((out / 'summary-2-of-2.json').read_text())['runs']
+    assert [run['folder'] for run in runs] == ['b', 'd']
+    assert track(*bags, tmp_path / 'whole') == 0
+    assert {name: text for name, text in contents(out).items() if 'summary' not in name} == (
+        contents(tmp_path / 'whole')
+    )
+    # Downstream all shards are one; a share again makes what is missing; one may be empty.
+    capsys.readouterr()
+    assert main(['evaluate', str(out), '--json', '--no-report']) == 0
+    assert sorted(json.loads(capsys.readouterr().out)) == list('abcde')
+    assert main(['export', str(out), str(tmp_path / 'x.csv')]) == 2
+    assert 'several runs, which summary-1-of-2.json lists' in capsys.readouterr().err
+    (out / 'c' / 'run.json').unlink()
+    assert track(*bags, out, '--shard', '1/2') == 0
+    assert '1 tracked, 2 kept' in capsys.readouterr().out
+    assert track(bags[0], tmp_path / 'few', '--shard', '2/3') == 0
+    assert '0 runs in' in capsys.readouterr().out
+    assert track(bags[0], tmp_path / 'few', '--shard', '1/3') == 0
+    assert (tmp_path / 'few' / 'a' / 'run.json').is_file()
+
+
+@pytest.mark.parametrize('shard', ['0/2', '3/2', '1', '1/', '-1/2', '1/2/3', 'a/b'])
+def test_a_share_that_cannot_be(tmp_path, capsys, shard):
+    assert track('a', 'b', tmp_path / 'out', '--shard', shard) == 2
+    error = capsys.readouterr().err
+    assert 'not of the form I/N' in error and 'Traceback' not in error
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
+    tables = tmp_path / 'tables'
+    tables.mkdir()
+    for k, name in enumerate(('a', 'b', 'c')):
+        rows = [f'{10 + t},{k + t},{2 * t}' for t in range(4)]
+        (tables / f'{name}.csv').write_text('stamp,x,y\n' + '\n'.join(rows) + '\n')
+    made = {}
+    for jobs in ('1', '2'):
+        out = tmp_path / jobs
+        capsys.readouterr()
+        assert main(['convert', 'fixes', str(tables), str(out), '--jobs', jobs]) == 0
+        assert '3 bags in' in capsys.readouterr().out
+        made[jobs] = contents(out)
+    assert made['1'] == made['2'] and {Path(name).parts[0] for name in made['1']} == set('abc')
+    # The same as one by one; one that fails is named and stops no other.
+    assert main(['convert', 'fixes', str(tables / 'b.csv'), str(tmp_path / 'b')]) == 0
+    alone = {f'b/{name}': content for name, content in contents(tmp_path / 'b').items()}
+    assert alone.items() <= made['1'].items()
+    (tables / 'broken.csv').write_text('what\n1\n')
+    capsys.readouterr()
+    assert main(['convert', 'fixes', str(tables), str(tmp_path / 'o'), '--json']) == 1
+    found = capsys.readouterr()
+    assert found.err.startswith(str(tables / 'broken.csv')) and 'Traceback' not in found.err
+    entries = json.loads(found.out)['bags']
+    assert [Path(entry['source']).name for entry in entries if entry['failure']] == ['broken.csv']
+    assert [entry['rows'] for entry in entries if not entry['failure']] == [4, 4, 4]
+    (tables / 'a.txt').write_text('')
+    assert main(['convert', 'fixes', str(tables), str(tmp_path / 'p')]) == 2
+    assert 'two recordings would be converted into' in capsys.readouterr().err
+    (tmp_path / 'none').mkdir()
+    assert main(['convert', 'fixes', str(tmp_path / 'none'), str(tmp_path / 'q')]) == 2
+    assert 'nothing to convert' in capsys.readouterr().err
+    assert not (tmp_path / 'p').exists() and not (tmp_path / 'q').exists()

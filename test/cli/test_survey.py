@@ -24,8 +24,11 @@ from helpers.clusters import small_cluster
 import numpy as np
 import pytest
 
+from msg_adapters.soundings import write_soundings
+from sonar_imm.soundings import COLUMNS, Soundings
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.export.points import read_points
+from sonar_imm_tools.recordings.export.points import read_points, write_table
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import jobs, making
 from sonar_imm_tools.survey.looks import joined
 from sonar_imm_tools.survey.making import plan_tiles
@@ -142,6 +145,39 @@ def test_the_other_files_say_what_they_should(lines, made):
     assert 'local' in coverage['name'] and coverage['features']
 
 
+def test_other_programs_read_the_products(lines, made, tmp_path):
+    """What QGIS reads them with: GDAL for rasters and for vectors, Arrow for the table."""
+    import pyarrow.parquet
+
+    pyogrio = pytest.importorskip('pyogrio')
+    place = ('--crs', 32632, '--origin', '500000,6000000')
+    assert run('survey', lines, tmp_path / 'out', '--resolution', 2, *place) == 0
+    for out, number in ((made, None), (tmp_path / 'out', 32632)):
+        with rasterio.open(out / 'survey.tif') as file:
+            assert file.tags(ns='IMAGE_STRUCTURE')['LAYOUT'] == 'COG'
+            assert set(file.dtypes) == {'float32'} and file.count == 11
+            assert file.descriptions[:2] == ('depth', 'uncertainty')
+            assert (file.crs.to_epsg() if file.crs else None) == number
+            depth, box = file.read(1, masked=True), file.bounds
+        layers = pyogrio.list_layers(out / 'coverage.geojson')
+        assert layers[0][1] == 'Polygon'
+        info = pyogrio.read_info(out / 'coverage.geojson')
+        assert info['features'] >= 1 and '4326' in info['crs']
+        west, south, east, north = info['total_bounds']
+        if number:
+            (west, east), (south, north) = rasterio.warp.transform(
+                'EPSG:4326', f'EPSG:{number}', [west, east], [south, north]
+            )
+        table = pyarrow.parquet.read_table(out / 'provenance.parquet')
+        x, y = table['x'].to_numpy(), table['y'].to_numpy()
+        half = 0.5 * table['cell'].to_numpy().max()
+        # All three lie at one place, and the depths are those of the floor.
+        for values, low, high in ((x, west, east), (y, south, north)):
+            assert low - 2.0 < values.min() - half and values.max() + half < high + 2.0
+        assert box.left - 2.0 < west and east < box.right + 2.0
+        assert 10.0 < depth.min() and depth.max() < 30.0
+
+
 def test_the_page_shows_chart_misties_and_what_is_not_known(made):
     page = (made / 'report.html').read_text(encoding='utf-8')
     for words in ('<h2>Depth', '<h2>Uncertainty', '<h2>Competing depths', '<h2>Misties'):
@@ -151,9 +187,10 @@ def test_the_page_shows_chart_misties_and_what_is_not_known(made):
     assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
 
 
-def test_the_same_bytes_with_two_processes(lines, made, tmp_path):
-    assert run('survey', lines, tmp_path / 'two', '--adjust', '--jobs', 2) == 0
-    assert products(tmp_path / 'two') == products(made)
+@pytest.mark.parametrize('count', [2, 8])
+def test_the_same_bytes_with_many_processes(lines, made, tmp_path, count):
+    assert run('survey', lines, tmp_path / 'out', '--adjust', '--jobs', count) == 0
+    assert products(tmp_path / 'out') == products(made)
 
 
 def test_the_same_bytes_on_a_cluster(lines, made, tmp_path):
@@ -237,6 +274,19 @@ def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
     assert np.nanmin(bands['uncertainty']) > adjustment['crossings']['rms_before']
 
 
+def test_groups_that_do_not_overlap_are_adjusted_with_a_warning(lines, tmp_path, capsys):
+    for k, (source, east) in enumerate([(0, 0.0), (1, 0.0), (0, 5000.0), (1, 5000.0)]):
+        points = read_points(lines / f'line_{source:03d}' / 'soundings.csv')
+        folder = tmp_path / 'runs' / f'line_{k}'
+        folder.mkdir(parents=True)
+        write_table(folder / 'soundings.csv', points.moved((east, 0.0, 0.0)))
+    out = tmp_path / 'out'
+    assert run('survey', tmp_path / 'runs', out, '--adjust', '--resolution', 4) == 0
+    (sentence,) = json.loads((out / 'survey.json').read_text())['warnings']
+    assert sentence in capsys.readouterr().err
+    assert '2 groups that do not overlap' in sentence and 'priors alone' in sentence
+
+
 def test_parquet_and_a_coordinate_system(lines, tmp_path):
     import pyarrow
     import pyarrow.csv
@@ -257,6 +307,43 @@ def test_parquet_and_a_coordinate_system(lines, tmp_path):
     assert run('survey', tmp_path / 'runs', tmp_path / 'b', '--crs', 32633) == 2
 
 
+def test_recordings_of_soundings_are_lines_too(lines, made, tmp_path, capsys):
+    """As a node publishes them, or as the bag `estimate` of a run has them."""
+    runs = tmp_path / 'runs'
+    shutil.copytree(lines / 'line_000', runs / 'line_000')
+    record(lines / 'line_000', runs / 'line_000' / 'estimate')  # the same line, not another
+    record(lines / 'line_001', runs / 'day' / 'line_001')
+    record(lines / 'line_002', tmp_path / 'line_002')
+    (file,) = (tmp_path / 'line_002').glob('*.mcap')
+    shutil.copy(file, runs / 'line_002.mcap')
+    record(lines / 'line_003', runs / 'line_003')
+    with BagWriter(runs / 'other') as bag:  # not a line, and no mistake
+        bag.write('/x', ros_message('std_msgs/msg/Float64', data=1.0), 1)
+    assert run('survey', runs, tmp_path / 'out', '--adjust') == 0
+    survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
+    assert [line['name'] for line in survey['lines']] == [f'line_{k:03d}' for k in range(4)]
+    bands, whole = read(tmp_path / 'out' / 'survey.tif')[0], read(made / 'survey.tif')[0]
+    assert np.nanmax(np.abs(bands['depth'] - whole['depth'])) < 1e-3
+    # Two sonars in a recording are two lines, which nobody has told apart.
+    shutil.rmtree(runs / 'line_003')
+    record(lines / 'line_003', runs / 'line_003', '/a/soundings', '/b/soundings')
+    capsys.readouterr()
+    assert run('survey', runs, tmp_path / 'again') == 1
+    assert 'has the topics /a/soundings and /b/soundings' in capsys.readouterr().err
+
+
+def record(line, bag, *topics):
+    points = read_points(line / 'soundings.csv')
+    with BagWriter(bag) as writer:
+        for stamp in np.unique(points.stamp_ns).tolist():
+            rows = points.stamp_ns == stamp
+            columns = {**points.columns, **{f'p{name}': points[name] for name in 'xyz'}}
+            ping = {name: columns[name][rows].astype(kind) for name, kind in COLUMNS.items()}
+            message = write_soundings(Soundings(stamp, 'map', ping), ros_message)
+            for topic in topics or ('/bathymetry/soundings',):
+                writer.write(topic, message, stamp)
+
+
 @pytest.mark.parametrize(
     'change, options, words',
     [
@@ -264,6 +351,8 @@ def test_parquet_and_a_coordinate_system(lines, tmp_path):
         ('missing', (), 'is no folder'),
         ('crs', (), 'line_000 is in EPSG 32632 and line_001 in EPSG 32633'),
         ('apart', ('--adjust',), 'no two lines overlap'),
+        ('broken', (), 'no line can be read; the first: '),
+        ('', ('--scheduler', 'nonsense'), 'no dask scheduler at nonsense'),
         ('', ('--resolution', '0.001'), 'too large'),
         ('', ('--fix', 'other'), 'no line other'),
         ('', ('--crs', '1'), 'EPSG number 1'),
@@ -284,6 +373,9 @@ def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
             if change == 'crs':
                 run_json = json.dumps({'epsg': 32632 + k})
                 (runs / f'line_{k:03d}' / 'run.json').write_text(run_json)
+    if change == 'broken':
+        for k in (0, 1):
+            (runs / f'line_{k:03d}' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
     if change == 'apart':
         shutil.rmtree(runs / 'line_001')
     assert run('survey', runs, out, *options) in (1, 2)

@@ -37,6 +37,7 @@ def small(seed=1, lines=3, cells=60):
         D, Y = rng.uniform(10.0, 14.0, cells), rng.uniform(3.0, 30.0, cells)
         basis = np.zeros((cells, BASIS))
         basis[:, 0], basis[:, 1] = side * Y, (Y * Y / D - D) / 1500.0
+        basis[:, 8] = 0.5 * Y * Y / D
         z = -12.0 + basis[:, 0] * 0.01 + 0.2 * k + basis[:, 1] * 2.0 + rng.normal(0, 0.03, cells)
         n = np.zeros(cells, np.int64)
         looks = Looks(
@@ -77,7 +78,10 @@ def dense(made, priors):
     blocks = np.array(
         [(k, t) == (a, b) for k, t in zip(looks.line, times) for a, b in zip(looks.line, times)]
     ).reshape(m, m)
+    depth = 2.0 * looks.basis[:, 8] - 1500.0 * looks.basis[:, 1]
+    layers = looks.basis[:, 1] * (depth / np.median(depth) - 1.0)
     U = {'roll': np.outer(J[:, 0], J[:, 0]) * blocks, 'heave': 1.0 * blocks}
+    U['layers'] = np.outer(layers, layers)
     return J, looks.z, v, U, G, prior
 
 
@@ -109,6 +113,7 @@ def test_states_are_generalized_least_squares(plain):
     made, priors = small(), Priors()
     J, z, v, U, G, prior = dense(made, priors)
     V = v * np.eye(len(z)) + BUDGET.attitude**2 * U['roll'] + BUDGET.heave**2 * U['heave']
+    V += module.LAYERS_STD**2 * U['layers']
     A = np.hstack([J, -G])  # z + J beta = h
     W = np.linalg.inv(V)
     N = A.T @ W @ A
@@ -135,6 +140,23 @@ def test_the_consider_covariance_is_that_of_the_plain_estimate(plain):
         (inverse @ (-A.T @ z / v))[: len(prior)], rel=1e-6, abs=1e-9
     )
     assert found.covariance == pytest.approx(C, rel=1e-6, abs=1e-12)
+
+
+def test_layers_at_a_depth_are_not_taken_for_the_speed_of_all():
+    """Where the mean speed grows with the depth, that at the median depth is found."""
+    made = small(lines=4, cells=400)
+    depth = np.where(np.arange(400) % 10 < 6, 10.0, 18.0)
+    for looks in made:
+        side = looks.basis[:, 0]
+        looks.z[:] -= 2.0 * looks.basis[:, 1]
+        looks.basis[:, 1] = (side**2 / depth - depth) / 1500.0
+        looks.basis[:, 8] = 0.5 * side**2 / depth
+        looks.z[:] += looks.basis[:, 1] * (2.0 + 10.0 * (depth / 10.0 - 1.0))
+    plain = adjust(corrected(made), 4, BUDGET, states=False)
+    found = adjust(corrected(made), 4, BUDGET)
+    speeds = found.kind == 4
+    assert np.abs(plain.value[speeds].mean() + 2.0) > 0.6
+    assert np.abs(found.value[speeds].mean() + 2.0) < 0.3
 
 
 def test_the_level_is_that_of_the_priors():

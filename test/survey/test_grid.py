@@ -84,6 +84,18 @@ def test_lines_vote_and_soundings_do_not():
     assert made.seen_residual == pytest.approx([0.0] * 4, abs=1e-9)
 
 
+def test_an_outlier_that_is_alone_in_its_cell_competes_with_what_lies_around():
+    """And stays visible; a cell that nobody saw stays empty, a cell that many saw is as before."""
+    around = [(-0.5, 0.5), (1.5, 0.5), (0.5, 1.5), (0.5, -0.5)]
+    x, y = np.array([(0.5, 0.5), *around]).T
+    made = node([line(x, y, [-6.0, -10.0, -10.0, -10.0, -10.0])])
+    assert made.z == pytest.approx([-10.0]) and made.count.tolist() == [4]
+    assert made.competing_z == pytest.approx([-6.0]) and made.competing_count.tolist() == [1.0]
+    assert len(node([line(x[1:], y[1:], [-10.0] * 4)]).z) == 0
+    many = line([0.5] * 5 + [1.5], [0.5] * 6, [-10.0] * 5 + [-10.2])
+    assert node([many]).count.tolist() == [5]
+
+
 def test_a_floor_that_slopes_is_carried_to_the_node():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(-2.0, 3.0, (2, 400))

@@ -15,6 +15,8 @@
 """A process that is killed leaves nothing that looks whole."""
 
 import math
+import os
+from pathlib import Path
 import random
 import signal
 import subprocess
@@ -106,3 +108,42 @@ def test_a_bag_that_is_being_written_is_not_there(tmp_path):
         with BagReader(out) as bag:
             assert not bag.problems
     assert all(path.name.startswith('scene') for path in tmp_path.iterdir())
+
+
+def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
+    """While lines are read, while statistics are made, and while tiles are."""
+    pytest.importorskip('rasterio')
+    pytest.importorskip('pyarrow')
+    lines = tmp_path / 'lines'
+    small = [f'--set={name}' for name in ('lines=3', 'length=60', 'ghost=false', 'spacing=20')]
+    simulate = command('simulate', 'survey', lines, '--soundings', *small)
+    subprocess.run(simulate, cwd=ROOT, check=True)
+    first = None
+    for work in (None, 'lines/*.npz', 'looks/*.npz', 'tiles/*.npz'):
+        out = tmp_path / f'out{len(list(tmp_path.iterdir()))}'
+        arguments = command('survey', lines, out, '--adjust', '--jobs', 2)
+        with subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, text=True) as it:
+            while work and it.poll() is None and not list((out / '.work').glob(work)):
+                time.sleep(0.002)
+            workers = _workers(it.pid) if work else []
+            for worker in workers[:1]:
+                os.kill(worker, signal.SIGKILL)
+            error = it.communicate()[1]
+        assert it.returncode == 0, error
+        assert 'Traceback' not in error and (not work or len(workers) == 2)
+        found = {
+            path.relative_to(out): path.read_bytes()
+            for path in sorted(out.rglob('*'))
+            if path.is_file() and '.work' not in path.parts and path.name != 'survey.json'
+        }
+        first = first or found
+        assert found == first and Path('survey.tif') in found
+
+
+def _workers(command_id):
+    """The processes that share the work of the command."""
+    task = Path(f'/proc/{command_id}/task/{command_id}/children')
+    children = [int(word) for word in task.read_text().split()]
+    return [
+        child for child in children if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()
+    ]

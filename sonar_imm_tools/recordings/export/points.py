@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Soundings as points: the table of a run, plain XYZ, LAS and LAZ.
+"""Soundings as points: the table of a run or its recording, plain XYZ, LAS and LAZ.
 
 LAS keeps whole numbers times a scale: a millimetre here, from an offset at the first sounding, so
 that 32 bits reach 2000 km. What LAS has no field for becomes an extra dimension of the same name.
@@ -26,12 +26,17 @@ from pathlib import Path
 from attrs import frozen
 import numpy as np
 
+from msg_adapters.soundings import read_soundings
 from sonar_imm.estimates import PLACES
 from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import COLUMNS
 
-from ..sources import BagError
+from ..reader import BagReader
+from ..sources import BagError, is_recording
 
+TOPIC = 'soundings'
+"""Name of the topic of soundings in a recording, behind its namespace."""
 SCALE = 0.001
 """Metres of one count in a LAS file."""
 _LAS_EXTRAS = (
@@ -64,8 +69,10 @@ class Points:
 
 
 def read_points(path: Path) -> Points:
-    """The soundings of a soundings.csv or soundings.parquet, which needs pyarrow. Raises
-    `BagError` for a file that is none."""
+    """The soundings of a soundings.csv or soundings.parquet, which needs pyarrow, or of a
+    recording of `~/soundings`. Raises `BagError` for what is none."""
+    if is_recording(path):
+        return _read_recording(path)
     wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
     if path.suffix == '.parquet':
         return _read_parquet(path, wanted)
@@ -107,6 +114,38 @@ def _read_parquet(path: Path, wanted: list[str]) -> Points:
         if name in table.column_names
     }
     return _exact(table['stamp_ns'].to_numpy().astype(np.int64), columns)
+
+
+def topics_of_soundings(reader: BagReader) -> list[str]:
+    """The topics of an open recording that hold soundings, by name and type."""
+    return [
+        topic.name
+        for topic in reader.topics
+        if topic.name.rpartition('/')[2] == TOPIC and topic.type_name.endswith('/PointCloud2')
+    ]
+
+
+def _read_recording(path: Path) -> Points:
+    with BagReader(path) as reader:
+        topics = topics_of_soundings(reader)
+        if len(topics) != 1:
+            named = f'the topics {" and ".join(topics)}' if topics else f'no topic {TOPIC}'
+            raise BagError(f'{path} has {named}; a line is one')
+        try:
+            pings = [read_soundings(item.message) for item in reader.messages(topics)]
+        except Rejection as rejection:
+            raise BagError(f'{path}, topic {topics[0]}: {rejection}') from None
+        recorded = sum(topic.count for topic in reader.topics if topic.name in topics)
+        if len(pings) < recorded:
+            raise BagError(f'{path}: only {len(pings)} of {recorded} messages can be read')
+    if not pings:
+        raise BagError(f'{path} has no soundings')
+    stamps = np.repeat([ping.stamp_ns for ping in pings], [len(ping) for ping in pings])
+    columns = {
+        name: np.concatenate([ping.columns[name] for ping in pings]).astype(np.float64)
+        for name in COLUMNS
+    }
+    return _exact(stamps.astype(np.int64), columns)
 
 
 def _exact(stamps: IntArray, columns: dict[str, FloatArray]) -> Points:
