@@ -133,8 +133,9 @@ def main(
                         tracked(traces, truth, particles=particles, slope_std=0.0)
                     )
                     known = np.ones(truth.shape, int)
-                    bound = {'right': known[:, 0], 'found': kalman(traces, truth, gap)}
-                    ways['Kalman'].append({**bound, 'ids': known, 'named': 8, 'dipping': np.nan})
+                    bound: dict[str, Any] = {'found': kalman(traces, truth, gap), 'ids': known}
+                    bound |= {'right': known[:, 0], 'named': len(LAYERS)}
+                    ways['Kalman'].append({**bound, 'dipping': float(dip > 0.0)})
                 for name, made in ways.items():
                     yield {'table': {f'{kind} {dip:g} m, gap {gap}, {name}': summary(made)}}
 

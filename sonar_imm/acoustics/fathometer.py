@@ -221,7 +221,7 @@ def surface_share(
 
 
 def sampled_share(csdm: ComplexArray, loading: float, snapshots: float) -> FloatArray:
-    """What MVDR powers of so many snapshots are, on average, of those of the exact cross-spectra
+    """What MVDR powers of so many snapshots are about, of those of the exact cross-spectra
     (F,): ``1 - (d - 1) / snapshots``, d = sum l / (l + loading tr R / M) over the eigenvalues l of
     R, how many directions are fitted. From every 16th row."""
     rows = np.arange(0, len(csdm), 16)

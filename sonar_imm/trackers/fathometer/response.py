@@ -476,19 +476,23 @@ def _comb(frequency: FloatArray) -> tuple[NDArray[np.int64], float]:
     return index, spacing
 
 
-def envelope_parameters(pulse_width: float, noise_sigma: float) -> dict[str, Any]:
+def envelope_parameters(
+    pulse_width: float, noise_sigma: float, window: float = np.inf
+) -> dict[str, Any]:
     """Parameters of the tracker by name, for a pulse of standard deviation `pulse_width`, m, and
-    noise of `noise_sigma`, in the units of the record."""
+    noise of `noise_sigma`, in the units of the record, 0 where each record states it; window: of
+    the depths, m."""
+    # Two pulses nearer than that make one hump.
+    separation = 3.0 * pulse_width
     return {
         'pulse': 'gaussian',
         'pulse_width': pulse_width,
         'noise_sigma': noise_sigma,
         'scatter_decay': DECAYS,
-        # Two pulses nearer than that make one hump.
-        'min_separation': 3.0 * pulse_width,
+        'min_separation': separation,
         # Records come several a second and the floor slopes; 1.4 m a record can be followed.
         'depth_std': 0.35,
-        'order_max': 6,
+        'order_max': max(1, int(min(window / separation, 6.0))),
     }
 
 

@@ -34,9 +34,9 @@ enters the particle filter as the walk of the members near it (`Walks`), a mixtu
 
 Layers above each other are parallel as a rule. The slope of each is therefore drawn towards that
 of the others that dip, N(V, v): V their mean, by weight and precision, v the error of V and how
-far they differ, as estimated from their own scatter (random effects; method of moments). Where they
-are not parallel they differ much, and each goes by its own. What a reflector has learned itself is
-kept apart, so that nothing counts twice.
+far they differ, as estimated from their own scatter (random effects; method of moments). Where
+they are not parallel they differ much, and each goes by its own. What a reflector has learned
+itself is kept apart, so that nothing counts twice.
 
 Sources: H. A. P. Blom and Y. Bar-Shalom, *The interacting multiple model algorithm for systems
 with Markovian switching coefficients*, IEEE Trans. AC 33 (1988); R. DerSimonian and N. Laird,
