@@ -36,9 +36,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.fathometer_gaps import BEFORE, highest, scene, SECONDS, STEP, tracked
+from benchmarks.fathometer_gaps import (
+    BEFORE,
+    highest,
+    scene,
+    SECONDS,
+    seen_variance,
+    STEP,
+    tracked,
+)
 from benchmarks.study import Parts, rms, study
-from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Trace
 
@@ -61,11 +68,8 @@ def case(kind: str, dip: float, gap: int, seed: int) -> tuple[list[Trace], Float
 
 def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
     """Errors and stated standard deviations (records, 8, 2) with known association."""
-    pulse = band_pulse(50.0, 4000.0, 1500.0)
-    curvature = -float(np.diff(pulse(np.array([-1e-3, 0.0, 1e-3])), 2)[0]) / 1e-6
-    noise = 1.0 / (np.square(SIGMAS) * curvature) + STEP**2 / 12.0
     found = np.empty((*truth.shape, 2))
-    for i, r in enumerate(noise):
+    for i, r in enumerate(seen_variance(SIGMAS)):
         mean, P = np.array([truth[0, i], 0.0]), np.diag([1e6, 0.4**2])
         for k, trace in enumerate(traces):
             times = 1 + gap * (k == BEFORE)

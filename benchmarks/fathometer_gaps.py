@@ -92,13 +92,17 @@ def highest(trace: Trace, depth: float) -> float:
     return float(trace.depth[near[np.argmax(trace.amplitude[near])]])
 
 
-def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
-    """Errors and stated standard deviations (records, 6, 2) with known association."""
+def seen_variance(sigmas: FloatArray) -> FloatArray:
+    """Variance (K,) of the depth of the highest point of echoes of so many sigmas (K,), m^2."""
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     curvature = -float(np.diff(pulse(np.array([-1e-3, 0.0, 1e-3])), 2)[0]) / 1e-6
-    noise = 1.0 / (np.square(SIGMAS) * curvature) + STEP**2 / 12.0
+    return 1.0 / (np.square(sigmas) * curvature) + STEP**2 / 12.0
+
+
+def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
+    """Errors and stated standard deviations (records, 6, 2) with known association."""
     found = np.empty((*truth.shape, 2))
-    for i, r in enumerate(noise):
+    for i, r in enumerate(seen_variance(SIGMAS)):
         mean, P = 0.0, 1e6
         for k, trace in enumerate(traces):
             seen = highest(trace, truth[k, i])
