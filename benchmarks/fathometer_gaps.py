@@ -34,6 +34,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.study import Parts, rms, study
 from sonar_imm.acoustics.pulse import band_pulse
@@ -47,46 +48,64 @@ STEP, BEFORE, AFTER, SECONDS = 1.0 / 64.0, 20, 10, 10.0
 DEPTH = 38.0 + STEP * np.arange(3072)
 ARRAY_STD = 0.0
 CASES = (0.1, 0.15)
+ONCE = {'record_interval': 86400.0, 'slope_std': 0.0}
 GAPS = (0, 10, 30, 120)
 
 
-def scene(gap: int, walk: float, seed: int) -> tuple[list[Trace], FloatArray]:
-    """Traces, and the true depths (records, 6)."""
+def scene(
+    gap: int,
+    walk: float,
+    seed: int,
+    dip: float | FloatArray = 0.0,
+    depth: NDArray[np.floating[Any]] = DEPTH,
+    layers: FloatArray = LAYERS,
+    sigmas: FloatArray = SIGMAS,
+) -> tuple[list[Trace], FloatArray]:
+    """Traces, and the true depths (records, layers). dip: what the layers (layers,) are deeper by
+    from record to record (records,), m."""
     rng = np.random.default_rng([seed, gap])
-    every = LAYERS + np.cumsum(
-        walk * rng.standard_normal((BEFORE + gap + AFTER, len(LAYERS))), axis=0
-    )
+    moved = walk * rng.standard_normal((BEFORE + gap + AFTER, len(layers))) + dip
+    every = layers + np.cumsum(moved, axis=0)
     there = np.r_[0:BEFORE, BEFORE + gap : len(every)]
-    pulse, lags = band_pulse(50.0, 4000.0, 1500.0), np.arange(2 * len(DEPTH))
+    pulse, lags = band_pulse(50.0, 4000.0, 1500.0), np.arange(2 * len(depth))
     spectrum = np.fft.rfft(pulse(STEP * np.minimum(lags, len(lags) - lags)))
     root = np.sqrt(spectrum.real.clip(min=0.0))
     traces = []
     for k in there:
         noise = np.fft.irfft(root * np.fft.rfft(rng.standard_normal(len(lags))), len(lags))
-        echoes = pulse(DEPTH[:, None] - every[k]) @ SIGMAS
+        echoes = pulse(depth[:, None] - every[k]) @ sigmas
         traces.append(
             Trace(
                 stamp_ns=round((k + 1) * SECONDS * 1e9),
-                depth=DEPTH,
-                amplitude=noise[: len(DEPTH)] / noise.std() + echoes,
-                sigma=np.ones(len(DEPTH)),
+                depth=depth,
+                amplitude=noise[: len(depth)] / noise.std() + echoes,
+                sigma=np.ones(len(depth)),
                 reference_depth=30.0,
             )
         )
     return traces, every[there]
 
 
-def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
-    """Errors and stated standard deviations (records, 6, 2) with known association."""
+def highest(trace: Trace, depth: float) -> float:
+    """The depth of the highest point of a record within 0.25 m of `depth`."""
+    near = np.flatnonzero(np.abs(trace.depth - depth) < 0.25)
+    return float(trace.depth[near[np.argmax(trace.amplitude[near])]])
+
+
+def seen_variance(sigmas: FloatArray) -> FloatArray:
+    """Variance (K,) of the depth of the highest point of echoes of so many sigmas (K,), m^2."""
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     curvature = -float(np.diff(pulse(np.array([-1e-3, 0.0, 1e-3])), 2)[0]) / 1e-6
-    noise = 1.0 / (np.square(SIGMAS) * curvature) + STEP**2 / 12.0
+    return 1.0 / (np.square(sigmas) * curvature) + STEP**2 / 12.0
+
+
+def kalman(traces: Sequence[Trace], truth: FloatArray, gap: int) -> FloatArray:
+    """Errors and stated standard deviations (records, 6, 2) with known association."""
     found = np.empty((*truth.shape, 2))
-    for i, r in enumerate(noise):
+    for i, r in enumerate(seen_variance(SIGMAS)):
         mean, P = 0.0, 1e6
         for k, trace in enumerate(traces):
-            near = np.flatnonzero(np.abs(DEPTH - truth[k, i]) < 0.25)
-            seen = DEPTH[near[np.argmax(trace.amplitude[near])]]
+            seen = highest(trace, truth[k, i])
             P += 0.1**2 * (1 + gap * (k == BEFORE))
             gain = P / (P + r)
             mean, P = mean + gain * (seen - mean), (1.0 - gain) * P
@@ -103,18 +122,28 @@ def tracked(traces: Sequence[Trace], truth: FloatArray, **parameters: Any) -> di
     tracker = FathometerTracker(config)
     right = np.zeros(len(traces), bool)
     found, ids = np.full((*truth.shape, 2), np.nan), np.zeros(truth.shape, int)
+    named: set[int] = set()
+    dipping = []
     for k, trace in enumerate(traces):
         (estimate,) = tracker.process(trace)
-        right[k] = int(np.argmax(estimate.probabilities[0])) + config.order_min == len(LAYERS)
+        right[k] = int(np.argmax(estimate.probabilities[0])) + config.order_min == truth.shape[1]
         if not np.isfinite(estimate.state[:, 0]).all():
             continue
+        named.update(estimate.extras['track_id'].tolist())
+        dipping.append(float(np.mean(estimate.extras['dipping'])))
         for i, z in enumerate(truth[k]):
             row = int(np.argmin(np.abs(estimate.state[:, 0] - z)))
             error = estimate.state[row, 0] - z
             if abs(error) < 0.5:
                 found[k, i] = error, np.sqrt(estimate.covariance[row, 0, 0])
                 ids[k, i] = estimate.extras['track_id'][row]
-    return {'right': right, 'found': found, 'ids': ids}
+    return {
+        'right': right,
+        'found': found,
+        'ids': ids,
+        'named': len(named),
+        'dipping': float(np.mean(dipping)),
+    }
 
 
 def summary(runs: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -153,9 +182,7 @@ def main(
                 traces, truth = scene(gap, walk, seed)
                 ways['tracker'].append(tracked(traces, truth, particles=particles))
                 if gap:
-                    ways['once'].append(
-                        tracked(traces, truth, particles=particles, record_interval=86400.0)
-                    )
+                    ways['once'].append(tracked(traces, truth, particles=particles, **ONCE))
                 known = np.ones(truth.shape, int)
                 bound = {'right': known[:, 0], 'found': kalman(traces, truth, gap), 'ids': known}
                 ways['Kalman'].append(bound)

@@ -27,8 +27,9 @@ five records are not scored.
 noise: the matrices are the exact ones, the layers are fitted with either pulse and taken off, and
 the largest peaks further than 0.4 m from any layer are listed, each with the nearest place
 z_i + z_j - z_k. MVDR is no linear function of the matrices, so that echoes that interfere beat.
-Then the exact echo of one layer beside the pulses of processor and band, by distance, and how much
-of it there is in each octave, against W.
+Then the exact echo of one layer (what changes with the sign of its amplitude) beside the pulses of
+processor and band, by distance, and how much of it there is in each octave, against W, as it is
+('all noise') and with the share of the surface only ('processor').
 """
 
 from __future__ import annotations
@@ -40,7 +41,12 @@ import numpy as np
 
 from benchmarks import fathometer_paper
 from benchmarks.study import mean_of, Parts, rms, standard_error, study
-from sonar_imm.acoustics.fathometer import coherence_and_power, echo_spectrum, steering
+from sonar_imm.acoustics.fathometer import (
+    coherence_and_power,
+    echo_spectrum,
+    steering,
+    surface_share,
+)
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra
 from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
@@ -196,19 +202,24 @@ def echoes() -> dict[str, dict[str, dict[str, float]]]:
         )
         frequency = rows / config.snapshot_seconds
         R = expected_csdm(config, floor, 0, frequency)
-        w = steering(
-            frequency, config.element_spacing * np.arange(config.phones), config.sound_speed
-        )
+        mirrored = evolve(floor, amplitude=-floor.amplitude)
+        heights = config.element_spacing * np.arange(config.phones)
+        w = steering(frequency, heights, config.sound_speed)
         gamma, power = coherence_and_power(R, w, 'mvdr')
+        other = coherence_and_power(expected_csdm(config, mirrored, 0, frequency), w, 'mvdr')[0]
         turn = np.exp(4j * np.pi * frequency * height / config.sound_speed)
+        gamma = 0.5 * (gamma - other)
         echo = (gamma * turn).real
-        W = echo_spectrum(R, frequency, power)
+        every = echo_spectrum(R, frequency, power)
+        W = every * surface_share(R, frequency, heights, config.sound_speed)
+        W = W / W.mean()
         table: dict[str, dict[str, float]] = {}
         for away in (0.05, 0.1, 0.2, 0.3, 0.5):
             shift = np.exp(4j * np.pi * frequency * away / config.sound_speed)
             table[f'pulse at {away} m'] = {
                 'echo': float((gamma * turn * shift).real.mean() / echo.mean()),
-                'processor': float((W * shift).real.mean() / W.mean()),
+                'processor': float((W * shift).real.mean()),
+                'all noise': float((every * shift).real.mean()),
                 'band': float(shift.real.mean()),
             }
         for low in (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0):
@@ -217,6 +228,7 @@ def echoes() -> dict[str, dict[str, dict[str, float]]]:
                 table[f'{low:.0f} Hz to {2 * low:.0f} Hz'] = {
                     'echo': float(echo[octave].mean() / echo.mean()),
                     'processor': float(W[octave].mean()),
+                    'all noise': float(every[octave].mean()),
                     'band': 1.0,
                 }
         tables[name] = table

@@ -19,6 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from attrs import evolve
+import numpy as np
+
 from sonar_imm.estimates import Estimate
 
 from ..estimates import write_model_probabilities
@@ -27,13 +30,18 @@ from .tracks import Drawn, MODELS, NAMED_SCALARS
 
 
 class Displays:
-    """How probable each number of reflectors is, the same in all rows."""
+    """How probable each number of reflectors is, the same in all rows; and that a reflector is
+    still, or dipping, in the mean of them."""
 
     topics: Mapping[str, str] = {MODELS: NAMED_SCALARS}
 
     def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
         if is_wanted(MODELS) and len(estimate):
-            yield MODELS, write_model_probabilities(estimate, 0, make)
+            # Recordings of earlier versions have no slopes.
+            dipping = float(np.mean(estimate.extras.get('dipping', 0.0)))
+            extras = {'still': np.array([1.0 - dipping]), 'dipping': np.array([dipping])}
+            shown = evolve(estimate, extras=extras)
+            yield MODELS, write_model_probabilities(shown, 0, make, tuple(extras))
 
     def forget(self, make: Make) -> Drawn:
         return iter(())

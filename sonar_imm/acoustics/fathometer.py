@@ -53,6 +53,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..estimation.arrays import FloatArray
+from .ambient import noise_integral
 
 ComplexArray = NDArray[np.complexfloating]
 
@@ -188,10 +189,54 @@ def echo_spectrum(csdm: ComplexArray, frequency: ArrayLike, power: FloatArray) -
     f = np.asarray(frequency, np.float64)
     f = np.maximum(f, np.min(f, where=f > 0.0, initial=np.inf))
     W = np.einsum('fmm->f', csdm).real.astype(np.float64) / (M * f * power)
-    half = min(_RUNNING // 2, len(W) - 1)
-    padded = np.pad(W, half, 'reflect')
-    smooth = np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), 'valid')
+    smooth = _running_mean(W)
     return np.asarray(smooth / smooth.mean())
+
+
+def surface_share(
+    csdm: ComplexArray, frequency: ArrayLike, heights: NDArray[np.floating], sound_speed: float
+) -> FloatArray:
+    """How much of the power of a hydrophone comes from the surface (F,), as a running mean over 31
+    rows: of that alone there are echoes. W of `echo_spectrum` takes all power for it, and below
+    200 Hz most may be of ships, which is heard from the horizontal.
+
+    What is as loud from above as from below, and what the hydrophones do not share, leaves the
+    cross-spectra real; noise from the surface alone has the imaginary part of `noise_integral`
+    between two heights (M,). Its level is the least-squares fit to the imaginary parts.
+    """
+    k = 2.0 * np.pi * np.asarray(frequency, np.float64)[:, None] / sound_speed
+    upper, lower = np.tril_indices(len(heights), -1)
+    apart, group = np.unique(np.round(heights[upper] - heights[lower], 6), return_inverse=True)
+    g = noise_integral(k * apart).imag
+    found = np.stack(
+        [
+            csdm[:, upper[group == n], lower[group == n]].imag.sum(axis=1)
+            for n in range(len(apart))
+        ],
+        axis=1,
+    )
+    level = (found * g).sum(axis=1) / (np.square(g) @ np.bincount(group))
+    power = np.einsum('fmm->f', csdm).real.astype(np.float64) / len(heights)
+    return np.maximum(_running_mean(level / power), 1e-3)
+
+
+def sampled_share(csdm: ComplexArray, loading: float, snapshots: float) -> FloatArray:
+    """What MVDR powers of so many snapshots are about, of those of the exact cross-spectra
+    (F,): ``1 - (d - 1) / snapshots``, d = sum l / (l + loading tr R / M) over the eigenvalues l of
+    R, how many directions are fitted. From every 16th row."""
+    rows = np.arange(0, len(csdm), 16)
+    values = np.linalg.eigvalsh(csdm[rows]).clip(min=0.0)
+    ridge = loading * values.mean(axis=1, keepdims=True)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        fitted = np.nan_to_num(values / (values + ridge)).sum(axis=1)
+    share = np.interp(np.arange(len(csdm)), rows, 1.0 - (fitted - 1.0) / snapshots)
+    return np.maximum(share, 1.0 / snapshots)
+
+
+def _running_mean(values: FloatArray) -> FloatArray:
+    half = min(_RUNNING // 2, len(values) - 1)
+    padded = np.pad(values, half, 'reflect')
+    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), 'valid')
 
 
 def depth_response(

@@ -41,11 +41,12 @@ Data-driven proposals
     filter: with eight sharp peaks in a record, all but a handful of its particles are lost at
     every step.
 
-Gaps
+Gaps, and members that may walk far
     Where the time of several records passed since the last one, members may have walked far and
-    been replaced. The gains of all peaks are then lowered to what births get at most, each peak
-    keeping its own shape (`levelled`): by its full gain the strongest peak within reach would draw
-    all members to itself.
+    been replaced; where they move on by a slope that is not known yet, they may be far from where
+    they were after one record, too (`Walks`). The gains of all peaks are then lowered to what
+    births get at most, each peak keeping its own shape (`levelled`): by its full gain the
+    strongest peak within reach would draw all members to itself.
 
 Random numbers are counter based: those of a record come from a Philox generator whose key is the
 seed and the record's own name (its stamp), and each particle has its row of them, ``(1 + c + J)``
@@ -77,7 +78,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from . import set_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise, systematic
-from .set_model import repeated_walk, SetModel, Sets, turnover
+from .set_model import repeated_walk, SetModel, Sets, turnover, Walks
 from .set_scatter import fit_scatter, guide, NO_SCATTER, ScatterFit
 from .set_shifts import Shift, shift_tables, ShiftPath, ShiftTables
 
@@ -87,11 +88,11 @@ _PASSAGES = 16
 
 
 class Passage(NamedTuple):
-    """How sets change while the time of so many `records` passes: walk (2 r + 1,); motion; shift,
-    None without one, and its tables."""
+    """How sets change while the time of so many `records` passes: walks; motion; shift, None
+    without one, and its tables."""
 
     records: int
-    walk: FloatArray
+    walks: Walks
     motion: kernels.SetMotion
     shift: Shift | None
     shifts: ShiftTables
@@ -99,9 +100,9 @@ class Passage(NamedTuple):
 
 class Record(NamedTuple):
     """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
-    key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign, see
-    `gains`; amplitudes: how members answer in it; background: of its scatter; proposals: its
-    tables, walks not filled in; passage: since the record before."""
+    key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign that
+    walks look at, see `gains`; amplitudes: how members answer in it; background: of its scatter;
+    proposals: its tables, walks not filled in; passage: since the record before."""
 
     b: FloatArray
     key: tuple[int, int]
@@ -162,8 +163,7 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        shape = model.record_cells * len(model.signs), len(model.walk)
-        self._walk, self._walk_ratio = np.empty(shape), np.empty(shape)
+        self._tables: tuple[FloatArray, FloatArray] = (np.empty((0, 0)), np.empty((0, 0)))
         self._log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
         self._passages: dict[int, Passage] = {}
         self._passage(1)
@@ -199,7 +199,8 @@ class SetFilter:
             cumulative=np.cumsum(chances, axis=1),
         )
         tables = shift_tables(shift, self._log_sum, model.walk_share)
-        found = Passage(records, walk, motion, shift, tables)
+        walks = Walks.alike(walk, model.record_cells, wide=records > 1)
+        found = Passage(records, walks, motion, shift, tables)
         if len(self._passages) > _PASSAGES:
             self._passages = {1: self._passages[1]}
         self._passages[records] = found
@@ -211,20 +212,24 @@ class SetFilter:
         key: tuple[int, int],
         gram: FloatArray | None = None,
         records: int = 1,
+        walks: Walks | None = None,
     ) -> Record:
         """The record b, see `Record`. gram (n,): of this record, where it is not the model's;
-        records: how many records' time passed since the one before."""
+        records: how many records' time passed since the one before; walks: by then, where they are
+        not the model's."""
         model, passage = self.model, self._passage(records)
+        walks = walks or passage.walks
         amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
         background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
-        g, tables = gains(model, b, background), (self._walk, self._walk_ratio)
-        if records > 1:
-            g = levelled(model, g)
-            shape = len(self._walk), len(passage.walk)
-            tables = np.empty(shape), np.empty(shape)
-        births = propose_births(model, g)
-        proposals = kernels.Proposals(*tables, *births, passage.shifts)
-        return Record(b, key, g, amplitudes, background, proposals, passage)
+        g = gains(model, b, background)
+        walked = levelled(model, g) if walks.wide else g
+        shape = model.record_cells * len(model.signs), walks.probability.shape[1]
+        if self._tables[0].shape != shape:
+            self._tables = np.empty(shape), np.empty(shape)
+        births = propose_births(model, walked if records > 1 else g)
+        driven = np.exp(walked) if walks.wide else np.empty((len(walked), 0))
+        proposals = kernels.Proposals(*self._tables, *births, passage.shifts, walks, driven)
+        return Record(b, key, walked, amplitudes, background, proposals, passage)
 
     def start(self, record: Record) -> Weighted:
         """Sets before the first record, drawn where it will want them."""
@@ -345,12 +350,12 @@ class SetFilter:
         """Sets drawn from the proposals by uniform (N, uniforms), and log of model to proposal."""
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio, proposals = np.empty(self.particles), record.proposals
-        walk, motion, amplitudes = record.passage.walk, record.passage.motion, self._amplitudes
+        motion, amplitudes = record.passage.motion, self._amplitudes
         if model.shift:
-            kernels.fill_all_walks(old, record.gains, walk, model.walk_share, proposals)
+            kernels.fill_all_walks(old, record.gains, model.walk_share, proposals)
         else:
-            filled = np.zeros(len(self._walk), np.bool_)
-            kernels.fill_walks(old, record.gains, walk, model.walk_share, filled, proposals)
+            filled = np.zeros(len(proposals.walk), np.bool_)
+            kernels.fill_walks(old, record.gains, model.walk_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first, last, motion, amplitudes, proposals, uniform, old, new, log_ratio
@@ -380,9 +385,18 @@ def levelled(model: SetModel, g: FloatArray) -> FloatArray:
     lowered by as much, so that it keeps its shape."""
     half = model.separation // 2
     around = sliding_window_view(np.pad(g, ((0, 0), (half, half))), 2 * half + 1, axis=1)
-    height = around.max(axis=2)
-    mass = height + np.log(np.exp(around - height[:, :, None]).mean(axis=2))
-    return np.asarray(g - np.maximum(mass - model.birth_cap, 0.0))
+    height, width = np.pad(g, ((0, 0), (half, half))), 1
+    while width < 2 * half + 1:
+        step = min(width, 2 * half + 1 - width)
+        height = np.maximum(height[:, :-step], height[:, step:])
+        width += step
+    low = g.copy()
+    # Elsewhere no sum exceeds it.
+    high = height > model.birth_cap
+    top = height[high]
+    mass = top + np.log(np.exp(around[high] - top[:, None]).mean(axis=1))
+    low[high] -= np.maximum(mass - model.birth_cap, 0.0)
+    return low
 
 
 def propose_births(model: SetModel, g: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

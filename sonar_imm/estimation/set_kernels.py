@@ -27,7 +27,7 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
-from .set_model import Sets
+from .set_model import Sets, Walks
 from .set_scatter import against, ScatterFit
 from .set_shifts import draw_shift, empty_memory, ShiftTables
 
@@ -50,10 +50,11 @@ class SetMotion(NamedTuple):
 
 class Proposals(NamedTuple):
     """Tables of one record, for S signs: walk (S n, 2 r + 1) cumulative, walk_ratio (S n, 2 r + 1)
-    log of model to proposal, for cells from which a member walks (others are not filled in),
+    of model to proposal, for cells from which a member walks (others are not filled in),
     negative members in the second n rows; birth (n + 1,) running sum of the birth weights of both
     signs, birth_ratio (S, n) log of model to weight, birth_positive (n,) the weight of positive
-    births; shifts."""
+    births; shifts; walks, from which the first two are made, with driven (S, n), exp of the gains,
+    where those are small enough, else (S, 0)."""
 
     walk: FloatArray
     walk_ratio: FloatArray
@@ -61,6 +62,8 @@ class Proposals(NamedTuple):
     birth_ratio: FloatArray
     birth_positive: FloatArray
     shifts: ShiftTables
+    walks: Walks
+    driven: FloatArray
 
 
 class AmplitudeModel(NamedTuple):
@@ -90,28 +93,37 @@ def _fill_row(
     row: int,
     z: int,
     g: FloatArray,
-    walk: FloatArray,
     share: float,
     wanted: bool,
     proposals: Proposals,
 ) -> float:
     """Row `row` of walk and walk_ratio of `proposals`, from the cell z, as far as it is wanted;
     log Z of it."""
+    walks, kind = proposals.walks, proposals.walks.kind[z]
+    walk = walks.probability[kind]
     n, width = len(g), len(walk)
-    radius = width // 2
-    low, high = max(0, radius - z), min(width, n + radius - z)
+    radius = width // 2 - walks.centre[kind]
+    low, high = max(walks.first[kind], radius - z), min(walks.last[kind], n + radius - z)
     best, inside = -math.inf, 0.0
-    for step in range(low, high):
-        best = max(best, g[z + step - radius])
-        inside += walk[step]
     # Of the places within reach; the row of ratios is scratch until its own numbers come.
     driven = proposals.walk_ratio[row]
     data_driven = 0.0
-    for step in range(low, high):
-        driven[step] = math.exp(g[z + step - radius] - best)
-        data_driven += walk[step] * driven[step]
+    if proposals.driven.shape[1] > 0:
+        best, known = 0.0, proposals.driven[row // n]
+        for step in range(low, high):
+            inside += walk[step]
+            driven[step] = known[z + step - radius]
+            data_driven += walk[step] * driven[step]
+    else:
+        for step in range(low, high):
+            best = max(best, g[z + step - radius])
+            inside += walk[step]
+        for step in range(low, high):
+            driven[step] = math.exp(g[z + step - radius] - best)
+            data_driven += walk[step] * driven[step]
+    log_sum = best + math.log(data_driven) if data_driven > 0.0 else -math.inf
     if not wanted:
-        return best + math.log(data_driven)
+        return log_sum
     total = 0.0
     for step in range(width):
         q = 0.0
@@ -120,15 +132,14 @@ def _fill_row(
             q += (1.0 - share) * walk[step] / inside
         total += q
         proposals.walk[row, step] = total
-        proposals.walk_ratio[row, step] = math.log(walk[step] / q) if q > 0.0 else -math.inf
-    return best + math.log(data_driven)
+        proposals.walk_ratio[row, step] = walk[step] / q if q > 0.0 else 0.0
+    return log_sum
 
 
 @kernel
 def fill_walks(
     sets: Sets,
     gain: FloatArray,
-    walk: FloatArray,
     share: float,
     filled: BoolArray,
     proposals: Proposals,
@@ -142,13 +153,11 @@ def fill_walks(
             row = z + gain.shape[1] * negative
             if not filled[row]:
                 filled[row] = True
-                _fill_row(row, z, gain[negative], walk, share, True, proposals)
+                _fill_row(row, z, gain[negative], share, True, proposals)
 
 
 @kernel
-def fill_all_walks(
-    sets: Sets, gain: FloatArray, walk: FloatArray, share: float, proposals: Proposals
-) -> None:
+def fill_all_walks(sets: Sets, gain: FloatArray, share: float, proposals: Proposals) -> None:
     """As `fill_walks`, where a shift is drawn before the walks: the rows that some particle may
     come to by one, and log_sum of all rows."""
     n, step, reached = gain.shape[1], proposals.shifts.step, np.zeros(gain.shape, np.bool_)
@@ -163,9 +172,7 @@ def fill_all_walks(
             if reached[negative, z]:
                 wanted[z : z + last + 1 : step] = True
         for z in range(n):
-            found = _fill_row(
-                z + n * negative, z, gain[negative], walk, share, wanted[z], proposals
-            )
+            found = _fill_row(z + n * negative, z, gain[negative], share, wanted[z], proposals)
             proposals.shifts.log_sum[negative, z] = found
 
 
@@ -276,7 +283,7 @@ def propagate(
     proposal, -inf for impossible sets (whose members mean nothing)."""
     order_min, separation, changes, cumulative = motion
     orders, columns = cumulative.shape
-    width, cells = proposals.walk.shape[1], proposals.birth_ratio.shape[1]
+    width, cells, walks = proposals.walk.shape[1], proposals.birth_ratio.shape[1], proposals.walks
     J, G = new.cell.shape[1], len(proposals.shifts.start)
     last_cell = cells - 1 - proposals.shifts.step * (G - 1)
     parent, rows, memory = np.empty(J, np.int64), np.empty(J, np.int64), empty_memory(J, G)
@@ -309,9 +316,10 @@ def propagate(
             row = rows[k] + offset
             table = proposals.walk[row]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
-            ratio += proposals.walk_ratio[row, step]
+            paid = proposals.walk_ratio[row, step]
+            ratio += math.log(paid) if paid > 0.0 else -math.inf
             # What leaves the lattice is impossible already; its number must stay an index.
-            z += step - width // 2
+            z += step - width // 2 + walks.centre[walks.kind[z + offset]]
             if not 0 <= z <= last_cell:
                 ratio = -math.inf
             z = min(max(z, 0), last_cell)

@@ -22,7 +22,8 @@ that depends on a record is a table made once, and no particle ever looks at a w
 The set, in the order in which it is drawn
     1. the order m' from row m of ``transition`` (rows from, columns to, from ``order_min`` on);
     2. deaths: for m' < m, a uniformly drawn subset of m - m' leaves;
-    3. each survivor walks by ``walk``; what leaves the lattice is impossible;
+    3. each survivor walks by ``walk``, or by what is known of it beforehand (`Walks`); what leaves
+       the lattice is impossible;
     4. births: for m' > m, m' - m are born, each uniformly on the lattice;
     5. sets whose members come closer than ``separation`` cells are impossible.
     Where the time of k records passed since the last one, 1 is drawn as k such changes of the
@@ -107,6 +108,35 @@ def repeated_walk(walk: FloatArray, times: int, *, reach: float = 4.0) -> FloatA
     cut = int(min(walk_reach(std, reach=reach), radius * times))
     K = total[np.arange(-cut, cut + 1)]
     return np.asarray(K / K.sum())
+
+
+class Walks(NamedTuple):
+    """How members walk by the time of a record, by the cell where each was: kind (n,) of a cell of
+    the record; for each of T kinds centre (T,), cells, and probability (T, 2 r + 1) around it,
+    zero but for first (T,) <= entry < last (T,); wide: some reach further than a member is from
+    the next, so that the peaks of the record are lowered to one mass."""
+
+    kind: IntArray
+    centre: IntArray
+    probability: FloatArray
+    first: IntArray
+    last: IntArray
+    wide: bool
+
+    @classmethod
+    def of(
+        cls, kind: IntArray, centre: IntArray, probability: FloatArray, *, wide: bool = False
+    ) -> Walks:
+        """Without first and last, which are found."""
+        there = probability > 0.0
+        last = probability.shape[1] - np.argmax(there[:, ::-1], axis=1)
+        return cls(kind, centre, probability, np.argmax(there, axis=1), last, wide)
+
+    @classmethod
+    def alike(cls, walk: FloatArray, cells: int, *, wide: bool = False) -> Walks:
+        """All of them by `walk` (2 r + 1,)."""
+        kind, centre = np.zeros(cells, np.int64), np.zeros(1, np.int64)
+        return cls(kind, centre, walk[None], centre, np.array([len(walk)]), wide)
 
 
 def turnover(transition: FloatArray, order_min: int, records: int) -> FloatArray:

@@ -20,7 +20,8 @@ record; with `preview_seconds` also one at each sliding update between records, 
 Besides, for the newest record or preview:
 
 - ``~/response``: its depth response, as a table like that of ``trace`` with ``x y z`` before it;
-- ``~/model_probabilities``: how probable each number of reflectors is, by name.
+- ``~/model_probabilities``: how probable each number of reflectors is, by name, then that a
+  reflector is still, or dipping, in the mean of them.
 """
 
 from __future__ import annotations

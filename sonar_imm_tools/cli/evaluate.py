@@ -100,14 +100,15 @@ def command(
 
     Writes metrics.json beside each run and one self-contained HTML report. Without truth only
     what needs none is scored: the normalised innovations (NIS) and the model probabilities. With
-    --crossing nothing is written: the depths of two lines are compared where they cross.
+    --crossing the depths of two lines are compared where they cross; only the figure of that is
+    written, where --report names a file.
     """
     from ..offline.batch import run_folders
 
     if crossing != (other is not None):
         raise click.UsageError('--crossing compares two runs: OUT_DIR and OTHER')
     if other is not None:
-        _compare_crossing(out_dir, other, position_std, as_json)
+        _compare_crossing(out_dir, other, position_std, report, as_json)
         return
     options = JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
     judgements = {folder: evaluate_run(folder, options) for folder in run_folders(out_dir)}
@@ -130,11 +131,15 @@ def _name(folder: Path, out_dir: Path) -> str:
     return folder.relative_to(out_dir).as_posix()
 
 
-def _compare_crossing(a: Path, b: Path, position_std: float, as_json: bool) -> None:
-    from ..evaluation.fathometer.crossing import crossing_lines, crossing_metrics
+def _compare_crossing(
+    a: Path, b: Path, position_std: float, report: Path | None, as_json: bool
+) -> None:
+    from ..evaluation.fathometer.crossing import crossing_lines, crossing_metrics, mistie_figure
     from ..offline.run_folder import RunFolder
 
     metrics = crossing_metrics(RunFolder(a), RunFolder(b), position_std)
+    if report is not None:
+        mistie_figure(metrics).write_html(report, include_plotlyjs=True)
     if as_json:
         print_json(metrics)
         return

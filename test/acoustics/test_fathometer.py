@@ -36,7 +36,9 @@ from sonar_imm.acoustics.fathometer import (
     echo_spectrum,
     mvdr,
     noise_sigma,
+    sampled_share,
     steering,
+    surface_share,
     white_noise_loading,
 )
 from sonar_imm.acoustics.pulse import band_pulse
@@ -265,3 +267,36 @@ def test_power_and_coherence_make_the_correlation(band):
     w = steering(frequency, HEIGHTS, C)
     gamma, power = coherence_and_power(R, w, 'mvdr')
     assert gamma * power == pytest.approx(1j * mvdr(R, w, 1e-2)[0])
+
+
+def test_the_share_of_the_surface_is_that_of_the_powers():
+    """Noise from the horizontal and of the hydrophones themselves makes no echo."""
+    frequency = np.arange(50.0, 4000.0, 10.0)
+    heights = 0.18 * np.arange(16)
+    surface = surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
+    assert surface_share(surface, frequency, heights, 1500.0) == pytest.approx(1.0)
+    ships = 3.0 / (1.0 + (frequency / 200.0) ** 2)
+    others = ships[:, None, None] * horizontal_noise_csdm(frequency, 16, 0.18, 0.03, 1500.0)
+    R = (surface + others + 0.1 * np.eye(16)) * (frequency[:, None, None] / 1000.0) ** -1.6
+    share = surface_share(R, frequency, heights, 1500.0)
+    assert share[20:-20] == pytest.approx(1.0 / (1.1 + ships[20:-20]), rel=0.1)
+    # Some hydrophones are dead.
+    alive = np.array([0, 1, 2, 4, 7, 8, 9, 12, 13, 15])
+    some = surface_share(R[:, alive[:, None], alive], frequency, heights[alive], 1500.0)
+    assert some == pytest.approx(share, rel=0.05)
+
+
+def test_the_power_of_few_snapshots_is_less_by_what_is_fitted():
+    frequency, heights = np.full(32, 800.0), 0.18 * np.arange(16)
+    R = surface_noise_csdm(frequency, 16, 0.18, np.empty(0), np.empty(0), 1500.0)
+    R = R + 0.01 * np.eye(16)
+    w = steering(frequency, heights, 1500.0)
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(20):
+        sampled = sample_csdm(R, 40, rng)
+        drawn.append(coherence_and_power(sampled, w, 'mvdr')[1])
+    exact = coherence_and_power(R, w, 'mvdr')[1]
+    expected = sampled_share(sampled.astype(np.complex128), 1e-2, 40.0)
+    assert expected.max() < 0.9
+    # That of every beam together: a beam where it is quiet is fitted less.
+    assert np.mean(drawn) / exact[0] == pytest.approx(expected.mean(), rel=0.08)

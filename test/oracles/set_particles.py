@@ -23,7 +23,7 @@ import numpy as np
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.set_filter import gains, propose_births
 from sonar_imm.estimation.set_kernels import Proposals
-from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_model import SetModel, Sets, Walks
 from sonar_imm.estimation.set_scatter import fit_scatter, NO_SCATTER, ScatterFit
 from sonar_imm.estimation.set_shifts import shift_tables, ShiftTables
 
@@ -50,10 +50,11 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     q = model.walk_share * data_driven / data_driven.sum(axis=1, keepdims=True)
     q += (1.0 - model.walk_share) * K / K.sum(axis=1, keepdims=True)
     with np.errstate(divide='ignore', invalid='ignore'):
-        ratio = np.where(q > 0.0, np.log(K / q), IMPOSSIBLE)
+        ratio = np.where(q > 0.0, K / q, 0.0)
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
     shifts = shift_tables(model.shift, log_sum, model.walk_share)
-    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, gained), shifts)
+    births, walks = propose_births(model, gained), Walks.alike(model.walk, n)
+    return Proposals(np.cumsum(q, axis=1), ratio, *births, shifts, walks, np.empty((signs, 0)))
 
 
 def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
@@ -116,7 +117,8 @@ def propagate(
             table = proposals.walk[row]
             point = uniform[i, 1 + changes + k] * table[-1]
             step = min(int(np.searchsorted(table, point, 'right')), 2 * radius)
-            log_ratio[i] += proposals.walk_ratio[row, step]
+            with np.errstate(divide='ignore'):
+                log_ratio[i] += np.log(proposals.walk_ratio[row, step])
             survivors.append((z + step - radius, j))
         places = sorted(z for z, _ in survivors)
         sign = {z: int(sets.sign[i, j]) for z, j in survivors}

@@ -166,6 +166,13 @@ class FathometerConfig(StampParameters):
     depth_std: float = parameter(0.1, 'm',
         'standard deviation of the change of the depth of a reflector from record to record',
         range=(1e-4, 100.0))
+    slope_std: float = parameter(0.4, 'm',
+        'standard deviation of the slope of a reflector that dips, as the change of its depth '
+        'from record to record; 0: all are still. With heave there are no slopes',
+        range=(0.0, 100.0))
+    slope_switch_probability: float = parameter(0.02, '',
+        'slopes (slope_std): probability that from a record to the next a reflector begins to '
+        'dip, ends it, or has a new slope', range=(1e-6, 0.3))
     record_interval: float = parameter(0.0, 's',
         'time from record to record that depth_std, order_switch_probability and what else is per '
         'record are meant for: after a gap they count as often as records would have come; 0: the '

@@ -47,12 +47,25 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.association import new_ids
 from ...estimation.set_filter import Members
+from ...estimation.set_model import Walks
 from .config import FathometerConfig
 from .response import Lattice, Response
+from .slopes import (
+    begun,
+    Common,
+    common_slope,
+    learned,
+    REACH,
+    Slope,
+    slopes_followed,
+    STILL,
+    walks_to,
+    ways,
+)
 
 IdArray = NDArray[np.uint32]
-_REACH, BOTTOM_REACH = 4.0, 12.0
-"""How many `depth_std` a reflector, and the first return in scatter, may jump and keep its id."""
+BOTTOM_REACH = 12.0
+"""How many `depth_std` the first return in scatter may jump and keep its id."""
 PRIOR, OUTLIERS, RECORDS = 0.25, 0.05, 30
 MOST_WAYS = 200
 _NEAR = 6.0
@@ -60,17 +73,24 @@ _NEAR = 6.0
 
 class Identified(NamedTuple):
     """A reflector that has an id: where it was last seen, in how many records since it was not,
-    and for how many more there was time."""
+    and for how many more there was time; its slope."""
 
     track_id: int
     depth: float
     missed: int
     absent: int = 0
+    slope: Slope = STILL
 
     @property
     def walked(self) -> int:
         """How many records' walks lie between where it was seen and the next record."""
         return 1 + self.missed + self.absent
+
+    @property
+    def place(self) -> float:
+        """Where it probably was in the last record."""
+        slope = self.slope.mean if self.slope.dipping > 0.5 else 0.0
+        return self.depth + (self.walked - 1) * slope
 
 
 @frozen
@@ -82,10 +102,14 @@ class Identities:
     bottom_id: int = 0
 
     def name(
-        self, depth: FloatArray, is_bottom: FloatArray, config: FathometerConfig
+        self,
+        depth: FloatArray,
+        is_bottom: FloatArray,
+        config: FathometerConfig,
+        variance: FloatArray | None = None,
     ) -> tuple[Identities, IdArray]:
         """Ids (K,) for reflectors at `depth` (K,) of the next record, is_bottom (K,) the
-        probability of each to be the first return."""
+        probability of each to be the first return, variance (K,) of the depth, m^2."""
         ids = nearest_ids(depth, self.reflectors, config)
         bottom_id = self.bottom_id
         if config.scatter_decay and len(depth):
@@ -93,7 +117,10 @@ class Identities:
         new = np.flatnonzero(ids == 0)
         living = np.array([known.track_id for known in self.reflectors], np.uint32)
         ids[new], next_id = new_ids(self.next_id, len(new), living)
-        seen = [Identified(int(i), float(z), 0) for i, z in zip(ids, depth)]
+        slopes = self._slopes(
+            ids, depth, np.zeros(len(ids)) if variance is None else variance, config
+        )
+        seen = [Identified(int(i), float(z), 0, 0, s) for i, z, s in zip(ids, depth, slopes)]
         missed = [
             known._replace(missed=known.missed + 1)
             for known in self.reflectors
@@ -102,6 +129,43 @@ class Identities:
         if config.scatter_decay and len(depth) and not bottom_id:
             bottom_id = _id_of_bottom(ids, is_bottom)
         return Identities((*seen, *missed), next_id, bottom_id), ids
+
+    def _slopes(
+        self, ids: IdArray, depth: FloatArray, variance: FloatArray, config: FathometerConfig
+    ) -> list[Slope]:
+        """What is known of the slopes of those that now have `ids` (K,) and `depth` (K,)."""
+        known = {
+            each.track_id: (each, common)
+            for each, common in zip(self.reflectors, _commons(self.reflectors, config))
+        }
+        if not slopes_followed(config):
+            return [STILL] * len(ids)
+        fresh, found = common_slope([each.slope for each in self.reflectors]), []
+        for track_id, z, noise in zip(ids.tolist(), depth.tolist(), variance.tolist()):
+            if track_id not in known:
+                found.append(begun(fresh, noise, config))
+                continue
+            before, common = known[track_id]
+            change = z - before.depth
+            found.append(learned(before.slope, common, change, noise, before.walked, config))
+        return found
+
+    def slopes(self, ids: IdArray) -> tuple[FloatArray, ...]:
+        """Of the reflectors `ids` (K,): the probability that they dip, mean and standard deviation
+        of the slope as that leaves them, m per record; of those not known, nothing."""
+        known = {each.track_id: each.slope for each in self.reflectors}
+        found = np.array([known.get(int(i), STILL)[:3] for i in ids]).reshape(-1, 3)
+        d, mean, variance = found.T
+        return d, d * mean, np.sqrt(d * (variance + (1.0 - d) * np.square(mean)))
+
+    def walks(self, lattice: Lattice, records: int, config: FathometerConfig) -> Walks:
+        """How members walk to the record after the time of so many."""
+        known = [
+            (each.place, each.slope, common)
+            for each, common in zip(self.reflectors, _commons(self.reflectors, config))
+        ]
+        fresh = common_slope([each.slope for each in self.reflectors])
+        return walks_to(known, fresh, lattice, records, config)
 
     def _follow_bottom(
         self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig
@@ -119,7 +183,7 @@ class Identities:
         if before is None:
             return int(ids[row])
         steps = abs(depth[row] - before.depth) / np.sqrt(before.walked) / config.depth_std
-        if steps > (BOTTOM_REACH if not ids[row] else _REACH):
+        if steps > (BOTTOM_REACH if not ids[row] else REACH):
             return int(ids[row])
         ids[ids == before.track_id] = 0
         ids[row] = before.track_id
@@ -148,23 +212,32 @@ def nearest_ids(
     """Ids (K,) for reflectors at `depth` (K,): those of those `earlier` that are near enough,
     the most probable pairs first; 0: none.
 
-    A reflector walks by `depth_std` a record: of those seen equally long ago the nearest is the
-    most probable, and one that has been missed could be anywhere in a wider range, so that it is
-    less so at any one place. By distance alone, what was lost takes over from what is still seen.
+    A reflector walks by `depth_std` a record, and by its slope: of those seen equally long ago the
+    nearest to where they lead is the most probable, and one that has been missed could be anywhere
+    in a wider range, so that it is less so at any one place. By distance alone, what was lost
+    takes over from what is still seen.
     """
     ids = np.zeros(len(depth), np.uint32)
     taken = np.zeros(len(earlier), np.bool_)
     if not len(depth) or not earlier:
         return ids
-    distance = np.abs(depth[:, None] - np.array([known.depth for known in earlier]))
-    records = np.array([known.walked for known in earlier], np.float64)
-    reach = np.maximum(config.min_separation, _REACH * config.depth_std * np.sqrt(records))
-    surprise = np.square(distance / config.depth_std) / records + np.log(records)
+    surprise = np.empty((len(depth), len(earlier)))
+    for column, (known, common) in enumerate(zip(earlier, _commons(earlier, config))):
+        to, change = ways(known.slope, common, known.walked, config), depth - known.depth
+        surprise[:, column] = to.surprise(change, config, config.min_separation)
     for place in np.argsort(surprise, axis=None, kind='stable'):
         row, column = divmod(int(place), len(earlier))
-        if not ids[row] and not taken[column] and distance[row, column] <= reach[column]:
+        if not ids[row] and not taken[column] and np.isfinite(surprise[row, column]):
             ids[row], taken[column] = earlier[column].track_id, True
     return ids
+
+
+def _commons(reflectors: Sequence[Identified], config: FathometerConfig) -> list[Common]:
+    """What the others say of the slope of each."""
+    if not slopes_followed(config):
+        return [Common()] * len(reflectors)
+    slopes = [each.slope for each in reflectors]
+    return [common_slope([*slopes[:k], *slopes[k + 1 :]]) for k in range(len(slopes))]
 
 
 @frozen(eq=False)
@@ -297,13 +370,14 @@ def write_estimate(
     ids: IdArray,
     pmf: FloatArray,
     multiple: FloatArray,
+    slopes: Sequence[FloatArray],
     response: Response,
     config: FathometerConfig,
     *,
     preview: bool = False,
 ) -> Estimate:
-    """One row per reflector, multiple (K,) the probability that it is a multiple; without any, one
-    row whose depth is NaN, for the PMF's sake."""
+    """One row per reflector, multiple (K,) the probability that it is a multiple, slopes: see
+    `Identities.slopes`; without any, one row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     extras: dict[str, np.ndarray] = {
@@ -318,6 +392,9 @@ def write_estimate(
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
         'multiple_probability': np.full(rows, np.nan),
+        'dipping': np.zeros(rows),
+        'slope': np.zeros(rows),
+        'slope_std': np.zeros(rows),
         'sediment_depth': np.full(rows, np.nan),
         'sediment_depth_std': np.full(rows, np.nan),
         'sigma': np.full(rows, float(np.median(response.sigma))),
@@ -336,6 +413,8 @@ def write_estimate(
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
         extras['polarity'][:] = np.sign(reflectors.amplitude)
         extras['multiple_probability'][:] = multiple
+        for name, values in zip(('dipping', 'slope', 'slope_std'), slopes):
+            extras[name][:] = values
         extras['is_bottom'][:] = reflectors.is_bottom
         found = sediment_depths(reflectors, config)
         extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found

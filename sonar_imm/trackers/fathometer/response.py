@@ -270,7 +270,8 @@ def array_response(
     seconds = config.snapshot_seconds or 1.0 / spacing
     pulse = None
     if config.pulse == 'processor' and config.processor == 'mvdr':
-        pulse = processor_pulse(coherence, lattice, config.sound_speed)
+        heard = coherence._replace(weight=coherence.weight * coherence.share)
+        pulse = processor_pulse(heard, lattice, config.sound_speed)
 
     def at(low: float, step: float, count: int, *, envelope: bool = False) -> FloatArray:
         return fathometer.depth_response(
@@ -352,13 +353,15 @@ def mirror_sigma(
 class ArrayCoherence(NamedTuple):
     """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
     spacing in Hz; aperture: length of the array, m; weight (F,): the spectrum of an echo, NaN as
-    gamma."""
+    gamma, if all noise were the surface's and the matrices exact; share (F,): by what it is less
+    than that."""
 
     gamma: NDArray[np.complexfloating]
     first: float
     spacing: float
     aperture: float
     weight: FloatArray
+    share: FloatArray
 
 
 def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCoherence:
@@ -400,7 +403,27 @@ def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCohe
         csdm[there], frequency[there], power[there]
     )
     aperture = float(heights[-1] - heights[0])
-    return ArrayCoherence(gamma, float(record.frequency[rows[0]]), spacing, aperture, weight)
+    share = np.full(len(gamma), np.nan)
+    share[index[use][there]] = _echo_share(
+        csdm[there], frequency[there], heights, record.snapshots, config
+    )
+    first = float(record.frequency[rows[0]])
+    return ArrayCoherence(gamma, first, spacing, aperture, weight, share)
+
+
+def _echo_share(
+    csdm: NDArray[np.complexfloating],
+    frequency: FloatArray,
+    heights: NDArray[np.floating[Any]],
+    snapshots: float,
+    config: FathometerConfig,
+) -> FloatArray:
+    if config.pulse != 'processor' or config.processor != 'mvdr' or len(heights) < 2:
+        return np.ones(len(csdm))
+    share = fathometer.surface_share(csdm, frequency, heights, config.sound_speed)
+    if snapshots > 0.0:
+        share = share * fathometer.sampled_share(csdm, config.loading, snapshots)
+    return share
 
 
 def _near_one(
@@ -453,19 +476,23 @@ def _comb(frequency: FloatArray) -> tuple[NDArray[np.int64], float]:
     return index, spacing
 
 
-def envelope_parameters(pulse_width: float, noise_sigma: float) -> dict[str, Any]:
+def envelope_parameters(
+    pulse_width: float, noise_sigma: float, window: float = np.inf
+) -> dict[str, Any]:
     """Parameters of the tracker by name, for a pulse of standard deviation `pulse_width`, m, and
-    noise of `noise_sigma`, in the units of the record."""
+    noise of `noise_sigma`, in the units of the record, 0 where each record states it; window: of
+    the depths, m."""
+    # Two pulses nearer than that make one hump.
+    separation = 3.0 * pulse_width
     return {
         'pulse': 'gaussian',
         'pulse_width': pulse_width,
         'noise_sigma': noise_sigma,
         'scatter_decay': DECAYS,
-        # Two pulses nearer than that make one hump.
-        'min_separation': 3.0 * pulse_width,
+        'min_separation': separation,
         # Records come several a second and the floor slopes; 1.4 m a record can be followed.
         'depth_std': 0.35,
-        'order_max': 6,
+        'order_max': max(1, int(min(window / separation, 6.0))),
     }
 
 

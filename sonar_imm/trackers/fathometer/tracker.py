@@ -89,6 +89,7 @@ from .response import (
     scatter_of,
     trace_response,
 )
+from .slopes import slopes_followed
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
@@ -365,20 +366,22 @@ class FathometerTracker:
 
     def _cycle(self, response: Response, records: int) -> SetStep:
         """The particle filter over one record; what is kept of it is decided by the caller."""
-        assert self._filter is not None
+        assert self._filter is not None and self._lattice is not None
         # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
             b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
         b = np.ascontiguousarray(np.nan_to_num(b))
         key, gram = (self.config.seed, response.stamp_ns), None
         if response.pulse is not None:
-            assert self._lattice is not None
             lags = self._lattice.step * np.arange(self._lattice.cells, dtype=np.float64)
             gram = np.ascontiguousarray(response.pulse(lags))
         particles, before = self._filter, self._before
         if not self._bridged(records):
             records, before = 1, None
-        record = particles.record(b, key, gram, records)
+        walks = None
+        if before is not None and slopes_followed(self.config):
+            walks = self._ids.walks(self._lattice, records, self.config)
+        record = particles.record(b, key, gram, records, walks)
         before = before or particles.start(record)
         sets = particles.propagate(before, record)
         step = particles.weigh(sets, record)
@@ -395,7 +398,8 @@ class FathometerTracker:
 
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
-        return known.name(reflectors.depth, reflectors.is_bottom, self.config)
+        variance = reflectors.covariance[:, 0, 0]
+        return known.name(reflectors.depth, reflectors.is_bottom, self.config, variance)
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step, records = self._filtered(response)
@@ -417,16 +421,16 @@ class FathometerTracker:
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]))
-        newest = self._write(reflectors, ids, pmf, response, records)
+        newest = self._write(reflectors, ids, pmf, response, self._ids, records)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config, records))
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
         response, step, records = self._filtered(response)
         reflectors, pmf = self._summarise(step, response)
-        _, ids = self._named(reflectors, records)
+        known, ids = self._named(reflectors, records)
         self.counts['previews'] += 1
-        return self._write(reflectors, ids, pmf, response, records, preview=True)
+        return self._write(reflectors, ids, pmf, response, known, records, preview=True)
 
     def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
@@ -441,7 +445,7 @@ class FathometerTracker:
             free = [named for named in taken.named if named.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
             ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
-        return [self._write(reflectors, ids, pmf, response)]
+        return [self._write(reflectors, ids, pmf, response, self._ids)]
 
     def _write(
         self,
@@ -449,6 +453,7 @@ class FathometerTracker:
         ids: IdArray,
         pmf: FloatArray,
         response: Response,
+        known: Identities,
         records: int = 1,
         *,
         preview: bool = False,
@@ -459,8 +464,9 @@ class FathometerTracker:
             span = self._lattice.step * self._lattice.cells
             seen = seen_as(reflectors, ids, self.config, records)
             multiple = self._multiples.probabilities(seen, self.config, span)
+        slopes = known.slopes(ids)
         return write_estimate(
-            reflectors, ids, pmf, multiple, response, self.config, preview=preview
+            reflectors, ids, pmf, multiple, slopes, response, self.config, preview=preview
         )
 
     def _summarise(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:

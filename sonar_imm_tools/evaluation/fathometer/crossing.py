@@ -41,18 +41,20 @@ from typing import Any, NamedTuple
 
 from attrs import evolve
 import numpy as np
+import plotly.graph_objects as go
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 from ...offline.run_folder import read_measurements, RunFolder
+from ...recordings.export.horizons import EARTH_RADIUS
 from ...recordings.positions import read_positions
 from ...recordings.reader import BagReader
 from ...recordings.sources import BagError
+from ..plotting import COLOURS, styled
 
 AT, REACH, LEAST = 5.0, 25.0, 5
-_EARTH = 6_371_008.8
 
 
 class Line(NamedTuple):
@@ -185,6 +187,40 @@ def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def mistie_figure(metrics: Mapping[str, Any]) -> go.Figure:
+    """The difference of each horizon that both lines have, from above, with two stated standard
+    deviations; filled where it is judged. metrics: of `crossing_metrics`."""
+    figure = go.Figure()
+    for number, crossing in enumerate(metrics['crossings'], start=1):
+        for judged in (True, False):
+            shown = [h for h in crossing['horizons'] if h['judged'] == judged]
+            if not shown:
+                continue
+            kinds = [
+                'floor' if h['bottom'] else 'multiple' if h['multiple'] else '' for h in shown
+            ]
+            depths = [0.5 * (h['depth_a_m'] + h['depth_b_m']) for h in shown]
+            colour = COLOURS[(number - 1) % len(COLOURS)]
+            figure.add_scatter(
+                x=[h['difference_m'] for h in shown],
+                y=[f'{kind} {depth:.1f} m ({number})' for kind, depth in zip(kinds, depths)],
+                error_x={'array': [2.0 * h['std_m'] for h in shown], 'color': colour},
+                mode='markers',
+                marker={
+                    'color': colour,
+                    'size': 9,
+                    'symbol': 'circle' if judged else 'circle-open',
+                },
+                name=f'crossing {number}' + ('' if judged else ', not judged'),
+            )
+    figure.add_vline(x=0.0, line_width=1)
+    rows = sum(len(crossing['horizons']) for crossing in metrics['crossings'])
+    title = f'{metrics["line_a"]} minus {metrics["line_b"]} [m], with two standard deviations'
+    return styled(
+        figure, 160 + 34 * rows, {'title': title}, {'type': 'category', 'autorange': 'reversed'}
+    )
+
+
 def _line(folder: RunFolder) -> Line:
     run = folder.read_run()
     if run['system'] != 'fathometer':
@@ -230,8 +266,8 @@ def tracked_depths(run: Mapping[str, Any], config: FathometerConfig) -> FloatArr
 def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
     """East and north (T, 2) of the origin in metres: lines are short against the Earth."""
     turned = (line.longitude - origin[0] + 180.0) % 360.0 - 180.0
-    east = np.radians(turned) * _EARTH * np.cos(np.radians(origin[1]))
-    return np.column_stack([east, np.radians(line.latitude - origin[1]) * _EARTH])
+    east = np.radians(turned) * EARTH_RADIUS * np.cos(np.radians(origin[1]))
+    return np.column_stack([east, np.radians(line.latitude - origin[1]) * EARTH_RADIUS])
 
 
 def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, float]]:

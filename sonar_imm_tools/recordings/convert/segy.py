@@ -21,10 +21,13 @@ given. Headers count whole seconds, so the traces of one second are spread over 
 
 Traces that are never negative are envelopes. For them the pulse and the noise are measured
 and written beside the bag, where the tracker finds them: the water above the floor is quiet, so
-that the first arrival of a trace is plain to see, and its shape is that of the pulse where little
-scatters below it. The lower quartile over all traces of its width at half height is taken. What is
-above the first arrival is noise; of coarse steps of a converter it is at least half a step. Places
-in seconds of arc or degrees become the topic ``/position``.
+that the first arrival of a trace is plain to see, and its shape is that of the pulse where the
+floor is level and little scatters below it. Steep floors, gas and roughness only make it wider: of
+its widths at half height, where the arrivals beside it begin within a sample of it, the tenth part
+from below is taken. What is above the first arrival is noise; of coarse steps of a converter it is
+at least half a step. Where a gain that grows with time raises the noise with the depth, each trace
+states it by depth (`noise_by_depth`). Places in seconds of arc or degrees become the topic
+``/position``.
 """
 
 from __future__ import annotations
@@ -54,7 +57,8 @@ if TYPE_CHECKING:
 
 SECOND = 10**9
 _RUN, _REACH, _LOUD = 3, 4, 8.0
-_LEAST_ARRIVALS = 10
+_LEAST_ARRIVALS, _LEAST_QUIET, _AROUND = 10, 20, 3
+_NARROW = 0.1
 _NEAR = 1.5
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -85,9 +89,10 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
         offset = start + spacing * how.first_sample
         if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
             report.notes['sample_interval'] = doubt
-    records = _records(report, Path(path), line.stamps, depth, amplitude, how.stack, how.frame_id)
+    own, sigma = _instrument(report, amplitude, spacing, how.stack)
+    traces = (line.stamps, depth, amplitude, sigma)
+    records = _records(report, Path(path), traces, how.stack, how.frame_id)
     records += _positions(line) if records else []
-    own = _instrument(report, amplitude, spacing, how.stack)
     return write_bag(
         out,
         records,
@@ -171,31 +176,35 @@ def _positions(line: SegyLine) -> list[Record]:
 
 def _instrument(
     report: ConversionReport, amplitude: NDArray, spacing: float, stack: int
-) -> dict[str, Any]:
-    """Parameters of the tracker for the traces (T, n), none unless they are envelopes."""
+) -> tuple[dict[str, Any], FloatArray | None]:
+    """Parameters of the tracker for the traces (T, n), none unless they are envelopes; and their
+    noise (n,) where it grows with the depth."""
     if len(amplitude) < stack or not np.isfinite(amplitude).all() or not is_envelope(amplitude):
-        return {}
+        return {}, None
     measured = measured_instrument(amplitude, spacing, stack)
     if measured is None:
         report.notes['pulse'] = (
             'the traces are envelopes, but no first arrival stands free to measure the pulse; '
             'leave out the transmit pulse (--first-sample) or give the tracker parameters'
         )
-        return {}
+        return {}, None
     width, noise = (float(f'{value:.3g}') for value in measured)
-    report.notes['pulse'] = f'of an envelope, {width:g} m; noise {noise:g}; see parameters.yaml'
-    return envelope_parameters(width, noise)
+    sigma, window = noise_by_depth(amplitude, stack, noise), spacing * amplitude.shape[1]
+    said = f'{noise:g}'
+    if sigma is not None:
+        said, noise = f'{sigma[0]:.3g} to {sigma[-1]:.3g}, growing with the depth', 0.0
+    report.notes['pulse'] = f'of an envelope, {width:g} m; noise {said}; see parameters.yaml'
+    return envelope_parameters(width, noise, window), sigma
 
 
 def _records(
     report: ConversionReport,
     path: Path,
-    stamps: list[int],
-    depth: NDArray,
-    amplitude: NDArray,
+    traces: tuple[list[int], NDArray, NDArray, FloatArray | None],
     stack: int,
     frame_id: str,
 ) -> list[Record]:
+    stamps, depth, amplitude, sigma = traces
     records: list[Record] = []
     for first in range(0, len(stamps) - stack + 1, stack):
         report.rows += stack
@@ -206,6 +215,7 @@ def _records(
                 frame_id=frame_id,
                 depth=depth,
                 amplitude=amplitude[first : first + stack].mean(axis=0),
+                sigma=sigma,
             )
         except Rejection as error:
             report.bad_row(path, f'trace {first}', error)
@@ -274,18 +284,54 @@ def measured_instrument(
     """Standard deviation of the pulse, m, and noise, for envelopes (T, n) with samples `spacing` m
     apart, of which `stack` successive ones are averaged; None when too few first arrivals stand
     free."""
-    step = _step(amplitude)
-    count = len(amplitude) // stack
-    amplitude = amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1)
-    arrivals = first_arrivals(amplitude)
+    step, amplitude = _step(amplitude), _stacked(amplitude, stack)
+    arrivals, edges = first_arrivals(amplitude), arrival_edges(amplitude)
     free = [(trace, int(i)) for trace, i in zip(amplitude, arrivals) if i >= _REACH]
-    widths = [width for trace, i in free if (width := _width(trace, i)) is not None]
-    if len(widths) < _LEAST_ARRIVALS:
+    widths = np.array(
+        [
+            np.nan if i < _REACH or (width := _width(trace, int(i))) is None else width
+            for trace, i in zip(amplitude, arrivals)
+        ]
+    )
+    beside = np.pad(np.abs(np.diff(edges)), 1, 'edge') if len(edges) > 1 else np.zeros(2)
+    level = np.isfinite(widths) & (np.maximum(beside[1:], beside[:-1]) <= 1)
+    if np.count_nonzero(level) < _LEAST_ARRIVALS:
+        level = np.isfinite(widths)
+    if np.count_nonzero(level) < _LEAST_ARRIVALS:
         return None
-    pulse = spacing * max(float(np.quantile(widths, 0.25)) / _FWHM, 0.4)
+    pulse = spacing * max(float(np.quantile(widths[level], _NARROW)) / _FWHM, 0.4)
     quiet = np.concatenate([trace[: i - _REACH] for trace, i in free] or [np.empty(0)])
     rms = float(np.sqrt(np.mean(np.square(quiet)))) if len(quiet) else 0.0
     return pulse, max(rms, 0.5 * step, 1e-3 * float(amplitude.max()))
+
+
+def noise_by_depth(amplitude: FloatArray, stack: int, least: float) -> FloatArray | None:
+    """Noise (n,), rms, of envelopes (T, n) of which `stack` successive ones are averaged, where it
+    grows with the depth to more than twice of what it is at first, else None; nowhere less than
+    `least`.
+
+    Above the first arrivals it is seen. Below them it is no more than what the quietest tenth of
+    the traces has at a depth, of which noise of that rms has as little; and since it only grows,
+    no more than at any greater depth."""
+    amplitude = _stacked(amplitude, stack)
+    edges, n = arrival_edges(amplitude), amplitude.shape[1]
+    water = np.arange(n) < (edges - _REACH)[:, None]
+    seen = water.sum(axis=0)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        above = np.sqrt((np.square(amplitude) * water).sum(axis=0) / seen)
+    drawn = np.random.default_rng(0).rayleigh(np.sqrt(0.5), (20_000, stack)).mean(axis=1)
+    scale = np.sqrt(np.mean(np.square(drawn))) / np.quantile(drawn, _NARROW)
+    found = np.where(seen >= _LEAST_QUIET, above, scale * np.quantile(amplitude, _NARROW, axis=0))
+    # Of a few samples each depth has chance in it.
+    pad = np.pad(found, _AROUND, 'edge')
+    found = np.median(np.lib.stride_tricks.sliding_window_view(pad, 2 * _AROUND + 1), axis=1)
+    sigma = np.maximum(np.minimum.accumulate(found[::-1])[::-1], least)
+    return sigma if sigma[-1] > 2.0 * sigma[0] else None
+
+
+def _stacked(amplitude: FloatArray, stack: int) -> FloatArray:
+    count = len(amplitude) // stack
+    return np.asarray(amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1))
 
 
 def _width(trace: FloatArray, peak: int) -> float | None:

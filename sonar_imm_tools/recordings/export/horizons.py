@@ -37,6 +37,7 @@ from ..positions import Positions
 from ..sources import BagError
 from .points import wkt_of
 
+EARTH_RADIUS = 6_371_008.8
 _COPIED = ('existence', 'is_bottom', 'multiple_probability')
 
 
@@ -44,7 +45,8 @@ _COPIED = ('existence', 'is_bottom', 'multiple_probability')
 class Picks:
     """K picks by horizon, then time: horizon (K,) its number; record (K,) from 1 on; stamp_ns
     (K,); two_way_time (K,) s; depth and depth_std (K,) m; columns (K,) by name; longitude and
-    latitude (K,) degrees, NaN where unknown."""
+    latitude (K,) degrees, NaN where unknown; distance (K,) along the line from the first record
+    that has a place, m, NaN where unknown."""
 
     horizon: IntArray
     record: IntArray
@@ -55,6 +57,7 @@ class Picks:
     columns: dict[str, FloatArray]
     longitude: FloatArray
     latitude: FloatArray
+    distance: FloatArray
 
     def __len__(self) -> int:
         return len(self.horizon)
@@ -67,28 +70,31 @@ def picks_of(
     system."""
     rows: list[tuple[float, ...]] = []
     where: list[tuple[int, int, int]] = []
-    record = 0
+    stamps: list[int] = []
     for estimate in estimates:
         columns = estimate.columns()
         if 'two_way_time' not in columns:
             raise BagError('these estimates have no two_way_time: they are not of the fathometer')
         if columns['preview'][0]:
             continue
-        record += 1
+        stamps.append(estimate.stamp_ns)
         for k in np.flatnonzero(np.isfinite(columns['depth'])):
             depth, time = float(columns['depth'][k]), float(columns['two_way_time'][k])
             if not np.isfinite(time):
                 time = 2.0 * depth / sound_speed
             std = float(np.sqrt(columns['cov_depth_depth'][k]))
-            where.append((int(columns['track_id'][k]), record, estimate.stamp_ns))
+            where.append((int(columns['track_id'][k]), len(stamps), estimate.stamp_ns))
             rows.append((time, depth, std, *(float(columns[name][k]) for name in _COPIED)))
     if not rows:
         raise BagError('there are no reflectors to export')
     order = sorted(range(len(rows)), key=lambda k: where[k])
     places = np.array([where[k] for k in order], np.int64)
     values = np.array([rows[k] for k in order])
-    nowhere = np.full(len(rows), np.nan)
-    east, north = (nowhere, nowhere) if positions is None else positions.at(places[:, 2])
+    nowhere = np.full(len(stamps), np.nan)
+    east, north = nowhere, nowhere
+    if positions is not None:
+        east, north = positions.at(np.array(stamps, np.int64))
+    way, at = _along(east, north), places[:, 1] - 1
     return Picks(
         places[:, 0],
         places[:, 1],
@@ -97,9 +103,22 @@ def picks_of(
         values[:, 1],
         values[:, 2],
         {name: values[:, 3 + k] for k, name in enumerate(_COPIED)},
-        east,
-        north,
+        east[at],
+        north[at],
+        way[at],
     )
+
+
+def _along(longitude: FloatArray, latitude: FloatArray) -> FloatArray:
+    """Distance (T,) from the first of the places (T,) that is known, m, NaN where one is not."""
+    way, there = np.full(len(longitude), np.nan), np.flatnonzero(np.isfinite(longitude))
+    turned = np.radians(np.unwrap(longitude[there], period=360.0))
+    north = np.radians(latitude[there])
+    # Records are short steps apart.
+    east = np.diff(turned) * np.cos(0.5 * (north[1:] + north[:-1]))
+    steps = EARTH_RADIUS * np.hypot(east, np.diff(north))
+    way[there] = np.append(0.0, np.cumsum(steps))[: len(there)]
+    return way
 
 
 def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> None:
@@ -110,7 +129,7 @@ def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> Non
         writer.writerow(
             (
                 *('horizon', 'line', 'trace', 'x', 'y', 'longitude', 'latitude', 'twt_ms'),
-                *('depth_m', 'depth_std_m', *_COPIED, 'time_utc'),
+                *('depth_m', 'depth_std_m', *_COPIED, 'time_utc', 'distance_m'),
             )
         )
         for k in range(len(picks)):
@@ -126,6 +145,7 @@ def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> Non
                     f'{picks.depth_std[k]:.3f}',
                     *(_number(picks.columns[name][k], 3) for name in _COPIED),
                     utc_text(int(picks.stamp_ns[k])),
+                    _number(picks.distance[k], 2),
                 )
             )
 
@@ -151,6 +171,7 @@ def write_geojson(path: Path, picks: Picks) -> int:
             'twt_ms': round(1e3 * float(picks.two_way_time[k]), 4),
             'depth_m': round(float(picks.depth[k]), 3),
             'depth_std_m': round(float(picks.depth_std[k]), 3),
+            'distance_m': round(float(picks.distance[k]), 2),
             # JSON has no NaN.
             **{name: round(v, 3) if np.isfinite(v) else None for name, v in extra.items()},
         }

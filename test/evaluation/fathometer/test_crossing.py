@@ -27,6 +27,7 @@ from sonar_imm_tools.evaluation.fathometer.crossing import (
     common_shift,
     crossing_lines,
     crossing_metrics,
+    mistie_figure,
     summary,
 )
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -103,6 +104,21 @@ def test_where_lines_cross_their_horizons_agree(lines):
         assert horizon['depth_a_m'] == pytest.approx(true, abs=0.25)
         assert abs(horizon['difference_m']) < 0.3 and abs(horizon['sigmas']) < 2.5
     assert [horizon['bottom'] for horizon in one['horizons']] == [True, False]
+
+
+def test_misties_are_drawn_by_horizon(lines, tmp_path):
+    metrics = crossed(lines, 'we', 'sn')
+    horizons = metrics['crossings'][0]['horizons']
+    [drawn] = mistie_figure(metrics).data
+    assert list(drawn.x) == [horizon['difference_m'] for horizon in horizons]
+    assert list(drawn.error_x.array) == [2.0 * horizon['std_m'] for horizon in horizons]
+    assert drawn.y[0].startswith('floor') and drawn.marker.symbol == 'circle'
+    cut = mistie_figure(crossed(lines, 'we', 'cut')).data
+    assert [each.marker.symbol for each in cut] == ['circle-open']
+    page = tmp_path / 'misties.html'
+    runs = [str(lines[name]) for name in ('we', 'sn')]
+    assert main(['evaluate', *runs, '--crossing', '--report', str(page)]) == 0
+    assert 'with two standard deviations' in page.read_text()
 
 
 def test_the_error_of_a_position_counts_by_the_slope(lines):

@@ -18,12 +18,15 @@ import numpy as np
 import pytest
 import yaml
 
+from msg_adapters.array_records import read_trace
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.recordings.convert import convert_segy
 from sonar_imm_tools.recordings.convert.segy import (
     doubted_spacing,
     first_arrivals,
     is_envelope,
     measured_instrument,
+    noise_by_depth,
 )
 from sonar_imm_tools.recordings.positions import read_positions
 from sonar_imm_tools.recordings.reader import BagReader
@@ -109,3 +112,62 @@ def test_what_is_no_envelope_is_left_alone(tmp_path):
     path = write_segy(tmp_path / 'deaf.seg', ECHO[:, 34:])
     report = convert_segy(path, tmp_path / 'deaf', sample_spacing=0.4)
     assert 'no first arrival stands free' in report.notes['pulse']
+
+
+def line(*, gas=0.0, steep=0.0, growth=0.0, seed=1):
+    """Envelopes (400, 200), .1 m apart, of a pulse of .3 m on a floor that rises by `steep` m from
+    trace to trace, and falls; `gas`: share of arrivals that are up to six times as broad; noise of
+    .02 that grows by exp(growth)."""
+    rng, rows, z = np.random.default_rng(seed), np.arange(400), 0.1 * np.arange(200)
+    floor = 6.0 + 2.0 * np.sin(rows / 40.0) + steep * np.abs(rows % 20 - 10)
+    width = 0.3 * (1.0 + (rng.random(400) < gas) * rng.uniform(1.0, 5.0, 400))
+    away = z - floor[:, None]
+
+    def complex_noise(rms):
+        return rms * np.sqrt(0.5) * (rng.standard_normal((2, 400, 200)).T @ [1.0, 1j]).T
+
+    field = (
+        np.exp(-0.5 * np.square(away / width[:, None]))
+        * np.exp(2j * np.pi * rng.random(400))[:, None]
+    )
+    field = field + complex_noise(0.15) * np.where(away > 0.0, np.exp(-away / 3.0), 0.0)
+    return np.abs(field + complex_noise(0.02) * np.exp(growth * z / z[-1]))
+
+
+@pytest.mark.parametrize('field', [{}, {'gas': 0.8}, {'steep': 0.3}, {'gas': 0.5, 'steep': 0.3}])
+def test_gas_and_slopes_do_not_widen_the_pulse(field):
+    """What scatters just below a floor widens it by a tenth."""
+    pulse, _ = measured_instrument(line(**field), 0.1)
+    assert pulse == pytest.approx(0.3, rel=0.25)
+
+
+@pytest.mark.parametrize('stack', [1, 4])
+def test_noise_that_grows_with_the_depth_is_measured(stack):
+    true = 0.02 * np.exp(3.0 * np.linspace(0.0, 1.0, 200))
+    stacked = line(growth=3.0)
+    found = noise_by_depth(stacked, stack, 1e-3)
+    assert (np.diff(found) >= 0.0).all()
+    # A mean of four envelopes has less rms than one, by the spread that is averaged.
+    scale = np.sqrt(np.pi / 4.0 + (1.0 - np.pi / 4.0) / stack)
+    assert found == pytest.approx(scale * true, rel=0.45)
+    assert noise_by_depth(line(), stack, 1e-3) is None
+
+
+def test_traces_state_noise_that_grows(tmp_path):
+    write_segy(tmp_path / 'in.sgy', line(growth=3.0))
+    report = convert_segy(tmp_path / 'in.sgy', tmp_path / 'out', sample_spacing=0.1)
+    assert 'growing with the depth' in report.notes['pulse']
+    own = yaml.safe_load((tmp_path / 'out' / 'parameters.yaml').read_text())
+    own = own['fathometer']['ros__parameters']
+    assert own['noise_sigma'] == 0.0
+    with BagReader(tmp_path / 'out') as bag:
+        trace = read_trace(next(iter(bag.messages(['/trace']))).message)
+    assert trace.sigma[-1] > 10.0 * trace.sigma[0]
+
+
+def test_as_many_reflectors_as_the_window_holds():
+    """A pulse too broad for six reflectors in the window: fewer, and no run refused for that."""
+    broad = envelope_parameters(2.6, 0.1, 27.8)
+    assert broad['order_max'] == 3 and broad['order_max'] * broad['min_separation'] <= 27.8
+    assert envelope_parameters(0.5, 0.1, 27.8) == envelope_parameters(0.5, 0.1)
+    assert envelope_parameters(50.0, 0.1, 27.8)['order_max'] == 1
