@@ -63,14 +63,20 @@ def rmse(estimate, height):
             'height_bank',
             'height cov_height_height prob_rw_1 prob_rw_2 prob_rw_3 prob_rw_4 range angle',
         ),
+        (
+            'scatter_bank',
+            'height cov_height_height prob_steady prob_undulating prob_scatter_1 prob_scatter_2 '
+            'prob_rw_1 prob_rw_2 prob_rw_3 range angle',
+        ),
     ],
 )
 def test_columns_are_those_of_the_contract(model_set, columns):
     snapshot = floor(0.0)
     table = run(snapshot, model_set=model_set).columns()
     after = 'valid log_likelihood label label_probability'
-    if model_set == 'height_bank':
+    if model_set.endswith('_bank'):
         after += ' rough'
+    after += ' label_confidence told detectable_std'
     after += ' existence_2 surfaces'
     assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
     assert table['valid'].dtype == np.uint8
