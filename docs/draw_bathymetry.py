@@ -52,6 +52,8 @@ AS_PRINTED = {
     'two RW': {'variant': 'paper', 'model_set': 'height_two_rw'},
 }
 ANGLES = {'variant': 'paper', 'model_set': 'angle_two_rw'}
+SURFACE_DB = -6.0
+"""Power of the echoes by way of the surface, relative to those of the floor."""
 SHADOW = (35.0, 36.0)
 """Slant ranges of the discontinuity in the picture of particle clouds, m."""
 CLOUDS_AT = (20.0, 35.5, 45.0, 70.0)
@@ -73,6 +75,7 @@ def main() -> None:
     angles = BathymetryTracker(BathymetryConfig(**ANGLES)).process(ping)[0]
     draw_scene(config, truth)
     draw_spectra(ping, truth, printed, angles)
+    draw_multipath()
     draw_profile(ping, truth, runs)
     draw_clouds()
     draw_sensitivity()
@@ -140,6 +143,36 @@ def spectrum(axis, ping, truth, method, estimate) -> None:
     axis.plot(ping.range, np.degrees(found), color=RED, linewidth=1.0, label='particle filter')
     axis.set(ylim=(-30, 35), ylabel='angle [deg]', title=method)
     axis.legend(loc='upper right', fontsize=8, facecolor='0.85')
+
+
+def draw_multipath() -> None:
+    """Figure 3 with what it is about: echoes by way of a calm surface in the Capon spectrum, and
+    the estimate that goes through them, as printed and with `multipath`."""
+    config = scenario('multipath', {'pings': 1, 'multipath_level_db': SURFACE_DB})
+    scene = simulate(config, 1)
+    ping, truth = scene.measurements[0].measurement, scene.truth[0]
+    expected = {
+        'model_set': 'angle_two_rw',
+        'multipath': True,
+        'multipath_level_db': SURFACE_DB,
+    }
+    depth, tilt = config.sonar_height - truth.height, math.radians(config.tilt_deg)
+    surface = array.multipath_sines(depth, truth.range, tilt, config.sonar_depth)
+    figure, axes = plt.subplots(2, 1, figsize=(9, 5.5), sharex=True, layout='constrained')
+    for axis, values, name in (
+        (axes[0], ANGLES, 'as printed'),
+        (axes[1], expected, 'echoes by way of the surface expected'),
+    ):
+        estimate = BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
+        spectrum(axis, ping, truth, 'capon', estimate)
+        for sine in surface.T:
+            angle = np.degrees(np.arcsin(sine))
+            axis.plot(ping.range, angle, '--', color=BLUE, linewidth=0.8)
+        error = columns(estimate)['angle'] - truth.angle
+        rms = math.degrees(math.sqrt(np.mean(np.square(error[truth.valid]))))
+        axis.set(title=f'{name}: {rms:.2f} deg RMS', ylim=(-75, 35))
+    axes[-1].set_xlabel('slant range [m]')
+    save(figure, 'bathymetry_multipath.png', tight=False)
 
 
 def draw_clouds() -> None:
