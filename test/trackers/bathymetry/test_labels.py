@@ -109,7 +109,7 @@ def test_the_smoother_is_that_of_dense_matrices():
     assert seen.likelihood.echo.all()
     assert track.mean[:, 0] == pytest.approx(mean, abs=1e-5)
     assert track.covariance[:, 0, 0] == pytest.approx(variance, rel=5e-4)
-    assert track.probability == pytest.approx(probability, abs=1e-5)
+    assert track.probability == pytest.approx(probability, abs=1e-4)
     assert 0.02 < probability[:, 1].min() and probability[:, 1].max() > 0.5
 
 
@@ -196,7 +196,7 @@ def test_told_is_never_smooth_beyond_what_is_detectable(model_set):
     [
         ({'patch_std': 0.3}, 0.7),
         ({'slope': 0.1}, 0.9),
-        ({'undulation_height': 0.5, 'undulation_length': 15.0}, 0.8),
+        ({'undulation_height': 0.5, 'undulation_length': 15.0}, 0.6),
         ({'roughness_law': 'exponential', 'correlation_length': 1.0, 'patch_std': 0.3}, 0.5),
     ],
 )
