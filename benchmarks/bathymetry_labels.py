@@ -136,7 +136,7 @@ def pings(changes: Mapping[str, Any], count: int, seed: int) -> Iterator[tuple[S
 
 def part_of(table: Any, bins: BoolArray) -> Any:
     """Some bins of a snapshot, or of what is true of it."""
-    values = {entry.name: getattr(table, entry.name) for entry in fields(type(table))}
+    values = {e.name: getattr(table, e.name) for e in fields(type(table)) if e.init}
     return evolve(
         table,
         **{

@@ -340,7 +340,9 @@ def test_noise_of_any_kind_gives_finite_answers(bins, P, exponent, holes, values
     iq = 10.0**exponent * (rng.normal(size=(bins, P)) + 1j * rng.normal(size=(bins, P)))
     iq[1:][rng.random(bins - 1) < holes] = np.nan
     snapshot = Snapshot(stamp_ns=1, range=np.sort(rng.uniform(0.0, 100.0, bins)), iq=iq)
-    engines = ('particles',) if values['model_set'] == 'height_rw_ncs' else ('particles', 'grid')
+    engines = {'height_rw_ncs': ('particles',), 'scatter_bank': ('grid',)}.get(
+        values['model_set'], ('particles', 'grid')
+    )
     for engine in engines:
         estimate = run(snapshot, engine=engine, particles_per_model=20, **values)
         assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all()
