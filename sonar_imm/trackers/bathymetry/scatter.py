@@ -66,6 +66,8 @@ UNDULATING_SHARE, ROUGH_SHARE = 0.3, 0.3
 BECOMES_ROUGH, ROUGH_ENDS = 0.5, 5.0
 """In units of 1 - stay: how often smooth floor becomes rough (as often it takes another slope),
 and rough floor ends."""
+SCATTER_REACH = 5.0
+"""Bins scatter no further than so many standard deviations."""
 ENDS_SMOOTH = 0.95
 """Rough floor becomes smooth in so many cases, else it becomes rough in another way."""
 
@@ -181,14 +183,14 @@ def _blur(
     level: FloatArray,
     likelihood: FloatArray,
 ) -> float:
-    """What bin t says of the base on [low, high), into likelihood (M, G), and of the height, into
+    """What bin t says of the base on [low, high), into likelihood (K, G), and of the height, into
     level (G,) on the window into wide (2,), both relative to the largest, whose logarithm is
     returned: -inf where the bin is impossible everywhere, and no more is written then.
-    spread (M,): scatter, in cells; work (12, max(G, 128) + 16) is scratch."""
+    spread (K,): scatter, in cells; work (12, max(G, 128) + 16) is scratch."""
     G, widest = cells.shape[0], 0.0
     for j in range(spread.shape[0]):
         widest = max(widest, spread[j])
-    reach = grid.reach_of(widest)
+    reach = int(math.ceil(SCATTER_REACH * widest))
     start, end = max(low - reach, 0), min(high + reach, G)
     wide[0], wide[1] = start, end
     n = end - start
@@ -227,7 +229,7 @@ def _answer(
     track: Track,
 ) -> None:
     """Mean and variance of the height of bin t and the probabilities of the models, from the joint
-    density p (M, G) of the base before the bin itself is heard, and what it says, see `_blur`."""
+    density p (K, G) of the base before the bin itself is heard, and what it says, see `_blur`."""
     height, square, whole = 0.0, 0.0, 0.0
     middle, probability = cells[(low + high) // 2], track.probability[t]
     for m in range(probability.shape[0]):
@@ -263,7 +265,7 @@ def _rest(
     t: int,
     track: Track,
 ) -> None:
-    """The answer for a bin without an echo, from the density p (M, G) of the base."""
+    """The answer for a bin without an echo, from the density p (K, G) of the base."""
     height, square, whole, step = 0.0, 0.0, 0.0, cells[1] - cells[0]
     middle, probability = cells[(low + high) // 2], track.probability[t]
     for m in range(probability.shape[0]):
@@ -287,7 +289,7 @@ def _rest(
 
 @kernel
 def _weigh(p: FloatArray, low: int, high: int, likelihood: FloatArray) -> float:
-    """Multiply p (M, G) on [low, high) by likelihood (M, G) and normalise it; the ratio of its
+    """Multiply p (K, G) on [low, high) by likelihood (K, G) and normalise it; the ratio of its
     sums. An impossible likelihood changes nothing: 0 is returned."""
     before, after = 0.0, 0.0
     for j in range(p.shape[0]):
@@ -310,17 +312,18 @@ def filter_scatter(
     track: Track,
     keep: bool,
 ) -> FloatArray:
-    """All T bins from p (M, G), the joint probability of model and base before the first.
+    """All T bins from p (K, G), the joint probability of model and base before the first.
 
     The windows [low, high) of the predicted densities go into window (T, 2), the answers into
-    `track`. With `keep` the predicted densities are returned, M rows for each bin; else nothing.
+    `track`. With `keep` these are the log likelihoods alone, the rest is that of `smooth_scatter`,
+    and the predicted densities are returned, K rows for each bin; else nothing (0,).
     """
-    (M, G), T = p.shape, ping.ranges.shape[0]
+    (K, G), T = p.shape, ping.ranges.shape[0]
     motion, kind, spread, lean = moves.grid, moves.kind, moves.spread, moves.lean
     cells, sigma, coast = motion.cells, motion.sigma, motion.coast
-    mixed, moved = np.empty((M, G)), np.empty(G)
+    mixed, moved = np.empty((K, G)), np.empty(G)
     work = np.empty((12, max(G, 128) + 16))
-    level, likelihood = np.empty(G), np.empty((M, G))
+    level, likelihood = np.empty(G), np.empty((K, G))
     kept, used = np.empty(4096 if keep else 0), 0
     wide = np.empty(2, np.int64)
     low, high = grid.trim(p, 0, G)
@@ -331,15 +334,15 @@ def filter_scatter(
             if motion.favour.shape[0] > 0:
                 favour_cells(mixed, low, high, motion.favour[t])
         else:
-            for j in range(M):
+            for j in range(K):
                 for g in range(low, high):
                     mixed[j, g] = p[j, g]
-        for j in range(M):
+        for j in range(K):
             model = j if echo else coast
             further = grid.reach_of(sigma[t, model]) + int(math.ceil(abs(lean[model]))) + 2
             reach = max(reach, further)
         new_low, new_high = max(low - reach, 0), min(high + reach, G)
-        for j in range(M):
+        for j in range(K):
             model = j if echo else coast
             if lean[model] != 0.0:
                 further = int(math.ceil(abs(lean[model]))) + 2
@@ -351,13 +354,13 @@ def filter_scatter(
         low, high = grid.trim(p, new_low, new_high)
         window[t, 0], window[t, 1] = low, high
         if keep:
-            needed = used + M * (high - low)
+            needed = used + K * (high - low)
             if needed > kept.shape[0]:
                 larger = np.empty(2 * needed)
                 for s in range(used):
                     larger[s] = kept[s]
                 kept = larger
-            for j in range(M):
+            for j in range(K):
                 for g in range(low, high):
                     kept[used] = p[j, g]
                     used += 1
@@ -366,9 +369,10 @@ def filter_scatter(
             best = _blur(ping, t, cells, low, high, spread, wide, work, level, likelihood)
         ratio = 0.0
         if math.isfinite(best):
-            _answer(p, low, high, cells, kind, spread, wide, work, level, t, track)
+            if not keep:
+                _answer(p, low, high, cells, kind, spread, wide, work, level, t, track)
             ratio = _weigh(p, low, high, likelihood)
-        if not ratio > 0.0:
+        if not ratio > 0.0 and not keep:
             _rest(p, low, high, cells, kind, spread, t, track)
         track.log_likelihood[t] = 0.0
         if echo:
@@ -389,28 +393,28 @@ def smooth_scatter(
     are written anew into `track`."""
     motion, kind, spread, lean = moves.grid, moves.kind, moves.spread, moves.lean
     cells, coast, T = motion.cells, motion.coast, ping.ranges.shape[0]
-    M, G = motion.transition.shape[0], cells.shape[0]
-    beta, back, p = np.empty((M, G)), np.empty((M, G)), np.empty((M, G))
+    K, G = motion.transition.shape[0], cells.shape[0]
+    beta, back, p = np.empty((K, G)), np.empty((K, G)), np.empty((K, G))
     work, moved = np.empty((12, max(G, 128) + 16)), np.empty(G)
-    level, likelihood = np.empty(G), np.empty((M, G))
+    level, likelihood = np.empty(G), np.empty((K, G))
     backwards, end = motion.transition.T.copy(), 0  # in rows, as `grid.mix` is compiled for
     wide = np.empty(2, np.int64)
     for t in range(T):
-        end += M * (window[t, 1] - window[t, 0])
+        end += K * (window[t, 1] - window[t, 0])
     low, high = window[T - 1, 0], window[T - 1, 1]
-    for j in range(M):
+    for j in range(K):
         for g in range(low, high):
             beta[j, g] = 1.0
     for t in range(T - 1, -1, -1):
         echo = ping.echo[t]
-        end -= M * (high - low)
+        end -= K * (high - low)
         total, s = 0.0, end
-        for j in range(M):
+        for j in range(K):
             for g in range(low, high):
                 p[j, g] = kept[s] * beta[j, g]
                 total += p[j, g]
                 s += 1
-        for j in range(M):
+        for j in range(K):
             for g in range(low, high):
                 p[j, g] /= total
         best = -math.inf
@@ -424,7 +428,7 @@ def smooth_scatter(
         if t == 0:
             break
         new_low, new_high = window[t - 1, 0], window[t - 1, 1]
-        for j in range(M):
+        for j in range(K):
             model = j if echo else coast
             width = motion.sigma[t, model]
             if lean[model] != 0.0:
@@ -440,6 +444,6 @@ def smooth_scatter(
                 favour_cells(back, low, high, motion.favour[t])
             grid.mix(back, low, high, backwards, beta)
         else:
-            for j in range(M):
+            for j in range(K):
                 for g in range(low, high):
                     beta[j, g] = back[j, g]
