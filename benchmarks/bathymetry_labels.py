@@ -74,8 +74,8 @@ FLOORS: dict[str, dict[str, Any]] = {
         'undulation_length': 15.0,
     },
 }
-AROUND = 15.0
-"""Of a ping only the bins so near to the middle of the patch are used, m."""
+AROUND, WHOLE = 15.0, 1e3
+"""Of a ping the bins so near to the middle of the patch are used, m: of `floors` all."""
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 CONTRASTS = {'3 dB': 3.0, '6 dB': 6.0}
 
@@ -125,12 +125,14 @@ class Labels:
         }
 
 
-def pings(changes: Mapping[str, Any], count: int, seed: int) -> Iterator[tuple[Snapshot, Any]]:
-    """Snapshots and what is true of them."""
+def pings(
+    changes: Mapping[str, Any], count: int, seed: int, around: float = AROUND
+) -> Iterator[tuple[Snapshot, Any]]:
+    """Snapshots and what is true of them, within `around` m of the middle of the patch."""
     config = scenario('paper', {'pings': count, **changes})
     scene = simulate(config, seed)
     for item, truth in zip(scene.measurements, scene.truth):
-        near = np.abs(truth.range - 0.5 * (config.patch_start + config.patch_end)) < AROUND
+        near = np.abs(truth.range - 0.5 * (config.patch_start + config.patch_end)) < around
         yield part_of(item.measurement, near), part_of(truth, near)
 
 
@@ -148,16 +150,14 @@ def part_of(table: Any, bins: BoolArray) -> Any:
 
 
 def labelled(
-    changes: Mapping[str, Any], count: int, seed: int, whole: Mapping[str, Labels]
+    changes: Mapping[str, Any], count: int, seed: int, around: float = AROUND
 ) -> dict[str, Labels]:
-    """What each set makes of the same pings; added to `whole`, too."""
+    """What each set makes of the same pings."""
     std = float(changes.get('patch_std', 0.5))
     found = {name: Labels() for name in SETS}
-    for snapshot, truth in pings(changes, count, seed):
+    for snapshot, truth in pings(changes, count, seed, around):
         for name, config in SETS.items():
             found[name].add(look(Ping(config, snapshot, None)), None, truth, std)
-    for name, labels in found.items():
-        whole[name].extend(labels)
     return found
 
 
@@ -236,8 +236,8 @@ def amplitude(
 
 def main(count: int = 3, seed: int = 1, only: str = '') -> Parts:
     yield {'pings': count, 'seed': seed}
-    whole = {name: Labels() for name in SETS}
     if only in ('', 'cells'):
+        whole = {name: Labels() for name in SETS}
         for place, (start, end) in PATCHES.items():
             for std in STDS:
                 for kind, length in LENGTHS.items():
@@ -248,14 +248,16 @@ def main(count: int = 3, seed: int = 1, only: str = '') -> Parts:
                         'correlation_length': length,
                         'roughness_law': 'exponential',
                     }
-                    found = labelled(changes, count, seed, whole)
+                    found = labelled(changes, count, seed)
+                    for name, labels in found.items():
+                        whole[name].extend(labels)
                     row = {name: labels.overlap() for name, labels in found.items()}
                     yield {'cells': {f'{place}, {std:g} m, {kind}': row}}
         yield {'calibration': {name: calibration(labels) for name, labels in whole.items()}}
         yield {'verdicts': {name: verdicts(labels) for name, labels in whole.items()}}
     if only in ('', 'floors'):
         for name, changes in FLOORS.items():
-            found = labelled(changes, count, seed, whole)
+            found = labelled(changes, count, seed, WHOLE)
             for title, labels in found.items():
                 yield {'floors': {f'{name}, {title}': labels.row()}}
     if only in ('', 'amplitude'):
