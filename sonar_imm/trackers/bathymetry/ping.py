@@ -348,24 +348,16 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'log_likelihood': track.log_likelihood,
         'label': label.astype(np.uint8),
         'label_probability': track.probability[np.arange(len(label)), label],
+        **_label_columns(seen, track, floor),
     }
-    rough = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     if config.in_bank:
-        extras['rough'] = rough
-    detectable = DETECTABLE * swath.snapshot_std(
-        floor.angle, ping.signal / ping.noise, snapshot.staves
-    )
-    extras['label_confidence'] = np.maximum(rough, 1.0 - rough).astype(np.float32)
-    extras['told'] = verdict(rough, detectable, config.rough_std)
-    extras['told'][~ping.echo] = CANNOT_TELL
-    extras['detectable_std'] = detectable.astype(np.float32)
+        extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     if seen.layover is not None:
         second = np.where(ping.echo, seen.layover.existence, 0.0)
         two = second > GATE
         extras['valid'] = (ping.echo & ~two).astype(np.uint8)
         extras['existence_2'] = second.astype(np.float32)
         extras['surfaces'] = np.where(ping.echo, 1 + two, 0).astype(np.uint8)
-        extras['told'][two] = CANNOT_TELL
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         extras |= {
@@ -381,6 +373,8 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         covariance[:, 0, 0] += config.sonar_height_std**2
     if posed is not None or snapshot.side:
         extras['side'] = np.full(len(label), SIDES.index(swath.side), np.uint8)
+    if 'surfaces' in extras:
+        extras['told'][extras['surfaces'] == 2] = CANNOT_TELL
     return Estimate(
         stamp_ns=snapshot.stamp_ns,
         frame_id=snapshot.frame_id if posed is None else posed.frame_id,
@@ -392,6 +386,22 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         probabilities=track.probability,
         extras=extras,
     )
+
+
+def _label_columns(seen: Look, track: Track, floor: Floor) -> dict[str, np.ndarray]:
+    """Columns (T,): how sure smooth or rough is, which of them or neither, and the standard
+    deviation that roughness needs to be seen."""
+    swath, ping = seen.swath, seen.likelihood
+    rough = np.minimum(track.probability[:, seen.models.rough].sum(axis=1), 1.0)
+    snr = ping.signal / ping.noise
+    detectable = DETECTABLE * swath.snapshot_std(floor.angle, snr, seen.ping.snapshot.staves)
+    kind = verdict(rough, detectable, seen.config.rough_std)
+    kind[~ping.echo] = CANNOT_TELL
+    return {
+        'label_confidence': np.maximum(rough, 1.0 - rough).astype(np.float32),
+        'told': kind,
+        'detectable_std': detectable.astype(np.float32),
+    }
 
 
 def verdict(rough: FloatArray, detectable: FloatArray, rough_std: float) -> np.ndarray:

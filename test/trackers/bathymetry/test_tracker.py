@@ -74,9 +74,9 @@ def test_columns_are_those_of_the_contract(model_set, columns):
     snapshot = floor(0.0)
     table = run(snapshot, model_set=model_set).columns()
     after = 'valid log_likelihood label label_probability'
+    after += ' label_confidence told detectable_std'
     if model_set.endswith('_bank'):
         after += ' rough'
-    after += ' label_confidence told detectable_std'
     after += ' existence_2 surfaces'
     assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
     assert table['valid'].dtype == np.uint8
