@@ -35,7 +35,7 @@ from attrs import evolve, fields
 import numpy as np
 from scipy.special import kve
 
-from benchmarks.study import Parts, study
+from benchmarks.study import Parts, study, truths
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.ping import (
@@ -49,6 +49,7 @@ from sonar_imm.trackers.bathymetry.ping import (
     SMOOTH,
 )
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig
+from sonar_imm.truth import TrueProfile
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SETS = {
@@ -131,7 +132,7 @@ def pings(
     """Snapshots and what is true of them, within `around` m of the middle of the patch."""
     config = scenario('paper', {'pings': count, **changes})
     scene = simulate(config, seed)
-    for item, truth in zip(scene.measurements, scene.truth):
+    for item, truth in zip(scene.measurements, truths(scene, TrueProfile)):
         near = np.abs(truth.range - 0.5 * (config.patch_start + config.patch_end)) < around
         yield part_of(item.measurement, near), part_of(truth, near)
 

@@ -17,8 +17,9 @@
     python -m benchmarks.bathymetry_speed --out docs/results/bathymetry_speed.json
 
 Whole `process` of a ping of 2000 bins and 8 staves in complex64, best of some rounds in turn:
-particles and grid, filter and smoother, at rest and on a ship that moves, with straight and with
-bent rays, without and with the test for a second surface. `numpy` is the same filter, bin by bin.
+particles and grid, at rest and on a ship that moves, with straight and with bent rays, without and
+with the test for a second surface; and other models and sizes at rest. `numpy` is the same filter,
+bin by bin.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 ENGINES: dict[str, dict[str, Any]] = {
     'particles': {},
     'grid': {'engine': 'grid'},
-    'grid, forward-backward': {'engine': 'grid', 'smoothing': 'states'},
-    'height_bank': {'model_set': 'height_bank'},
-    'scatter_bank': {'model_set': 'scatter_bank'},
 }
 SCENES = {'at rest': 'paper', 'moving': 'moving', 'moving, bent rays': 'moving_profile'}
 LAYOVERS = ('ignored', 'gated')
 SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    'grid, forward-backward': ({'engine': 'grid', 'smoothing': 'states'}, {}),
+    'height_bank': ({'model_set': 'height_bank'}, {}),
+    'scatter_bank': ({'model_set': 'scatter_bank'}, {}),
     '1000 particles': ({'particles_per_model': 1000}, {}),
     'four walks': ({'model_set': 'height_bank', 'engine': 'particles'}, {}),
     '2 staves': ({}, {'staves': 2}),
@@ -69,7 +70,7 @@ def methods_of(scene_name: str) -> dict[str, Timed]:
 
 
 def sizes() -> dict[str, Timed]:
-    """Particles at rest without layover, of other sizes; and plain numpy."""
+    """Other models and sizes, at rest, without layover; and plain numpy."""
     methods: dict[str, Timed] = {}
     for name, (values, changes) in SIZES.items():
         ping = a_ping(**changes)
