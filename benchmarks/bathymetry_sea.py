@@ -84,6 +84,21 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         {**unknown(10.0), **EXACT_NAVIGATION},
         {**TOLD, **GRID},
     ),
+    'height 20 m, told 15, grid, exact navigation': (
+        'moving',
+        {**unknown(20.0), **EXACT_NAVIGATION},
+        {**TOLD, **GRID},
+    ),
+    'height 15 m, told 10, grid, exact navigation': (
+        'moving',
+        {**unknown(15.0), **EXACT_NAVIGATION},
+        {**TOLD, **GRID, 'sonar_height': 10.0},
+    ),
+    'height 15 m, told 15, grid, exact navigation': (
+        'moving',
+        {**unknown(15.0), **EXACT_NAVIGATION},
+        {**TOLD, **GRID},
+    ),
     'height 20 m, told 15, grid': ('moving', unknown(20.0), {**TOLD, **GRID}),
     'height 20 m, told 15, particles': ('moving', unknown(20.0), TOLD),
     'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),

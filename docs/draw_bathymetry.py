@@ -52,6 +52,8 @@ AS_PRINTED = {
     'two RW': {'variant': 'paper', 'model_set': 'height_two_rw'},
 }
 ANGLES = {'variant': 'paper', 'model_set': 'angle_two_rw'}
+SURFACE_DB = -6.0
+"""Power of the echoes by way of the surface, relative to those of the floor."""
 SHADOW = (35.0, 36.0)
 """Slant ranges of the discontinuity in the picture of particle clouds, m."""
 CLOUDS_AT = (20.0, 35.5, 45.0, 70.0)
@@ -73,9 +75,11 @@ def main() -> None:
     angles = BathymetryTracker(BathymetryConfig(**ANGLES)).process(ping)[0]
     draw_scene(config, truth)
     draw_spectra(ping, truth, printed, angles)
+    draw_multipath()
     draw_profile(ping, truth, runs)
     draw_clouds()
     draw_sensitivity()
+    draw_labels()
 
 
 def save(figure, name: str, *, tight: bool = True) -> None:
@@ -140,6 +144,36 @@ def spectrum(axis, ping, truth, method, estimate) -> None:
     axis.plot(ping.range, np.degrees(found), color=RED, linewidth=1.0, label='particle filter')
     axis.set(ylim=(-30, 35), ylabel='angle [deg]', title=method)
     axis.legend(loc='upper right', fontsize=8, facecolor='0.85')
+
+
+def draw_multipath() -> None:
+    """Figure 3 with what it is about: echoes by way of a calm surface in the Capon spectrum, and
+    the estimate that goes through them, as printed and with `multipath`."""
+    config = scenario('multipath', {'pings': 1, 'multipath_level_db': SURFACE_DB})
+    scene = simulate(config, 1)
+    ping, truth = scene.measurements[0].measurement, scene.truth[0]
+    expected = {
+        'model_set': 'angle_two_rw',
+        'multipath': True,
+        'multipath_level_db': SURFACE_DB,
+    }
+    depth, tilt = config.sonar_height - truth.height, math.radians(config.tilt_deg)
+    surface = array.multipath_sines(depth, truth.range, tilt, config.sonar_depth)
+    figure, axes = plt.subplots(2, 1, figsize=(9, 5.5), sharex=True, layout='constrained')
+    for axis, values, name in (
+        (axes[0], ANGLES, 'as printed'),
+        (axes[1], expected, 'echoes by way of the surface expected'),
+    ):
+        estimate = BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
+        spectrum(axis, ping, truth, 'capon', estimate)
+        for sine in surface.T:
+            angle = np.degrees(np.arcsin(sine))
+            axis.plot(ping.range, angle, '--', color=BLUE, linewidth=0.8)
+        error = columns(estimate)['angle'] - truth.angle
+        rms = math.degrees(math.sqrt(np.mean(np.square(error[truth.valid]))))
+        axis.set(title=f'{name}: {rms:.2f} deg RMS', ylim=(-75, 35))
+    axes[-1].set_xlabel('slant range [m]')
+    save(figure, 'bathymetry_multipath.png', tight=False)
 
 
 def draw_clouds() -> None:
@@ -209,6 +243,32 @@ def draw_sensitivity() -> None:
     right.set(xlabel='sigma of the rough walk [m]', ylabel='RMSE of the height [m]', ylim=(0, 0.4))
     right.legend(fontsize=8)
     save(figure, 'bathymetry_sensitivity.png')
+
+
+def draw_labels() -> None:
+    """Overlap over roughness, range and correlation, and how often a label is right."""
+    result = json.loads((ROOT / 'docs' / 'results' / 'bathymetry_labels.json').read_text())
+    colours = {'two walks': AMBER, 'height_bank': RED, 'scatter_bank': BLUE}
+    figure, axes = plt.subplots(1, 4, figsize=(10, 2.8), layout='constrained')
+    stds = (0.2, 0.3, 0.5)
+    for axis, place in zip(axes, ('20-26 m', '40-50 m', '58-68 m')):
+        for name, colour in colours.items():
+            for kind, style in (('white', '-'), ('.3 m', '--'), ('1 m', ':')):
+                rows = [result['cells'][f'{place}, {std:g} m, {kind}'] for std in stds]
+                axis.plot(stds, [row[name] for row in rows], style, color=colour, linewidth=1.2)
+        axis.set(title=place, ylim=(-0.03, 1.03), xlabel='roughness, standard deviation [m]')
+    axes[0].set_ylabel('overlap')
+    for kind, style in (('white', '-'), ('correlated over .3 m', '--'), ('over 1 m', ':')):
+        axes[0].plot([], [], style, color=INK, label=kind)
+    axes[0].legend(fontsize=7, loc='lower right')
+    axes[3].plot([0, 1], [0, 1], color='0.8', linewidth=0.8)
+    for name, colour in colours.items():
+        rows = result['calibration'][name].values()
+        said, right = [row['said'] for row in rows], [row['right'] for row in rows]
+        axes[3].plot(said, right, 'o-', color=colour, markersize=3, linewidth=1.0, label=name)
+    axes[3].set(title='detectable bins', xlabel='probability of rough floor', ylabel='share rough')
+    axes[3].legend(fontsize=7, loc='upper left')
+    save(figure, 'bathymetry_labels.png', tight=False)
 
 
 def draw_profile(ping, truth, runs) -> None:

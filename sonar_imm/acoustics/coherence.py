@@ -51,6 +51,9 @@ GATE_BINS = 5
 FALSE_ALARM = 1e-3
 """Probability that the gate takes a bin of noise for an echo, for one bin and for the mean."""
 FEWEST_STAVES_ALONE = 4
+STRETCHES, FEWEST_IN_STRETCH, FEWEST_STRETCHES = 8, 10, 6
+SAME_PHASE = 0.1
+"""Radians from stave to stave that are none."""
 _LEVELS = 4096
 
 
@@ -136,6 +139,26 @@ def silent_bins(
     together = coherence_threshold(staves, GATE_BINS, false_alarm, spacing)
     mean = moving_mean(values, GATE_BINS // 2, np.isfinite(values))
     return ~((values >= alone) & (mean >= together))
+
+
+def common_mode(iq: NDArray, coherent: BoolArray) -> float:
+    """Share of the `coherent` bins (n,) of a ping iq (n, P) whose staves have all the same phase,
+    at nearly all ranges: the third smallest share of the eighths of the ping, where an eighth with
+    less than ten coherent bins has none.
+
+    A floor lies at broadside over a short stretch of ranges at most. What does so at all ranges is
+    a signal common to the staves, such as one that their electronics share.
+    """
+    y = np.where(coherent[:, None], iq, 0.0)
+    turn = np.angle((y[:, 1:] * y[:, :-1].conj()).sum(axis=1))
+    alike = coherent & (np.abs(turn) < SAME_PHASE)
+    shares = [
+        float(part.sum() / all_of.sum()) if all_of.sum() >= FEWEST_IN_STRETCH else 0.0
+        for part, all_of in zip(
+            np.array_split(alike, STRETCHES), np.array_split(coherent, STRETCHES)
+        )
+    ]
+    return sorted(shares)[STRETCHES - FEWEST_STRETCHES]
 
 
 def first_return(

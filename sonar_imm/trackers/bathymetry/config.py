@@ -35,13 +35,18 @@ DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
     'height_two_rw': (0.01, 0.5),
     'height_bank': (0.003, 0.03, 0.07, 0.5),
+    'scatter_bank': (0.01, 0.01, 0.02, 0.05, 0.1),
 }
-"""Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
+"""Noise of each model a range bin: metres, but 1/m for the slope model `ncs`; of `scatter_bank`
+the rough ones alone."""
+DEFAULT_SCATTERS = (0.2, 0.5, 0.0, 0.0, 0.0)
+"""`scatter_bank`: standard deviation of the bins of each rough model about its base, m."""
 PAPER_SIGMAS = {'height_rw_ncs': (1.0, 1.0), 'height_two_rw': (0.01, 1.0)}
 DEFAULT_STAY, BANK_STAY, PAPER_STAY = 0.995, 0.998, 0.98
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
-MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
-SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
+BANKS = ('height_bank', 'scatter_bank')
+SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
+MODEL_SETS = ('height_rw_ncs', *SCALAR_SETS)
 """The sets of one state, which the grid engine can run."""
 NAVIGATION = ('auto', 'required', 'ignored')
 LAYOVER = ('ignored', 'gated')
@@ -62,7 +67,8 @@ class BathymetryConfig(MountingParameters):
         choices=('corrected', 'paper'))
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
-        'ncs; empty: values that suit most floors; height_bank takes any number of values',
+        'ncs; empty: values that suit most floors; height_bank takes any number of values, '
+        'scatter_bank those of its rough models',
         range=(0.0, 1000.0), kind='float[]')
     sigmas_deg: tuple[float, ...] = live((), 'deg',
         'angle_two_rw: process noise of the first model over a range bin, then of the second at '
@@ -74,12 +80,20 @@ class BathymetryConfig(MountingParameters):
     rough_sigma: float = live(0.07, 'm',
         'height_bank: random walks with at least this noise over a range bin are rough floor; '
         'undulations and slopes of a smooth floor need up to 0.05', range=(0.0, 1000.0))
+    scatters: tuple[float, ...] = live((), 'm',
+        'scatter_bank: standard deviation of single bins about the walk of each rough model, in '
+        'the order of sigmas; empty: values that suit most floors', range=(0.0, 100.0),
+        kind='float[]')
+    rough_std: float = live(0.3, 'm',
+        'floor is labelled smooth (told 0) only where roughness of this standard deviation would '
+        'be seen; smooth means less than that', range=(0.0, 1000.0))
     transition_matrix: tuple[float, ...] = live((), '',
         'transition matrix over a range bin, row-major, row = from; empty: stay_probability',
         range=(0.0, 1.0), kind='float[]')
     stay_probability: float = live(0.0, '',
         'probability of keeping the model over a range bin, used without transition_matrix; 0: '
-        '0.995, or 0.998 in height_bank, or 0.98 in variant paper', range=(0.0, 1.0))
+        '0.995, or 0.998 in height_bank and scatter_bank (of its smooth models, whose slopes '
+        'change besides), or 0.98 in variant paper', range=(0.0, 1.0))
     initial_probabilities: tuple[float, ...] = live((), '',
         'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
         kind='float[]')
@@ -144,19 +158,19 @@ class BathymetryConfig(MountingParameters):
     # -- computation -----------------------------------------------------------------------------
     engine: str = live('auto', '',
         'particles, or grid (exact, without Monte Carlo noise, for sets of one state); auto: grid '
-        'for height_bank, else particles', choices=('auto', 'particles', 'grid'))
+        'for height_bank and scatter_bank, else particles', choices=('auto', 'particles', 'grid'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
     grid_step: float = live(0.0, '',
         'distance between grid points, m or rad; 0: the smallest noise, at most 0.01 m or 0.05 '
-        'deg; 0.01 m for height_bank', range=(0.0, 100.0))
+        'deg; 0.01 m for height_bank, 0.02 m for scatter_bank', range=(0.0, 100.0))
     grid_extent: float = live(20.0, 'm',
         'distance that a grid of heights reaches to both sides of the start, at least 2 '
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
-        'states (forward-backward on the grid: everything); auto: states for height_bank on the '
-        'grid, which finds nothing rough without, else none',
+        'states (forward-backward on the grid: everything); auto: states for height_bank and '
+        'scatter_bank on the grid, which find little without, else none',
         choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
         'strength with which the model labels of neighbouring pings influence each other; 0: not '
@@ -207,9 +221,14 @@ class BathymetryConfig(MountingParameters):
     def check(self) -> list[str]:
         problems = super().check() + self._ship_problems() + self._check_sigmas()
         models = self.model_count()
-        problems += chain_problems(
-            self.transition_matrix, self.initial_probabilities, models, self.model_set
-        )
+        if self.model_set == 'scatter_bank':
+            problems += self._scatter_problems()
+        else:
+            problems += chain_problems(
+                self.transition_matrix, self.initial_probabilities, models, self.model_set
+            )
+            if self.scatters:
+                problems.append('scatters is for scatter_bank only')
         if self.runs_on_grid and self.model_set not in SCALAR_SETS:
             problems.append(
                 f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
@@ -244,6 +263,24 @@ class BathymetryConfig(MountingParameters):
                 )
         return problems
 
+    def _scatter_problems(self) -> list[str]:
+        problems = []
+        if self.transition_matrix or self.initial_probabilities:
+            problems.append(
+                'scatter_bank has a chain of its own: it takes stay_probability, neither '
+                'transition_matrix nor initial_probabilities'
+            )
+        if len(self.scatters_used) != len(self.sigmas_used):
+            problems.append(
+                f'scatter_bank needs a scatter for each of its {len(self.sigmas_used)} sigmas, '
+                f'got {len(self.scatters_used)}'
+            )
+        if not self.runs_on_grid:
+            problems.append('scatter_bank needs engine grid')
+        if self.smoothing == 'modes':
+            problems.append('scatter_bank smooths states, or nothing (none)')
+        return problems
+
     def _check_sigmas(self) -> list[str]:
         if self.model_set == 'angle_two_rw':
             problems = ['angle_two_rw takes sigmas_deg, not sigmas'] if self.sigmas else []
@@ -255,9 +292,11 @@ class BathymetryConfig(MountingParameters):
             return problems
         problems = ['sigmas_deg is for angle_two_rw only'] if self.sigmas_deg else []
         wanted = len(DEFAULT_SIGMAS[self.model_set])
-        if self.model_set == 'height_bank':
+        if self.in_bank:
             if len(self.sigmas) > 16:
-                problems.append(f'height_bank takes at most 16 sigmas, got {len(self.sigmas)}')
+                problems.append(
+                    f'{self.model_set} takes at most 16 sigmas, got {len(self.sigmas)}'
+                )
         elif len(self.sigmas) not in (0, wanted):
             problems.append(
                 f'sigmas needs {wanted} values for model_set {self.model_set}, got '
@@ -308,6 +347,11 @@ class BathymetryConfig(MountingParameters):
         )
 
     @property
+    def scatters_used(self) -> tuple[float, ...]:
+        """Scatter of each rough model of `scatter_bank`, m."""
+        return self.scatters or DEFAULT_SCATTERS
+
+    @property
     def gate_used(self) -> bool:
         """Whether bins without an echo are passed over; the paper tracks through them."""
         return self.shadow_gate and not self.as_printed
@@ -329,10 +373,11 @@ class BathymetryConfig(MountingParameters):
 
     @property
     def in_bank(self) -> bool:
-        return self.model_set == 'height_bank'
+        return self.model_set in BANKS
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""
         if self.model_set == 'angle_two_rw':
             return 2
-        return len(self.sigmas_used)
+        smooth = 2 if self.model_set == 'scatter_bank' else 0
+        return smooth + len(self.sigmas_used)

@@ -381,7 +381,7 @@ def filter_ping(
         if echo:
             grid.mix(p, low, high, motion.transition, mixed)
             if motion.favour.shape[0] > 0:
-                _favour_cells(mixed, low, high, motion.favour[t])
+                favour_cells(mixed, low, high, motion.favour[t])
         else:
             for j in range(M):
                 for g in range(low, high):
@@ -403,7 +403,7 @@ def filter_ping(
         n = high - low
         here = value[:n]
         if echo:
-            _log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
+            state_log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
         else:
             for g in range(n):
                 here[g] = 0.0
@@ -455,7 +455,7 @@ def smooth_ping(
         echo = ping.echo[t + 1]
         if echo:
             n = high - low
-            _log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
+            state_log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
             grid.weigh(beta, low, high, value[:n], work)
         new_low, new_high = window[t, 0], window[t, 1]
         drifts = t + 1 >= ping.geometry.drift_from
@@ -474,7 +474,7 @@ def smooth_ping(
         low, high = new_low, new_high
         if echo:
             if motion.favour.shape[0] > 0:
-                _favour_cells(back, low, high, motion.favour[t + 1])
+                favour_cells(back, low, high, motion.favour[t + 1])
             grid.mix(back, low, high, backwards, beta)
         else:
             for j in range(M):
@@ -496,7 +496,7 @@ def smooth_ping(
 
 
 @kernel
-def _favour_cells(p: FloatArray, low: int, high: int, favour: FloatArray) -> None:
+def favour_cells(p: FloatArray, low: int, high: int, favour: FloatArray) -> None:
     """Multiply each model's row of p (M, G) on [low, high) by its factor."""
     for j in range(p.shape[0]):
         for g in range(low, high):
@@ -504,7 +504,7 @@ def _favour_cells(p: FloatArray, low: int, high: int, favour: FloatArray) -> Non
 
 
 @kernel
-def _log_likelihoods(
+def state_log_likelihoods(
     state: FloatArray,
     ping: PingLikelihood,
     t: int,

@@ -133,6 +133,15 @@ class Swath:
         sine = s * g.cos_tilt[:, None] - np.sqrt(1.0 - s * s) * g.sin_tilt[:, None]
         return np.where(possible, sine, np.nan)
 
+    def snapshot_std(self, angle: FloatArray, snr: FloatArray, staves: int) -> FloatArray:
+        """Standard deviation (T,) of the height from one snapshot by itself, m: the bound of a
+        plane wave from angle (T,), at signal-to-noise ratio snr (T,) of a stave."""
+        g = self.geometry
+        turns = 2.0 * math.pi * abs(g.spacing)
+        sine = 1.0 / (turns * np.sqrt(snr * staves * (staves**2 - 1) / 6.0))
+        cosine = np.maximum(np.cos(angle), 1e-3)
+        return np.abs(g.reach * np.cos(angle + g.tilt)) * sine / cosine
+
     def beam_angle(self, angle: FloatArray) -> FloatArray:
         """From straight down, port positive (T,), of angles (T,) of echoes; NaN stays."""
         assert self.looks is not None

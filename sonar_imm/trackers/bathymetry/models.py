@@ -21,6 +21,9 @@ height_two_rw
     The height h of the floor is a random walk, slow (smooth floor) or fast (rough floor).
 height_bank
     The same with as many walks as there are sigmas.
+scatter_bank
+    Smooth floor has a slope, `steady` or `undulating`; rough floor is a walk, or bins that
+    scatter about one, see `scatter`.
 height_rw_ncs
     State (h, b), b the slope dh/dr over slant range. `rw`: h is a random walk and b means
     nothing; it is drawn anew from N(0, redrawn_slope_std^2), so that a slope model that takes over
@@ -48,9 +51,10 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
 from .kernels import Geometry
+from .scatter import bank_of, Scatter
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
-HEIGHT_STEP, ANGLE_STEP = 0.01, math.radians(0.05)
+HEIGHT_STEP, ANGLE_STEP, SCATTER_STEP = 0.01, math.radians(0.05), 0.02
 FIRST_RETURN_ERROR = 0.25
 """Metres by which the first return may be found too early."""
 MOST_CELLS = 20_000
@@ -101,6 +105,8 @@ class TerrainModels:
     coast: the model that crosses bins without an echo. rough (M,): models that mean rough
     floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
     the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
+
+    With `scatter` several models are one entry of `names`, `rough`, `favour` and the answers.
     """
 
     names: tuple[str, ...]
@@ -116,6 +122,7 @@ class TerrainModels:
     rough: BoolArray
     start: UnknownHeight | None = None
     favour: FloatArray = field(factory=lambda: np.empty((0, 0)))
+    scatter: Scatter | None = None
 
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
@@ -153,15 +160,34 @@ def build_models(
     """The models that `config` names for bins at `ranges` (T,) m, T > 1, of which the bin number
     `first` is the first with an echo; floor_below: how far below the array the floor is said to
     be, m."""
-    M, T = config.model_count(), len(ranges)
-    slope_set = config.model_set == 'height_rw_ncs'
+    T = len(ranges)
+    mean, std = _start(config, geometry, first, floor_below)
+    start = _unknown_height(config, ranges, geometry, first, floor_below)
+    if config.model_set == 'scatter_bank':
+        bank = bank_of(config.sigmas_used, config.scatters_used, config.stay_used)
+        M = len(bank.sigma)
+        return TerrainModels(
+            names=bank.names,
+            state_names=_states(config),
+            F=np.ones((M, 1, 1)),
+            G=np.ones((M, 1, 1)),
+            scale=np.tile(_growth(config, ranges) * bank.sigma, (T, 1)),
+            transition=bank.transition,
+            initial=bank.initial,
+            mean=np.array([mean]),
+            std=np.array([std]),
+            coast=bank.coast,
+            rough=bank.rough,
+            start=start,
+            scatter=Scatter(bank.kind, bank.spread, bank.lean * _bin_width(ranges)),
+        )
+    M, slope_set = config.model_count(), config.model_set == 'height_rw_ncs'
     if slope_set:
         F, G = _slope_motions(config, ranges)
         scale = np.ones((1, M))
     else:
         F, G = np.ones((M, 1, 1)), np.ones((M, 1, 1))
         scale = _noises(config, ranges)
-    mean, std = _start(config, geometry, first, floor_below)
     return TerrainModels(
         names=_names(config, M),
         state_names=_states(config),
@@ -174,7 +200,7 @@ def build_models(
         std=np.array([std, config.initial_slope_std][: F.shape[1]]),
         coast=1 if slope_set else int(np.argmin(scale.sum(axis=0))),
         rough=_rough(config, M),
-        start=_unknown_height(config, ranges, geometry, first, floor_below),
+        start=start,
     )
 
 
@@ -278,6 +304,8 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
     if not step > 0.0:
         noises = models.scale[models.scale > 0.0]
         finest = ANGLE_STEP if angle else HEIGHT_STEP
+        if models.scatter is not None:
+            finest = SCATTER_STEP
         # The smallest walk of a bank is far below what an echo tells: no need to resolve it.
         step = finest if config.in_bank else min(noises.min(initial=np.inf), finest)
     extent = math.pi if angle else max(config.grid_extent, 2.0 * config.sonar_height_std)

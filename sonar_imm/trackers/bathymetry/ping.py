@@ -32,7 +32,7 @@ from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics import variances
-from ...acoustics.coherence import FEWEST_STAVES_ALONE
+from ...acoustics.coherence import common_mode, FEWEST_STAVES_ALONE
 from ...acoustics.geometry import Pose
 from ...acoustics.layover import GATE, Layover, layover
 from ...acoustics.rays import profile_of
@@ -64,7 +64,14 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, grid_cells, TerrainModels
+from .scatter import filter_scatter, ScatterMotion, smooth_scatter
 
+SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
+"""Values of the column `told`."""
+SURE = 0.9
+"""Probability from which on floor is called rough, or smooth."""
+DETECTABLE = 1.5
+"""Roughness is seen where its standard deviation is that of so many single snapshots."""
 FEWEST_BINS = 100
 """Of fewer bins `residual_ratio` says nothing."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.
@@ -113,7 +120,7 @@ class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
     of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
     where layover is ignored; how many bins from the depth of the floor on are usable, and how many
-    of these are passed over."""
+    of these are passed over; `coherence.common_mode`."""
 
     bins: int
     silent: int
@@ -121,6 +128,7 @@ class LoudBins(NamedTuple):
     array_error: float = math.nan
     beyond: int = 0
     beyond_silent: int = 0
+    common_mode: float = 0.0
 
 
 class Answer(NamedTuple):
@@ -235,14 +243,23 @@ def run_grid(
 ) -> Track:
     """The exact filter along a ping for models of one state, on `cells` (G,), evenly spaced; with
     `smooth` the exact smoother."""
-    T, M = models.scale.shape
-    track = _empty(T, M, 1)
+    T, scatter = len(models.scale), models.scatter
+    track = _empty(T, len(models.names), 1)
     track.sample_size[:] = np.nan
     shape = models.density(cells)
     p = models.initial[:, None] * (shape / shape.sum())
-    sigma = models.scale / (cells[1] - cells[0])
-    motion = GridMotion(cells, models.transition, sigma, models.coast, models.favour)
+    step = cells[1] - cells[0]
+    favour = models.favour
+    if scatter is not None and len(favour):
+        favour = np.ascontiguousarray(favour[:, scatter.kind])
+    motion = GridMotion(cells, models.transition, models.scale / step, models.coast, favour)
     window = np.empty((T, 2), np.int64)
+    if scatter is not None:
+        moves = ScatterMotion(motion, scatter.kind, scatter.spread / step, scatter.lean / step)
+        kept = filter_scatter(p, moves, ping, window, track, smooth)
+        if smooth:
+            smooth_scatter(kept, window, moves, ping, track)
+        return _with_constants(track, ping)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:
         smooth_ping(kept, window, motion, ping, track)
@@ -287,11 +304,13 @@ def summarise(seen: Look, track: Track) -> Answer:
         math.nan if seen.layover is None else seen.layover.array_error,
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
+        common_mode(snapshot.iq, echo),
     )
     if seen.layover is not None:
         counts['bins_two'] = int((echo & (seen.layover.existence > GATE)).sum())
         health['array_error'] = loud.array_error
     health['decorrelation'] = loud.decorrelation
+    health['common_mode'] = loud.common_mode
     health['residual_ratio'] = _residual(seen, track)
     return Answer(estimate_of(seen, track), counts, health, loud, health['residual_ratio'])
 
@@ -329,6 +348,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'log_likelihood': track.log_likelihood,
         'label': label.astype(np.uint8),
         'label_probability': track.probability[np.arange(len(label)), label],
+        **_label_columns(seen, track, floor),
     }
     if config.in_bank:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
@@ -353,6 +373,8 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         covariance[:, 0, 0] += config.sonar_height_std**2
     if posed is not None or snapshot.side:
         extras['side'] = np.full(len(label), SIDES.index(swath.side), np.uint8)
+    if 'surfaces' in extras:
+        extras['told'][extras['surfaces'] == 2] = CANNOT_TELL
     return Estimate(
         stamp_ns=snapshot.stamp_ns,
         frame_id=snapshot.frame_id if posed is None else posed.frame_id,
@@ -364,6 +386,31 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         probabilities=track.probability,
         extras=extras,
     )
+
+
+def _label_columns(seen: Look, track: Track, floor: Floor) -> dict[str, np.ndarray]:
+    """Columns (T,): how sure smooth or rough is, which of them or neither, and the standard
+    deviation that roughness needs to be seen."""
+    swath, ping = seen.swath, seen.likelihood
+    rough = np.minimum(track.probability[:, seen.models.rough].sum(axis=1), 1.0)
+    snr = ping.signal / ping.noise
+    detectable = DETECTABLE * swath.snapshot_std(floor.angle, snr, seen.ping.snapshot.staves)
+    kind = verdict(rough, detectable, seen.config.rough_std)
+    kind[~ping.echo] = CANNOT_TELL
+    return {
+        'label_confidence': np.maximum(rough, 1.0 - rough).astype(np.float32),
+        'told': kind,
+        'detectable_std': detectable.astype(np.float32),
+    }
+
+
+def verdict(rough: FloatArray, detectable: FloatArray, rough_std: float) -> np.ndarray:
+    """Smooth, rough or cannot tell (n,), from the probability of rough floor (n,) and the standard
+    deviation (n,) that roughness needs to be seen, m, NaN where unknown. Floor is smooth only
+    where roughness of `rough_std` would be seen: smooth means less than that."""
+    smooth = (rough < 1.0 - SURE) & (detectable <= rough_std)
+    kind = np.where(rough > SURE, ROUGH, np.where(smooth, SMOOTH, CANNOT_TELL))
+    return kind.astype(np.uint8)
 
 
 def _swath(ping: Ping) -> tuple[Swath, float]:

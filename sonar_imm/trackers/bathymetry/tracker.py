@@ -165,8 +165,8 @@ class BathymetryTracker:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
         of the particles of a model (NaN for the grid), mean log likelihood of a bin, noise
         variance, what is left beside the echo in stated noises (`ping.residual_ratio`), what of
-        loud echoes is no plane wave (`layover.array_error`); and how many pings wait for
-        navigation."""
+        loud echoes is no plane wave (`layover.array_error`), how much is the same at all staves
+        (`coherence.common_mode`); and how many pings wait for navigation."""
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
         held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
         return {**self._health, **waiting, **held}
@@ -174,7 +174,7 @@ class BathymetryTracker:
     def warnings(self) -> list[str]:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
-        stated = [*self._silence(), *noise_warnings(self._residuals)]
+        stated = [*self._silence(), *self._common_mode(), *noise_warnings(self._residuals)]
         if loud < FEWEST_LOUD:
             return stated
         silent = sum(ping.silent for ping in self._loud) / loud
@@ -213,6 +213,17 @@ class BathymetryTracker:
             f'{silent / beyond:.0%} of the bins beyond the depth of the floor were passed over as '
             'silent: check noise_variance (of the snapshot, the parameter, or the water column, '
             'which has to be quiet), sonar_height and element_spacing_wavelengths'
+        ]
+
+    def _common_mode(self) -> list[str]:
+        """What to say when the echoes of most pings are a signal common to all staves."""
+        shares = [ping.common_mode for ping in self._loud]
+        if not shares or (typical := float(np.median(shares))) <= 0.5:
+            return []
+        return [
+            f'at nearly all ranges all staves have the same phase in {typical:.0%} of the bins: '
+            'that is no floor, but a signal that the staves share, such as of their electronics; '
+            'estimates follow it'
         ]
 
     def process(self, measurement: Any) -> list[Estimate]:

@@ -104,6 +104,14 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
             'One row per ping. Dark: probably rough.',
             segmentation_figure(swath),
         )
+    if profile.verdict is not None:
+        yield Section(
+            'Smooth, rough, or cannot tell',
+            'Probability of rough floor along one ping. Blue: the true rough patch. Marked: bins '
+            'that are called neither smooth nor rough, since nobody could tell there, or the '
+            f'probability lies between .1 and .9.{which}',
+            verdict_figure(profile, swath.roughness(profile)),
+        )
 
 
 def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
@@ -243,6 +251,25 @@ def segmentation_figure(swath: Swath) -> go.Figure:
         name = 'ends of the true patch'
         add_points(figure, x, y, name, COLOURS[1], 6, symbol='line-ns-open')
     return styled(figure, 340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)
+
+
+def verdict_figure(profile: Profile, rough: FloatArray) -> go.Figure:
+    """Probability (n,) of rough floor along one ping, and the bins that cannot be told."""
+    figure = go.Figure()
+    shown = thin(len(profile.range), MOST_BINS)
+    if profile.truth is not None:
+        for begin, end in runs(profile.truth.patch):
+            ends = {'x0': profile.range[begin], 'x1': profile.range[end - 1]}
+            figure.add_vrect(**ends, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
+    add_line(figure, profile.range[shown], rough[shown], 'rough', COLOURS[0], 1.4)
+    assert profile.verdict is not None
+    place = profile.range[shown][profile.verdict[shown] == 2]
+    if len(place):
+        bottom = np.full(len(place), -0.05)
+        add_points(figure, place, bottom, 'cannot tell', COLOURS[3], symbol='line-ns-open')
+    return styled(
+        figure, 300, SLANT | {'zeroline': False}, {'title': 'probability of rough floor'}
+    )
 
 
 def points_of(folder: Path) -> Points | None:

@@ -29,7 +29,7 @@ from ..columns import read_columns
 
 _BINS = (
     'range?', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
-    'surfaces?',
+    'surfaces?', 'told?',
 )  # fmt: skip
 _TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?', 'surfaces?')
 FAR = 0.55
@@ -56,7 +56,8 @@ class Profile:
     probabilities (n, M) of the models; valid: bins with an echo of one surface; two: bins with
     echoes of two, None where the tracker does not look for them; truth: None where unknown;
     side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
-    the estimate itself says it, as those of a bank do."""
+    the estimate itself says it, as those of a bank do; verdict (n,): smooth 0, rough 1 or cannot
+    tell 2, None where the estimate does not say it."""
 
     stamp_ns: int
     range: FloatArray
@@ -70,6 +71,7 @@ class Profile:
     side: str = ''
     rough: FloatArray | None = None
     two: BoolArray | None = None
+    verdict: FloatArray | None = None
 
     @property
     def heard(self) -> BoolArray:
@@ -146,6 +148,7 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
         rough=bins['rough'] if 'rough' in estimate.extras else None,
         side=SIDES[estimate.source] if 'side' in estimate.extras else '',
         two=bins['surfaces'] == 2 if 'surfaces' in estimate.extras else None,
+        verdict=bins['told'] if 'told' in estimate.extras else None,
     )
 
 

@@ -21,7 +21,7 @@ models have more than half of the probability.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,7 @@ def score(swath: Swath) -> dict[str, Any]:
     looked = [profile.two for profile in profiles if profile.two is not None]
     if looked:
         metrics['two_share'] = _mean(looked)
+    metrics |= _verdicts(profiles)
     known = [(profile, profile.truth) for profile in profiles if profile.truth is not None]
     if known:
         metrics |= {'scored_pings': len(known), **_errors(known), 'gate': _gate(known)}
@@ -113,6 +114,28 @@ def _layover(known: Known) -> dict[str, Any]:
         return {}
     counts = {'bins': sum(map(len, two)), 'found': _mean(two), 'soundings': _mean(kept)}
     return {'layover': {**counts, 'lost': _mean(one)}}
+
+
+def _verdicts(profiles: Sequence[Profile]) -> dict[str, Any]:
+    """Shares of the bins with an echo that are called smooth and rough, and where the truth is
+    known how many of these are; the others cannot be told. Empty for runs of older versions."""
+    called: dict[str, list[BoolArray]] = {'smooth': [], 'rough': []}
+    right: dict[str, list[BoolArray]] = {'smooth': [], 'rough': []}
+    for profile in profiles:
+        if profile.verdict is None:
+            return {}
+        for value, name in enumerate(called):
+            bins = profile.valid & (profile.verdict == value)
+            called[name].append(bins[profile.valid])
+            if profile.truth is not None:
+                patch = profile.truth.patch if name == 'rough' else ~profile.truth.patch
+                right[name].append(patch[bins & profile.truth.echo])
+    if not called['rough']:
+        return {}
+    shares = {name: _mean(parts) for name, parts in called.items()}
+    verdicts = {**shares, 'cannot_tell': 1.0 - sum(shares.values())}
+    verdicts |= {f'{name}_right': _mean(parts) for name, parts in right.items() if parts}
+    return {'verdicts': verdicts}
 
 
 def segmentation(swath: Swath, known: Known) -> dict[str, Any]:

@@ -79,6 +79,16 @@ METRICS = (
         when=lambda metrics: look_up(metrics, 'segmentation.patches'),
     ),
     Metric(
+        label='floor called smooth / rough / cannot tell',
+        line='{verdicts.smooth:.0%} / {verdicts.rough:.0%} / {verdicts.cannot_tell:.0%}',
+        when=lambda metrics: look_up(metrics, 'verdicts.rough') is not None,
+    ),
+    Metric(
+        label='of these right, smooth / rough',
+        line='{verdicts.smooth_right:.1%} / {verdicts.rough_right:.1%}',
+        when=lambda metrics: look_up(metrics, 'verdicts.rough_right') is not None,
+    ),
+    Metric(
         label='bins late, into / out of a patch',
         line='{segmentation.bins_late_in:.0f} / {segmentation.bins_late_out:.0f}',
     ),

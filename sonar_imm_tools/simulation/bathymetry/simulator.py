@@ -31,6 +31,7 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from sonar_imm.acoustics import array, geometry, sounding
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
@@ -43,7 +44,7 @@ from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, T
 
 SIDES = ('starboard', 'port', 'both')
 LAWS = ('laplace', 'gaussian', 'k')
-ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal')
+ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal', 'exponential')
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -107,10 +108,11 @@ class BathymetryScenario(ShipScenario):
         'distance by which the rough patch moves outwards from ping to ping')
     roughness_law: str = parameter('gaussian', '',
         'distribution of the heights of the rough patch; fractal: Gaussian with a spectrum that '
-        'falls with the square of the wave number', choices=ROUGHNESS_LAWS)
+        'falls with the square of the wave number; exponential: Gaussian, correlated as '
+        'exp(-distance / correlation_length)', choices=ROUGHNESS_LAWS)
     correlation_length: float = parameter(0.0, 'm',
-        'standard deviation of the kernel that smooths the heights of the rough patch; 0: white',
-        range=(0.0, 100.0))
+        'standard deviation of the kernel that smooths the heights of the rough patch, or as '
+        'roughness_law says; 0: white', range=(0.0, 100.0))
 
     object: str = parameter('none', '',
         'object on the floor, which is level then: a step up (ledge), a box 2 m wide, a wall or a '
@@ -383,7 +385,11 @@ def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) 
         white = np.fft.irfft(wave, bins)
         white /= white.std()
     width = config.correlation_length / config.bin_width
-    if width > 0.0:
+    if width > 0.0 and config.roughness_law == 'exponential':
+        kept = math.exp(-1.0 / width)
+        white[1:] *= math.sqrt(1.0 - kept * kept)
+        white = lfilter([1.0], [1.0, -kept], white)
+    elif width > 0.0:
         smooth = gaussian_filter1d(white, width, mode='wrap')
         kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
         white = smooth / np.linalg.norm(kernel)

@@ -68,12 +68,14 @@ def test_a_run_is_scored_and_has_a_page(tracked, capsys):
     assert metrics['height']['smooth']['rmse_m'] < 0.1 < metrics['height']['patch']['rmse_m'] < 0.6
     assert metrics['segmentation']['iou'] > 0.6
     assert metrics['inside_band']['all'] > 0.85
+    assert metrics['verdicts']['smooth_right'] > 0.95 and metrics['verdicts']['cannot_tell'] > 0.05
     page = (tracked / 'report.html').read_text()
     for title in (
         'Profile of the floor',
         'Pseudo-spectrum and estimated angle',
         'Which terrain model held',
         'Rough floor over the whole run',
+        'Smooth, rough, or cannot tell',
     ):
         assert title in page
 

@@ -14,10 +14,11 @@
 
 """Scores of floors, from profiles whose errors are known by hand."""
 
+from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm_tools.evaluation.bathymetry.figures import profile_figure
+from sonar_imm_tools.evaluation.bathymetry.figures import profile_figure, verdict_figure
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
 from sonar_imm_tools.evaluation.bathymetry.summary import METRICS, summary_sentence
@@ -88,6 +89,28 @@ def test_overlap_and_delay_of_the_segmentation():
     assert (missed['patches'], missed['patches_missed'], missed['iou']) == (1, 1, 0.0)
     to_the_end = score(swath(profile(rough=slice(8, N))))['segmentation']
     assert (to_the_end['bins_late_in'], to_the_end['bins_late_out']) == (0.0, 6.0)
+
+
+def test_what_is_called_smooth_and_rough_and_how_much_of_it_is():
+    verdict = np.full(N, 2.0)
+    verdict[:4], verdict[8:10], verdict[12:16] = 0, 0, 1
+    called = evolve(profile(), verdict=verdict)
+    metrics = score(swath(called))
+    assert metrics['verdicts'] == pytest.approx(
+        {
+            'smooth': 0.3,
+            'rough': 0.2,
+            'cannot_tell': 0.5,
+            'smooth_right': 4 / 6,
+            'rough_right': 0.5,
+        }
+    )
+    assert dict(lines(METRICS, metrics))['of these right, smooth / rough'] == '66.7 % / 50.0 %'
+    unknown = score(swath(evolve(called, truth=None)))
+    assert set(unknown['verdicts']) == {'smooth', 'rough', 'cannot_tell'}
+    assert 'verdicts' not in score(swath(profile()))
+    marks = verdict_figure(called, np.zeros(N)).data[-1]
+    assert list(marks.x) == list(called.range[verdict == 2])
 
 
 def test_shadow_is_scored_apart():

@@ -203,3 +203,8 @@ def test_other_laws_of_echoes_and_of_rough_floor():
     low, high = spectrum[4:8].mean(), spectrum[40:80].mean()
     assert low / high == pytest.approx(100.0, rel=0.4)
     assert np.std(fractal) == pytest.approx(0.5, rel=0.05)
+    changes = {'roughness_law': 'exponential', 'correlation_length': 1.0, 'pings': 60}
+    rough = np.stack([true.height[true.patch] for _, true in run(**changes)])
+    assert rough.std() == pytest.approx(0.5, rel=0.1)
+    after = (rough[:, :-20] * rough[:, 20:]).mean() / rough.var()
+    assert after == pytest.approx(np.exp(-1.0), abs=0.1)

@@ -46,11 +46,12 @@ def test_a_gated_bin_is_marked_and_nothing_else_changes(values):
     a, b = gated.columns(), ignored.columns()
     assert [name for name in a if name not in b] == NEW
     for name in b:
-        if name != 'valid':
+        if name not in ('valid', 'told'):
             np.testing.assert_array_equal(a[name], b[name])
     two = a['surfaces'] == 2
     assert two[150:200].mean() > 0.7 and not two[:145].any() and not two[205:].any()
     np.testing.assert_array_equal(a['valid'], b['valid'] & ~two)
+    np.testing.assert_array_equal(a['told'], np.where(two, 2, b['told']))
     np.testing.assert_array_equal(a['surfaces'] == 0, b['valid'] == 0)
     np.testing.assert_array_equal(two, a['existence_2'] > np.float32(layover.GATE))
     assert a['existence_2'].dtype == np.float32 and a['surfaces'].dtype == np.uint8

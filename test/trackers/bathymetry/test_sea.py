@@ -26,8 +26,8 @@ from sonar_imm.measurements import Altitude, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.kernels import _log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
+from sonar_imm.trackers.bathymetry.kernels import state_log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 

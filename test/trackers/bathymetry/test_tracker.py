@@ -63,13 +63,19 @@ def rmse(estimate, height):
             'height_bank',
             'height cov_height_height prob_rw_1 prob_rw_2 prob_rw_3 prob_rw_4 range angle',
         ),
+        (
+            'scatter_bank',
+            'height cov_height_height prob_steady prob_undulating prob_scatter_1 prob_scatter_2 '
+            'prob_rw_1 prob_rw_2 prob_rw_3 range angle',
+        ),
     ],
 )
 def test_columns_are_those_of_the_contract(model_set, columns):
     snapshot = floor(0.0)
     table = run(snapshot, model_set=model_set).columns()
     after = 'valid log_likelihood label label_probability'
-    if model_set == 'height_bank':
+    after += ' label_confidence told detectable_std'
+    if model_set.endswith('_bank'):
         after += ' rough'
     after += ' existence_2 surfaces'
     assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
@@ -334,7 +340,9 @@ def test_noise_of_any_kind_gives_finite_answers(bins, P, exponent, holes, values
     iq = 10.0**exponent * (rng.normal(size=(bins, P)) + 1j * rng.normal(size=(bins, P)))
     iq[1:][rng.random(bins - 1) < holes] = np.nan
     snapshot = Snapshot(stamp_ns=1, range=np.sort(rng.uniform(0.0, 100.0, bins)), iq=iq)
-    engines = ('particles',) if values['model_set'] == 'height_rw_ncs' else ('particles', 'grid')
+    engines = {'height_rw_ncs': ('particles',), 'scatter_bank': ('grid',)}.get(
+        values['model_set'], ('particles', 'grid')
+    )
     for engine in engines:
         estimate = run(snapshot, engine=engine, particles_per_model=20, **values)
         assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all()
