@@ -26,7 +26,8 @@ from sonar_imm.files import whole
 from .common import example, json_option, place_options, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
-HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
+MAP = 'geojson'
+HORIZON_FORMATS = ('csv', MAP, 'sgy', 'segy', 'seg')
 
 
 @click.command(
@@ -36,6 +37,7 @@ HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
         'sonar-imm export out survey.xyz',
         'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg',
+        'sonar-imm export out obstacles.geojson --epsg 32632 --origin 500000,6000000',
     )
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
@@ -66,7 +68,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the soundings or horizons of a tracked RUN to OUT for charts and other programs.
+    """Write soundings, horizons or obstacles of a tracked RUN to OUT for charts and programs.
 
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
     its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
@@ -74,6 +76,7 @@ def command(
     with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
     the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
     Where the recording has no fixes by satellite, the places of horizons come from its navigation,
+    with --crs and --origin. Obstacles: .geojson (all that are known at the end of the recording),
     with --crs and --origin.
     """
     from ..offline.run_folder import RunFolder, SOUNDINGS
@@ -89,6 +92,9 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
+    if kind == MAP and record['system'] == 'obstacle':
+        _export_obstacles(run, record, out, epsg, origin, as_json)
+        return
     if kind in HORIZON_FORMATS:
         _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
         return
@@ -113,6 +119,33 @@ def command(
         return
     shape = f' in {result["rows"]} by {result["columns"]} cells' if 'rows' in result else ''
     say(f'{out}: {len(points)} soundings{shape}')
+
+
+def _export_obstacles(
+    run: Path,
+    record: dict[str, Any],
+    out: Path,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    as_json: bool,
+) -> None:
+    """The obstacles that are known at the end of a run; record: its run.json."""
+    from ..recordings.export.obstacles import write_obstacles
+    from ..recordings.sources import BagError
+
+    landmarks = record.get('landmarks', [])
+    if not landmarks:
+        raise BagError(f'{run} knows no obstacles at its end')
+    if epsg is None:
+        raise click.UsageError(
+            'places are in metres: say with --epsg and --origin where their origin lies'
+        )
+    with whole(out) as unfinished:
+        write_obstacles(unfinished, landmarks, epsg, origin)
+    if as_json:
+        print_json({'out': str(out), 'obstacles': len(landmarks)})
+        return
+    say(f'{out}: {len(landmarks)} obstacles')
 
 
 def _export_horizons(

@@ -36,7 +36,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from . import behaviour_kernels, kernels
-from .behaviour_kernels import COMMON, Motion, Step
+from .behaviour_kernels import COMMON, Motion
 from .config import BEHAVIOURS, ObstacleConfig
 from .filters import depth_slices, depth_span, DepthSlices, Mixture, Sonar, View
 
@@ -107,14 +107,10 @@ class BehaviourSlices(DepthSlices):
     def advance(
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
-        motion = self._motion(dt)
         mixed = behaviour_kernels.mix(
-            *mixture, motion.prior, self.slices, self.M, self._stay(dt), DROPPED
+            *mixture, self._prior, self.slices, self.M, self._stay(dt), DROPPED
         )
-        noise = np.array(self._noise) * dt
-        step = Step(*before.pose, *after.pose, noise, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixed, motion, step)
-        return Mixture(x, P, mixed[2]), int(np.count_nonzero(repaired))
+        return self.carried(Mixture(*mixed), before.pose, after.pose, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         return np.asarray(mu @ self._of)

@@ -176,6 +176,15 @@ class ObstacleConfig(
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 6)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 10)
 
+    # -- memory ----------------------------------------------------------------------------------
+    max_landmarks: int = live(200, '',
+        'largest number of obstacles remembered after they left the field of view, to come back '
+        'under their own number; 0: none; the oldest and least certain ones are given up for more',
+        range=(0, 10000))
+    landmark_time: float = live(86400.0, 's',
+        'mean time for which an obstacle that nobody sees stays where it was',
+        range=(1.0, 1e8))
+
     # -- time ------------------------------------------------------------------------------------
     max_navigation_gap: float = parameter(1.0, 's',
         'longest time between two poses of nav that is interpolated; pings in longer gaps are '

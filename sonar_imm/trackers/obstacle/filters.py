@@ -181,9 +181,19 @@ class DepthSlices:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
-        step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixture, self._still, step)
+        return self.carried(mixture, before.pose, after.pose, dt)
+
+    def carried(
+        self, mixture: Mixture, before: Pose, after: Pose, dt: float
+    ) -> tuple[Mixture, int]:
+        """`advance` of targets that go on with what they do."""
+        step = Step(*before, *after, np.array(self._noise) * dt, self.cone)
+        x, P, repaired = behaviour_kernels.advance(*mixture, self._motion(dt), step)
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
+
+    def _motion(self, dt: float) -> Motion:
+        """What the components do in `dt` seconds."""
+        return self._still
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)

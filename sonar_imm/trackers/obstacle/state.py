@@ -31,13 +31,15 @@ from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .intensity import Strengths
 from .looks import Looks
+from .memory import Existence, Memory
 
 
 class PingState(NamedTuple):
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
     each component assumes them; bodies: how far their echoes wander; looks: pings that did not
-    show them, and what that says."""
+    show them, and what that says; existence: how sure it is that they are there; memory: those
+    that are not in view any more."""
 
     stamp_ns: int
     sonar: Sonar
@@ -47,6 +49,8 @@ class PingState(NamedTuple):
     strengths: Strengths
     bodies: Bodies
     looks: Looks
+    existence: Existence
+    memory: Memory = ()
     repairs: int = 0
     alike: bool = False
 
@@ -60,6 +64,7 @@ class PingState(NamedTuple):
             strengths=self.strengths.rows(kept),
             bodies=self.bodies.rows(kept),
             looks=self.looks.rows(kept),
+            existence=self.existence.rows(kept),
         )
 
     def only(self, kept: np.ndarray) -> PingState:
@@ -87,11 +92,3 @@ class ObstacleState:
     broken: int = 0
     alike: int = 0
     innovations: NisMemory = NisMemory()
-
-
-def identities(state: ObstacleState) -> ObstacleState:
-    """What outlives a restarted clock: the identities that are used up."""
-    if state.last is None:
-        return ObstacleState()
-    nobody = np.zeros(len(state.last.life), bool)
-    return ObstacleState(last=state.last._replace(stamp_ns=0).only(nobody))
