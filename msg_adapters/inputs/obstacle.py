@@ -20,6 +20,7 @@ from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage
 
 from ..detections import (
     read_detections,
+    read_detections_3d,
     read_laser_scan,
     read_pose_array,
     read_sonar_detections,
@@ -49,6 +50,7 @@ TOPICS = (
             'sensor_msgs/msg/PointCloud2': read_detections,
             'sensor_msgs/msg/LaserScan': read_laser_scan,
             'geometry_msgs/msg/PoseArray': read_pose_array,
+            'vision_msgs/msg/Detection3DArray': read_detections_3d,
             'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
             'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
         },

@@ -34,7 +34,15 @@ MAX_IMAGE_CELLS = 4_000_000
 """No sonar makes larger images."""
 
 
-OPTIONAL_COLUMNS = ('var_range', 'var_bearing', 'intensity', 'extent_range', 'extent_bearing')
+OPTIONAL_COLUMNS = (
+    'var_range',
+    'var_bearing',
+    'intensity',
+    'extent_range',
+    'extent_bearing',
+    'elevation',
+    'var_elevation',
+)
 """What a detection may say besides range and bearing."""
 
 
@@ -50,8 +58,9 @@ class Detections:
     The stamp is the transmission. range: (n,) metres; bearing: (n,) rad, REP-103: positive to
     port; var_range: (n,) m^2 and var_bearing: (n,) rad^2, NaN where the sender does not know them;
     intensity: (n,), NaN where unknown; extent_range: (n,) m and extent_bearing: (n,) rad, spread
-    (standard deviation) of the echo, NaN where unknown. Columns left out are unknown. A row
-    without a finite range and bearing is no echo.
+    (standard deviation) of the echo, NaN where unknown; elevation: (n,) rad, positive up, NaN
+    where the sonar does not measure it, var_elevation: (n,) rad^2. Columns left out are unknown.
+    A row without a finite range and bearing is no echo.
     """
 
     FRAME: ClassVar[str] = 'own'
@@ -65,6 +74,8 @@ class Detections:
     frame_id: str = ''
     extent_range: FloatArray = field(factory=_unknown)
     extent_bearing: FloatArray = field(factory=_unknown)
+    elevation: FloatArray = field(factory=_unknown)
+    var_elevation: FloatArray = field(factory=_unknown)
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -84,9 +95,10 @@ class Detections:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key(
-            'detections', self.range, self.bearing, self.var_range, self.var_bearing
-        )
+        columns = [self.range, self.bearing, self.var_range, self.var_bearing]
+        if np.isfinite(self.elevation).any():
+            columns += [self.elevation, self.var_elevation]
+        return content_key('detections', *columns)
 
 
 @frozen(eq=False, kw_only=True)

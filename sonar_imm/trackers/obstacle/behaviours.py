@@ -76,11 +76,13 @@ class BehaviourSlices(DepthSlices):
         self._prior = self._swaying * config.sway_std**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
 
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, ends: FloatArray | None = None
+    ) -> Mixture:
         B, M, last = len(z), self.M, self.slices * self.M
         floor, known = sonar.seabed_below(), 'seabed' in self.behaviours
         known = known and bool(np.isfinite(floor))
-        lowest, highest = depth_span(z, sonar, self.config)
+        lowest, highest = depth_span(z, sonar, self.config, ends)
         if known:
             # What lies deeper than the sea floor below the vehicle is left to its own slice.
             highest = np.minimum(highest, np.maximum(floor, lowest + 0.5 * (highest - lowest)))

@@ -108,6 +108,9 @@ class ObstacleConfig(
     bearing_step_deg: float = live(0.18, 'deg',
         'sampling step of a bearing that comes without variance, adds step^2 / 12',
         range=(0.0, 45.0))
+    elevation_std_deg: float = live(1.0, 'deg',
+        'standard deviation of an elevation that comes without variance; of sonars that measure '
+        'elevations only', range=(0.01, 45.0))
     max_range: float = parameter(100.0, 'm', 'range to which the sonar sees', range=(1.0, 10000.0))
     horizontal_fov_deg: float = parameter(45.0, 'deg',
         'full width of the sector that the sonar sees', range=(1.0, 170.0))

@@ -151,19 +151,24 @@ class DepthSlices:
         """Whether a target can begin: the sea floor has to be known for `seafloor`."""
         return not self.seafloor or bool(np.isfinite(sonar.altitude))
 
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
-        """New targets from detections z (B, 2), R (B, 2, 2)."""
-        fresh = self._begin(z, R, sonar, self.K)
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, ends: FloatArray | None = None
+    ) -> Mixture:
+        """New targets from detections z (B, 2), R (B, 2, 2); ends (B, 2): the elevations between
+        which each lies, rad below the axis of the sonar, NaN for the whole beam."""
+        fresh = self._begin(z, R, sonar, self.K, ends)
         return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
 
-    def _begin(self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int) -> Mixture:
+    def _begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, ends: FloatArray | None
+    ) -> Mixture:
         """New targets in K slices of equal weight, four states."""
         B = len(z)
         x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
         P[..., 3, 3] = self.scale**2
-        span = depth_span(z, sonar, self.config)
+        span = depth_span(z, sonar, self.config, ends)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
         P[..., 2, 2] = np.square(sigma)[:, None]
@@ -281,22 +286,28 @@ class DepthSlices:
 
 
 def depth_span(
-    z: FloatArray, sonar: Sonar, config: ObstacleConfig
+    z: FloatArray, sonar: Sonar, config: ObstacleConfig, elevations: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
-    beam, below the surface, above the sea floor."""
+    beam, or between `elevations` (B, 2) where they are not NaN, below the surface, above the sea
+    floor."""
     a, b, c = sonar.pose.R[2]
     d, delta = z.T
     k = a * np.cos(delta) + b * np.sin(delta)
     edge = np.radians(min(0.5 * BEAM_MARGIN * config.vertical_fov_deg, 85.0))
     ends = d * (k * np.cos(edge) + c * np.array([[-1.0], [1.0]]) * np.sin(edge))
-    lowest, highest = ends.min(axis=0), ends.max(axis=0)
+    lowest, highest, least = ends.min(axis=0), ends.max(axis=0), 0.02 * d
+    if elevations is not None:
+        seen = d[:, None] * (k[:, None] * np.cos(elevations) + c * np.sin(elevations))
+        known = np.isfinite(seen).all(axis=1)
+        lowest = np.where(known, seen.min(axis=1), lowest)
+        highest = np.where(known, seen.max(axis=1), highest)
+        least = np.where(known, 0.001 * d, least)
     if config.max_offset > 0.0:
         lowest, highest = (
             np.maximum(lowest, -config.max_offset),
             np.minimum(highest, config.max_offset),
         )
-    least = 0.02 * d
     if np.isfinite(sonar.altitude):
         highest = np.minimum(highest, max(sonar.altitude, 0.0) + least)
     if config.depth_is_absolute:

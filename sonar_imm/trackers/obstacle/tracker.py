@@ -51,6 +51,7 @@ from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
 from .config import ObstacleConfig
+from .elevation import Elevations, fits, outliers, updated
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
 from .looks import Looks
@@ -272,11 +273,12 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, intensity, extended = self._detections(ping)
+        z, R, intensity, extended, up, var_up = self._detections(ping)
+        seen = Elevations.of(up, var_up, self.config)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         now = self._recall(now)
-        chosen, expected, fit = self._associate(now, z, R)
-        now = self._update(now, chosen, expected, z, R, extended)
+        chosen, expected, fit = self._associate(now, z, R, seen)
+        now = self._update(now, chosen, expected, z, R, extended, seen)
         if self.config.vertical_beam_width_deg and before:
             dt = (now.stamp_ns - before.stamp_ns) * 1e-9
             level = np.append(level_db(intensity), np.nan)[chosen]
@@ -292,7 +294,8 @@ class ObstacleTracker:
         if np.count_nonzero(hit) < len(z):
             free = np.ones(len(z), bool)
             free[chosen[hit]] = False
-            now = self._spawn(now, z[free], R[free], extended[free])
+            seen = seen and seen.rows(free)
+            now = self._spawn(now, z[free], R[free], extended[free], seen)
         confirmed = now.life.status != TENTATIVE
         return now._replace(alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
@@ -312,29 +315,33 @@ class ObstacleTracker:
         return (now.only(is_finite) if broken else now), broken
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
-        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is stated (D,), of the rows
-        that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
-        says nothing and is left out."""
+        """z (D, 2), R (D, 2, 2), intensity (D,), whether an extent is stated (D,), elevation and
+        its variance (D,), of the rows that are echoes, azimuth positive to starboard. A row that
+        is as uncertain as it is far says nothing and is left out."""
         *echoes, real = ping_kernels.echoes(
             ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
         )
-        columns = *echoes, ping.intensity, np.isfinite(ping.extent_range)
+        extended = np.isfinite(ping.extent_range)
+        columns = *echoes, ping.intensity, extended, ping.elevation, ping.var_elevation
         if np.count_nonzero(real) == len(real):
             return columns
         return tuple(column[real] for column in columns)
 
     def _associate(
-        self, now: PingState, z: FloatArray, R: FloatArray
+        self, now: PingState, z: FloatArray, R: FloatArray, seen: Elevations | None
     ) -> tuple[np.ndarray, FloatArray, FloatArray]:
         """The detection of each track (T,), -1 for none, what was expected (T, K, 2), and the log
         density (T,) of what was found; confirmed tracks choose before tentative ones."""
         h, C = self.filter.expected(now.mixture, now.sonar)
         if not len(h) or not len(z):
             return np.full(len(h), -1), h, np.zeros(len(h))
-        threshold = gate_threshold(self.config.gate_probability, 2)
-        fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
-        tentative = now.life.status == TENTATIVE
         config = self.config
+        if seen:
+            fit = fits(now.mixture, h, now.sonar.pose, z, R, seen, config)
+        else:
+            threshold = gate_threshold(config.gate_probability, 2)
+            fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
+        tentative = now.life.status == TENTATIVE
         chosen = assign_fits(fit, tentative, config.detection_probability, config.clutter_density)
         return chosen, h, fit[np.arange(len(fit)), chosen]
 
@@ -346,6 +353,7 @@ class ObstacleTracker:
         z: FloatArray,
         R: FloatArray,
         extended: np.ndarray,
+        seen: Elevations | None,
     ) -> PingState:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
@@ -357,7 +365,12 @@ class ObstacleTracker:
             mixture, bodies, h, chosen = mixture.rows(hit), bodies.rows(hit), h[hit], chosen[hit]
         z, R = z[chosen], R[chosen]
         bodies, R = bodies.seen(extended[chosen], z, R, self._own_variance)
+        before = mixture
         mixture, nis[hit], repairs = self.filter.update(mixture, h, z, R, now.sonar)
+        if seen:
+            chance = self.config.outlier_probability
+            doubt = outliers(before, h, z, R, chance, self.filter.outlier_density)
+            mixture = updated(mixture, seen.rows(chosen), doubt, now.sonar.pose, self.config)
         if not every:
             mixture = now.mixture.replaced(hit, mixture)
             bodies = now.bodies.replaced(hit, bodies)
@@ -459,7 +472,12 @@ class ObstacleTracker:
         return ObstacleState(last=last._replace(stamp_ns=0).only(~everybody))
 
     def _spawn(
-        self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
+        self,
+        now: PingState,
+        z: FloatArray,
+        R: FloatArray,
+        extended: np.ndarray,
+        seen: Elevations | None,
     ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
         ready = self.filter.ready(now.sonar)
@@ -468,7 +486,14 @@ class ObstacleTracker:
         if not len(z):
             return now
         bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
-        fresh = self.filter.begin(z, R, now.sonar)
+        if seen:
+            seen = seen.rows(np.arange(len(z)))
+            fresh = self.filter.begin(z, R, now.sonar, seen.ends())
+            fresh = updated(
+                fresh, seen, self.config.outlier_probability, now.sonar.pose, self.config
+            )
+        else:
+            fresh = self.filter.begin(z, R, now.sonar)
         life = now.life.born(len(z), now.stamp_ns, self.rules)
         return self._joined(now, life, fresh, bodies, 0.0)
 

@@ -125,6 +125,8 @@ class ObstacleScenario(ImageScenario):
     range_step: float = parameter(0.17, 'm', 'sampling step of the range', range=(0.0, 10.0))
     bearing_step_deg: float = parameter(0.18, 'deg',
         'sampling step of the bearing', range=(0.0, 10.0))
+    elevation_std_deg: float = parameter(0.0, 'deg',
+        'standard deviation of an elevation; 0: the sonar measures none', range=(0.0, 45.0))
     sound_speed_error: float = parameter(0.001, '',
         'scale error of the ranges, 1 sigma', range=(0.0, 0.2))
     detection_probability: float = parameter(1.0, '',
@@ -208,6 +210,10 @@ _FIELD = {
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'approach': ('an obstacle 3 m below the sonar', {}),
+    'elevation': (
+        'the same, and the sonar measures elevations to 1 degree',
+        {'elevation_std_deg': 1.0},
+    ),
     'nearly_level': ('an obstacle 0.5 m below the sonar', {'vertical_offset': 0.5}),
     'above': ('an obstacle 6 m above the sonar', {'vertical_offset': -6.0}),
     'float': (
