@@ -23,7 +23,16 @@ from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, column, content_key, floats, point, quaternion, Rejection
+from .checks import (
+    check_stamp,
+    column,
+    content_key,
+    floats,
+    point,
+    points,
+    quaternion,
+    Rejection,
+)
 
 BEAM_AXES = ('marine', 'rep103', 'auto')
 """What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
@@ -195,3 +204,36 @@ class Altitude:
     def key(self) -> bytes:
         """See `content_key`."""
         return content_key('altitude', np.float64(self.altitude))
+
+
+@frozen(eq=False, kw_only=True)
+class Ground:
+    """Soundings: places of the sea floor in the world.
+
+    position: (n, 3) m, ENU; variance: (n,) m^2 of the height, 0 where unknown.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=points)
+    variance: FloatArray = field(converter=column)
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if len(self.variance) != len(self):
+            raise Rejection(
+                'bad_shape', f'{len(self)} soundings have {len(self.variance)} variances'
+            )
+        if not (np.isfinite(self.position).all() and np.isfinite(self.variance).all()):
+            raise Rejection('nan', 'a sounding is not finite')
+        if len(self) and np.abs(self.position).max() > 1e8:
+            raise Rejection(
+                'out_of_range', 'a sounding lies further than 100,000 km from the origin'
+            )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('ground', self.position, self.variance)

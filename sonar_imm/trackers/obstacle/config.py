@@ -67,6 +67,13 @@ class ObstacleConfig(
         'behaviour seabed: standard deviation of the depth of the sea floor at the obstacle, '
         'relative to that below the vehicle', range=(0.01, 100.0))
 
+    ground_std: float = parameter(0.5, 'm',
+        'behaviour seabed: standard deviation of the depth of an obstacle on the sea floor, '
+        'relative to the soundings of ground around it', range=(0.01, 100.0))
+    ground_radius: float = parameter(5.0, 'm',
+        'distance to which soundings of ground tell the depth of the sea floor at an obstacle',
+        range=(0.5, 1000.0))
+
     # -- where the sonar sits and how things are written -----------------------------------------
     sonar_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
         'vector from the navigation reference to the sonar: x forward, y port, z up (vehicle FLU)',

@@ -87,6 +87,16 @@ class Sonar(NamedTuple):
         return self.altitude - self.reference
 
 
+class Hints(NamedTuple):
+    """What is known of the height of B new obstacles besides the beam, NaN where nothing is:
+    elevations (B, 2) between which each lies, rad below the axis of the sonar; floor (B,): how far
+    below the sonar the sea floor is at each, m, with its standard deviation (B,)."""
+
+    elevations: FloatArray
+    floor: FloatArray
+    floor_std: FloatArray
+
+
 class Mixture(NamedTuple):
     """x (T, K, n), P (T, K, n, n), mu (T, K)."""
 
@@ -152,15 +162,14 @@ class DepthSlices:
         return not self.seafloor or bool(np.isfinite(sonar.altitude))
 
     def begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, ends: FloatArray | None = None
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
     ) -> Mixture:
-        """New targets from detections z (B, 2), R (B, 2, 2); ends (B, 2): the elevations between
-        which each lies, rad below the axis of the sonar, NaN for the whole beam."""
-        fresh = self._begin(z, R, sonar, self.K, ends)
+        """New targets from detections z (B, 2), R (B, 2, 2)."""
+        fresh = self._begin(z, R, sonar, self.K, hints)
         return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
 
     def _begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, ends: FloatArray | None
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, hints: Hints | None
     ) -> Mixture:
         """New targets in K slices of equal weight, four states."""
         B = len(z)
@@ -168,7 +177,7 @@ class DepthSlices:
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
         P[..., 3, 3] = self.scale**2
-        span = depth_span(z, sonar, self.config, ends)
+        span = depth_span(z, sonar, self.config, hints)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
         P[..., 2, 2] = np.square(sigma)[:, None]
@@ -286,19 +295,19 @@ class DepthSlices:
 
 
 def depth_span(
-    z: FloatArray, sonar: Sonar, config: ObstacleConfig, elevations: FloatArray | None = None
+    z: FloatArray, sonar: Sonar, config: ObstacleConfig, hints: Hints | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
-    beam, or between `elevations` (B, 2) where they are not NaN, below the surface, above the sea
-    floor."""
+    beam, or where `hints` say, below the surface, above the sea floor."""
     a, b, c = sonar.pose.R[2]
     d, delta = z.T
     k = a * np.cos(delta) + b * np.sin(delta)
     edge = np.radians(min(0.5 * BEAM_MARGIN * config.vertical_fov_deg, 85.0))
     ends = d * (k * np.cos(edge) + c * np.array([[-1.0], [1.0]]) * np.sin(edge))
     lowest, highest, least = ends.min(axis=0), ends.max(axis=0), 0.02 * d
-    if elevations is not None:
-        seen = d[:, None] * (k[:, None] * np.cos(elevations) + c * np.sin(elevations))
+    if hints is not None:
+        ends = hints.elevations
+        seen = d[:, None] * (k[:, None] * np.cos(ends) + c * np.sin(ends))
         known = np.isfinite(seen).all(axis=1)
         lowest = np.where(known, seen.min(axis=1), lowest)
         highest = np.where(known, seen.max(axis=1), highest)
@@ -309,7 +318,12 @@ def depth_span(
             np.minimum(highest, config.max_offset),
         )
     if np.isfinite(sonar.altitude):
-        highest = np.minimum(highest, max(sonar.altitude, 0.0) + least)
+        bottom = np.full(len(d), max(sonar.altitude, 0.0))
+    else:
+        bottom = np.full(len(d), np.inf)
+    if hints is not None:
+        bottom = np.where(np.isfinite(hints.floor), hints.floor + 2.0 * hints.floor_std, bottom)
+    highest = np.minimum(highest, bottom + least)
     if config.depth_is_absolute:
         lowest = np.maximum(lowest, np.minimum(-sonar.pose.position[2], 0.0) - least)
     # A beam that looks at nothing but rock or air shows an echo all the same: keep some reach.

@@ -29,6 +29,7 @@ from ...measurements import Altitude, Detections
 from ..navigation import NavigationBuffer
 from .bodies import Bodies
 from .filters import Mixture, Sonar
+from .ground import GroundMap
 from .intensity import Strengths
 from .looks import Looks
 from .memory import Existence, Memory
@@ -78,6 +79,7 @@ class PingState(NamedTuple):
 class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
+    ground: soundings so far;
     skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
     because too many waited; broken: tracks ended so far because their numbers were not finite;
     alike: pings so far in which most obstacles moved alike; innovations: of confirmed ones."""
@@ -86,6 +88,7 @@ class ObstacleState:
     done: tuple[PingState, ...] = ()
     navigation: NavigationBuffer = NavigationBuffer()
     altitude: Altitude | None = None
+    ground: GroundMap = GroundMap()
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
     missing: int = 0

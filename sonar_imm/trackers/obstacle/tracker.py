@@ -42,7 +42,7 @@ from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
-from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
+from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from .. import WarmStep
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
@@ -52,7 +52,8 @@ from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
 from .config import ObstacleConfig
 from .elevation import Elevations, fits, outliers, updated
-from .filters import Mixture, Sonar
+from .filters import Hints, Mixture, Sonar
+from .ground import GroundMap
 from .intensity import by_intensity, level_db, Strengths
 from .looks import Looks
 from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
@@ -78,8 +79,8 @@ _PLACE_COVARIANCES = tuple(
 
 
 class ObstacleTracker:
-    """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`, `Navigation`
-    and `Altitude`."""
+    """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`,
+    `Navigation`, `Altitude` and `Ground`."""
 
     STATE = ('_stream',)
 
@@ -100,7 +101,7 @@ class ObstacleTracker:
 
     def reset(self) -> None:
         self._stream = ReplayStream(
-            (Detections, Navigation, Altitude),
+            (Detections, Navigation, Altitude, Ground),
             StreamRules.of(self.config),
             step=self._step,
             initial=ObstacleState(),
@@ -198,12 +199,14 @@ class ObstacleTracker:
         self, before: ObstacleState, stamp_ns: int, items: Sequence[Measurement]
     ) -> ObstacleState:
         """The state after all measurements of one stamp. Pure."""
-        buffer, altitude = before.navigation, before.altitude
+        buffer, altitude, ground = before.navigation, before.altitude, before.ground
         for item in items:
             if isinstance(item, Navigation):
                 buffer = buffer.added(item)
             elif isinstance(item, Altitude):
                 altitude = item
+            elif isinstance(item, Ground):
+                ground = ground.added(item)
         pings = [item for item in items if isinstance(item, Detections)]
         waiting = [*before.waiting, *((ping, altitude) for ping in pings)]
         given_up = max(0, len(waiting) - MOST_WAITING)
@@ -218,7 +221,7 @@ class ObstacleTracker:
             if ready == 'gap':
                 skipped += 1
                 continue
-            last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
+            last, lost = self._ping(last, ping, self._sonar(buffer, ping, height), ground)
             broken += lost
             alike += last.alike
             sure = np.isfinite(last.nis) & (last.life.status != TENTATIVE)
@@ -230,6 +233,7 @@ class ObstacleTracker:
             done=tuple(done),
             navigation=buffer.since(oldest - nanoseconds(self.config.course_window)),
             altitude=altitude,
+            ground=ground,
             waiting=tuple(waiting),
             skipped=skipped,
             missing=before.missing + given_up,
@@ -270,7 +274,7 @@ class ObstacleTracker:
         return Sonar(pose, height, late, late_ns * 1e-9, reference, straight)
 
     def _ping(
-        self, before: PingState | None, ping: Detections, sonar: Sonar
+        self, before: PingState | None, ping: Detections, sonar: Sonar, ground: GroundMap
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
         z, R, intensity, extended, up, var_up = self._detections(ping)
@@ -295,7 +299,7 @@ class ObstacleTracker:
             free = np.ones(len(z), bool)
             free[chosen[hit]] = False
             seen = seen and seen.rows(free)
-            now = self._spawn(now, z[free], R[free], extended[free], seen)
+            now = self._spawn(now, z[free], R[free], extended[free], seen, ground)
         confirmed = now.life.status != TENTATIVE
         return now._replace(alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
@@ -478,6 +482,7 @@ class ObstacleTracker:
         R: FloatArray,
         extended: np.ndarray,
         seen: Elevations | None,
+        ground: GroundMap,
     ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
         ready = self.filter.ready(now.sonar)
@@ -486,14 +491,15 @@ class ObstacleTracker:
         if not len(z):
             return now
         bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
+        hints = None
+        if seen or ground:
+            seen = seen and seen.rows(np.arange(len(z)))
+            ends = seen.ends() if seen else np.full((len(z), 2), np.nan)
+            hints = Hints(ends, *ground.below(z, now.sonar, self.config))
+        fresh = self.filter.begin(z, R, now.sonar, hints)
         if seen:
-            seen = seen.rows(np.arange(len(z)))
-            fresh = self.filter.begin(z, R, now.sonar, seen.ends())
-            fresh = updated(
-                fresh, seen, self.config.outlier_probability, now.sonar.pose, self.config
-            )
-        else:
-            fresh = self.filter.begin(z, R, now.sonar)
+            chance = self.config.outlier_probability
+            fresh = updated(fresh, seen, chance, now.sonar.pose, self.config)
         life = now.life.born(len(z), now.stamp_ns, self.rules)
         return self._joined(now, life, fresh, bodies, 0.0)
 

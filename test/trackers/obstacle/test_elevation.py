@@ -25,7 +25,7 @@ from scipy.stats import norm
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.elevation import Elevations, expected, outliers, updated
-from sonar_imm.trackers.obstacle.filters import depth_span, Mixture, Sonar
+from sonar_imm.trackers.obstacle.filters import depth_span, Hints, Mixture, Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -182,7 +182,8 @@ def test_new_obstacles_lie_where_the_elevation_says():
     level = Sonar(geometry.Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), altitude=10.0)
     z = np.array([[40.0, 0.1], [40.0, 0.1]])
     ends = np.array([[-0.02, 0.06], [np.nan, np.nan]])
-    low, high = depth_span(z, level, ObstacleConfig(), ends)
+    hints = Hints(ends, *np.full((2, 2), np.nan))
+    low, high = depth_span(z, level, ObstacleConfig(), hints)
     plain = depth_span(z, level, ObstacleConfig())
     assert (low[0], high[0]) == pytest.approx((-0.8, 2.4), abs=0.01)
     assert (low[1], high[1]) == (plain[0][1], plain[1][1])
