@@ -14,8 +14,8 @@
 
 """The obstacle node: ``ros2 run sonar_imm obstacle_node``.
 
-Hears ``detections``, ``nav``, ``altitude`` and ``ground``. Besides ``~/estimate`` it publishes, for
-the newest state only and of confirmed obstacles (also those that have left the beam):
+Hears ``detections``, ``nav``, ``altitude`` and ``ground``. Besides ``~/estimate`` it publishes,
+for the newest state only and of confirmed obstacles (also those that have left the beam):
 
 - ``~/obstacles``: their places in the frame of the navigation, a PoseArray;
 - ``~/markers``: a bar for the 90 % band of the height, a ball at the mean, a label;

@@ -16,9 +16,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from attrs import frozen
+import numpy as np
 
 from ...acoustics.geometry import AZIMUTH_MODELS
+from ...estimation.arrays import FloatArray
 from ...measurements import BEAM_AXES
 from ...parameters import inherited, live, parameter
 from ..shared_parameters import (
@@ -31,6 +35,8 @@ from ..shared_parameters import (
 METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 MISSES = ('ignored', 'evidence')
+LEAST_DETECTION = 1e-3
+"""An echo is never quite impossible."""
 
 
 @frozen(kw_only=True)
@@ -139,6 +145,15 @@ class ObstacleConfig(
         'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
     outlier_probability: float = live(0.02, '',
         'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
+    detection_ranges: tuple[float, ...] = live((), 'm',
+        'ranges at which detection_factors are given, rising; empty: detection_probability counts '
+        'at every range', range=(0.0, 1e5), kind='float[]')
+    detection_factors: tuple[float, ...] = live((), '',
+        'share of detection_probability that is left at each of detection_ranges; linear between '
+        'them, constant beyond', range=(0.0, 1.0), kind='float[]')
+    sector_edge_deg: float = live(0.0, 'deg',
+        'width at either edge of the sector in which an obstacle without an echo is not missed',
+        range=(0.0, 45.0))
     misses: str = parameter('ignored', '',
         'what pings without an echo say of the height of an obstacle, gaussian_sum only: nothing '
         '(ignored), or that it is less probable in the beam (evidence)', choices=MISSES)
@@ -220,6 +235,17 @@ class ObstacleConfig(
             problems.append('vertical_beam_width_deg needs the method gaussian_sum')
         if not set(self.behaviours) & set(BEHAVIOURS[:3]):
             problems.append('behaviours needs one of fixed, swaying, moving at least')
+        if len(self.detection_ranges) != len(self.detection_factors):
+            problems.append('detection_ranges and detection_factors need as many values each')
+        if any(a >= b for a, b in pairwise(self.detection_ranges)):
+            problems.append('detection_ranges have to rise')
         if len(set(self.behaviours)) < len(self.behaviours):
             problems.append('behaviours names one of them twice')
         return problems
+
+    def detection_at(self, distance: FloatArray) -> FloatArray:
+        """Probability that a ping shows obstacles at ranges (T,) in the beam."""
+        if not self.detection_ranges:
+            return np.full(len(distance), self.detection_probability)
+        factor = np.interp(distance, self.detection_ranges, self.detection_factors)
+        return np.clip(self.detection_probability * factor, LEAST_DETECTION, 1.0)

@@ -151,6 +151,9 @@ class DepthSlices:
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
         self._beam = beam_of(config)
+        vertical, horizontal, reach = self._beam
+        edge = np.radians(config.sector_edge_deg)
+        self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
         self._noise = (
             config.position_noise**2,
             np.radians(config.yaw_noise_deg) ** 2,
@@ -270,10 +273,13 @@ class DepthSlices:
         return np.ones((len(mu), 1))
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
+        """Probability (T,) that the beam holds the target, not at the edge of its sector, and
+        whether (T,) it lies ahead."""
         x, P, mu = mixture
         spread = np.sqrt(P[:, :, 2, 2]) / x[:, :, 0]
-        return kernels.outlook(kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._beam)
+        return kernels.outlook(
+            kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._surely
+        )
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo

@@ -160,16 +160,18 @@ def in_view(memory: Memory, stamp_ns: int, sonar: Sonar, config: ObstacleConfig)
 
 class Existence(NamedTuple):
     """Of T tracks: log-odds (T,) of their existence at the last echo; pings (T,) without one
-    since that may have held them, and their probability (T,) of that, summed."""
+    since that may have held them; held (T,): their probability of that, summed; silence (T,): log
+    probability of no echo in all these pings of what was held."""
 
     log_odds: FloatArray
     pings: FloatArray
     held: FloatArray
+    silence: FloatArray
 
     @staticmethod
     def of(log_odds: FloatArray) -> Existence:
         """Of tracks that begin."""
-        return Existence(log_odds, np.zeros(len(log_odds)), np.zeros(len(log_odds)))
+        return Existence(log_odds, *np.zeros((3, len(log_odds))))
 
     def rows(self, which: np.ndarray) -> Existence:
         return Existence(*(part[which] for part in self))
@@ -178,24 +180,27 @@ class Existence(NamedTuple):
         return Existence(*(np.concatenate(both) for both in zip(self, other)))
 
     def after(
-        self, hit: BoolArray, fit: FloatArray, in_beam: FloatArray, config: ObstacleConfig
+        self, hit: BoolArray, fit: FloatArray, in_beam: FloatArray, p: FloatArray, clutter: float
     ) -> Existence:
         """After a ping with echoes of log density fit (T,) where `hit` (T,), of tracks that the
-        beam held with the probability in_beam (T,)."""
+        beam held with the probability in_beam (T,) and that would then be detected with p (T,).
+        clutter: density of false echoes."""
         silent = ~hit & (in_beam > HELD)
-        pings, held = self.pings + silent, self.held + np.where(silent, in_beam, 0.0)
+        since = (
+            self.pings + silent,
+            self.held + np.where(silent, in_beam, 0.0),
+            self.silence + np.where(silent, np.log1p(-np.minimum(p, 1.0 - 1e-9)), 0.0),
+        )
         if not np.count_nonzero(hit):
-            return self._replace(pings=pings, held=held)
-        seen = math.log(config.detection_probability / config.clutter_density)
-        found = np.clip(self.now(config) + seen + np.where(hit, fit, 0.0), -SUREST, SUREST)
-        log_odds = np.where(hit, found, self.log_odds)
-        return Existence(log_odds, np.where(hit, 0.0, pings), np.where(hit, 0.0, held))
+            return Existence(self.log_odds, *since)
+        found = self.now() + np.log(p / clutter) + np.where(hit, fit, 0.0)
+        log_odds = np.where(hit, np.clip(found, -SUREST, SUREST), self.log_odds)
+        return Existence(log_odds, *(np.where(hit, 0.0, part) for part in since))
 
-    def now(self, config: ObstacleConfig) -> FloatArray:
+    def now(self) -> FloatArray:
         """Log-odds (T,) with the pings since the last echo."""
         B = np.minimum(self.held / np.maximum(self.pings, 1.0), 1.0)
-        missed = (1.0 - config.detection_probability) ** self.pings
-        still = np.maximum(1.0 - B * (1.0 - missed), 1e-30)
+        still = np.maximum(1.0 + B * np.expm1(self.silence), 1e-30)
         return np.clip(self.log_odds + np.log(still), -SUREST, SUREST)
 
 

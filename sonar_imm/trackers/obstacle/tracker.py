@@ -346,7 +346,12 @@ class ObstacleTracker:
             threshold = gate_threshold(config.gate_probability, 2)
             fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
         tentative = now.life.status == TENTATIVE
-        chosen = assign_fits(fit, tentative, config.detection_probability, config.clutter_density)
+        usual = config.detection_probability
+        weighed = fit
+        if config.detection_ranges:  # as probable as it is at the range of each track
+            p = self._chance(now.mixture)
+            weighed = fit + np.log(p / (1.0 - p) * (1.0 - usual) / usual)[:, None]
+        chosen = assign_fits(weighed, tentative, usual, config.clutter_density)
         return chosen, h, fit[np.arange(len(fit)), chosen]
 
     def _update(
@@ -381,14 +386,22 @@ class ObstacleTracker:
         repairs += now.repairs
         return now._replace(mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
+    def _chance(self, mixture: Mixture) -> FloatArray:
+        """Probability (T,) that a ping shows obstacles that the beam holds."""
+        return self.config.detection_at(np.einsum('tk,tk->t', mixture.mu, mixture.x[..., 0]))
+
     def _prune(self, now: PingState, hit: np.ndarray, fit: FloatArray) -> PingState:
         """End the tracks that are over or passed; `hit` (T,): those that got a detection of log
         density `fit` (T,)."""
         tentative = now.life.status == TENTATIVE
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
-        looked = tentative | (in_beam > IN_BEAM)
+        p = self._chance(now.mixture)
+        probable = in_beam * p > IN_BEAM * self.config.detection_probability
+        looked = tentative | (probable if self.config.detection_ranges else in_beam > IN_BEAM)
         life, stays = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
-        now = now._replace(existence=now.existence.after(hit, fit, in_beam, self.config))
+        now = now._replace(
+            existence=now.existence.after(hit, fit, in_beam, p, self.config.clutter_density)
+        )
         if self.config.max_landmarks:
             coasted = now.stamp_ns - now.life.last_hit_ns > self.rules.max_coast_ns
             now = self._remember(now, np.where(stays, ~ahead, coasted & ~hit))
@@ -399,7 +412,7 @@ class ObstacleTracker:
         over = over & (now.life.status != TENTATIVE)
         if not np.count_nonzero(over):
             return now
-        log_odds = now.existence.now(self.config)
+        log_odds = now.existence.now()
         stays = now.mixture.mu[:, self.filter.moves].sum(axis=1) <= 0.5
         which = np.flatnonzero(over & stays & (log_odds > 0.0))
         if not len(which):

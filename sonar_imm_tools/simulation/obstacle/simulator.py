@@ -331,7 +331,11 @@ def _pings(
         rows: list[FloatArray] = []
         up: list[float] = []
         for echo, inside in echoes:
-            seen = rng.uniform() < config.detection_probability
+            chance = config.detection_probability
+            if config.detection_ranges:
+                share = np.interp(echo[k, 0], config.detection_ranges, config.detection_factors)
+                chance *= float(share)
+            seen = rng.uniform() < chance
             outlier = rng.uniform() < config.outlier_probability
             error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)
             if seen and inside[k]:
