@@ -356,8 +356,8 @@ def test_the_probability_of_a_detection_falls_with_range():
 
 
 def test_misses_count_where_the_sonar_would_see():
-    """An obstacle 55 m ahead, surely in the beam, of a vehicle that stands still gives six echoes and then none for
-    ten seconds: to be expected of a sonar that hardly sees that far."""
+    """An obstacle 55 m ahead, surely in the beam, of a vehicle that stands still gives six echoes
+    and then none for ten seconds: to be expected of a sonar that hardly sees that far."""
     ended = {}
     for values in ({}, FALLS):
         tracker = ObstacleTracker(ObstacleConfig(max_offset=2.0, **values))
