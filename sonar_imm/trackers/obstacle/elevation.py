@@ -45,8 +45,8 @@ from .filters import Mixture
 
 REACH = 4.0
 """Standard deviations of an elevation over which a new obstacle has its slices."""
-_STEPS = np.array([1e-3, 1e-5, 1e-3])
-"""m, rad, m: of range, azimuth and depth, for derivatives."""
+SMALLEST = 0.1
+"""Cosine of 84 degrees: no sonar sees obstacles so steeply above or below."""
 _LEAST = 1e-8
 """rad^2; no sonar measures an elevation to less than 0.006 degrees."""
 
@@ -81,19 +81,42 @@ class Elevations(NamedTuple):
 
 def expected(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, FloatArray]:
     """The elevation (T, K) of each component, rad below the axis of the sonar, and its derivatives
-    (T, K, n) by the states."""
-    T, K, n = mixture.x.shape
-    moved = np.tile(mixture.x, (7, 1, 1))
-    for i, step in enumerate(_STEPS):
-        moved[(2 * i + 1) * T : (2 * i + 2) * T, :, i] += step
-        moved[(2 * i + 2) * T : (2 * i + 3) * T, :, i] -= step
-    m = kernels.points(moved, *pose, cone)
+    (T, K, 3) by range, azimuth and depth.
+
+    They follow from what fixes the elevation, with n = (a, b, c) the vertical seen from the sonar
+    and s the vertical offset: ``k cos eps + c sin eps = s / d``, where ``k = a cos delta + b sin
+    delta``; on the cone the same for the angle eta in the x-z plane, ``sin eps = cos delta sin
+    eta``.
+    """
+    x = mixture.x
+    d, cosine, sine = x[..., 0], np.cos(x[..., 1]), np.sin(x[..., 1])
+    a, b, c = pose.R[2]
+    m = kernels.points(x, *pose, cone)
     level = np.sqrt(m[..., 0] * m[..., 0] + m[..., 1] * m[..., 1])
-    angle = np.arctan2(m[..., 2], level).reshape(7, T, K)
-    H = np.zeros((T, K, n))
-    for i, step in enumerate(_STEPS):
-        H[:, :, i] = (angle[2 * i + 1] - angle[2 * i + 2]) / (2.0 * step)
-    return angle[0], H
+    H = np.empty((*d.shape, 3))
+    if not cone:
+        up, along = m[..., 2] / d, level / d
+        k, across = a * cosine + b * sine, b * cosine - a * sine
+        turn = _at_least(c * along - k * up)
+        H[..., 0] = -(k * along + c * up) / (d * turn)
+        H[..., 1] = -along * across / turn
+        H[..., 2] = 1.0 / (d * turn)
+        return np.arctan2(m[..., 2], level), H
+    r = d * cosine
+    out, down = m[..., 0] / r, m[..., 2] / r
+    turn = _at_least(c * out - a * down)
+    ahead = a * out + c * down
+    scale = cosine * out / np.maximum(level / d, SMALLEST)
+    H[..., 0] = -scale * (cosine * ahead + b * sine) / (r * turn)
+    H[..., 1] = -scale * (b * cosine - sine * ahead) / (cosine * turn)
+    H[..., 1] -= sine * down / np.maximum(level / d, SMALLEST)
+    H[..., 2] = scale / (r * turn)
+    return np.arctan2(m[..., 2], level), H
+
+
+def _at_least(turn: FloatArray) -> FloatArray:
+    """Away from 0, where an obstacle would lie straight above or below."""
+    return np.copysign(np.maximum(np.abs(turn), SMALLEST), turn)
 
 
 def fits(
@@ -112,7 +135,7 @@ def fits(
     angle, slope = expected(mixture, pose, config.azimuth_model == 'cone')
     H = np.zeros((T, K, 3, n))
     H[:, :, 0, 0] = H[:, :, 1, 1] = 1.0
-    H[:, :, 2] = slope
+    H[:, :, 2, :3] = slope
     fov = np.radians(config.vertical_fov_deg)
     z3, R3 = np.zeros((len(z), 3)), np.zeros((len(z), 3, 3))
     z3[:, :2], R3[:, :2, :2] = z, R

@@ -388,6 +388,8 @@ class ObstacleTracker:
 
     def _chance(self, mixture: Mixture) -> FloatArray:
         """Probability (T,) that a ping shows obstacles that the beam holds."""
+        if not self.config.detection_ranges:
+            return np.full(len(mixture.mu), self.config.detection_probability)
         return self.config.detection_at(np.einsum('tk,tk->t', mixture.mu, mixture.x[..., 0]))
 
     def _prune(self, now: PingState, hit: np.ndarray, fit: FloatArray) -> PingState:
