@@ -92,7 +92,7 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
-    if kind == MAP and record['system'] == 'obstacle':
+    if kind == MAP and 'landmarks' in record:
         _export_obstacles(run, record, out, epsg, origin, as_json)
         return
     if kind in HORIZON_FORMATS:

@@ -286,8 +286,8 @@ class OfflineRun:
 
     def landmarks(self) -> dict[str, Any]:
         """The obstacles that are known at the end; nothing of a tracker that keeps none."""
-        known: list[Any] = getattr(self.tracker, 'known', list)()
-        return {'landmarks': known} if known else {}
+        known = getattr(self.tracker, 'known', None)
+        return {} if known is None else {'landmarks': known()}
 
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
