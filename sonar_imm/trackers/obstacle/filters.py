@@ -261,7 +261,7 @@ class DepthSlices:
             own,
             *band,
             position + together[:, :3],
-            both[:, :3, :3],
+            np.ascontiguousarray(both[:, :3, :3]),  # also what there is none of is so
             self.behaviour(mu),
             together[:, 3:],
             both[:, 3:, 3:],
