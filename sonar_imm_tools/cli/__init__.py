@@ -46,7 +46,7 @@ COMMANDS = {
     'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
-    'export': 'Write soundings, horizons or obstacles of a tracked bag for other programs.',
+    'export': 'Write soundings, horizons, tracks or obstacles of a run for other programs.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
     'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',

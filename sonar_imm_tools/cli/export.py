@@ -26,8 +26,8 @@ from sonar_imm.files import whole
 from .common import example, json_option, place_options, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
-MAP = 'geojson'
-HORIZON_FORMATS = ('csv', MAP, 'sgy', 'segy', 'seg')
+HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
+TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
 
 
 @click.command(
@@ -37,7 +37,9 @@ HORIZON_FORMATS = ('csv', MAP, 'sgy', 'segy', 'seg')
         'sonar-imm export out survey.xyz',
         'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg',
-        'sonar-imm export out obstacles.geojson --epsg 32632 --origin 500000,6000000',
+        'sonar-imm export out tracks.gpx',
+        'sonar-imm export out tracks.geojson --epsg 32632 --origin 500000,6000000',
+        'sonar-imm export out map.geojson --map --epsg 32632 --origin 500000,6000000',
     )
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
@@ -56,6 +58,12 @@ HORIZON_FORMATS = ('csv', MAP, 'sgy', 'segy', 'seg')
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help='horizons: the SEG-Y file that the recording was converted from.',
 )
+@click.option(
+    '--map',
+    'as_map',
+    is_flag=True,
+    help='obstacles: .geojson with those that are known at the end, in place of their tracks.',
+)
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
@@ -65,10 +73,11 @@ def command(
     origin: tuple[float, float, float],
     cell: float,
     original: Path | None,
+    as_map: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write soundings, horizons or obstacles of a tracked RUN to OUT for charts and programs.
+    """Write the soundings, horizons or tracks of a RUN to OUT for charts and other programs.
 
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
     its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
@@ -76,8 +85,9 @@ def command(
     with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
     the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
     Where the recording has no fixes by satellite, the places of horizons come from its navigation,
-    with --crs and --origin. Obstacles: .geojson (all that are known at the end of the recording),
-    with --crs and --origin.
+    with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml, .geojson (lines and points
+    with uncertainty and model), .csv and .parquet; --crs and --origin say where they lie where the
+    run does not.
     """
     from ..offline.run_folder import RunFolder, SOUNDINGS
     from ..recordings.export.points import read_points, write_las, write_xyz
@@ -86,16 +96,20 @@ def command(
     from ..survey.line import budget_of
 
     kind = out.suffix.lower().lstrip('.')
-    if kind not in FORMATS + HORIZON_FORMATS:
-        known = ', '.join(f'.{name}' for name in FORMATS + HORIZON_FORMATS)
+    every = dict.fromkeys(FORMATS + HORIZON_FORMATS + TRACK_FORMATS)
+    if kind not in every:
+        known = ', '.join(f'.{name}' for name in every)
         raise click.UsageError(f"'{out.name}' ends in none of {known}")
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
-    if kind == MAP and 'landmarks' in record:
-        _export_obstacles(run, record, out, epsg, origin, as_json)
+    if as_map:
+        _export_map(run, record, out, kind, epsg, origin, as_json)
         return
-    if kind in HORIZON_FORMATS:
+    if kind in TRACK_FORMATS and record['system'] != 'fathometer':
+        _export_tracks(run, out, kind, epsg, origin, as_json)
+        return
+    if kind in HORIZON_FORMATS + TRACK_FORMATS:
         _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
         return
     if not (run / SOUNDINGS).is_file():
@@ -121,10 +135,11 @@ def command(
     say(f'{out}: {len(points)} soundings{shape}')
 
 
-def _export_obstacles(
+def _export_map(
     run: Path,
     record: dict[str, Any],
     out: Path,
+    kind: str,
     epsg: int | None,
     origin: tuple[float, float, float],
     as_json: bool,
@@ -133,6 +148,8 @@ def _export_obstacles(
     from ..recordings.export.obstacles import write_obstacles
     from ..recordings.sources import BagError
 
+    if kind != 'geojson':
+        raise click.UsageError('--map writes .geojson')
     landmarks = record.get('landmarks', [])
     if not landmarks:
         raise BagError(f'{run} knows no obstacles at its end')
@@ -146,6 +163,40 @@ def _export_obstacles(
         print_json({'out': str(out), 'obstacles': len(landmarks)})
         return
     say(f'{out}: {len(landmarks)} obstacles')
+
+
+def _export_tracks(
+    run: Path,
+    out: Path,
+    kind: str,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    as_json: bool,
+) -> None:
+    """Tracks of a run of divers or obstacles."""
+    import numpy as np
+
+    from ..offline.run_folder import RunFolder
+    from ..recordings.export.points import degrees_of
+    from ..recordings.export.tracks import tracks_of, write_tracks
+
+    degrees = None
+    if epsg is not None:
+        number = epsg
+
+        def degrees(places: Any) -> Any:
+            return degrees_of(places + np.array(origin[:2]), number)
+
+    tracks = tracks_of(RunFolder(run).read_estimates(), degrees)
+    with whole(out) as unfinished:
+        left_out = write_tracks(unfinished, tracks, kind, run.name)
+    result = {'out': str(out), 'rows': len(tracks), 'left_out': left_out}
+    result['tracks'] = sum(1 for _ in tracks.each())
+    if as_json:
+        print_json(result)
+        return
+    left = f', {left_out} left out that have no place on Earth' if left_out else ''
+    say(f'{out}: {result["tracks"]} tracks, {len(tracks)} rows{left}')
 
 
 def _export_horizons(
@@ -170,7 +221,10 @@ def _export_horizons(
     from ..recordings.sources import BagError
 
     if record['system'] != 'fathometer':
-        raise BagError(f'{run} is of {record["system"]}: only the fathometer has horizons')
+        raise BagError(
+            f'{run} is of {record["system"]}: .{out.suffix[1:]} is for the tracks of divers and '
+            'obstacles and the horizons of the fathometer'
+        )
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
         raise click.UsageError(

@@ -108,7 +108,7 @@ def test_obstacles_of_a_run_as_geojson(tmp_path, capsys):
     assert run('track', tmp_path / 'bag', tmp_path / 'run') == 0
     (told,) = json.loads((tmp_path / 'run' / 'run.json').read_text())['landmarks']
     place = ('--epsg', '32632', '--origin', '500000,6000000,-5')
-    assert run('export', tmp_path / 'run', tmp_path / 'a.geojson', *place) == 0
+    assert run('export', tmp_path / 'run', tmp_path / 'a.geojson', '--map', *place) == 0
     (found,) = json.loads((tmp_path / 'a.geojson').read_text())['features']
     longitude, latitude, height = found['geometry']['coordinates']
     # 500 km east is the central meridian; a degree of latitude is about 111.3 km here.
@@ -119,5 +119,5 @@ def test_obstacles_of_a_run_as_geojson(tmp_path, capsys):
     assert properties['track_id'] == told['track_id'] and properties['existence'] > 0.99
     assert properties['z_low_m'] < height < properties['z_high_m']
     assert properties['x_std_m'] == pytest.approx(told['cov_x_x'] ** 0.5, abs=1e-3)
-    assert run('export', tmp_path / 'run', tmp_path / 'b.geojson') == 2
+    assert run('export', tmp_path / 'run', tmp_path / 'b.geojson', '--map') == 2
     assert '--epsg' in capsys.readouterr().err

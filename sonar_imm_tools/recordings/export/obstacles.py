@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from .horizons import utc
+from .horizons import utc_text
 from .points import degrees_of
 
 
@@ -48,7 +48,7 @@ def write_obstacles(
             'track_id': int(each['track_id']),
             'existence': round(each['existence'], 4),
             **{name: round(value, 3) for name, value in (std | band).items()},
-            'last_seen_utc': utc(int(each['seen_ns'])),
+            'last_seen_utc': utc_text(int(each['seen_ns'])),
         }
         place = [
             round(float(longitude[k]), 8),
