@@ -17,8 +17,9 @@
 Our own message is a table with one row per echo and one message per ping. A ping in which nothing
 was seen is a table without rows, because a miss is evidence too. Columns: ``x y z`` f4 [m, for
 display]; ``range`` [m], ``bearing`` [rad, REP-103: positive to port]; optional ``var_range``,
-``var_bearing``, ``intensity``, ``extent_range``, ``extent_bearing``. A table without range and
-bearing is read from x, y, z.
+``var_bearing``, ``intensity``, ``extent_range``, ``extent_bearing``, ``elevation`` [rad, positive
+up], ``var_elevation``. A table without range and bearing is read from x, y, z, of which z says no
+elevation: flat sonars send 0.
 
 The other messages use different axes; the rules are these. In the messages of
 marine_acoustic_msgs receive angles count to starboard, and beams point along z with x up and y to
@@ -71,7 +72,7 @@ def read_detections(message: Any, *, bearing_positive: str = 'port', **_: Any) -
     else:
         distance = bearing = np.empty(0)
     optional = {name: scalar_column(columns, name) for name in OPTIONAL_COLUMNS if name in columns}
-    for name in ('var_range', 'var_bearing'):
+    for name in ('var_range', 'var_bearing', 'var_elevation'):
         if name in optional:
             optional[name] = _variances(optional[name])
     return _detections(message, distance, bearing, bearing_positive, **optional)
@@ -83,6 +84,44 @@ def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -
         [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
     ).reshape(-1, 3)
     return _detections(message, *_polar(*places.T), bearing_positive)
+
+
+def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
+    """Read a vision_msgs/Detection3DArray: centres of boxes in the sonar's frame, x forward, y to
+    port, z up, each of which has an elevation.
+
+    Variances are those of the covariance of the first hypothesis, where it states one; intensity
+    is its score. A box whose centre is nowhere (all 0) is where that hypothesis has it.
+    """
+    places, covariances, scores = [], [], []
+    for detection in message.detections:
+        best = detection.results[0] if len(detection.results) else None
+        centre = detection.bbox.center.position
+        if best is not None and not (centre.x or centre.y or centre.z):
+            centre = best.pose.pose.position
+        stated = np.zeros(36) if best is None else np.asarray(best.pose.covariance, np.float64)
+        places.append([centre.x, centre.y, centre.z])
+        covariances.append(stated.reshape(6, 6)[:3, :3])
+        scores.append(np.nan if best is None else float(best.hypothesis.score))
+    m, C = np.array(places, np.float64).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
+    distance, bearing = _polar(*m.T)
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        level = np.hypot(m[:, 0], m[:, 1])
+        elevation = np.arctan2(m[:, 2], level)
+        along = m / distance[:, None]
+        aside = np.column_stack([-np.sin(bearing), np.cos(bearing), np.zeros(len(m))])
+        variances = [_along(axis, C) for axis in (along, aside, np.cross(along, aside))]
+        scales: list[FloatArray] = [np.ones(len(m)), level**2, distance**2]
+        stated_variances = [_variances(v / scale) for v, scale in zip(variances, scales)]
+    return _detections(
+        message,
+        distance,
+        bearing,
+        bearing_positive,
+        elevation=elevation,
+        intensity=np.array(scores, np.float64),
+        **dict(zip(('var_range', 'var_bearing', 'var_elevation'), stated_variances)),
+    )
 
 
 def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
@@ -218,6 +257,11 @@ def _detections(
 def _polar(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     with np.errstate(over='ignore', invalid='ignore'):
         return np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x)
+
+
+def _along(axis: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Variance (n,) along unit vectors (n, 3) of covariances (n, 3, 3)."""
+    return np.asarray(np.einsum('ni,nij,nj->n', axis, covariance, axis))
 
 
 def _variances(values: FloatArray) -> FloatArray:

@@ -48,11 +48,16 @@ SURE = 0.9
 
 def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     """Write a PoseArray of the obstacles in `rows`, without orientation."""
-    poses = [_pose(make, *(float(value) for value in estimate.xyz[row])) for row in rows]
+    places = [estimate.xyz[row] for row in rows]
+    return write_places(places, estimate.stamp_ns, estimate.frame_id, make)
+
+
+def write_places(places: Iterable[np.ndarray], stamp_ns: int, frame_id: str, make: Make) -> Any:
+    """Write a PoseArray of places, each (3,), without orientation."""
     return make(
         'geometry_msgs/msg/PoseArray',
-        header=make_header(estimate.stamp_ns, estimate.frame_id, make),
-        poses=poses,
+        header=make_header(stamp_ns, frame_id, make),
+        poses=[_pose(make, *(float(value) for value in place)) for place in places],
     )
 
 

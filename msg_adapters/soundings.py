@@ -18,14 +18,17 @@ from __future__ import annotations
 
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
-from sonar_imm.estimates import PLACES
-from sonar_imm.measurements import Rejection
+from sonar_imm.estimates import PLACES, places
+from sonar_imm.measurements import Ground, Rejection
 from sonar_imm.soundings import COLUMNS, Soundings
 
-from .headers import Make, stamp_ns
-from .table import decode_table, encode_table, require_columns
+from .headers import Make, stamp_ns, swap_axes, to_enu
+from .table import decode_table, encode_table, require_columns, scalar_column
+
+MOST_SOUNDINGS = 1_000_000
 
 
 def write_soundings(soundings: Soundings, make: Make) -> Any:
@@ -49,3 +52,42 @@ def read_soundings(message: Any) -> Soundings:
     return Soundings(
         stamp_ns(message), str(message.header.frame_id), {name: columns[name] for name in COLUMNS}
     )
+
+
+def read_ground(message: Any, *, world_frame: str = 'enu', **_: Any) -> Ground:
+    """Read soundings as the floor under obstacles: a table with the columns ``px py pz``, else
+    ``x y z``, and ``vertical_uncertainty``, a variance m^2, where it is there. Rows that are not
+    finite are left out. Raises `Rejection`."""
+    wanted = (*PLACES, *'xyz', 'vertical_uncertainty')
+    columns = decode_table(message, wanted, most_rows=MOST_SOUNDINGS)
+    names = PLACES if set(PLACES) <= columns.keys() else tuple('xyz')
+    if columns or message.height * message.width:
+        require_columns(columns, names, 'ground')
+    axes = [scalar_column(columns, name) for name in names] if columns else np.empty((3, 0))
+    position = np.column_stack([*axes])
+    variance = np.zeros(len(position))
+    if 'vertical_uncertainty' in columns:
+        variance = scalar_column(columns, 'vertical_uncertainty')
+        variance = np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0)
+    kept = np.isfinite(position).all(axis=1)
+    ground = Ground(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        position=position[kept],
+        variance=variance[kept],
+    )
+    return to_enu(ground, world_frame, _turned)
+
+
+def write_ground(ground: Ground, make: Make) -> Any:
+    """Write the table that `read_ground` reads."""
+    columns: dict[str, Any] = {
+        **dict(zip('xyz', ground.position.T.astype(np.float32))),
+        'vertical_uncertainty': ground.variance.astype(np.float32),
+        **places(ground.position),
+    }
+    return encode_table(columns, stamp_ns=ground.stamp_ns, frame_id=ground.frame_id, make=make)
+
+
+def _turned(ground: Ground) -> Ground:
+    return evolve(ground, position=swap_axes(ground.position))

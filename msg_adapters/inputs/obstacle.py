@@ -16,10 +16,11 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage
+from sonar_imm.measurements import Altitude, Detections, Ground, Navigation, SonarImage
 
 from ..detections import (
     read_detections,
+    read_detections_3d,
     read_laser_scan,
     read_pose_array,
     read_sonar_detections,
@@ -36,6 +37,7 @@ from ..navigation import (
     write_range,
 )
 from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..soundings import read_ground, write_ground
 from ..transforms import TF_STATIC
 from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
@@ -49,10 +51,12 @@ TOPICS = (
             'sensor_msgs/msg/PointCloud2': read_detections,
             'sensor_msgs/msg/LaserScan': read_laser_scan,
             'geometry_msgs/msg/PoseArray': read_pose_array,
+            'vision_msgs/msg/Detection3DArray': read_detections_3d,
             'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
             'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
         },
         write=write_detections,
+        by_name=frozenset({'vision_msgs/msg/Detection3DArray'}),
         settings=('beam_axes', 'bearing_positive', 'sound_speed'),
         required=lambda settings: True,
     ),
@@ -77,6 +81,14 @@ TOPICS = (
             'dave_interfaces/msg/DVL': read_dave_dvl,
         },
         write=write_range,
+    ),
+    InputTopic(
+        'ground',
+        'soundings of the sea floor in the frame of nav, such as the soundings of bathymetry_node',
+        measurement=Ground,
+        readers={'sensor_msgs/msg/PointCloud2': read_ground},
+        write=write_ground,
+        companion=True,
     ),
     TF_STATIC,
 )

@@ -227,7 +227,7 @@ class Tracks:
     """Hits, misses and status of T tracks. An immutable value: `scan` and `born` return the next
     one.
 
-    track_id: (T,) increasing and not used again, but for `new_ids`; status: (T,) TrackStatus;
+    track_id: (T,) not used again for another target, but for `new_ids`; status: (T,) TrackStatus;
     age: (T,) scans; seen: (T, confirm_window) True for hits, newest last; misses: (T,)
     in a row; last_hit_ns: (T,); next_id: of the next track.
     """
@@ -271,6 +271,18 @@ class Tracks:
             np.concatenate([self.misses, np.zeros(count, np.int64)]),
             np.concatenate([self.last_hit_ns, np.full(count, stamp_ns, np.int64)]),
             next_id,
+        )
+
+    def resumed(self, track_id: int, stamp_ns: int, rules: TrackRules) -> Tracks:
+        """Append a confirmed track that ended before, without a hit; it may coast from now on."""
+        return Tracks(
+            np.append(self.track_id, np.uint32(track_id)),
+            np.append(self.status, np.uint8(COASTING)),
+            np.append(self.age, np.int64(0)),
+            np.pad(_window(self.seen, rules.confirm_window), ((0, 1), (0, 0))),
+            np.append(self.misses, np.int64(0)),
+            np.append(self.last_hit_ns, np.int64(stamp_ns)),
+            self.next_id,
         )
 
     def scan(

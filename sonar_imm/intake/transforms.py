@@ -35,6 +35,7 @@ from ..measurements import (
     Arrivals,
     Fix,
     Fixes,
+    Ground,
     Navigation,
     Rejection,
     Start,
@@ -142,6 +143,11 @@ def _(navigation: Navigation, pose: Pose) -> Navigation:
         orientation=_after(geometry.euler_angles(pose.R)[2], navigation.orientation),
         pose_covariance=None if covariance is None else turn @ covariance @ turn.T,
     )
+
+
+@_moved.register
+def _(ground: Ground, pose: Pose) -> Ground:
+    return evolve(ground, position=_placed(ground.position, pose))
 
 
 def _placed(points: FloatArray, pose: Pose) -> FloatArray:

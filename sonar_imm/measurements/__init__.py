@@ -29,6 +29,7 @@ from .obstacle import (
     Altitude,
     BEAM_AXES,
     Detections,
+    Ground,
     IMAGE_ORDERS,
     MAX_IMAGE_CELLS,
     Navigation,
@@ -56,6 +57,7 @@ __all__ = [
     'Fix',
     'Fixes',
     'GeodeticFix',
+    'Ground',
     'IMAGE_ORDERS',
     'MAX_BINS',
     'MAX_IMAGE_CELLS',
@@ -97,5 +99,6 @@ Measurement = (
     | Detections
     | Navigation
     | Altitude
+    | Ground
     | StaticTransforms
 )

@@ -23,7 +23,16 @@ from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, column, content_key, floats, point, quaternion, Rejection
+from .checks import (
+    check_stamp,
+    column,
+    content_key,
+    floats,
+    point,
+    points,
+    quaternion,
+    Rejection,
+)
 
 BEAM_AXES = ('marine', 'rep103', 'auto')
 """What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
@@ -34,7 +43,15 @@ MAX_IMAGE_CELLS = 4_000_000
 """No sonar makes larger images."""
 
 
-OPTIONAL_COLUMNS = ('var_range', 'var_bearing', 'intensity', 'extent_range', 'extent_bearing')
+OPTIONAL_COLUMNS = (
+    'var_range',
+    'var_bearing',
+    'intensity',
+    'extent_range',
+    'extent_bearing',
+    'elevation',
+    'var_elevation',
+)
 """What a detection may say besides range and bearing."""
 
 
@@ -50,8 +67,9 @@ class Detections:
     The stamp is the transmission. range: (n,) metres; bearing: (n,) rad, REP-103: positive to
     port; var_range: (n,) m^2 and var_bearing: (n,) rad^2, NaN where the sender does not know them;
     intensity: (n,), NaN where unknown; extent_range: (n,) m and extent_bearing: (n,) rad, spread
-    (standard deviation) of the echo, NaN where unknown. Columns left out are unknown. A row
-    without a finite range and bearing is no echo.
+    (standard deviation) of the echo, NaN where unknown; elevation: (n,) rad, positive up, NaN
+    where the sonar does not measure it, var_elevation: (n,) rad^2. Columns left out are unknown.
+    A row without a finite range and bearing is no echo.
     """
 
     FRAME: ClassVar[str] = 'own'
@@ -65,6 +83,8 @@ class Detections:
     frame_id: str = ''
     extent_range: FloatArray = field(factory=_unknown)
     extent_bearing: FloatArray = field(factory=_unknown)
+    elevation: FloatArray = field(factory=_unknown)
+    var_elevation: FloatArray = field(factory=_unknown)
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -84,9 +104,10 @@ class Detections:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key(
-            'detections', self.range, self.bearing, self.var_range, self.var_bearing
-        )
+        columns = [self.range, self.bearing, self.var_range, self.var_bearing]
+        if np.isfinite(self.elevation).any():
+            columns += [self.elevation, self.var_elevation]
+        return content_key('detections', *columns)
 
 
 @frozen(eq=False, kw_only=True)
@@ -183,3 +204,36 @@ class Altitude:
     def key(self) -> bytes:
         """See `content_key`."""
         return content_key('altitude', np.float64(self.altitude))
+
+
+@frozen(eq=False, kw_only=True)
+class Ground:
+    """Soundings: places of the sea floor in the world.
+
+    position: (n, 3) m, ENU; variance: (n,) m^2 of the height, 0 where unknown.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=points)
+    variance: FloatArray = field(converter=column)
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if len(self.variance) != len(self):
+            raise Rejection(
+                'bad_shape', f'{len(self)} soundings have {len(self.variance)} variances'
+            )
+        if not (np.isfinite(self.position).all() and np.isfinite(self.variance).all()):
+            raise Rejection('nan', 'a sounding is not finite')
+        if len(self) and np.abs(self.position).max() > 1e8:
+            raise Rejection(
+                'out_of_range', 'a sounding lies further than 100,000 km from the origin'
+            )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('ground', self.position, self.variance)

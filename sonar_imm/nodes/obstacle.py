@@ -14,13 +14,14 @@
 
 """The obstacle node: ``ros2 run sonar_imm obstacle_node``.
 
-Hears ``detections``, ``nav`` and ``altitude``. Besides ``~/estimate`` it publishes, for the newest
-state only and of confirmed obstacles (also those that have left the beam):
+Hears ``detections``, ``nav``, ``altitude`` and ``ground``. Besides ``~/estimate`` it publishes,
+for the newest state only and of confirmed obstacles (also those that have left the beam):
 
 - ``~/obstacles``: their places in the frame of the navigation, a PoseArray;
 - ``~/markers``: a bar for the 90 % band of the height, a ball at the mean, a label;
 - ``~/model_probabilities``: above and below, then the behaviours that are considered, of the
-  obstacle that has been tracked longest.
+  obstacle that has been tracked longest;
+- ``~/map``, latched: the places of the obstacles that are remembered and not in view.
 """
 
 from __future__ import annotations
@@ -35,7 +36,12 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
+from msg_adapters.obstacles import write_places
+
+from ..estimates import Estimate
 from .base import TrackerNode
+from .messages import make, message_class
+from .qos import latched_qos
 from .running import run
 
 
@@ -43,7 +49,32 @@ class ObstacleNode(TrackerNode):
     """Tracks obstacles ahead and how far above or below the sonar they lie."""
 
     def __init__(self, **options: Any):
+        self._shown: tuple[Any, ...] = ()
         super().__init__('obstacle', **options)
+
+    def advertise_more(self) -> None:
+        self._map = self._endpoints.advertise(
+            message_class('geometry_msgs/msg/PoseArray'), '~/map', latched_qos()
+        )
+        newest_ns = max((each.stamp_ns for each in self.tracker.landmarks), default=0)
+        self._show_map(newest_ns)
+
+    def show(self, estimates: list[Estimate]) -> None:
+        super().show(estimates)
+        self._show_map(estimates[-1].stamp_ns)
+
+    def start_afresh(self) -> None:
+        super().start_afresh()
+        self._show_map(0)
+
+    def _show_map(self, stamp_ns: int) -> None:
+        """Publish the landmarks when they changed."""
+        landmarks = self.tracker.landmarks
+        if landmarks is not self._shown:
+            self._shown = landmarks
+            places = [each.place for each in landmarks]
+            frame_id = self.tracker.frames.frame_id
+            self._map.publish(write_places(places, stamp_ns, frame_id, make))
 
 
 def main(args: list[str] | None = None) -> int:

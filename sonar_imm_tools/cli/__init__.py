@@ -47,7 +47,7 @@ COMMANDS = {
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'fuse': 'Fuse the diver tracks of two nodes into one run.',
-    'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
+    'export': 'Write soundings, horizons, tracks or obstacles of a run for other programs.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
     'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',

@@ -39,6 +39,7 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
         'sonar-imm export out picks.sgy --segy line.seg',
         'sonar-imm export out tracks.gpx',
         'sonar-imm export out tracks.geojson --epsg 32632 --origin 500000,6000000',
+        'sonar-imm export out map.geojson --map --epsg 32632 --origin 500000,6000000',
     )
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
@@ -57,6 +58,12 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help='horizons: the SEG-Y file that the recording was converted from.',
 )
+@click.option(
+    '--map',
+    'as_map',
+    is_flag=True,
+    help='obstacles: .geojson with those that are known at the end, in place of their tracks.',
+)
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
@@ -66,6 +73,7 @@ def command(
     origin: tuple[float, float, float],
     cell: float,
     original: Path | None,
+    as_map: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -95,6 +103,9 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
+    if as_map:
+        _export_map(run, record, out, kind, epsg, origin, as_json)
+        return
     if kind in TRACK_FORMATS and record['system'] != 'fathometer':
         _export_tracks(run, out, kind, epsg, origin, as_json)
         return
@@ -122,6 +133,36 @@ def command(
         return
     shape = f' in {result["rows"]} by {result["columns"]} cells' if 'rows' in result else ''
     say(f'{out}: {len(points)} soundings{shape}')
+
+
+def _export_map(
+    run: Path,
+    record: dict[str, Any],
+    out: Path,
+    kind: str,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    as_json: bool,
+) -> None:
+    """The obstacles that are known at the end of a run; record: its run.json."""
+    from ..recordings.export.obstacles import write_obstacles
+    from ..recordings.sources import BagError
+
+    if kind != 'geojson':
+        raise click.UsageError('--map writes .geojson')
+    landmarks = record.get('landmarks', [])
+    if not landmarks:
+        raise BagError(f'{run} knows no obstacles at its end')
+    if epsg is None:
+        raise click.UsageError(
+            'places are in metres: say with --epsg and --origin where their origin lies'
+        )
+    with whole(out) as unfinished:
+        write_obstacles(unfinished, landmarks, epsg, origin)
+    if as_json:
+        print_json({'out': str(out), 'obstacles': len(landmarks)})
+        return
+    say(f'{out}: {len(landmarks)} obstacles')
 
 
 def _export_tracks(

@@ -284,6 +284,11 @@ class OfflineRun:
         origin = getattr(self.tracker, 'origin', None)
         return {} if origin is None else {'origin': asdict(origin)}
 
+    def landmarks(self) -> dict[str, Any]:
+        """The obstacles that are known at the end; nothing of a tracker that keeps none."""
+        known = getattr(self.tracker, 'known', None)
+        return {} if known is None else {'landmarks': known()}
+
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
         return {'mounting': self._intake.mounting} if self._intake.mounting else {}
@@ -361,6 +366,7 @@ def write_run(
         problems=list(offline.bag.problems),
         **offline.origin(),
         **offline.mounting(),
+        **offline.landmarks(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)

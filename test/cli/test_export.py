@@ -99,3 +99,25 @@ def test_runs_without_soundings_and_files_in_the_way_are_named(tracked, tmp_path
     assert run('export', tracked, tmp_path / 'a.xyz', '--overwrite') == 0
     assert run('evaluate', tracked) == 0
     assert 'track of the ship' in (tracked / 'report.html').read_text()
+
+
+def test_obstacles_of_a_run_as_geojson(tmp_path, capsys):
+    pytest.importorskip('rasterio')
+    scene = ('simulate', 'obstacle', tmp_path / 'bag', '--set', 'last_range=50')
+    assert run(*scene) == 0
+    assert run('track', tmp_path / 'bag', tmp_path / 'run') == 0
+    (told,) = json.loads((tmp_path / 'run' / 'run.json').read_text())['landmarks']
+    place = ('--epsg', '32632', '--origin', '500000,6000000,-5')
+    assert run('export', tmp_path / 'run', tmp_path / 'a.geojson', '--map', *place) == 0
+    (found,) = json.loads((tmp_path / 'a.geojson').read_text())['features']
+    longitude, latitude, height = found['geometry']['coordinates']
+    # 500 km east is the central meridian; a degree of latitude is about 111.3 km here.
+    assert longitude == pytest.approx(9.0 + told['x'] / 65_500.0, abs=1e-4)
+    assert latitude == pytest.approx(54.1481 + told['y'] / 111_300.0, abs=2e-4)
+    assert height == pytest.approx(told['z'] - 5.0, abs=1e-3)
+    properties = found['properties']
+    assert properties['track_id'] == told['track_id'] and properties['existence'] > 0.99
+    assert properties['z_low_m'] < height < properties['z_high_m']
+    assert properties['x_std_m'] == pytest.approx(told['cov_x_x'] ** 0.5, abs=1e-3)
+    assert run('export', tmp_path / 'run', tmp_path / 'b.geojson', '--map') == 2
+    assert '--epsg' in capsys.readouterr().err

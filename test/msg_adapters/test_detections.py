@@ -14,6 +14,8 @@
 
 """Detections from every message that carries them; the sign of the bearing above all."""
 
+from types import SimpleNamespace
+
 from helpers import marine
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -23,6 +25,7 @@ import pytest
 
 from msg_adapters.detections import (
     read_detections,
+    read_detections_3d,
     read_laser_scan,
     read_pose_array,
     read_sonar_detections,
@@ -237,6 +240,58 @@ def test_a_pose_array_is_read_by_its_places():
     )
     assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
     assert len(read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header()))) == 0
+
+
+# -- vision_msgs -------------------------------------------------------------------------------
+
+
+def box(place, covariance=(), score=0.7, at_hypothesis=False):
+    """A Detection3D; vision_msgs is not installed here, and fields are read by name."""
+    position = SimpleNamespace(**dict(zip('xyz', place)))
+    nowhere = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+    stated = np.zeros((6, 6))
+    if len(covariance):
+        stated[:3, :3] = covariance
+    pose = SimpleNamespace(
+        pose=SimpleNamespace(position=position if at_hypothesis else nowhere),
+        covariance=stated.ravel(),
+    )
+    hypothesis = SimpleNamespace(class_id='rock', score=score)
+    return SimpleNamespace(
+        results=[SimpleNamespace(hypothesis=hypothesis, pose=pose)],
+        bbox=SimpleNamespace(
+            center=SimpleNamespace(position=nowhere if at_hypothesis else position)
+        ),
+    )
+
+
+def test_boxes_in_three_dimensions_have_an_elevation():
+    up, port = np.radians(5.0), np.radians(20.0)
+    axis = [np.cos(up) * np.cos(port), np.cos(up) * np.sin(port), np.sin(up)]
+    aside = [-np.sin(port), np.cos(port), 0.0]
+    axes = np.column_stack([axis, aside, np.cross(axis, aside)])
+    # .1 m along, 1 degree across, 2 degrees in height at 40 m.
+    std = np.array([0.1, 40.0 * np.cos(up) * np.radians(1.0), 40.0 * np.radians(2.0)])
+    place = 40.0 * np.array(axis)
+    stated = axes @ np.diag(std**2) @ axes.T
+    boxes = [box(place, stated), box(place, at_hypothesis=True), box([np.nan, 0.0, 0.0])]
+    ping = read_detections_3d(SimpleNamespace(header=header(), detections=boxes))
+    assert ping.range == pytest.approx([40.0, 40.0]) and ping.bearing == pytest.approx([port] * 2)
+    assert ping.elevation == pytest.approx([up, up]) and ping.intensity.tolist() == [0.7, 0.7]
+    assert ping.var_range[0] == pytest.approx(0.01) and np.isnan(ping.var_range[1])
+    assert np.sqrt(ping.var_bearing[0]) == pytest.approx(np.radians(1.0))
+    assert np.sqrt(ping.var_elevation[0]) == pytest.approx(np.radians(2.0))
+    assert len(read_detections_3d(SimpleNamespace(header=header(), detections=[]))) == 0
+
+
+def test_elevations_of_a_table_come_back():
+    sent = Detections(
+        stamp_ns=10**9, range=[20.0, 30.0], bearing=[0.1, 0.2], elevation=[0.05, np.nan],
+        var_elevation=[3e-4, np.nan],
+    )  # fmt: skip
+    back = read_detections(write_detections(sent, ros_message))
+    assert back.elevation == pytest.approx([0.05, np.nan], nan_ok=True)
+    assert back.var_elevation == pytest.approx([3e-4, np.nan], nan_ok=True)
 
 
 # -- marine_acoustic_msgs ----------------------------------------------------------------------

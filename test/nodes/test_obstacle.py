@@ -31,7 +31,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
-from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.nodes.qos import latched_qos, lockstep_qos
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
@@ -278,3 +278,19 @@ def test_places_of_the_tracker_are_not_rounded_either():
     assert any(len(estimate) for estimate in runs[0])
     for one, other in zip(*runs, strict=True):
         np.testing.assert_allclose(other.xyz - shift, one.xyz, atol=1e-4)
+
+
+def test_what_was_passed_is_on_the_map(rig):
+    """Latched: who listens later gets it."""
+    scene = simulate(scenario('approach', {'first_range': 30.0, 'last_range': -6.0}), 3)
+    for item in scene.measurements:
+        rig.send(item.measurement)
+    (mark,) = rig.node.tracker.landmarks
+    maps = rig.bench.listen(PoseArray, '/obstacle/map', latched_qos())
+    rig.bench.spin_until(lambda: maps)
+    (pose,) = maps[-1].poses
+    assert maps[-1].header.frame_id == 'odom'
+    found = (pose.position.x, pose.position.y, pose.position.z)
+    assert found == pytest.approx(tuple(mark.place))
+    rig.node.start_afresh()
+    rig.bench.spin_until(lambda: not maps[-1].poses)

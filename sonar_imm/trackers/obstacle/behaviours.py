@@ -36,9 +36,9 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from . import behaviour_kernels, kernels
-from .behaviour_kernels import COMMON, Motion, Step
+from .behaviour_kernels import COMMON, Motion
 from .config import BEHAVIOURS, ObstacleConfig
-from .filters import depth_slices, depth_span, DepthSlices, Mixture, Sonar, View
+from .filters import depth_slices, depth_span, DepthSlices, Hints, Mixture, Sonar, View
 
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
@@ -76,14 +76,21 @@ class BehaviourSlices(DepthSlices):
         self._prior = self._swaying * config.sway_std**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
 
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
+    ) -> Mixture:
         B, M, last = len(z), self.M, self.slices * self.M
-        floor, known = sonar.seabed_below(), 'seabed' in self.behaviours
-        known = known and bool(np.isfinite(floor))
-        lowest, highest = depth_span(z, sonar, self.config)
-        if known:
-            # What lies deeper than the sea floor below the vehicle is left to its own slice.
-            highest = np.minimum(highest, np.maximum(floor, lowest + 0.5 * (highest - lowest)))
+        floor, floor_std = np.full(B, sonar.seabed_below()), np.full(B, self.config.seabed_std)
+        if hints is not None:
+            sounded = np.isfinite(hints.floor)
+            floor = np.where(sounded, hints.floor, floor)
+            std = np.hypot(hints.floor_std, self.config.ground_std)
+            floor_std = np.where(sounded, std, floor_std)
+        known = np.isfinite(floor) & ('seabed' in self.behaviours)
+        lowest, highest = depth_span(z, sonar, self.config, hints)
+        # What lies deeper than the sea floor is left to its own slice.
+        above_floor = np.maximum(floor, lowest + 0.5 * (highest - lowest))
+        highest = np.where(known, np.minimum(highest, above_floor), highest)
         centre, sigma = _cut_slices(lowest, highest, self.slices)
         x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
         x[..., :2] = z[:, None]
@@ -91,14 +98,18 @@ class BehaviourSlices(DepthSlices):
         P[..., 3, 3] = self.scale**2
         x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
         P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
-        prior = {name: PRIOR[name] for name in self.behaviours if name != 'seabed' or known}
-        total = sum(prior.values())
         mu = np.zeros((B, self.K))
-        for name in prior:
-            mu[:, self._is[name]] = prior[name] / total / self._is[name].sum()
+        for some in (known, ~known):
+            prior = {name: PRIOR[name] for name in self.behaviours}
+            if some is not known:
+                prior.pop('seabed', None)
+            total = sum(prior.values())
+            for name in prior:
+                share = prior[name] / total / self._is[name].sum()
+                mu[np.ix_(some, self._is[name])] = share
         if 'seabed' in self.behaviours:
-            x[:, last, 2] = sonar.pose.position[2] + (floor if known else 0.0)
-            P[:, last, 2, 2] = self.config.seabed_std**2
+            x[:, last, 2] = sonar.pose.position[2] + np.where(known, floor, 0.0)
+            P[:, last, 2, 2] = floor_std**2
         # e is unknown and uncorrelated with the rest.
         for i in (COMMON, COMMON + 1):
             P[:, :, i, i] = self._prior
@@ -107,14 +118,10 @@ class BehaviourSlices(DepthSlices):
     def advance(
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
-        motion = self._motion(dt)
         mixed = behaviour_kernels.mix(
-            *mixture, motion.prior, self.slices, self.M, self._stay(dt), DROPPED
+            *mixture, self._prior, self.slices, self.M, self._stay(dt), DROPPED
         )
-        noise = np.array(self._noise) * dt
-        step = Step(*before.pose, *after.pose, noise, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixed, motion, step)
-        return Mixture(x, P, mixed[2]), int(np.count_nonzero(repaired))
+        return self.carried(Mixture(*mixed), before.pose, after.pose, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         return np.asarray(mu @ self._of)

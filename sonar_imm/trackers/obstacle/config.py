@@ -16,9 +16,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from attrs import frozen
+import numpy as np
 
 from ...acoustics.geometry import AZIMUTH_MODELS
+from ...estimation.arrays import FloatArray
 from ...measurements import BEAM_AXES
 from ...parameters import inherited, live, parameter
 from ..shared_parameters import (
@@ -31,6 +35,8 @@ from ..shared_parameters import (
 METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 MISSES = ('ignored', 'evidence')
+LEAST_DETECTION = 1e-3
+"""An echo is never quite impossible."""
 
 
 @frozen(kw_only=True)
@@ -66,6 +72,13 @@ class ObstacleConfig(
     seabed_std: float = parameter(1.0, 'm',
         'behaviour seabed: standard deviation of the depth of the sea floor at the obstacle, '
         'relative to that below the vehicle', range=(0.01, 100.0))
+
+    ground_std: float = parameter(0.5, 'm',
+        'behaviour seabed: standard deviation of the depth of an obstacle on the sea floor, '
+        'relative to the soundings of ground around it', range=(0.01, 100.0))
+    ground_radius: float = parameter(5.0, 'm',
+        'distance to which soundings of ground tell the depth of the sea floor at an obstacle',
+        range=(0.5, 1000.0))
 
     # -- where the sonar sits and how things are written -----------------------------------------
     sonar_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
@@ -108,6 +121,9 @@ class ObstacleConfig(
     bearing_step_deg: float = live(0.18, 'deg',
         'sampling step of a bearing that comes without variance, adds step^2 / 12',
         range=(0.0, 45.0))
+    elevation_std_deg: float = live(1.0, 'deg',
+        'standard deviation of an elevation that comes without variance; of sonars that measure '
+        'elevations only', range=(0.01, 45.0))
     max_range: float = parameter(100.0, 'm', 'range to which the sonar sees', range=(1.0, 10000.0))
     horizontal_fov_deg: float = parameter(45.0, 'deg',
         'full width of the sector that the sonar sees', range=(1.0, 170.0))
@@ -129,6 +145,15 @@ class ObstacleConfig(
         'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
     outlier_probability: float = live(0.02, '',
         'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
+    detection_ranges: tuple[float, ...] = live((), 'm',
+        'ranges at which detection_factors are given, rising; empty: detection_probability counts '
+        'at every range', range=(0.0, 1e5), kind='float[]')
+    detection_factors: tuple[float, ...] = live((), '',
+        'share of detection_probability that is left at each of detection_ranges; linear between '
+        'them, constant beyond', range=(0.0, 1.0), kind='float[]')
+    sector_edge_deg: float = live(0.0, 'deg',
+        'width at either edge of the sector in which an obstacle without an echo is not missed',
+        range=(0.0, 45.0))
     misses: str = parameter('ignored', '',
         'what pings without an echo say of the height of an obstacle, gaussian_sum only: nothing '
         '(ignored), or that it is less probable in the beam (evidence)', choices=MISSES)
@@ -176,6 +201,15 @@ class ObstacleConfig(
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 6)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 10)
 
+    # -- memory ----------------------------------------------------------------------------------
+    max_landmarks: int = live(200, '',
+        'largest number of obstacles remembered after they left the field of view, to come back '
+        'under their own number; 0: none; the oldest and least certain ones are given up for more',
+        range=(0, 10000))
+    landmark_time: float = live(86400.0, 's',
+        'mean time for which an obstacle that nobody sees stays where it was',
+        range=(1.0, 1e8))
+
     # -- time ------------------------------------------------------------------------------------
     max_navigation_gap: float = parameter(1.0, 's',
         'longest time between two poses of nav that is interpolated; pings in longer gaps are '
@@ -201,6 +235,17 @@ class ObstacleConfig(
             problems.append('vertical_beam_width_deg needs the method gaussian_sum')
         if not set(self.behaviours) & set(BEHAVIOURS[:3]):
             problems.append('behaviours needs one of fixed, swaying, moving at least')
+        if len(self.detection_ranges) != len(self.detection_factors):
+            problems.append('detection_ranges and detection_factors need as many values each')
+        if any(a >= b for a, b in pairwise(self.detection_ranges)):
+            problems.append('detection_ranges have to rise')
         if len(set(self.behaviours)) < len(self.behaviours):
             problems.append('behaviours names one of them twice')
         return problems
+
+    def detection_at(self, distance: FloatArray) -> FloatArray:
+        """Probability that a ping shows obstacles at ranges (T,) in the beam."""
+        if not self.detection_ranges:
+            return np.full(len(distance), self.detection_probability)
+        factor = np.interp(distance, self.detection_ranges, self.detection_factors)
+        return np.clip(self.detection_probability * factor, LEAST_DETECTION, 1.0)

@@ -87,6 +87,16 @@ class Sonar(NamedTuple):
         return self.altitude - self.reference
 
 
+class Hints(NamedTuple):
+    """What is known of the height of B new obstacles besides the beam, NaN where nothing is:
+    elevations (B, 2) between which each lies, rad below the axis of the sonar; floor (B,): how far
+    below the sonar the sea floor is at each, m, with its standard deviation (B,)."""
+
+    elevations: FloatArray
+    floor: FloatArray
+    floor_std: FloatArray
+
+
 class Mixture(NamedTuple):
     """x (T, K, n), P (T, K, n, n), mu (T, K)."""
 
@@ -141,6 +151,9 @@ class DepthSlices:
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
         self._beam = beam_of(config)
+        vertical, horizontal, reach = self._beam
+        edge = np.radians(config.sector_edge_deg)
+        self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
         self._noise = (
             config.position_noise**2,
             np.radians(config.yaw_noise_deg) ** 2,
@@ -151,19 +164,23 @@ class DepthSlices:
         """Whether a target can begin: the sea floor has to be known for `seafloor`."""
         return not self.seafloor or bool(np.isfinite(sonar.altitude))
 
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
+    ) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
-        fresh = self._begin(z, R, sonar, self.K)
+        fresh = self._begin(z, R, sonar, self.K, hints)
         return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
 
-    def _begin(self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int) -> Mixture:
+    def _begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, hints: Hints | None
+    ) -> Mixture:
         """New targets in K slices of equal weight, four states."""
         B = len(z)
         x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
         P[..., 3, 3] = self.scale**2
-        span = depth_span(z, sonar, self.config)
+        span = depth_span(z, sonar, self.config, hints)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
         P[..., 2, 2] = np.square(sigma)[:, None]
@@ -181,9 +198,19 @@ class DepthSlices:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
-        step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixture, self._still, step)
+        return self.carried(mixture, before.pose, after.pose, dt)
+
+    def carried(
+        self, mixture: Mixture, before: Pose, after: Pose, dt: float
+    ) -> tuple[Mixture, int]:
+        """`advance` of targets that go on with what they do."""
+        step = Step(*before, *after, np.array(self._noise) * dt, self.cone)
+        x, P, repaired = behaviour_kernels.advance(*mixture, self._motion(dt), step)
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
+
+    def _motion(self, dt: float) -> Motion:
+        """What the components do in `dt` seconds."""
+        return self._still
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
@@ -234,7 +261,7 @@ class DepthSlices:
             own,
             *band,
             position + together[:, :3],
-            both[:, :3, :3],
+            np.ascontiguousarray(both[:, :3, :3]),  # also what there is none of is so
             self.behaviour(mu),
             together[:, 3:],
             both[:, 3:, 3:],
@@ -246,10 +273,13 @@ class DepthSlices:
         return np.ones((len(mu), 1))
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
+        """Probability (T,) that the beam holds the target, not at the edge of its sector, and
+        whether (T,) it lies ahead."""
         x, P, mu = mixture
         spread = np.sqrt(P[:, :, 2, 2]) / x[:, :, 0]
-        return kernels.outlook(kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._beam)
+        return kernels.outlook(
+            kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._surely
+        )
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -271,24 +301,35 @@ class DepthSlices:
 
 
 def depth_span(
-    z: FloatArray, sonar: Sonar, config: ObstacleConfig
+    z: FloatArray, sonar: Sonar, config: ObstacleConfig, hints: Hints | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
-    beam, below the surface, above the sea floor."""
+    beam, or where `hints` say, below the surface, above the sea floor."""
     a, b, c = sonar.pose.R[2]
     d, delta = z.T
     k = a * np.cos(delta) + b * np.sin(delta)
     edge = np.radians(min(0.5 * BEAM_MARGIN * config.vertical_fov_deg, 85.0))
     ends = d * (k * np.cos(edge) + c * np.array([[-1.0], [1.0]]) * np.sin(edge))
-    lowest, highest = ends.min(axis=0), ends.max(axis=0)
+    lowest, highest, least = ends.min(axis=0), ends.max(axis=0), 0.02 * d
+    if hints is not None:
+        ends = hints.elevations
+        seen = d[:, None] * (k[:, None] * np.cos(ends) + c * np.sin(ends))
+        known = np.isfinite(seen).all(axis=1)
+        lowest = np.where(known, seen.min(axis=1), lowest)
+        highest = np.where(known, seen.max(axis=1), highest)
+        least = np.where(known, 0.001 * d, least)
     if config.max_offset > 0.0:
         lowest, highest = (
             np.maximum(lowest, -config.max_offset),
             np.minimum(highest, config.max_offset),
         )
-    least = 0.02 * d
     if np.isfinite(sonar.altitude):
-        highest = np.minimum(highest, max(sonar.altitude, 0.0) + least)
+        bottom = np.full(len(d), max(sonar.altitude, 0.0))
+    else:
+        bottom = np.full(len(d), np.inf)
+    if hints is not None:
+        bottom = np.where(np.isfinite(hints.floor), hints.floor + 2.0 * hints.floor_std, bottom)
+    highest = np.minimum(highest, bottom + least)
     if config.depth_is_absolute:
         lowest = np.maximum(lowest, np.minimum(-sonar.pose.position[2], 0.0) - least)
     # A beam that looks at nothing but rock or air shows an echo all the same: keep some reach.

@@ -99,7 +99,8 @@ class Looks(NamedTuple):
         silent = np.flatnonzero(~hit)
         if not len(silent):
             return looks
-        stated = filter_.config.detection_probability
+        mean = np.einsum('tk,tk->t', mixture.mu[silent], mixture.x[silent, :, 0])
+        stated = filter_.config.detection_at(mean)
         p = (PINGS * stated + self.seen[silent]) / (PINGS + self.due[silent])
         shown = self.published(mixture)
         fresh = np.flatnonzero(~hit & (self.missed <= 0.0))

@@ -29,15 +29,18 @@ from ...measurements import Altitude, Detections
 from ..navigation import NavigationBuffer
 from .bodies import Bodies
 from .filters import Mixture, Sonar
+from .ground import GroundMap
 from .intensity import Strengths
 from .looks import Looks
+from .memory import Existence, Memory
 
 
 class PingState(NamedTuple):
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
     each component assumes them; bodies: how far their echoes wander; looks: pings that did not
-    show them, and what that says."""
+    show them, and what that says; existence: how sure it is that they are there; memory: those
+    that are not in view any more."""
 
     stamp_ns: int
     sonar: Sonar
@@ -47,6 +50,8 @@ class PingState(NamedTuple):
     strengths: Strengths
     bodies: Bodies
     looks: Looks
+    existence: Existence
+    memory: Memory = ()
     repairs: int = 0
     alike: bool = False
 
@@ -60,6 +65,7 @@ class PingState(NamedTuple):
             strengths=self.strengths.rows(kept),
             bodies=self.bodies.rows(kept),
             looks=self.looks.rows(kept),
+            existence=self.existence.rows(kept),
         )
 
     def only(self, kept: np.ndarray) -> PingState:
@@ -73,6 +79,7 @@ class PingState(NamedTuple):
 class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
+    ground: soundings so far;
     skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
     because too many waited; broken: tracks ended so far because their numbers were not finite;
     alike: pings so far in which most obstacles moved alike; innovations: of confirmed ones."""
@@ -81,17 +88,10 @@ class ObstacleState:
     done: tuple[PingState, ...] = ()
     navigation: NavigationBuffer = NavigationBuffer()
     altitude: Altitude | None = None
+    ground: GroundMap = GroundMap()
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
     missing: int = 0
     broken: int = 0
     alike: int = 0
     innovations: NisMemory = NisMemory()
-
-
-def identities(state: ObstacleState) -> ObstacleState:
-    """What outlives a restarted clock: the identities that are used up."""
-    if state.last is None:
-        return ObstacleState()
-    nobody = np.zeros(len(state.last.life), bool)
-    return ObstacleState(last=state.last._replace(stamp_ns=0).only(nobody))

@@ -42,7 +42,7 @@ from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
-from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
+from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from .. import WarmStep
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
@@ -51,11 +51,14 @@ from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
 from .config import ObstacleConfig
-from .filters import Mixture, Sonar
+from .elevation import Elevations, fits, outliers, updated
+from .filters import Hints, Mixture, Sonar
+from .ground import GroundMap
 from .intensity import by_intensity, level_db, Strengths
 from .looks import Looks
+from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
 from .navigation import Mount
-from .state import identities, ObstacleState, PingState
+from .state import ObstacleState, PingState
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -76,8 +79,8 @@ _PLACE_COVARIANCES = tuple(
 
 
 class ObstacleTracker:
-    """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`, `Navigation`
-    and `Altitude`."""
+    """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`,
+    `Navigation`, `Altitude` and `Ground`."""
 
     STATE = ('_stream',)
 
@@ -98,11 +101,11 @@ class ObstacleTracker:
 
     def reset(self) -> None:
         self._stream = ReplayStream(
-            (Detections, Navigation, Altitude),
+            (Detections, Navigation, Altitude, Ground),
             StreamRules.of(self.config),
             step=self._step,
             initial=ObstacleState(),
-            survivor=identities,
+            survivor=self._survivor,
         )
         self.counts = self._stream.counts
 
@@ -163,6 +166,7 @@ class ObstacleTracker:
             'moving_alike': int(state.last.alike) if state.last else 0,
             'pings_moving_alike': state.alike,
             'covariance_repairs': state.last.repairs if state.last else 0,
+            'landmarks': len(state.last.memory) if state.last else 0,
         }
 
     def warnings(self) -> list[str]:
@@ -175,18 +179,34 @@ class ObstacleTracker:
         pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
         return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
 
+    @property
+    def landmarks(self) -> Memory:
+        """The obstacles that are remembered and not in view."""
+        last = self._stream.state.last
+        return last.memory if last else ()
+
+    def known(self) -> list[dict[str, float]]:
+        """All obstacles at the newest ping, those in view too, see `Landmark.row`."""
+        state = self._stream.state
+        survivor = self._survivor(state).last
+        if state.last is None or survivor is None:
+            return []
+        return [each.row(state.last.stamp_ns, self.config) for each in survivor.memory]
+
     # -- one step ------------------------------------------------------------------------------
 
     def _step(
         self, before: ObstacleState, stamp_ns: int, items: Sequence[Measurement]
     ) -> ObstacleState:
         """The state after all measurements of one stamp. Pure."""
-        buffer, altitude = before.navigation, before.altitude
+        buffer, altitude, ground = before.navigation, before.altitude, before.ground
         for item in items:
             if isinstance(item, Navigation):
                 buffer = buffer.added(item)
             elif isinstance(item, Altitude):
                 altitude = item
+            elif isinstance(item, Ground):
+                ground = ground.added(item)
         pings = [item for item in items if isinstance(item, Detections)]
         waiting = [*before.waiting, *((ping, altitude) for ping in pings)]
         given_up = max(0, len(waiting) - MOST_WAITING)
@@ -201,7 +221,7 @@ class ObstacleTracker:
             if ready == 'gap':
                 skipped += 1
                 continue
-            last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
+            last, lost = self._ping(last, ping, self._sonar(buffer, ping, height), ground)
             broken += lost
             alike += last.alike
             sure = np.isfinite(last.nis) & (last.life.status != TENTATIVE)
@@ -213,6 +233,7 @@ class ObstacleTracker:
             done=tuple(done),
             navigation=buffer.since(oldest - nanoseconds(self.config.course_window)),
             altitude=altitude,
+            ground=ground,
             waiting=tuple(waiting),
             skipped=skipped,
             missing=before.missing + given_up,
@@ -253,13 +274,15 @@ class ObstacleTracker:
         return Sonar(pose, height, late, late_ns * 1e-9, reference, straight)
 
     def _ping(
-        self, before: PingState | None, ping: Detections, sonar: Sonar
+        self, before: PingState | None, ping: Detections, sonar: Sonar, ground: GroundMap
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, intensity, extended = self._detections(ping)
+        z, R, intensity, extended, up, var_up = self._detections(ping)
+        seen = Elevations.of(up, var_up, self.config)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
-        chosen, expected = self._associate(now, z, R)
-        now = self._update(now, chosen, expected, z, R, extended)
+        now = self._recall(now)
+        chosen, expected, fit = self._associate(now, z, R, seen)
+        now = self._update(now, chosen, expected, z, R, extended, seen)
         if self.config.vertical_beam_width_deg and before:
             dt = (now.stamp_ns - before.stamp_ns) * 1e-9
             level = np.append(level_db(intensity), np.nan)[chosen]
@@ -271,11 +294,12 @@ class ObstacleTracker:
         if self.config.misses == 'evidence' and before:
             looks = now.looks.after(hit, now.mixture, self.filter, sonar, before.sonar)
             now = now._replace(looks=looks)
-        now = self._prune(now, hit)
+        now = self._prune(now, hit, fit)
         if np.count_nonzero(hit) < len(z):
             free = np.ones(len(z), bool)
             free[chosen[hit]] = False
-            now = self._spawn(now, z[free], R[free], extended[free])
+            seen = seen and seen.rows(free)
+            now = self._spawn(now, z[free], R[free], extended[free], seen, ground)
         confirmed = now.life.status != TENTATIVE
         return now._replace(alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
@@ -295,31 +319,40 @@ class ObstacleTracker:
         return (now.only(is_finite) if broken else now), broken
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
-        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is stated (D,), of the rows
-        that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
-        says nothing and is left out."""
+        """z (D, 2), R (D, 2, 2), intensity (D,), whether an extent is stated (D,), elevation and
+        its variance (D,), of the rows that are echoes, azimuth positive to starboard. A row that
+        is as uncertain as it is far says nothing and is left out."""
         *echoes, real = ping_kernels.echoes(
             ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
         )
-        columns = *echoes, ping.intensity, np.isfinite(ping.extent_range)
+        extended = np.isfinite(ping.extent_range)
+        columns = *echoes, ping.intensity, extended, ping.elevation, ping.var_elevation
         if np.count_nonzero(real) == len(real):
             return columns
         return tuple(column[real] for column in columns)
 
     def _associate(
-        self, now: PingState, z: FloatArray, R: FloatArray
-    ) -> tuple[np.ndarray, FloatArray]:
-        """The detection of each track (T,), -1 for none, and what was expected (T, K, 2);
-        confirmed tracks choose before tentative ones."""
+        self, now: PingState, z: FloatArray, R: FloatArray, seen: Elevations | None
+    ) -> tuple[np.ndarray, FloatArray, FloatArray]:
+        """The detection of each track (T,), -1 for none, what was expected (T, K, 2), and the log
+        density (T,) of what was found; confirmed tracks choose before tentative ones."""
         h, C = self.filter.expected(now.mixture, now.sonar)
         if not len(h) or not len(z):
-            return np.full(len(h), -1), h
-        threshold = gate_threshold(self.config.gate_probability, 2)
-        fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
-        tentative = now.life.status == TENTATIVE
+            return np.full(len(h), -1), h, np.zeros(len(h))
         config = self.config
-        chosen = assign_fits(fit, tentative, config.detection_probability, config.clutter_density)
-        return chosen, h
+        if seen:
+            fit = fits(now.mixture, h, now.sonar.pose, z, R, seen, config)
+        else:
+            threshold = gate_threshold(config.gate_probability, 2)
+            fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
+        tentative = now.life.status == TENTATIVE
+        usual = config.detection_probability
+        weighed = fit
+        if config.detection_ranges:  # as probable as it is at the range of each track
+            p = self._chance(now.mixture)
+            weighed = fit + np.log(p / (1.0 - p) * (1.0 - usual) / usual)[:, None]
+        chosen = assign_fits(weighed, tentative, usual, config.clutter_density)
+        return chosen, h, fit[np.arange(len(fit)), chosen]
 
     def _update(
         self,
@@ -329,6 +362,7 @@ class ObstacleTracker:
         z: FloatArray,
         R: FloatArray,
         extended: np.ndarray,
+        seen: Elevations | None,
     ) -> PingState:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
@@ -340,23 +374,130 @@ class ObstacleTracker:
             mixture, bodies, h, chosen = mixture.rows(hit), bodies.rows(hit), h[hit], chosen[hit]
         z, R = z[chosen], R[chosen]
         bodies, R = bodies.seen(extended[chosen], z, R, self._own_variance)
+        before = mixture
         mixture, nis[hit], repairs = self.filter.update(mixture, h, z, R, now.sonar)
+        if seen:
+            chance = self.config.outlier_probability
+            doubt = outliers(before, h, z, R, chance, self.filter.outlier_density)
+            mixture = updated(mixture, seen.rows(chosen), doubt, now.sonar.pose, self.config)
         if not every:
             mixture = now.mixture.replaced(hit, mixture)
             bodies = now.bodies.replaced(hit, bodies)
         repairs += now.repairs
         return now._replace(mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
-    def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
-        """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
+    def _chance(self, mixture: Mixture) -> FloatArray:
+        """Probability (T,) that a ping shows obstacles that the beam holds."""
+        if not self.config.detection_ranges:
+            return np.full(len(mixture.mu), self.config.detection_probability)
+        return self.config.detection_at(np.einsum('tk,tk->t', mixture.mu, mixture.x[..., 0]))
+
+    def _prune(self, now: PingState, hit: np.ndarray, fit: FloatArray) -> PingState:
+        """End the tracks that are over or passed; `hit` (T,): those that got a detection of log
+        density `fit` (T,)."""
         tentative = now.life.status == TENTATIVE
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
-        looked = tentative | (in_beam > IN_BEAM)
-        life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
-        return now.rows(kept)._replace(life=life).only(ahead[kept])
+        p = self._chance(now.mixture)
+        probable = in_beam * p > IN_BEAM * self.config.detection_probability
+        looked = tentative | (probable if self.config.detection_ranges else in_beam > IN_BEAM)
+        life, stays = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
+        now = now._replace(
+            existence=now.existence.after(hit, fit, in_beam, p, self.config.clutter_density)
+        )
+        if self.config.max_landmarks:
+            coasted = now.stamp_ns - now.life.last_hit_ns > self.rules.max_coast_ns
+            now = self._remember(now, np.where(stays, ~ahead, coasted & ~hit))
+        return now.rows(stays)._replace(life=life).only(ahead[stays])
+
+    def _remember(self, now: PingState, over: np.ndarray) -> PingState:
+        """With landmarks of the confirmed obstacles whose tracks are `over` (T,)."""
+        over = over & (now.life.status != TENTATIVE)
+        if not np.count_nonzero(over):
+            return now
+        log_odds = now.existence.now()
+        stays = now.mixture.mu[:, self.filter.moves].sum(axis=1) <= 0.5
+        which = np.flatnonzero(over & stays & (log_odds > 0.0))
+        if not len(which):
+            return now
+        mixture, bodies = now.mixture.rows(which), now.bodies.rows(which)
+        mu = np.where(self.filter.moves, 0.0, mixture.mu)
+        mu = np.where(mu >= LEAST_WEIGHT * mu.max(axis=1, keepdims=True), mu, 0.0)
+        mixture = mixture._replace(mu=mu / mu.sum(axis=1, keepdims=True))
+        view = considered(
+            self.filter.view(mixture, now.sonar), now.sonar, bodies, self.config.range_scale_std
+        )
+        place, covariance = self.mount.to_enu(view.place, view.place_covariance)
+        level = place[:, 2] + view.state[:, 2]
+        fresh = []
+        for i, row in enumerate(which.tolist()):
+            weighs = np.flatnonzero(mixture.mu[i])
+            fresh.append(
+                Landmark(
+                    track_id=int(now.life.track_id[row]),
+                    stamp_ns=now.stamp_ns,
+                    seen_ns=int(now.life.last_hit_ns[row]),
+                    log_odds=float(log_odds[row]),
+                    sonar=now.sonar.pose,
+                    which=weighs,
+                    x=mixture.x[i, weighs],
+                    P=mixture.P[i, weighs],
+                    mu=mixture.mu[i, weighs],
+                    body=(float(bodies.number[i]), bodies.std[i]),
+                    place=place[i],
+                    covariance=covariance[i],
+                    low=float(level[i] - view.high[i]),
+                    high=float(level[i] - view.low[i]),
+                )
+            )
+        return now._replace(memory=kept((*now.memory, *fresh), now.stamp_ns, self.config))
+
+    def _recall(self, now: PingState) -> PingState:
+        """With tracks again of the landmarks that come into view, as long as there is room."""
+        memory = now.memory
+        if memory and memory[-1].stamp_ns > now.stamp_ns:
+            memory = kept(memory, now.stamp_ns, self.config)
+            now = now._replace(memory=memory)
+        if not memory or not self.filter.ready(now.sonar):
+            return now
+        back = in_view(memory, now.stamp_ns, now.sonar, self.config)
+        back = back[: max(0, self.config.max_tracks - len(now.life))]
+        for each in (memory[i] for i in sorted(back)):
+            if each.track_id in now.life.track_id:
+                continue  # numbers began anew, and this one lives
+            dt = (now.stamp_ns - each.stamp_ns) * 1e-9
+            mixture, repairs = self.filter.carried(
+                each.mixture(self.filter.K), each.sonar, now.sonar.pose, dt
+            )
+            if not ping_kernels.is_finite(mixture.x, mixture.P)[0]:
+                continue
+            number, std = each.body
+            now = self._joined(
+                now,
+                now.life.resumed(each.track_id, now.stamp_ns, self.rules),
+                mixture,
+                Bodies(np.array([number]), std[None]),
+                odds(each.existence(now.stamp_ns, self.config.landmark_time)),
+            )._replace(repairs=now.repairs + repairs)
+        gone = set(back)
+        memory = tuple(each for i, each in enumerate(memory) if i not in gone)
+        return now._replace(memory=memory) if gone else now
+
+    def _survivor(self, state: ObstacleState) -> ObstacleState:
+        """What outlives a restarted clock: the identities that are used up, and the landmarks."""
+        if state.last is None:
+            return ObstacleState()
+        everybody = np.ones(len(state.last.life), bool)
+        last = self._remember(state.last, everybody) if self.config.max_landmarks else state.last
+        return ObstacleState(last=last._replace(stamp_ns=0).only(~everybody))
 
     def _spawn(
-        self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
+        self,
+        now: PingState,
+        z: FloatArray,
+        R: FloatArray,
+        extended: np.ndarray,
+        seen: Elevations | None,
+        ground: GroundMap,
     ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
         ready = self.filter.ready(now.sonar)
@@ -365,14 +506,31 @@ class ObstacleTracker:
         if not len(z):
             return now
         bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
-        fresh = self.filter.begin(z, R, now.sonar)
+        hints = None
+        if seen or ground:
+            seen = seen and seen.rows(np.arange(len(z)))
+            ends = seen.ends() if seen else np.full((len(z), 2), np.nan)
+            hints = Hints(ends, *ground.below(z, now.sonar, self.config))
+        fresh = self.filter.begin(z, R, now.sonar, hints)
+        if seen:
+            chance = self.config.outlier_probability
+            fresh = updated(fresh, seen, chance, now.sonar.pose, self.config)
+        life = now.life.born(len(z), now.stamp_ns, self.rules)
+        return self._joined(now, life, fresh, bodies, 0.0)
+
+    def _joined(
+        self, now: PingState, life: Tracks, fresh: Mixture, bodies: Bodies, log_odds: float
+    ) -> PingState:
+        """With more obstacles, which `life` has already."""
+        B = len(fresh.mu)
         return now._replace(
-            life=now.life.born(len(z), now.stamp_ns, self.rules),
+            life=life,
             mixture=now.mixture.joined(fresh),
-            nis=np.append(now.nis, np.full(len(z), np.nan)),
-            strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
+            nis=np.append(now.nis, np.full(B, np.nan)),
+            strengths=now.strengths.joined(Strengths.unknown(B, self.filter.K)),
             bodies=now.bodies.joined(bodies),
             looks=now.looks.joined(Looks.first(fresh)),
+            existence=now.existence.joined(Existence.of(np.full(B, log_odds))),
         )
 
     def _nobody(self, sonar: Sonar) -> PingState:
@@ -388,6 +546,7 @@ class ObstacleTracker:
             strengths=Strengths.unknown(0, K),
             bodies=Bodies.unknown(0),
             looks=Looks.first(nothing),
+            existence=Existence.of(np.empty(0)),
         )
 
     def _estimate(self, ping: PingState) -> Estimate:

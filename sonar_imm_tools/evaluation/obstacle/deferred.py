@@ -45,8 +45,9 @@ class DeferredEstimates:
     scale refitted.
 
     All offsets hold at the first echo of the track, m below the sonar, NaN when unknown. `truth`;
-    `online` and `band`: what the tracker says at its last echo; `altitude`: of the vehicle above
-    the sea floor.
+    `online` with `online_std` and `band`: what the tracker says at its last echo; `altitude`: of
+    the sonar above the sea floor, with `altitude_std`. What is left of it below the obstacle is
+    the length of its tether, if it is moored.
     """
 
     track_id: int
@@ -55,8 +56,10 @@ class DeferredEstimates:
     both: Deferred
     refit: Deferred
     online: float
+    online_std: float
     band: tuple[float, float]
     altitude: float
+    altitude_std: float
     truth: float = float('nan')
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,6 +72,8 @@ class DeferredEstimates:
             'refit_m': self.refit.best,
             'online_m': self.online,
             'altitude_m': self.altitude,
+            'tether_m': self.altitude - self.online,
+            'tether_std_m': float(np.hypot(self.online_std, self.altitude_std)),
         }
         if np.isfinite(self.truth):
             result |= {
@@ -113,6 +118,9 @@ def deferred_estimates(
     first, last = track.stamp_ns[rows[:1]], rows[-1]
     path = truth.get(track_id)
     heights = [height for height in received if isinstance(height, Altitude)]
+    altitude = float('nan')
+    if heights:
+        altitude = min(heights, key=lambda height: abs(height.stamp_ns - int(first[0]))).altitude
     return DeferredEstimates(
         track_id=track_id,
         echoes=len(rows),
@@ -120,10 +128,10 @@ def deferred_estimates(
         both=deferred(z, at, config, both_sides=True),
         refit=deferred(z, at, config, both_sides=True, refit=True),
         online=float(track.state[last, 2]) + sunk,
+        online_std=float(np.sqrt(track.covariance[last, 2, 2])),
         band=(float(track.low[last]) + sunk, float(track.high[last]) + sunk),
-        altitude=min(heights, key=lambda height: abs(height.stamp_ns - int(first[0]))).altitude
-        if heights
-        else float('nan'),
+        altitude=altitude + config.sonar_lever[2],
+        altitude_std=config.altitude_std,
         truth=float(path.at(first, gap)[0, 2]) if path else float('nan'),
     )
 

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.elevation import Elevations
 from sonar_imm.trackers.obstacle.state import PingState
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
@@ -70,21 +70,19 @@ class Scored(ObstacleTracker):
         super().__init__(config)
 
     def _associate(
-        self, now: PingState, z: FloatArray, R: FloatArray
-    ) -> tuple[np.ndarray, FloatArray]:
-        chosen, h = super()._associate(now, z, R)
+        self, now: PingState, z: FloatArray, R: FloatArray, seen: Elevations | None
+    ) -> tuple[np.ndarray, FloatArray, FloatArray]:
+        chosen, h, fit = super()._associate(now, z, R, seen)
         config = self.config
         score = len(z) * math.log(config.clutter_density) - config.clutter_density * self.area
         if len(h):
             log_f = np.full(len(h), -np.inf)
-            hit = np.flatnonzero(chosen >= 0)
-            if len(hit):
-                _, C = self.filter.expected(now.mixture, now.sonar)
-                fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, math.inf)
-                log_f[hit] = fit[hit, chosen[hit]]
+            hit = chosen >= 0
+            log_f[hit] = fit[hit]
+            chance = self._chance(now.mixture)
             in_beam, _ = self.filter.outlook(now.mixture, now.sonar)
             for track, track_id in enumerate(now.life.track_id.tolist()):
-                p = config.detection_probability * float(np.clip(in_beam[track], 0.01, 1.0))
+                p = float(chance[track] * np.clip(in_beam[track], 0.01, 1.0))
                 gap = log_f[track] - math.log(config.clutter_density)
                 ratio = math.exp(min(gap, 600.0)) if np.isfinite(gap) else 0.0
                 r = self.existence.get(track_id, NEW)
@@ -92,4 +90,4 @@ class Scored(ObstacleTracker):
                 score += math.log(total)
                 self.existence[track_id] = r * (1.0 - p + p * ratio) / total
         self.scores[now.stamp_ns] = score, len(z) if len(h) else 0
-        return chosen, h
+        return chosen, h, fit

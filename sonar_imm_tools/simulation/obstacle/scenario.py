@@ -41,6 +41,8 @@ class ObstacleScenario(ImageScenario):
         'max_range',
         'horizontal_fov_deg',
         'vertical_fov_deg',
+        'detection_ranges',
+        'detection_factors',
     )
 
     # fmt: off
@@ -125,10 +127,18 @@ class ObstacleScenario(ImageScenario):
     range_step: float = parameter(0.17, 'm', 'sampling step of the range', range=(0.0, 10.0))
     bearing_step_deg: float = parameter(0.18, 'deg',
         'sampling step of the bearing', range=(0.0, 10.0))
+    elevation_std_deg: float = parameter(0.0, 'deg',
+        'standard deviation of an elevation; 0: the sonar measures none', range=(0.0, 45.0))
     sound_speed_error: float = parameter(0.001, '',
         'scale error of the ranges, 1 sigma', range=(0.0, 0.2))
     detection_probability: float = parameter(1.0, '',
         'probability that a ping shows an obstacle in the beam', range=(0.0, 1.0))
+    detection_ranges: tuple[float, ...] = parameter((), 'm',
+        'ranges at which detection_factors are given; empty: as detectable everywhere',
+        range=(0.0, 1e5), kind='float[]')
+    detection_factors: tuple[float, ...] = parameter((), '',
+        'share of detection_probability that is left at detection_ranges', range=(0.0, 1.0),
+        kind='float[]')
     outlier_probability: float = parameter(0.0, '',
         'probability that an echo of an obstacle is an outlier, which comes from elsewhere',
         range=(0.0, 1.0))
@@ -186,6 +196,8 @@ class ObstacleScenario(ImageScenario):
         problems = super().check()
         if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
             problems.append('obstacle_speed needs two values, the least and the greatest')
+        if len(self.detection_ranges) != len(self.detection_factors):
+            problems.append('detection_ranges and detection_factors need as many values each')
         if self.images and self.ping_timing != 'instant':
             problems.append('images are made at one instant: ping_timing has to be instant')
         return problems
@@ -208,6 +220,10 @@ _FIELD = {
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'approach': ('an obstacle 3 m below the sonar', {}),
+    'elevation': (
+        'the same, and the sonar measures elevations to 1 degree',
+        {'elevation_std_deg': 1.0},
+    ),
     'nearly_level': ('an obstacle 0.5 m below the sonar', {'vertical_offset': 0.5}),
     'above': ('an obstacle 6 m above the sonar', {'vertical_offset': -6.0}),
     'float': (

@@ -295,8 +295,8 @@ def _echoes(
     path: Path,
     sound: float,
 ) -> tuple[FloatArray, np.ndarray]:
-    """Range and azimuth (n, 2) of an obstacle at each ping without noise, and whether it is inside
-    the beam (n,)."""
+    """Range, azimuth and elevation, positive down, (n, 3) of an obstacle at each ping without
+    noise, and whether it is inside the beam (n,)."""
     out = geometry.to_body(vehicle.sonar(times), path.at(times))
     d, azimuth = geometry.project(out, config.azimuth_model)
     if config.ping_timing == 'two_way':
@@ -312,7 +312,7 @@ def _echoes(
         & (np.abs(plane) <= np.radians(0.5 * config.horizontal_fov_deg))
         & (d <= config.max_range)
     )
-    return np.column_stack([d * sound, azimuth]), inside
+    return np.column_stack([d * sound, azimuth, elevation]), inside
 
 
 def _pings(
@@ -328,22 +328,38 @@ def _pings(
     largest = np.array([config.outlier_range, np.radians(config.outlier_bearing_deg)])
     received = []
     for k, stamp in enumerate(stamps):
-        rows = []
+        rows: list[FloatArray] = []
+        up: list[float] = []
         for echo, inside in echoes:
-            seen = rng.uniform() < config.detection_probability
+            chance = config.detection_probability
+            if config.detection_ranges:
+                share = np.interp(echo[k, 0], config.detection_ranges, config.detection_factors)
+                chance *= float(share)
+            seen = rng.uniform() < chance
             outlier = rng.uniform() < config.outlier_probability
             error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)
             if seen and inside[k]:
-                rows.append(echo[k] + error)
+                rows.append(echo[k, :2] + error)
+                up.append(-echo[k, 2])
         for _ in range(rng.poisson(config.clutter)):
-            rows.append([rng.uniform(1.0, config.max_range), rng.uniform(-half, half)])
+            rows.append(np.array([rng.uniform(1.0, config.max_range), rng.uniform(-half, half)]))
         z = np.reshape(rows, (-1, 2))
         z = np.where(step > 0.0, np.round(z / np.where(step > 0.0, step, 1.0)) * step, z)
-        z = z[rng.permutation(len(z))]
+        order = rng.permutation(len(z))
+        z, elevation = z[order], np.full(len(z), np.nan)
+        if config.elevation_std_deg:
+            half_v, std = np.radians([0.5 * config.vertical_fov_deg, config.elevation_std_deg])
+            measured = np.array(up) + std * rng.normal(size=len(up))
+            false = rng.uniform(-half_v, half_v, len(z) - len(up))
+            elevation = np.concatenate([measured, false])[order]
         if rng.uniform() < config.ping_loss:
             continue
         detections = Detections(
-            stamp_ns=int(stamp), range=z[:, 0], bearing=-z[:, 1], frame_id='sonar'
+            stamp_ns=int(stamp),
+            range=z[:, 0],
+            bearing=-z[:, 1],
+            elevation=elevation,
+            frame_id='sonar',
         )
         late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
         received.append(Received(int(stamp) + nanoseconds(late), detections))

@@ -22,7 +22,7 @@ import pytest
 from scipy.special import ndtr
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
@@ -224,6 +224,8 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
     back = metrics['deferred']
     assert abs(back['refit_error_m']) < 2.0 and back['echoes'] > 50
     assert abs(back['online_error_m']) < 2.0
+    off = min(abs(back['tether_m'] - length) for length in (15.0, 12.0))
+    assert off < 2.0 * back['tether_std_m'] < 3.0
     assert verdict.accuracy(None).good and not verdict.accuracy(0.01).good
     assert 'obstacles were found' in verdict.summary
     titles = [section.title for section in verdict.part([]).sections]
@@ -248,6 +250,13 @@ def test_online_and_deferred_estimates_hold_at_the_first_echo_of_a_vehicle_that_
     found = deferred_estimates(series_of(estimates), received, ObstacleConfig(), {}, 60.0)
     assert found.echoes == 20 and found.plain.best == pytest.approx(8.0, abs=0.3)
     assert (found.online, *found.band) == pytest.approx((8.0, 7.0, 10.0))
+    assert np.isnan(found.as_dict()['tether_m'])
+    received.append(Altitude(stamp_ns=SECOND, altitude=20.0))
+    config = ObstacleConfig(sonar_lever=(0.0, 0.0, -0.5), altitude_std=0.3)
+    found = deferred_estimates(series_of(estimates), received, config, {}, 60.0)
+    assert found.as_dict()['tether_m'] == pytest.approx(19.5 - 8.0)
+    std = np.sqrt(estimates[-1].covariance[0, 2, 2])
+    assert found.as_dict()['tether_std_m'] == pytest.approx(np.hypot(std, 0.3))
 
 
 def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):

@@ -31,6 +31,7 @@ from sonar_imm.measurements import (
     Detections,
     Fix,
     Fixes,
+    Ground,
     Navigation,
     Pressure,
     Snapshot,
@@ -144,10 +145,17 @@ def _obstacle(k):
     yield 'nav', _pose(k, step)
     if k % 4 == 0:
         yield 'altitude', Altitude(stamp_ns=T0 + k * step, altitude=12.0, frame_id='altimeter')
+    if k % 4 == 2:
+        floor = np.array([[30.0, 0.0, -17.0], [31.0, 1.0, -17.1]]) + [0.5 * k, 0.0, 0.0]
+        yield (
+            'ground',
+            Ground(stamp_ns=T0 + k * step, frame_id='map', position=floor, variance=[0.01, 0.01]),
+        )
     ranges = np.array([40.0, 25.0]) - 0.5 * k
     yield 'detections', Detections(
         stamp_ns=T0 + k * step, frame_id='sonar', range=ranges, bearing=[0.05, -0.1],
         var_range=[0.04, 0.04], var_bearing=[1e-4, 1e-4], intensity=[10.0, 20.0],
+        elevation=[0.05, np.nan], var_elevation=[3e-4, np.nan],
     )  # fmt: skip
 
 

@@ -33,8 +33,11 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.obstacle.filters import DepthSlices, Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -334,3 +337,52 @@ def test_a_restarted_clock_begins_anew():
     used = {int(i) for one in first.values() for i in one.extras['track_id']}
     new = {int(i) for one in list(again.values())[20:] for i in one.extras['track_id']}
     assert new and not used & new
+
+
+# -- where a sonar sees less -------------------------------------------------------------------
+
+FALLS = {'detection_ranges': [20.0, 40.0, 60.0], 'detection_factors': [1.0, 0.6, 0.15]}
+
+
+def test_the_probability_of_a_detection_falls_with_range():
+    config = ObstacleConfig(detection_probability=0.8, **FALLS)
+    distance = np.array([5.0, 30.0, 60.0, 90.0])
+    assert_allclose(config.detection_at(distance), [0.8, 0.64, 0.12, 0.12])
+    assert ObstacleConfig().detection_at(distance).tolist() == [0.9] * 4
+    with pytest.raises(ConfigError, match='as many'):
+        ObstacleConfig(detection_ranges=[5.0])
+    with pytest.raises(ConfigError, match='rise'):
+        ObstacleConfig(detection_ranges=[5.0, 5.0], detection_factors=[1.0, 0.5])
+
+
+def test_misses_count_where_the_sonar_would_see():
+    """An obstacle 55 m ahead, surely in the beam, of a vehicle that stands still gives six echoes
+    and then none for ten seconds: to be expected of a sonar that hardly sees that far."""
+    ended = {}
+    for values in ({}, FALLS):
+        tracker = ObstacleTracker(ObstacleConfig(max_offset=2.0, **values))
+        for k in range(1, 27):
+            stamp = k * SECOND // 2
+            tracker.process(
+                Navigation(
+                    stamp_ns=stamp, position=[0.0, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
+                )
+            )
+            seen = [55.0] if k <= 6 else []
+            (estimate,) = tracker.process(
+                Detections(stamp_ns=stamp, range=seen, bearing=[0.0] * len(seen))
+            )
+        ended[bool(values)] = len(estimate)
+    assert ended == {False: 0, True: 1}
+
+
+@pytest.mark.parametrize('edge, counted', [(0.0, True), (2.0, False)])
+def test_at_the_edge_of_the_sector_nothing_is_missed(edge, counted):
+    """Of obstacles 1 degree inside the edge, of 22.5."""
+    config = ObstacleConfig(sector_edge_deg=edge, behaviours=('fixed',))
+    filter_ = DepthSlices(config)
+    sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)))
+    z = np.array([[30.0, np.radians(21.5)], [30.0, np.radians(20.0)]])
+    mixture = filter_.begin(z, np.tile(np.diag([0.02, 2e-5]), (2, 1, 1)), sonar)
+    in_beam, ahead = filter_.outlook(mixture, sonar)
+    assert (in_beam[0] > 0.3) == counted and in_beam[1] > 0.3 and ahead.all()

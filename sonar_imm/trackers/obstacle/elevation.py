@@ -1,0 +1,205 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Sonars that measure the elevation of an echo as well: imaging sonars in three dimensions, and
+multibeam sonars that look ahead.
+
+The filter is the same. What an elevation adds is a third measurement of each component,
+
+    eps(d, delta, z) = asin(m_z / d),    positive down, m the point seen from the sonar,
+
+linearised at the mean: within a depth slice it is nearly straight. A new obstacle has its slices
+over `REACH` standard deviations of the measured elevation, and no longer over the whole beam. An
+echo is gated in three dimensions; clutter is spread evenly over the height of the beam. Range and
+azimuth go into the update first, the elevation after them, with the probability that the echo is
+an outlier which they leave. Rows without elevation are treated as ever, also beside others.
+
+Source: docs/obstacle.md, section Elevation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...acoustics.geometry import Pose
+from ...estimation import imm_kernels
+from ...estimation.arrays import FloatArray
+from ...estimation.association import gate_threshold
+from . import kernels
+from .config import ObstacleConfig
+from .filters import Mixture
+
+REACH = 4.0
+"""Standard deviations of an elevation over which a new obstacle has its slices."""
+SMALLEST = 0.1
+"""Cosine of 84 degrees: no sonar sees obstacles so steeply above or below."""
+_LEAST = 1e-8
+"""rad^2; no sonar measures an elevation to less than 0.006 degrees."""
+
+
+class Elevations(NamedTuple):
+    """Of D detections: angle (D,) rad below the axis of the sonar, NaN where it is not measured;
+    variance (D,) rad^2."""
+
+    angle: FloatArray
+    variance: FloatArray
+
+    def rows(self, which: np.ndarray) -> Elevations:
+        return Elevations(self.angle[which], self.variance[which])
+
+    def ends(self) -> FloatArray:
+        """Between which angles (D, 2) the detections lie."""
+        reach = REACH * np.sqrt(self.variance)
+        return np.column_stack([self.angle - reach, self.angle + reach])
+
+    @classmethod
+    def of(cls, up: FloatArray, variance: FloatArray, config: ObstacleConfig) -> Elevations | None:
+        """Of elevations `up` (D,) rad, as they are stated; None where none is measured."""
+        known = np.isfinite(up) & (np.abs(up) < 0.5 * np.pi)
+        if not np.count_nonzero(known):
+            return None
+        own = np.radians(config.elevation_std_deg) ** 2
+        stated = np.isfinite(variance) & (variance > 0.0)
+        return cls(
+            np.where(known, -up, np.nan), np.maximum(np.where(stated, variance, own), _LEAST)
+        )
+
+
+def expected(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, FloatArray]:
+    """The elevation (T, K) of each component, rad below the axis of the sonar, and its derivatives
+    (T, K, 3) by range, azimuth and depth.
+
+    They follow from what fixes the elevation, with n = (a, b, c) the vertical seen from the sonar
+    and s the vertical offset: ``k cos eps + c sin eps = s / d``, where ``k = a cos delta + b sin
+    delta``; on the cone the same for the angle eta in the x-z plane, ``sin eps = cos delta sin
+    eta``.
+    """
+    x = mixture.x
+    d, cosine, sine = x[..., 0], np.cos(x[..., 1]), np.sin(x[..., 1])
+    a, b, c = pose.R[2]
+    m = kernels.points(x, *pose, cone)
+    level = np.sqrt(m[..., 0] * m[..., 0] + m[..., 1] * m[..., 1])
+    H = np.empty((*d.shape, 3))
+    if not cone:
+        up, along = m[..., 2] / d, level / d
+        k, across = a * cosine + b * sine, b * cosine - a * sine
+        turn = _at_least(c * along - k * up)
+        H[..., 0] = -(k * along + c * up) / (d * turn)
+        H[..., 1] = -along * across / turn
+        H[..., 2] = 1.0 / (d * turn)
+        return np.arctan2(m[..., 2], level), H
+    r = d * cosine
+    out, down = m[..., 0] / r, m[..., 2] / r
+    turn = _at_least(c * out - a * down)
+    ahead = a * out + c * down
+    scale = cosine * out / np.maximum(level / d, SMALLEST)
+    H[..., 0] = -scale * (cosine * ahead + b * sine) / (r * turn)
+    H[..., 1] = -scale * (b * cosine - sine * ahead) / (cosine * turn)
+    H[..., 1] -= sine * down / np.maximum(level / d, SMALLEST)
+    H[..., 2] = scale / (r * turn)
+    return np.arctan2(m[..., 2], level), H
+
+
+def _at_least(turn: FloatArray) -> FloatArray:
+    """Away from 0, where an obstacle would lie straight above or below."""
+    return np.copysign(np.maximum(np.abs(turn), SMALLEST), turn)
+
+
+def fits(
+    mixture: Mixture,
+    h: FloatArray,
+    pose: Pose,
+    z: FloatArray,
+    R: FloatArray,
+    seen: Elevations,
+    config: ObstacleConfig,
+) -> FloatArray:
+    """Table (T, D) as of `imm.gate`, of detections z (D, 2), R (D, 2, 2) with the elevations
+    `seen`, of which h (T, K, 2) is expected. Densities are those per metre and radian beside
+    clutter that is as dense at any elevation in the beam."""
+    T, K, n = mixture.x.shape
+    angle, slope = expected(mixture, pose, config.azimuth_model == 'cone')
+    H = np.zeros((T, K, 3, n))
+    H[:, :, 0, 0] = H[:, :, 1, 1] = 1.0
+    H[:, :, 2, :3] = slope
+    fov = np.radians(config.vertical_fov_deg)
+    z3, R3 = np.zeros((len(z), 3)), np.zeros((len(z), 3, 3))
+    z3[:, :2], R3[:, :2, :2] = z, R
+    known = np.isfinite(seen.angle)
+    z3[:, 2] = np.where(known, seen.angle, 0.0)
+    R3[:, 2, 2] = np.where(known, seen.variance, fov**2 / 12.0)  # anywhere in the beam
+    h3 = np.concatenate([h, angle[..., None]], axis=-1)
+    threshold = gate_threshold(config.gate_probability, 3)
+    fit = imm_kernels.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
+    return np.asarray(fit + np.log(fov))
+
+
+def outliers(
+    mixture: Mixture,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    probability: float,
+    density: float,
+) -> FloatArray:
+    """Probability (T, K) that detections z (T, 2), R (T, 2, 2) of which h (T, K, 2) was expected
+    are outliers, as `kernels.jipda_update` has it."""
+    s00 = mixture.P[..., 0, 0] + R[:, None, 0, 0]
+    s01 = mixture.P[..., 0, 1] + R[:, None, 0, 1]
+    s11 = mixture.P[..., 1, 1] + R[:, None, 1, 1]
+    r0, r1 = z[:, None, 0] - h[..., 0], z[:, None, 1] - h[..., 1]
+    determinant = s00 * s11 - s01 * s01
+    distance = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / determinant
+    own = (1.0 - probability) * np.exp(-0.5 * distance) / (2.0 * np.pi * np.sqrt(determinant))
+    other = probability * density
+    return np.asarray(other / np.maximum(own + other, 1e-300))
+
+
+def updated(
+    mixture: Mixture,
+    seen: Elevations,
+    outlier: FloatArray | float,
+    pose: Pose,
+    config: ObstacleConfig,
+) -> Mixture:
+    """After one elevation for each obstacle (T,), which is an outlier with the probability
+    `outlier` (T, K); matched in mean and covariance. NaN changes nothing."""
+    known = np.flatnonzero(np.isfinite(seen.angle))
+    if len(known) < len(seen.angle):
+        if not len(known):
+            return mixture
+        some = outlier[known] if isinstance(outlier, np.ndarray) else outlier
+        return mixture.replaced(
+            known, updated(mixture.rows(known), seen.rows(known), some, pose, config)
+        )
+    x, P, mu = mixture
+    angle, H = expected(mixture, pose, config.azimuth_model == 'cone')
+    # Only range, azimuth and depth show.
+    g = P[..., 0] * H[..., :1] + P[..., 1] * H[..., 1:2] + P[..., 2] * H[..., 2:3]
+    S = g[..., 0] * H[..., 0] + g[..., 1] * H[..., 1] + g[..., 2] * H[..., 2]
+    S += seen.variance[:, None]
+    v = seen.angle[:, None] - angle
+    own = (1.0 - outlier) * np.exp(-0.5 * v * v / S) / np.sqrt(2.0 * np.pi * S)
+    likelihood = own + outlier / np.radians(config.vertical_fov_deg)
+    beta = own / np.maximum(likelihood, 1e-300)
+    gain = g / S[..., None]
+    x1 = x + (beta * v)[..., None] * gain
+    less = beta * (S - (1.0 - beta) * v * v)
+    P1 = P - less[..., None, None] * (gain[..., :, None] * gain[..., None, :])
+    mu1 = mu * likelihood
+    total = mu1.sum(axis=1, keepdims=True)
+    return Mixture(x1, P1, np.where(total > 0.0, mu1 / np.maximum(total, 1e-300), mu))

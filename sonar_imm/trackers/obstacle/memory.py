@@ -1,0 +1,219 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Obstacles that have left the field of view: landmarks in the world.
+
+A track of an obstacle ends when the sonar no longer looks its way, or when nothing was seen of it
+for `max_coast`. What is known of the obstacle is kept, and when its place comes into the field of
+view again the track goes on under its own number, without an echo at first. Nothing else of the
+tracker knows of landmarks: a landmark that comes back is a track like any other, which an echo
+continues and misses end.
+
+**Existence.** A landmark that is not there any more has to go. The log-odds that a track is an
+obstacle change by
+
+    log(P_D f(z) / clutter_density)    with an echo z of predicted density f,
+    log(1 - B + B (1 - P_D)^n)         with the n pings without one since the last echo
+
+(integrated probabilistic data association with one echo), where B is the mean probability that the
+beam held it in these pings: either it did in all of them, or it lay above or below all the time.
+They are bounded, so that a few misses in plain view are enough to give up what was seen a hundred
+times. A track that ends by its misses is no landmark, nor is one that ends with less than one
+half. While nobody looks, the probability falls with `landmark_time`.
+
+**Drift.** The errors of navigation between two stamps are those between two pings, only more of
+them: coming back is one step of the prediction (`filters`), from the pose of the sonar when the
+track ended to that of now. Navigation that walks by `position_noise` makes a landmark uncertain
+by 0.6 m in an hour at the default. A landmark stays where it is: components that move are left
+out, and what mostly moves is not kept. Moored ones swing on.
+
+Source: docs/obstacle.md, section Memory; Musicki, Evans, Stankovic 1994, 'Integrated probabilistic
+data association', for the existence.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...acoustics import geometry
+from ...acoustics.geometry import Pose
+from ...estimation.arrays import BoolArray, FloatArray
+from .config import ObstacleConfig
+from .filters import Mixture, Sonar
+
+SUREST = 9.2
+"""Bound of the log-odds of existence: 0.9999."""
+LEAST_WEIGHT = 1e-3
+"""Components that weigh less are not kept."""
+HELD = 0.01
+"""A ping less probable than this to have held an obstacle counts for nothing."""
+RETURNS = 0.4
+"""Cosine to the axis of the sonar, 66 degrees, from which a landmark may come back; a track ends
+beyond 78."""
+
+
+class Landmark(NamedTuple):
+    """An obstacle that is not in view, as it was at `stamp_ns`, when its track ended.
+
+    seen_ns: last echo; log_odds: of its existence; sonar: pose then, NED and FRD; which (k,): the
+    components that are kept, of the filter's, with their x (k, n), P (k, n, n) and weights mu
+    (k,); body: number of echoes with an extent, and their standard deviations (2,) m; place (3,)
+    m, covariance (3, 3) and low, high, the 90 % band of its height, all in the world, ENU."""
+
+    track_id: int
+    stamp_ns: int
+    seen_ns: int
+    log_odds: float
+    sonar: Pose
+    which: np.ndarray
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+    body: tuple[float, FloatArray]
+    place: FloatArray
+    covariance: FloatArray
+    low: float
+    high: float
+
+    def mixture(self, K: int) -> Mixture:
+        """The components as a mixture of one obstacle with `K`."""
+        n = self.x.shape[1]
+        x, P = np.zeros((1, K, n)), np.tile(np.eye(n), (1, K, 1, 1))
+        mu = np.zeros((1, K))
+        x[0], P[0] = self.x[0], self.P[0]  # those that weigh nothing: any numbers that are finite
+        x[0, self.which], P[0, self.which], mu[0, self.which] = self.x, self.P, self.mu
+        return Mixture(x, P, mu)
+
+    def existence(self, stamp_ns: int, landmark_time: float) -> float:
+        """The probability that it is still there at `stamp_ns`."""
+        age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
+        return probability(self.log_odds) * math.exp(-age / landmark_time)
+
+    def spread(self, stamp_ns: int, config: ObstacleConfig) -> FloatArray:
+        """Covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation drifted."""
+        age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
+        drift = np.square([config.position_noise, config.position_noise, config.depth_noise])
+        return self.covariance + np.diag(drift * age)
+
+    def row(self, stamp_ns: int, config: ObstacleConfig) -> dict[str, float]:
+        """As plain values: where it is at `stamp_ns`, ENU, m, with covariance and the band of its
+        height, and the probability that it is there."""
+        spread = self.spread(stamp_ns, config)
+        return {
+            'track_id': self.track_id,
+            **dict(zip('xyz', self.place.tolist())),
+            'cov_x_x': float(spread[0, 0]),
+            'cov_x_y': float(spread[0, 1]),
+            'cov_y_y': float(spread[1, 1]),
+            'cov_z_z': float(spread[2, 2]),
+            'z_low': self.low,
+            'z_high': self.high,
+            'existence': self.existence(stamp_ns, config.landmark_time),
+            'seen_ns': self.seen_ns,
+        }
+
+
+Memory = tuple[Landmark, ...]
+"""In the order in which their tracks ended."""
+
+
+def kept(memory: Memory, stamp_ns: int, config: ObstacleConfig) -> Memory:
+    """At most `max_landmarks`: those that are most probably still there. None is newer than
+    `stamp_ns`: across a clock that went back nothing is known of the drift."""
+    memory = tuple(each for each in memory if each.stamp_ns <= stamp_ns)
+    if len(memory) <= config.max_landmarks:
+        return memory
+    chance = [each.existence(stamp_ns, config.landmark_time) for each in memory]
+    # Of equal ones the oldest goes first.
+    best = np.argsort(chance, kind='stable')[len(memory) - config.max_landmarks :]
+    return tuple(memory[i] for i in sorted(best.tolist()))
+
+
+def in_view(memory: Memory, stamp_ns: int, sonar: Sonar, config: ObstacleConfig) -> list[int]:
+    """The landmarks that a ping of `sonar` may show, three standard deviations beside the sector
+    included, the nearest first."""
+    place = geometry.flip_world([each.place for each in memory])
+    m = geometry.to_body(sonar.pose, place)
+    away = np.linalg.norm(m, axis=1)
+    reach = np.array([3.0 * math.sqrt(np.trace(each.covariance[:2, :2])) for each in memory])
+    age = np.array([max(stamp_ns - each.stamp_ns, 0) * 1e-9 for each in memory])
+    reach += 3.0 * config.position_noise * np.sqrt(age)
+    sector = np.radians(0.5 * config.horizontal_fov_deg) + reach / np.maximum(away, 1e-6)
+    seen = (np.abs(np.arctan2(m[:, 1], m[:, 0])) <= sector) & (m[:, 0] >= RETURNS * away)
+    seen &= away <= config.max_range + reach
+    return [int(i) for i in np.argsort(away, kind='stable') if seen[i]]
+
+
+class Existence(NamedTuple):
+    """Of T tracks: log-odds (T,) of their existence at the last echo; pings (T,) without one
+    since that may have held them; held (T,): their probability of that, summed; silence (T,): log
+    probability of no echo in all these pings of what was held."""
+
+    log_odds: FloatArray
+    pings: FloatArray
+    held: FloatArray
+    silence: FloatArray
+
+    @staticmethod
+    def of(log_odds: FloatArray) -> Existence:
+        """Of tracks that begin."""
+        return Existence(log_odds, *np.zeros((3, len(log_odds))))
+
+    def rows(self, which: np.ndarray) -> Existence:
+        return Existence(*(part[which] for part in self))
+
+    def joined(self, other: Existence) -> Existence:
+        return Existence(*(np.concatenate(both) for both in zip(self, other)))
+
+    def after(
+        self, hit: BoolArray, fit: FloatArray, in_beam: FloatArray, p: FloatArray, clutter: float
+    ) -> Existence:
+        """After a ping with echoes of log density fit (T,) where `hit` (T,), of tracks that the
+        beam held with the probability in_beam (T,) and that would then be detected with p (T,).
+        clutter: density of false echoes."""
+        silent = ~hit & (in_beam > HELD)
+        since = (
+            self.pings + silent,
+            self.held + np.where(silent, in_beam, 0.0),
+            self.silence + np.where(silent, np.log1p(-np.minimum(p, 1.0 - 1e-9)), 0.0),
+        )
+        if not np.count_nonzero(hit):
+            return Existence(self.log_odds, *since)
+        found = self.now() + np.log(p / clutter) + np.where(hit, fit, 0.0)
+        log_odds = np.where(hit, _bounded(found), self.log_odds)
+        return Existence(log_odds, *(np.where(hit, 0.0, part) for part in since))
+
+    def now(self) -> FloatArray:
+        """Log-odds (T,) with the pings since the last echo."""
+        B = np.minimum(self.held / np.maximum(self.pings, 1.0), 1.0)
+        still = np.maximum(1.0 + B * np.expm1(self.silence), 1e-30)
+        return _bounded(self.log_odds + np.log(still))
+
+
+def _bounded(log_odds: FloatArray) -> FloatArray:
+    return np.minimum(np.maximum(log_odds, -SUREST), SUREST)  # np.clip takes far longer
+
+
+def probability(log_odds: float) -> float:
+    """Of log-odds."""
+    return 1.0 / (1.0 + math.exp(-log_odds))
+
+
+def odds(chance: float) -> float:
+    """Log-odds of a probability, as bounded as those of tracks."""
+    p = min(max(chance, 1e-9), 1.0 - 1e-9)
+    return min(max(math.log(p / (1.0 - p)), -SUREST), SUREST)

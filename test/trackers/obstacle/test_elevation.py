@@ -1,0 +1,241 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Sonars that measure elevation: against the Cramer-Rao bound, and in the whole tracker."""
+
+from attrs import evolve
+from helpers.estimates import same
+from helpers.obstacle_runs import FIXED, run, SECOND, track_scene
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle.elevation import Elevations, expected, outliers, updated
+from sonar_imm.trackers.obstacle.filters import depth_span, Hints, Mixture, Sonar
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
+
+STD = np.array([0.15, np.radians(0.25), np.radians(1.0)])
+IDEAL = {
+    'ideal_navigation': True,
+    'sound_speed_error': 0.0,
+    'range_step': 0.0,
+    'bearing_step_deg': 0.0,
+}
+FAITHFUL = {
+    'scale_std': 0.0,
+    'position_noise': 0.0,
+    'yaw_noise_deg': 0.0,
+    'depth_noise': 0.0,
+    'range_scale_std': 0.0,
+    'outlier_probability': 0.0,
+    'range_step': 0.0,
+    'bearing_step_deg': 0.0,
+}
+POSE = geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.05, -0.08, 0.7))
+
+
+def bounds(scene, ranges):
+    """Cramer-Rao bounds of the height of a fixed obstacle when it is first nearer than `ranges`,
+    given range, azimuth and elevation of all pings before and the poses."""
+    truth = scene.truth[0]
+    poses = {
+        item.measurement.stamp_ns: item.measurement
+        for item in scene.measurements
+        if isinstance(item.measurement, Navigation)
+    }
+    information, out = np.zeros((3, 3)), []
+    for k, stamp in enumerate(truth.stamp_ns.tolist()):
+        at = poses[stamp]
+        R = geometry.flip_rotation(geometry.rotation_of_quaternion(at.orientation))
+        pose = geometry.Pose(geometry.flip_world(at.position), R)
+        place = geometry.flip_world(truth.position[k])
+
+        def echo(x, pose=pose):
+            m = geometry.to_body(pose, x)
+            return np.array([*geometry.project(m), np.arcsin(m[2] / np.linalg.norm(m))])
+
+        steps = 1e-4 * np.eye(3)
+        H = np.column_stack([(echo(place + e) - echo(place - e)) / 2e-4 for e in steps])
+        H /= STD[:, None]
+        information += truth.in_beam[k] * H.T @ H
+        if len(out) < len(ranges) and truth.range[k] < ranges[len(out)]:
+            out.append((k, np.sqrt(np.linalg.inv(information)[2, 2])))
+    return out
+
+
+@pytest.mark.statistics
+def test_the_height_is_known_as_well_as_the_cramer_rao_bound_allows():
+    errors, nees = [], []
+    for seed in range(30, 46):
+        scene, final = track_scene('elevation', seed, IDEAL, **FAITHFUL, **FIXED)
+        truth = scene.truth[0]
+        for k, bound in bounds(scene, (60.0, 40.0, 25.0)):
+            estimate = final[int(truth.stamp_ns[k])]
+            (row,) = np.flatnonzero(estimate.extras['track_id'] == 1)
+            error = estimate.state[row, 2] - truth.vertical_offset[k]
+            errors.append(error / bound)
+            nees.append(error**2 / estimate.covariance[row, 2, 2])
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
+    assert 0.6 < np.mean(nees) < 1.5
+
+
+def test_no_sixteen_metres_of_ambiguity():
+    """In calm water, 30 m ahead: a fifth of the metres that a flat sonar leaves, on the right
+    side, among all behaviours."""
+    half = []
+    for std in (0.0, 1.0):
+        overrides = {'elevation_std_deg': std, 'vertical_offset': -3.0, 'offset_spread': 0.0}
+        scene, final = track_scene('calm', 4, overrides)
+        truth = scene.truth[0]
+        k = int(np.flatnonzero(truth.range < 30.0)[0])
+        estimate = final[int(truth.stamp_ns[k])]
+        low, high = (estimate.extras[f'vertical_offset_{end}'][0] for end in ('lo', 'hi'))
+        half.append(0.5 * (high - low))
+    assert low < truth.vertical_offset[k] < high
+    assert half[1] < 0.2 * half[0] and half[1] < 0.5
+    assert estimate.probabilities[0, 0] > 0.999
+
+
+def some_mixture(T=3, K=4, seed=0):
+    rng = np.random.default_rng(seed)
+    x = np.zeros((T, K, 6))
+    x[..., 0] = rng.uniform(20.0, 60.0, (T, K))
+    x[..., 1] = rng.uniform(-0.3, 0.3, (T, K))
+    x[..., 2] = 20.0 + rng.uniform(-4.0, 4.0, (T, K))
+    root = rng.normal(size=(T, K, 6, 6)) * np.array([0.3, 0.01, 1.0, 0.003, 0.3, 0.3])[:, None]
+    return Mixture(x, root @ np.swapaxes(root, -1, -2), rng.dirichlet(np.ones(K), T))
+
+
+@pytest.mark.parametrize('cone', [False, True])
+def test_an_elevation_is_expected_where_geometry_has_it(cone):
+    mixture = some_mixture()
+    angle, H = expected(mixture, POSE, cone)
+    model = 'cone' if cone else 'plane'
+
+    def of(x):
+        m = geometry.reconstruct(x[..., 0], x[..., 1], x[..., 2] - 20.0, POSE.R, model)
+        return np.arcsin(m[..., 2] / x[..., 0])
+
+    np.testing.assert_allclose(angle, of(mixture.x), atol=1e-12)
+    for i, step in enumerate((1e-4, 1e-6, 1e-4, 1e-4)):
+        moved = np.zeros(6)
+        moved[i] = step
+        slope = (of(mixture.x + moved) - of(mixture.x - moved)) / (2.0 * step)
+        if i < 3:
+            np.testing.assert_allclose(H[..., i], slope, rtol=1e-5, atol=1e-7)
+        else:
+            assert not slope.any()
+
+
+def test_an_update_is_that_of_kalman_among_outliers():
+    mixture, config = some_mixture(), ObstacleConfig()
+    angle, H = expected(mixture, POSE, False)
+    seen = Elevations(np.array([0.01, np.nan, -0.05]), np.array([3e-4, 1.0, 1e-4]))
+    after = updated(mixture, seen, 0.1, POSE, config)
+    np.testing.assert_array_equal(after.x[1], mixture.x[1])
+    np.testing.assert_array_equal(after.mu[1], mixture.mu[1])
+    for t in (0, 2):
+        weight = np.empty(4)
+        for j in range(4):
+            P, h = mixture.P[t, j], np.append(H[t, j], np.zeros(3))
+            S = h @ P @ h + seen.variance[t]
+            v, K = seen.angle[t] - angle[t, j], P @ h / S
+            own = 0.9 * norm.pdf(v, 0.0, np.sqrt(S))
+            weight[j] = own + 0.1 / np.radians(config.vertical_fov_deg)
+            beta = own / weight[j]
+            # The mixture of both cases, matched.
+            mean = mixture.x[t, j] + beta * K * v
+            np.testing.assert_allclose(after.x[t, j], mean)
+            cases = [(beta, mixture.x[t, j] + K * v, P - np.outer(K, K) * S)]
+            cases.append((1.0 - beta, mixture.x[t, j], P))
+            spread = sum(b * (C + np.outer(m - mean, m - mean)) for b, m, C in cases)
+            np.testing.assert_allclose(after.P[t, j], spread, atol=1e-12)
+        np.testing.assert_allclose(after.mu[t], mixture.mu[t] * weight / (mixture.mu[t] @ weight))
+
+
+def test_an_echo_that_range_and_azimuth_call_an_outlier_says_nothing_of_the_height():
+    mixture = some_mixture(T=1, K=1)
+    z, R = mixture.x[:, 0, :2] + [[9.0, 0.0]], np.diag([0.02, 2e-5])[None]
+    doubt = outliers(mixture, mixture.x[..., :2], z, R, 0.02, 1.0)
+    assert doubt[0, 0] > 0.999
+    seen = Elevations(np.array([0.05]), np.array([1e-4]))
+    after = updated(mixture, seen, doubt, POSE, ObstacleConfig())
+    np.testing.assert_allclose(after.x, mixture.x, atol=0.02)
+    near = outliers(mixture, mixture.x[..., :2], mixture.x[:, 0, :2], R, 0.02, 1.0)
+    assert near[0, 0] < 0.05
+
+
+def test_new_obstacles_lie_where_the_elevation_says():
+    level = Sonar(geometry.Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), altitude=10.0)
+    z = np.array([[40.0, 0.1], [40.0, 0.1]])
+    ends = np.array([[-0.02, 0.06], [np.nan, np.nan]])
+    hints = Hints(ends, *np.full((2, 2), np.nan))
+    low, high = depth_span(z, level, ObstacleConfig(), hints)
+    plain = depth_span(z, level, ObstacleConfig())
+    assert (low[0], high[0]) == pytest.approx((-0.8, 2.4), abs=0.01)
+    assert (low[1], high[1]) == (plain[0][1], plain[1][1])
+
+
+def still(stamp, echoes):
+    """Navigation of a vehicle that stands, and a ping of echoes: range, bearing, elevation."""
+    rows = np.reshape(echoes, (-1, 3)).T
+    yield Navigation(stamp_ns=stamp, position=[0.0, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0])
+    yield Detections(stamp_ns=stamp, range=rows[0], bearing=rows[1], elevation=rows[2])
+
+
+def test_two_obstacles_one_above_the_other_are_two():
+    """At the same range and bearing, six degrees apart; their echoes come in turns of order."""
+    rng = np.random.default_rng(3)
+    tracker = ObstacleTracker(ObstacleConfig())
+    for k in range(20):
+        echoes = np.array([[40.0, 0.1, 0.05], [40.0, 0.1, -0.055]])
+        echoes += rng.normal(size=(2, 3)) * STD * [1, 1, 0.5]
+        for measurement in still((k + 2) * SECOND // 2, echoes[:: 1 if k % 2 else -1]):
+            made = tracker.process(measurement)
+    assert sorted(made[-1].state[:, 2].round().tolist()) == [-2.0, 2.0]
+    assert made[-1].extras['track_state'].tolist() == [1, 1]
+
+
+def test_rows_without_an_elevation_are_as_ever():
+    scene = simulate(scenario('approach', {'last_range': 60.0}), 2)
+    plain = [item.measurement for item in scene.measurements]
+    unknown = [
+        evolve(each, elevation=np.full(len(each), np.nan), var_elevation=np.full(len(each), 1e-4))
+        if isinstance(each, Detections)
+        else each
+        for each in plain
+    ]
+    ours, theirs = (
+        run(ObstacleTracker(ObstacleConfig()), measurements) for measurements in (plain, unknown)
+    )
+    assert list(ours) == list(theirs) and all(same(ours[k], theirs[k]) for k in ours)
+
+
+def test_an_obstacle_is_followed_when_only_some_echoes_have_an_elevation():
+    scene = simulate(scenario('elevation', {'last_range': 40.0}), 6)
+    measurements = []
+    for number, item in enumerate(scene.measurements):
+        each = item.measurement
+        if isinstance(each, Detections) and number % 3:
+            each = evolve(each, elevation=np.full(len(each), np.nan))
+        measurements.append(each)
+    final = run(ObstacleTracker(ObstacleConfig()), measurements)
+    (last,) = [list(final.values())[-1]]
+    assert set(last.extras['track_id'].tolist()) == {1}
+    assert abs(last.state[0, 2] - scene.truth[0].vertical_offset[-1]) < 0.6
+    assert last.covariance[0, 2, 2] < 0.3**2

@@ -1,0 +1,243 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Obstacles that leave the field of view and come back."""
+
+from attrs import evolve
+from helpers.estimates import same
+from helpers.obstacle_survey import survey
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.obstacle.memory import Existence, kept, SUREST
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.state_file import (
+    json_parameters,
+    read_state,
+    Saved,
+    tracker_from,
+    write_state,
+)
+from sonar_imm.trackers.state_values import frozen_state
+
+OBSTACLES = np.array([[60.0, 5.0, 22.0], [80.0, -4.0, 18.5], [50.0, 20.0, 21.0]])
+SECOND = 10**9
+
+
+def tracker_of(**values):
+    return ObstacleTracker(ObstacleConfig(max_range=60.0, **values))
+
+
+def followed(tracker, measurements, pings):
+    """The numbers of the confirmed tracks at each obstacle in each pass, and the landmarks at
+    every change."""
+    at, numbers, memories = {ping.stamp_ns: ping for ping in pings}, {}, []
+    for measurement in measurements:
+        for estimate in tracker.process(measurement):
+            ping = at[estimate.stamp_ns]
+            sure = estimate.extras['track_state'] > 0
+            for j in np.flatnonzero(ping.seen):
+                off = np.linalg.norm((estimate.xyz - ping.place[j])[:, :2], axis=1)
+                found = estimate.extras['track_id'][sure & (off < 3.0)].tolist()
+                numbers.setdefault((j, ping.leg), set()).update(found)
+        if not memories or tracker.landmarks is not memories[-1]:
+            memories.append(tracker.landmarks)
+    return numbers, memories
+
+
+def test_what_was_passed_has_the_same_number_in_the_third_pass():
+    measurements, pings = survey(OBSTACLES, 7)
+    tracker = tracker_of()
+    numbers, memories = followed(tracker, measurements, pings)
+    for j in range(2):
+        assert len(numbers[j, 0]) == 1 and numbers[j, 2] == numbers[j, 0]
+    assert max(map(len, memories)) >= 2
+    forgetful, _ = followed(tracker_of(max_landmarks=0), measurements, pings)
+    assert forgetful[0, 0] == numbers[0, 0] and forgetful[0, 2].isdisjoint(numbers[0, 0])
+    rows = {row['track_id']: row for row in tracker.known()}
+    (first,) = numbers[0, 0]
+    assert {first, *numbers[1, 0]} <= set(rows)
+    assert rows[first]['existence'] > 0.99
+    assert -24.0 < rows[first]['z_low'] < rows[first]['z_high'] < -19.5
+    assert rows[first]['x'] == pytest.approx(pings[-1].place[0, 0], abs=1.0)
+
+
+@pytest.mark.statistics
+def test_places_of_landmarks_are_as_good_as_they_state():
+    """Over 8 surveys, in the frame that the navigation has at that moment."""
+    level, height, inside, same_number = [], [], [], []
+    for seed in range(200, 208):
+        measurements, pings = survey(OBSTACLES, seed)
+        at = {ping.stamp_ns: ping.place for ping in pings}
+        numbers, memories = followed(tracker_of(), measurements, pings)
+        same_number += [numbers[j, 2] == numbers[j, 0] for j in range(2)]
+        unique = {(mark.track_id, mark.stamp_ns): mark for memory in memories for mark in memory}
+        for mark in unique.values():
+            true = at[mark.stamp_ns]
+            off = mark.place - true[np.argmin(np.linalg.norm((true - mark.place)[:, :2], axis=1))]
+            if np.linalg.norm(off[:2]) > 10.0:
+                continue  # of clutter
+            level.append(off[:2] @ np.linalg.solve(mark.covariance[:2, :2], off[:2]))
+            height.append(off[2] ** 2 / mark.covariance[2, 2])
+            inside.append(mark.low <= mark.place[2] - off[2] <= mark.high)
+    assert np.mean(same_number) >= 0.95
+    assert 1.0 < np.mean(level) < 3.0
+    assert 0.5 < np.mean(height) < 1.6
+    assert 0.78 < np.mean(inside) < 0.98
+
+
+def test_a_landmark_that_is_not_there_any_more_goes():
+    """It lay in the first pass; in the third its place is in plain view and there is nothing."""
+    there, _ = survey(OBSTACLES[:1], 3, clutter=0.0)
+    gone, pings = survey(OBSTACLES[:0], 3, clutter=0.0)
+    first_pass = pings[len(pings) // 3].stamp_ns
+    tracker = tracker_of()
+    for measurement in there:
+        if measurement.stamp_ns < first_pass:
+            tracker.process(measurement)
+    assert len(tracker.landmarks) == 1 and tracker.landmarks[0].existence(first_pass, 1e9) > 0.5
+    seen = 0
+    for measurement in gone:
+        if measurement.stamp_ns >= first_pass:
+            seen += sum(len(estimate) for estimate in tracker.process(measurement))
+    assert seen > 5  # it came back, coasting, and ended by its misses
+    assert tracker.landmarks == () and tracker.known() == []
+
+
+def test_existence_is_that_of_an_obstacle_that_the_beam_holds_always_or_never():
+    existence = Existence.of(np.array([0.5, 0.5, 0.5, 0.5]))
+    no, yes = np.zeros(4, bool), np.array([False, False, False, True])
+    in_beam, p = np.array([1.0, 0.6, 0.0, 1.0]), np.full(4, 0.8)
+    for _ in range(3):
+        existence = existence.after(no, np.zeros(4), in_beam, p, 0.1)
+    odds = np.exp(0.5) * np.array([0.2**3, 0.4 + 0.6 * 0.2**3, 1.0, 0.2**3])
+    np.testing.assert_allclose(existence.now(), np.log(odds))
+    far = existence.after(no, np.zeros(4), in_beam, np.full(4, 0.5), 0.1)
+    assert far.now()[0] == pytest.approx(np.log(np.exp(0.5) * 0.2**3 * 0.5))
+    existence = existence.after(yes, np.full(4, np.log(0.02)), in_beam, p, 0.1)
+    odds = odds[3] * 0.8 * 0.02 / 0.1
+    assert existence.now()[3] == pytest.approx(np.log(odds))
+    assert existence.pings.tolist() == [4.0, 4.0, 0.0, 0.0]
+    for _ in range(20):
+        existence = existence.after(yes, np.full(4, 5.0), in_beam, p, 0.1)
+    assert existence.now()[3] == SUREST
+
+
+def remembered():
+    """A tracker with landmarks, and what was left to hear."""
+    measurements, pings = survey(OBSTACLES, 11)
+    middle = pings[len(pings) // 2].stamp_ns
+    tracker = tracker_of()
+    for measurement in measurements:
+        if measurement.stamp_ns < middle:
+            tracker.process(measurement)
+    assert tracker.landmarks
+    return tracker, [each for each in measurements if each.stamp_ns >= middle]
+
+
+def test_the_oldest_and_least_certain_landmarks_are_given_up_first():
+    mark = remembered()[0].landmarks[0]
+    config = ObstacleConfig(max_landmarks=2, landmark_time=1000.0)
+    hour = 3600 * SECOND
+    memory = tuple(
+        mark._replace(track_id=k, stamp_ns=stamp, log_odds=odds)
+        for k, (stamp, odds) in enumerate([(0, 9.0), (hour, 1.0), (hour, 2.0), (hour // 2, 9.0)])
+    )
+    assert [each.track_id for each in kept(memory, hour, config)] == [1, 2]
+    sure = evolve(config, landmark_time=1e8)
+    assert [each.track_id for each in kept(memory, hour, sure)] == [0, 3]
+    assert [each.track_id for each in kept(memory, hour // 4, config)] == [0]  # not of the future
+    drifted = mark.spread(mark.stamp_ns + hour, config) - mark.covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(drifted)), 0.6)  # .01 m/sqrt(s) for an hour
+
+
+def test_landmarks_are_saved_with_the_state(tmp_path):
+    tracker, rest = remembered()
+    saved = Saved(
+        system='obstacle',
+        parameters=json_parameters(tracker.config),
+        saved_ns=0,
+        newest_ns=None,
+        state=frozen_state(tracker),
+        extras={},
+    )
+    write_state(tmp_path / 'state', saved)
+    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['obstacle'], tracker.config)
+    assert [each.track_id for each in again.landmarks] == [
+        each.track_id for each in tracker.landmarks
+    ]
+    for measurement in rest:
+        ours, theirs = tracker.process(measurement), again.process(measurement)
+        assert len(ours) == len(theirs) and all(map(same, ours, theirs))
+    assert again.known() == tracker.known()
+
+
+def test_landmarks_outlive_a_silence_but_not_a_clock_that_goes_back():
+    """What is in view when the clock jumps ahead is kept as well."""
+    tracker, rest = remembered()
+    known = {row['track_id'] for row in tracker.known()}
+    for measurement in rest[:300]:
+        tracker.process(evolve(measurement, stamp_ns=measurement.stamp_ns + 7200 * SECOND))
+    assert tracker.counts['restarts'] == 1
+    after = {row['track_id'] for row in tracker.known()}
+    assert known & after
+    back, _ = survey(OBSTACLES[:0], 11)
+    for measurement in back[:60]:
+        tracker.process(measurement)
+    assert tracker.counts['restarts'] == 2 and not tracker.landmarks
+
+
+def test_what_moves_is_no_landmark():
+    tracker, most = tracker_of(), 0
+    for k in range(84):
+        away = k >= 80  # the vehicle turns round
+        stamp = (k + 2) * SECOND // 2
+        where = 40.0 - 0.25 * k  # towards a vehicle that stands still
+        m = np.array([where, 12.0 - 0.4 * k, 1.0])
+        d, azimuth = geometry.project(m)
+        tracker.process(Altitude(stamp_ns=stamp, altitude=10.0))
+        tracker.process(
+            Navigation(
+                stamp_ns=stamp,
+                position=[0.0, 0.0, -20.0],
+                orientation=[0.0, 0.0, 1.0 * away, 1.0 - away],
+            )
+        )
+        inside = abs(azimuth) < np.radians(22.5) and not away
+        tracker.process(
+            Detections(
+                stamp_ns=stamp,
+                range=[d] if inside else [],
+                bearing=[-azimuth] if inside else [],
+            )
+        )
+        most = max(most, tracker.health()['confirmed'])
+    assert most == 1 and tracker.health()['tracks'] == 0 and tracker.landmarks == ()
+
+
+def test_late_pings_change_what_is_remembered_as_in_order():
+    measurements, _ = survey(OBSTACLES, 5, passes=2)
+    rng = np.random.default_rng(1)
+    delay = rng.uniform(0.0, 2.0, len(measurements)) * SECOND
+    arrival = np.array([each.stamp_ns for each in measurements]) + delay
+    in_order, shuffled = tracker_of(), tracker_of()
+    for k in range(len(measurements)):
+        in_order.process(measurements[k])
+    for k in np.argsort(arrival, kind='stable'):
+        shuffled.process(measurements[k])
+    assert in_order.known() and shuffled.known() == in_order.known()
