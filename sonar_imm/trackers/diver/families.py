@@ -89,7 +89,7 @@ REACH = 13.8
 
 def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet:
     """The four families, of which two are `heading_speed` sets with two noises of the speed."""
-    noises = (*LIVELY, *QUIET)
+    noises = config.acceleration_noise or (*LIVELY, *QUIET)
     count, moving = len(steady.names), len(noises)
     family = np.repeat(np.arange(4), [count, count, len(LIVELY), len(QUIET)])
     M, T = len(family), config.reference_step
@@ -329,9 +329,11 @@ def reacquired(
     models: ModelSet,
     chain: AdaptiveChain,
     layout: Layout,
+    unseen: BoolArray,
 ) -> tuple[DiverState, bool]:
     """What becomes of tracks that were not `hit` (T,) by a group of fixes of which some are `left`
-    (D,), and whether one began anew; whole (T, D) as in `Densities`.
+    (D,), and whether one began anew; whole (T, D) as in `Densities`; unseen (T,): tracks where the
+    sensor does not see, who may have done anything there.
 
     A fix that may have been a track's own and was not believed is remembered. One that agrees with
     it, as the next fix of a track that began at the first would, begins the track anew.
@@ -344,7 +346,8 @@ def reacquired(
     for track, row in _refusals(now, fixes, hit, left, whole):
         z, R = fixes.z[row], fixes.R[row]
         parts = None
-        if np.isfinite(refused[track, 0]) and _may_be_lost(now, track, fixes):
+        lost = _reaches(now, track, z, fixes) if unseen[track] else _may_be_lost(now, track, fixes)
+        if np.isfinite(refused[track, 0]) and lost:
             parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
         refused = refused.copy()
         if parts is None:
@@ -388,6 +391,14 @@ def _may_be_lost(now: DiverState, track: int, fixes: Positions) -> bool:
         return True
     missed = 1.0 - fixes.config.detection_probability
     return bool(missed ** (now.life.misses[track] + 1) <= LOST)
+
+
+def _reaches(now: DiverState, track: int, z: FloatArray, fixes: Positions) -> bool:
+    """Whether the diver of a track may have come to z (2,) since he was seen."""
+    mean = now.mu[track] @ now.x[track, :, :2]
+    passed = (now.stamp_ns - int(now.life.last_hit_ns[track])) * 1e-9
+    fastest = fixes.config.speed_mean + 3.0 * fixes.config.speed_std
+    return bool(np.hypot(*(z - mean)) <= fastest * passed)
 
 
 def _anew(

@@ -42,6 +42,7 @@ from ...estimation.covariance import is_psd
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
+from .coverage import Seen
 from .ping_kernels import (
     DEGREES,
     expect_measurements,
@@ -133,9 +134,11 @@ def associate_and_update(
     config: DiverConfig,
     factor: float,
     models: ModelSet,
+    detected: Seen | None = None,
 ) -> tuple[DiverState, BoolArray]:
     """The tracks after a ping, `factor` on the variances of its arrival times, and the rows (n,)
-    that are no track's. A tag whose name is known has a track of its own or begins one."""
+    that are no track's; detected: how probable a detection is, None where it is the same
+    everywhere. A tag whose name is known has a track of its own or begins one."""
     name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(now.target_id == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
@@ -153,6 +156,9 @@ def associate_and_update(
         return with_takings(now, takings), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
     takings, taken, score = explain(now, seen, config, layout, factor)
+    if detected is not None:
+        looks = 1 if ping.passive else len(seen.nodes)
+        score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
     free[seen.row[taken & seen.echo]] = False
     if ping.passive and not free.all():
         free[:] = False  # all are of one track, also those that were not used

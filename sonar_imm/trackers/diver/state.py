@@ -74,6 +74,7 @@ ROWS = (
     'near_to',
     'near_for',
     'refused',
+    'looks',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -169,11 +170,13 @@ class DiverState(NamedTuple):
     target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
     track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
-    believed, NaN since it took another (`families`); scale (2, 2): for
+    believed, NaN since it took another (`families`); looks (T,): parts of a miss that have not
+    been counted yet, where the sensor does not see everywhere (`coverage`); scale (2, 2): for
     fixes and for arrivals the sum of squared residuals in units of their stated variance, and
     their number; fixes, arrivals: what innovations say of the stated covariances of either;
-    last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
-    because their numbers were not finite; not_started: starts so far for which there was no room;
+    excess: of `estimation.consistency`, that those of arrivals are too small; last_named: names
+    and the stamp of each one's last measurement; broken: tracks ended so far because their numbers
+    were not finite; not_started: starts so far for which there was no room;
     repairs: covariances repaired so far (`estimation.covariance`).
     """
 
@@ -193,9 +196,11 @@ class DiverState(NamedTuple):
     near_to: IntArray
     near_for: IntArray
     refused: FloatArray
+    looks: FloatArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
+    excess: float = 0.0
     instruments: Instruments = Instruments()
     last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
@@ -223,6 +228,7 @@ class DiverState(NamedTuple):
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
             refused=np.empty((0, 6)),
+            looks=np.empty(0),
             scale=np.zeros((2, 2)),
         )
 
