@@ -35,7 +35,7 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SECONDS, SETTLED, FAR = 120, 10, 20.0
 
-CASES = {
+CASES: dict[str, tuple[str, float, float, int, int, float]] = {
     'boat, 12 m/s': ('boat', 12.0, 60.0, 15, 4, 1.0),
     'boat, 4 m/s': ('boat', 4.0, 60.0, 15, 4, 1.0),
     'ship, 6 m/s': ('ship', 6.0, 15.0, 40, 20, 1.0),
@@ -57,12 +57,12 @@ def path(
 
 
 def case(name: str, values: dict[str, Any], runs: int) -> dict[str, float]:
-    _, *motion, std = CASES[name]
+    _, speed, turn_deg, leg, turning, std = CASES[name]
     squared: list[float] = []
     ids, scans = 0, 0
     for seed in range(runs):
         rng = np.random.default_rng([63, seed])
-        truth, seen = path(*motion, rng), set()
+        truth, seen = path(speed, turn_deg, leg, turning, rng), set()
         tracker = DiverTracker(DiverConfig(**values))
         for second, place in enumerate(truth, start=1):
             at = np.append(place + std * rng.normal(size=2), 0.0)
@@ -87,7 +87,7 @@ def case(name: str, values: dict[str, Any], runs: int) -> dict[str, float]:
 def main(runs: int = 4) -> Parts:
     yield {'runs': runs}
     for name, (kind, *_) in CASES.items():
-        ways = {
+        ways: dict[str, dict[str, Any]] = {
             'default': {},
             'named': {'target': kind},
             'cv': {'model_set': 'cv', 'acceleration_noise': (1.0,), 'velocity_std': 10.0},

@@ -57,7 +57,7 @@ from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .models import build_models
-from .scan import name_of, Positions, Scan
+from .scan import Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments, Layout
 
@@ -255,24 +255,12 @@ class DiverTracker:
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
         for ping in scan.pings:
-            now, free = self._heard(now, ping, scan.factor)
+            of_ping = ping, self.config, scan.factor, self.models, self._covered
+            now, free = pings.associate_and_update(now, *of_ping)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
         now = self._learn(before, now, step, scan)
         now = self._prune(now, scan)
         return self._spawn(now, found, scan.starts)
-
-    def _heard(
-        self, now: DiverState, ping: Arrivals, factor: float
-    ) -> tuple[DiverState, BoolArray]:
-        """The tracks after a ping, and its rows (n,) that are no track's."""
-        config, before = self.config, now.nis_dof
-        seen = coverage.detectable(self._covered, '', now, config)
-        now, free = pings.associate_and_update(now, ping, config, factor, self.models, seen)
-        if self._covered and config.fixes_are_scans and name_of(ping) == NOBODY:
-            share = (now.nis_dof == before) & (now.target_id == NOBODY)
-            mask = self._layout(now.instruments).mask
-            now = coverage.missed(now, seen, share.astype(np.float64), mask)
-        return now, free
 
     def _scan(self, before: DiverState, items: Sequence[Measurement]) -> Scan:
         stated = self.config.covariance_scale
