@@ -141,15 +141,39 @@ class NisMemory:
         low, high = self.bounds
         return int(self.mean > high) - int(self.mean < low)
 
-    def warnings(self, what: str, advice: str) -> list[str]:
-        """A sentence where `what` states covariances that cannot be true."""
-        if not self.verdict:
+    def warnings(self, what: str, advice: str, *, more_than_stated: bool = False) -> list[str]:
+        """A sentence where `what` states covariances that cannot be true; more_than_stated: that
+        is known before there are hits enough for a verdict."""
+        verdict = 1 if more_than_stated else self.verdict
+        if not verdict:
             return []
-        more = 'more' if self.verdict > 0 else 'less'
+        more = 'more' if verdict > 0 else 'less'
         return [
             f'what the sensor states cannot be true: {what} miss by {more} than stated, mean NIS '
             f'{self.mean:.2g} for each coordinate, 1 is due; {advice}'
         ]
+
+
+TWICE, ENOUGH, MOST_EACH = 2.0, 10.0, 4.0
+"""Covariance, in units of the stated one, that `excess` asks for; evidence that is enough; the
+most of an innovation that counts as evidence, for each degree of freedom."""
+
+
+def excess(evidence: float, nis: FloatArray, dof: FloatArray) -> float:
+    """The evidence after hits nis (K,) of dof (K,) degrees of freedom that innovations have
+    `TWICE` the stated covariance: the sum of log-likelihood ratios since it was last at 0 (Page
+    1954, *Continuous inspection schemes*), `ENOUGH` long before a mean is sure. It stays between 0
+    and twice `ENOUGH`.
+
+    >>> import numpy as np
+    >>> excess(0.0, np.array([12.0]), np.array([3.0])) > 1.5 > excess(1.5, np.ones(1), np.ones(1))
+    True
+    """
+    for value, m in zip(nis.tolist(), dof.tolist()):
+        gained = 0.5 * (1.0 - 1.0 / TWICE) * min(value, MOST_EACH * m)
+        evidence += gained - 0.5 * m * math.log(TWICE)
+        evidence = min(max(evidence, 0.0), 2.0 * ENOUGH)
+    return evidence
 
 
 def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> float:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from attrs import evolve, frozen
 
@@ -38,14 +39,59 @@ MODEL_SETS = (
 BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 """The single-direction sets and how many models they have."""
 
+TARGETS: dict[str, dict[str, Any]] = {
+    'diver': {},
+    'rov': {
+        'speed_mean': 0.4,
+        'speed_std': 0.3,
+        'velocity_std': 0.5,
+        'hover_enter': 0.05,
+        'hover_stay': 0.95,
+        'acceleration_noise': (0.05, 0.4, 0.02),
+    },
+    'fish': {
+        'speed_mean': 0.6,
+        'speed_std': 0.5,
+        'velocity_std': 0.8,
+        'brisk_speed_noise': 0.2,
+        'stay_probability': 0.7,
+        'acceleration_noise': (0.1, 1.0, 0.05),
+    },
+    'boat': {
+        'speed_mean': 6.0,
+        'speed_std': 5.0,
+        'velocity_std': 8.0,
+        'speed_noise': 0.05,
+        'brisk_speed_noise': 0.5,
+        'lateral_noise': 1.0,
+        'stay_probability': 0.95,
+        'acceleration_noise': (0.3, 2.5, 0.1),
+    },
+    'ship': {
+        'speed_mean': 6.0,
+        'speed_std': 3.0,
+        'velocity_std': 7.0,
+        'speed_noise': 0.02,
+        'brisk_speed_noise': 0.1,
+        'lateral_noise': 0.5,
+        'stay_probability': 0.98,
+        'hover_enter': 0.001,
+        'acceleration_noise': (0.03, 0.3, 0.01),
+    },
+}
+"""What takes the place of the defaults for each kind of target, in the units of the parameters."""
+
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate')
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 NAMED_TRACKS = ('share', 'alone')
 VESSELS = ('moving', 'fixed')
 RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
-SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density')
-"""Parameters that may differ from sensor to sensor."""
+SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density', 'coverage_file')
+"""Parameters that may differ from sensor to sensor, as `coverage_sector` may."""
+
+SECTOR = 6
+"""Numbers of a sector."""
 
 _WORD = re.compile(r'[A-Za-z0-9_]+')
 
@@ -59,6 +105,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # -- which models ----------------------------------------------------------------------------
     model_set: str = parameter('families', '',
         'motion models run side by side', choices=MODEL_SETS)
+    target: str = parameter('diver', '',
+        'kind of target, for the motion of families: diver, rov, fish, boat or ship set speeds, '
+        'accelerations and turns of that kind, wherever a parameter is at its default',
+        choices=tuple(TARGETS))
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))
     hover: bool = parameter(True, '',
@@ -131,8 +181,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'world_headings and relative_headings: velocity noise over a reference step',
         range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
-        'cv, cv_cv and cv_ct: acceleration noise of each model over a reference step; empty: '
-        'values tuned for divers', range=(0.0, 100.0), kind='float[]')
+        'cv, cv_cv and cv_ct: acceleration noise of each model over a reference step; families: '
+        'of lively_calm, lively_sharp and quiet; empty: values tuned for divers',
+        range=(0.0, 100.0), kind='float[]')
     turn_rate_deg: float = parameter(20.0, 'deg/s',
         'cv_ct: turn rate of the two CT models', range=(0.0, 180.0))
 
@@ -226,6 +277,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     survival_time: float = live(500.0, 's',
         'jipda and kbest: time for which a diver is expected to stay', range=(1.0, 1e7))
 
+    # -- what the sensor covers ------------------------------------------------------------------
+    coverage_sector: tuple[float, ...] = live((), 'm, deg',
+        'six numbers: x and y of the sensor; direction of the middle of its sector, '
+        'counterclockwise from x, and width of the sector in degrees; least and greatest range. A '
+        'diver is detected with detection_probability inside and not at all outside; empty: '
+        'everywhere', kind='float[]')
+    coverage_file: str = parameter('', '',
+        'CSV file of the probability of detection, in place of detection_probability: a grid with '
+        'the columns x, y, probability, or range, probability with the range from the place in '
+        'coverage_sector, else the origin; outside it is 0; empty: none')
+
     # -- names -----------------------------------------------------------------------------------
     tags: tuple[str, ...] = parameter((), '',
         'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
@@ -248,6 +310,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     sensor_detection_probability: tuple[float, ...] = parameter((), '',
         'detection_probability of each of the sensors; empty: as detection_probability',
         range=(0.01, 0.9999), kind='float[]')
+    sensor_coverage_sector: tuple[float, ...] = live((), 'm, deg',
+        'coverage_sector of each of the sensors, six numbers each; a width of 360 and a range '
+        'from 0 to 1e6 is everywhere; empty: as coverage_sector', kind='float[]')
+    sensor_coverage_file: tuple[str, ...] = parameter((), '',
+        "coverage_file of each of the sensors, '' for none; empty: as coverage_file",
+        kind='str[]')
     sensor_clutter_density: tuple[float, ...] = parameter((), '1/m^2',
         'clutter_density of each of the sensors; empty: as clutter_density', range=(1e-12, 1e4),
         kind='float[]')
@@ -318,15 +386,31 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                 f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'
             )
         models = self.model_count()
-        if self.model_set in BASELINES and len(self.acceleration_noise) not in (0, models):
+        noises = BASELINES.get(self.model_set, 3)
+        if self._accelerates() and len(self.acceleration_noise) not in (0, noises):
             problems.append(
-                f'acceleration_noise needs one value for each of the {models} models of '
+                f'acceleration_noise needs one value for each of the {noises} models of '
                 f'{self.model_set}, got {len(self.acceleration_noise)}'
             )
         problems += chain_problems(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
         )
         return problems
+
+    def _accelerates(self) -> bool:
+        return self.model_set in BASELINES or self.model_set == 'families'
+
+    def for_target(self) -> DiverConfig:
+        """These parameters with those of the kind of target where they are at their defaults."""
+        if self.model_set != 'families':
+            return self
+        defaults = {spec.name: spec.default for spec in self.specs()}
+        own = {
+            name: value
+            for name, value in TARGETS[self.target].items()
+            if getattr(self, name) == defaults[name]
+        }
+        return evolve(self, **own) if own else self
 
     def _place_problems(self) -> list[str]:
         return [
@@ -344,11 +428,28 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                     f'sensor_{name} needs one value for each of the {len(self.sensors)} sensors, '
                     f'got {len(given)}'
                 )
+        places = 'coverage_sector', 'sensor_coverage_sector'
+        for name, count in zip(places, (1, len(self.sensors))):
+            sectors = getattr(self, name)
+            if len(sectors) not in (0, SECTOR * count):
+                each = f' for each of the {count} sensors' if name != places[0] else ''
+                problems.append(f'{name} needs {SECTOR} values{each}, got {len(sectors)}')
+                continue
+            for first in range(0, len(sectors), SECTOR):
+                width, least, greatest = sectors[first + 3 : first + SECTOR]
+                if not 0.0 < width <= 360.0:
+                    problems.append(f'{name}: a width of {width:g} is not between 0 and 360')
+                if not 0.0 <= least < greatest:
+                    problems.append(
+                        f'{name}: a range from {least:g} to {greatest:g} holds nothing'
+                    )
         for name in ('tags', 'sensors'):
             if bad := [word for word in getattr(self, name) if not _WORD.fullmatch(word)]:
                 problems.append(
                     f"{name}: '{bad[0]}' cannot be part of a topic; letters, digits and _ can"
                 )
+        if self.association == 'kbest' and (self.coverage_sector or self.coverage_file):
+            problems.append('association kbest needs a sensor that sees everywhere: no coverage_')
         return problems
 
     def origin(self) -> Origin | None:
@@ -362,14 +463,14 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         if sensor not in self.sensors:
             return self
         place = self.sensors.index(sensor)
-        return evolve(
-            self,
-            **{
-                name: values[place]
-                for name in SENSOR_NUMBERS
-                if (values := getattr(self, f'sensor_{name}'))
-            },
-        )
+        own = {
+            name: values[place]
+            for name in SENSOR_NUMBERS
+            if (values := getattr(self, f'sensor_{name}'))
+        }
+        if sectors := self.sensor_coverage_sector:
+            own['coverage_sector'] = sectors[SECTOR * place : SECTOR * (place + 1)]
+        return evolve(self, **own)
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""

@@ -52,6 +52,7 @@ from ...measurements import NOBODY
 from . import family_kernels
 from .baselines import white_acceleration
 from .config import DiverConfig
+from .coverage import Seen
 from .family_kernels import HEADING, HOVER, Mixing, VELOCITY
 from .fix_kernels import expected
 from .scan import Positions
@@ -89,7 +90,7 @@ REACH = 13.8
 
 def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet:
     """The four families, of which two are `heading_speed` sets with two noises of the speed."""
-    noises = (*LIVELY, *QUIET)
+    noises = config.acceleration_noise or (*LIVELY, *QUIET)
     count, moving = len(steady.names), len(noises)
     family = np.repeat(np.arange(4), [count, count, len(LIVELY), len(QUIET)])
     M, T = len(family), config.reference_step
@@ -241,13 +242,17 @@ def fit(
     expected: FloatArray,
     H: FloatArray,
     found: Densities | None,
+    seen: Seen | None = None,
 ) -> FloatArray:
     """The log density (T, D) of each fix under each track, -inf where it cannot be its own: by the
-    densities found, or by the gate of sets that have none."""
+    densities found, or by the gate of sets that have none. seen: how much more or less probable
+    detections are than anywhere, see `coverage`."""
+    ratio = 0.0 if seen is None else seen.log_ratio
     if found is not None:
-        return np.where(found.whole > bound(fixes.config), found.whole, -np.inf)
+        fit = found.whole + ratio
+        return np.where(fit > bound(fixes.config), fit, -np.inf)
     threshold = gate_threshold(fixes.config.gate_probability, 2)
-    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
 
 
 def update(
@@ -365,9 +370,11 @@ def reacquired(
     models: ModelSet,
     chain: AdaptiveChain,
     layout: Layout,
+    unseen: BoolArray,
 ) -> tuple[DiverState, bool]:
     """What becomes of tracks that were not `hit` (T,) by a group of fixes of which some are `left`
-    (D,), and whether one began anew; whole (T, D) as in `Densities`.
+    (D,), and whether one began anew; whole (T, D) as in `Densities`; unseen (T,): tracks where the
+    sensor does not see, who may have done anything there.
 
     A fix that may have been a track's own and was not believed is remembered. One that agrees with
     it, as the next fix of a track that began at the first would, begins the track anew.
@@ -380,7 +387,8 @@ def reacquired(
     for track, row in _refusals(now, fixes, hit, left, whole):
         z, R = fixes.z[row], fixes.R[row]
         parts = None
-        if np.isfinite(refused[track, 0]) and _may_be_lost(now, track, fixes):
+        lost = _reaches(now, track, z, fixes) if unseen[track] else _may_be_lost(now, track, fixes)
+        if np.isfinite(refused[track, 0]) and lost:
             parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
         refused = refused.copy()
         if parts is None:
@@ -424,6 +432,14 @@ def _may_be_lost(now: DiverState, track: int, fixes: Positions) -> bool:
         return True
     missed = 1.0 - fixes.config.detection_probability
     return bool(missed ** (now.life.misses[track] + 1) <= LOST)
+
+
+def _reaches(now: DiverState, track: int, z: FloatArray, fixes: Positions) -> bool:
+    """Whether the diver of a track may have come to z (2,) since he was seen."""
+    mean = now.mu[track] @ now.x[track, :, :2]
+    passed = (now.stamp_ns - int(now.life.last_hit_ns[track])) * 1e-9
+    fastest = fixes.config.speed_mean + 3.0 * fixes.config.speed_std
+    return bool(np.hypot(*(z - mean)) <= fastest * passed)
 
 
 def _anew(

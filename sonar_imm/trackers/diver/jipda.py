@@ -33,6 +33,7 @@ from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTA
 from ...measurements import NOBODY
 from . import families, names
 from .config import DiverConfig
+from .coverage import Seen
 from .scan import Positions
 from .state import DiverState
 from .state_space import Layout
@@ -57,6 +58,9 @@ NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
 """The same of a confirmed track and an older confirmed one: two tracks on one diver. There may be
 more scans where two divers are seldom detected both, see `names.patience`."""
 
+LEAST_DETECTED = 1e-9
+"""Probability of detection of a track outside of all that the sensor covers: that of a fix is
+divided by it."""
 
 StatusArray = NDArray[np.uint8]
 
@@ -78,13 +82,19 @@ class JointWeights(NamedTuple):
         hit = np.flatnonzero(self.detected > 0.5 * self.existence)
         return hit, self.beta[hit].argmax(axis=1) if len(hit) else hit
 
+    @property
+    def missed_share(self) -> FloatArray:
+        """(T,) how probable it is that a track has no fix, if its diver exists."""
+        return np.minimum(self.missed / np.maximum(self.existence, 1e-300), 1.0)
+
 
 class Association(NamedTuple):
     """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
     (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
     may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
     where these and not the pairs update the tracks; densities: of all pairs, of `families`;
-    counted (T,): tracks whose innovations tell how consistent fixes are, None for all."""
+    counted (T,): tracks whose innovations tell how consistent fixes are, None for all; seen: how
+    probable detections are, where the sensor does not see everywhere."""
 
     tracks: IndexArray
     detection: IntArray
@@ -95,6 +105,7 @@ class Association(NamedTuple):
     weights: JointWeights | None = None
     densities: families.Densities | None = None
     counted: BoolArray | None = None
+    seen: Seen | None = None
 
 
 def joint_weights(
@@ -104,9 +115,11 @@ def joint_weights(
     H: FloatArray,
     excluded: BoolArray,
     densities: families.Densities | None,
+    seen: Seen | None = None,
 ) -> JointWeights:
     """Weigh all pairings of tracks and `fixes`; h (T, M, 2) expected by H (1, M, 2, n); densities:
-    of the pairs, where these and no chi-square gate them."""
+    of the pairs, where these and no chi-square gate them; seen: how probable detections are, where
+    the sensor does not see everywhere."""
     config = fixes.config
     if densities is None:
         threshold = gate_threshold(config.gate_probability, 2)
@@ -119,15 +132,21 @@ def joint_weights(
         apart = 2.0 * (
             densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole
         )
-        nis = np.where(densities.whole > families.bound(config), apart, np.inf)
+        ratio = 0.0 if seen is None else seen.log_ratio
+        nis = np.where(densities.whole + ratio > families.bound(config), apart, np.inf)
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
-    seen = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
+    looked = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
+    ratio, detected = mixture / (config.clutter_density + config.birth_density), np.ones(1)
+    detected = detected * config.detection_probability
+    if seen is not None:
+        detected = np.maximum(seen.tracks, LEAST_DETECTED)
+        ratio = ratio * seen.fixes[None] / detected[:, None]
     beta, missed, existence = joint_association.associate(
-        mixture / (config.clutter_density + config.birth_density),
+        ratio,
         nis,
         known_existence(now.existence, now.life.status),
-        np.where(seen, config.detection_probability, 0.0),
+        np.where(looked, detected, 0.0),
         threshold,
     )
     return JointWeights(beta, missed, beta.sum(axis=1), existence, excluded)
@@ -224,6 +243,7 @@ def judge(
         return Judged(status, alive, now.near_to, now.near_for)
     nameless = [group for group in fixes if group.target_id is None]
     near_to, near_for = coalescence(now, was, *now.positions(E), nameless)
+    near_for = np.where(looked, near_for, np.where(near_to == now.near_to, now.near_for, 0))
     scans = [names.patience(group.config.detection_probability) for group in nameless]
     patience = np.where(was, max([SCANS_CONFIRMED, *scans]), SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)

@@ -27,7 +27,7 @@ one step here: an `Explanation` says what each track that takes part becomes, an
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import math
 from typing import NamedTuple
 
@@ -41,6 +41,7 @@ from ...estimation.association import assign, association_cost, gate_threshold, 
 from ...estimation.covariance import is_psd
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
+from . import coverage
 from .config import DiverConfig
 from .ping_kernels import (
     DEGREES,
@@ -82,6 +83,9 @@ NEAR = 28.0
 
 TAKEN = 0.5
 """Probability of being good from which a measurement counts as a track's."""
+
+EVERYWHERE: Mapping[str, coverage.Coverage] = {}
+"""Nothing is stated of what a sensor covers."""
 
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
@@ -133,9 +137,30 @@ def associate_and_update(
     config: DiverConfig,
     factor: float,
     models: ModelSet,
+    covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
 ) -> tuple[DiverState, BoolArray]:
     """The tracks after a ping, `factor` on the variances of its arrival times, and the rows (n,)
-    that are no track's. A tag whose name is known has a track of its own or begins one."""
+    that are no track's; covered: what is stated of sensors. A tag whose name is known has a track
+    of its own or begins one."""
+    before, seen = now.nis_dof, coverage.detectable(covered, '', now, config)
+    now, free = _by_ping(now, ping, config, factor, models, seen)
+    if covered and config.fixes_are_scans and name_of(ping) == NOBODY:
+        share = (now.nis_dof == before) & (now.target_id == NOBODY)
+        mask = now.instruments.layout(config, models).mask
+        now = coverage.missed(now, seen, share.astype(np.float64), mask)
+    return now, free
+
+
+def _by_ping(
+    now: DiverState,
+    ping: Arrivals,
+    config: DiverConfig,
+    factor: float,
+    models: ModelSet,
+    detected: coverage.Seen | None,
+) -> tuple[DiverState, BoolArray]:
+    """`associate_and_update` of what was heard; detected: how probable a detection is, None where
+    it is the same everywhere."""
     name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(now.target_id == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
@@ -153,6 +178,9 @@ def associate_and_update(
         return with_takings(now, takings), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
     takings, taken, score = explain(now, seen, config, layout, factor)
+    if detected is not None:
+        looks = 1 if ping.passive else len(seen.nodes)
+        score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
     free[seen.row[taken & seen.echo]] = False
     if ping.passive and not free.all():
         free[:] = False  # all are of one track, also those that were not used

@@ -56,7 +56,7 @@ class Positions:
     config: the parameters, with those of the sensor; factor: what the stated covariances were
     multiplied by to give R; target_id: (D,) whose fixes they are, None when that is not known of
     any; whole: whether they are all that there was to see, so that a diver without a fix was
-    missed.
+    missed; sensor: its name.
     """
 
     z: FloatArray
@@ -65,6 +65,7 @@ class Positions:
     factor: float
     target_id: IntArray | None
     whole: bool
+    sensor: str = ''
 
 
 @frozen(eq=False)
@@ -173,7 +174,7 @@ def _group(
         R = np.where(stated[:, None, None], scan.covariance, R)
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(scan.position[rows, :2])
-    return Positions(z, R[rows] * factor, config, factor, target_id, not named)
+    return Positions(z, R[rows] * factor, config, factor, target_id, not named, scan.sensor)
 
 
 def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
@@ -184,7 +185,8 @@ def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Posit
     for row, fix in enumerate(fixes):
         z[row] = fix.position[:2]
         R[row] = unknown if fix.covariance is None else fix.covariance
-    return Positions(z, R * factor, config, factor, None, config.fixes_are_scans)
+    whole, sensor = config.fixes_are_scans, fixes[0].sensor
+    return Positions(z, R * factor, config, factor, None, whole, sensor)
 
 
 # -- pings ---------------------------------------------------------------------------------------

@@ -77,6 +77,7 @@ ROWS = (
     'refused',
     'history',
     'came_from',
+    'looks',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -174,11 +175,14 @@ class DiverState(NamedTuple):
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
     believed, NaN since it took another (`families`); history (T, w): the numbers of its last
     fixes, came_from (T,): which row it was before this scan, -1 for none, hypotheses: which rows
-    belong together, and serial: of the last fix (`kbest`; nothing elsewhere); scale (2, 2): for
+    belong together, and serial: of the last fix (`kbest`; nothing elsewhere); looks (T,): parts
+    of a miss that have not been counted yet, where the sensor does not see everywhere
+    (`coverage`); scale (2, 2): for
     fixes and for arrivals the sum of squared residuals in units of their stated variance, and
     their number; fixes, arrivals: what innovations say of the stated covariances of either;
-    last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
-    because their numbers were not finite; not_started: starts so far for which there was no room;
+    excess: of `estimation.consistency`, that those of arrivals are too small; last_named: names
+    and the stamp of each one's last measurement; broken: tracks ended so far because their numbers
+    were not finite; not_started: starts so far for which there was no room;
     repairs: covariances repaired so far (`estimation.covariance`).
     """
 
@@ -200,9 +204,11 @@ class DiverState(NamedTuple):
     refused: FloatArray
     history: IntArray
     came_from: IntArray
+    looks: FloatArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
+    excess: float = 0.0
     instruments: Instruments = Instruments()
     hypotheses: Hypotheses = Hypotheses.none()
     serial: int = 0
@@ -234,6 +240,7 @@ class DiverState(NamedTuple):
             refused=np.empty((0, 6)),
             history=np.empty((0, 0), np.int64),
             came_from=np.empty(0, np.int64),
+            looks=np.empty(0),
             scale=np.zeros((2, 2)),
         )
 

@@ -44,12 +44,13 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, TENTATIVE, Tracks
+from ...estimation.consistency import ENOUGH, excess
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, families, fix_kernels, jipda, kbest, names, pings
+from . import births, coverage, families, fix_kernels, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -57,7 +58,7 @@ from .jipda import Association
 from .models import build_models
 from .scan import Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
-from .state_space import Instruments, Layout
+from .state_space import Instruments
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
@@ -72,7 +73,7 @@ class DiverTracker:
     STATE = ('_stream', '_georeferencer')
 
     def __init__(self, config: DiverConfig):
-        self.models = build_models(config)
+        self.models = build_models(config := config.for_target())
         self._position = np.ascontiguousarray(self.models.E[:, :2])
         mixing = self.models.mixing
         kind = partial(families.FamilyChain, mixing.family) if mixing else AdaptiveChain
@@ -90,10 +91,9 @@ class DiverTracker:
         self.config = config
         self._keeps_hypotheses = config.association == 'kbest'
         self.rules = track_rules(config)
-        self._layout = lru_cache(maxsize=16)(self._layout_of)
-
-    def _layout_of(self, instruments: Instruments) -> Layout:
-        return instruments.layout(self.config, self.models)
+        layouts = partial(Instruments.layout, config=config, models=self.models)
+        self._layout = lru_cache(maxsize=16)(layouts)
+        self._covered = coverage.stated(config)
 
     def reset(self) -> None:
         self._stream = ReplayStream(
@@ -124,6 +124,7 @@ class DiverTracker:
         return self._stream.frames
 
     def reconfigure(self, config: DiverConfig) -> None:
+        config = config.for_target()
         self.config.require_changeable(config)
         self._settle(config)
         self._georeferencer.config = config
@@ -144,9 +145,8 @@ class DiverTracker:
         tracker = self._for_warming()
         for second in (1, 2):
             for x in (0.0, 0.1):
-                position = np.array([x, 0.0, 0.0])
-                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
-                tracker.process(fix)
+                at = np.array([x, 0.0, 0.0])
+                tracker.process(Fix(stamp_ns=second * 10**9, position=at, covariance=np.eye(2)))
 
     def _warm_echoes(self) -> None:
         self._warm_pings(np.zeros(3))
@@ -212,7 +212,7 @@ class DiverTracker:
         return [
             *self._georeferencer.warnings(),
             *state.fixes.warnings(self.config.fix_bias_std > 0.0),
-            *state.arrivals.warnings('arrivals', advice),
+            *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
             *births.no_room(state, self.config),
         ]
 
@@ -242,14 +242,15 @@ class DiverTracker:
             if again:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
+            if self._covered and fixes.whole and fixes.target_id is None:
+                now = self._missed(now, fixes, association)
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
         if scan.pings and self._keeps_hypotheses:
             now = kbest.decided(now)
         for ping in scan.pings:
-            now, free = pings.associate_and_update(
-                now, ping, self.config, scan.factor, self.models
-            )
+            of_ping = ping, self.config, scan.factor, self.models, self._covered
+            now, free = pings.associate_and_update(now, *of_ping)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
         now = self._learn(before, now, step, scan)
         now = self._prune(now, scan)
@@ -305,25 +306,38 @@ class DiverTracker:
         excluded = now.target_id != NOBODY
         if config.named_tracks == 'share':
             excluded = np.zeros(len(excluded), bool)
+        where = now, config, fixes.z, fixes.R
+        seen = coverage.detectable(self._covered, fixes.sensor, *where)
         if config.association == 'jipda':
-            weights = jipda.joint_weights(now, fixes, expected, H, excluded, densities)
+            weights = jipda.joint_weights(now, fixes, expected, H, excluded, densities, seen)
             claimed = weights.beta.sum(axis=0)
             existence = jipda.birth_existence(config, claimed)
             tracks, likeliest = weights.likeliest()
             free = claimed < 0.5
-            return Association(
-                tracks, likeliest, expected, now.score, free, existence, weights, densities
-            )
-        fit = families.fit(now, fixes, expected, H, densities)
+            by_weights = free, existence, weights, densities
+            return Association(tracks, likeliest, expected, now.score, *by_weights, seen=seen)
+        fit = families.fit(now, fixes, expected, H, densities, seen)
         fit[excluded] = -np.inf
         p, clutter = config.detection_probability, config.clutter_density
         chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
         logs = np.log1p(-p), np.log(p / (1.0 - p)), np.log(clutter)
         score = fix_kernels.scores(now.score, fit, chosen, excluded, *logs)
+        if seen is not None:
+            score = score + np.where(excluded, 0.0, np.log1p(-seen.tracks) - logs[0])
         tracks = np.flatnonzero(chosen >= 0)
         free = np.ones(len(fixes.z), bool)
         free[chosen[tracks]] = False
-        return Association(tracks, chosen[tracks], expected, score, free, densities=densities)
+        hits = tracks, chosen[tracks], expected
+        return Association(*hits, score, free, densities=densities, seen=seen)
+
+    def _missed(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
+        """With what it says of the tracks that the sensor looked, and did not see them."""
+        weights = association.weights
+        share = np.ones(len(now.x)) if weights is None else weights.missed_share
+        share[association.tracks] = 0.0
+        if self.config.named_tracks == 'alone':
+            share[now.target_id != NOBODY] = 0.0
+        return coverage.missed(now, association.seen, share, self._layout(now.instruments).mask)
 
     def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
         """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
@@ -339,14 +353,25 @@ class DiverTracker:
     ) -> tuple[DiverState, bool]:
         """The tracks, those that were lost where two fixes say that they are, and whether there
         was one."""
-        if association.densities is None or association.weights is not None or not len(now.x):
+        seen, weights = association.seen, association.weights
+        if (
+            association.densities is None
+            or not len(now.x)
+            or (weights is not None and seen is None)
+        ):
             return now, False
         hit, left = np.zeros(len(now.x), bool), np.ones(len(fixes.z), bool)
         hit[association.tracks] = True
-        firm = now.life.status[association.tracks] != TENTATIVE
-        left[association.detection[firm]] = False
+        firm = now.life.status != TENTATIVE
+        unseen = np.zeros(len(now.x), bool) if seen is None else 2.0 * seen.tracks < seen.usual
+        if weights is None:
+            left[association.detection[firm[association.tracks]]] = False
+        else:
+            # Whom the sensor sees is not lost: his existence tells.
+            hit, left = hit | ~unseen, weights.beta[firm].sum(axis=0) < 0.5
         layout, whole = self._layout(now.instruments), association.densities.whole
-        return families.reacquired(now, fixes, hit, left, whole, self.models, self._chain, layout)
+        parts = self.models, self._chain, layout, unseen
+        return families.reacquired(now, fixes, hit, left, whole, *parts)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
         """The tracks after the fixes that are theirs."""
@@ -418,11 +443,13 @@ class DiverTracker:
                 step.dt,
                 np.flatnonzero(hit),
             )
-        nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
+        nis, arrivals, more = np.where(hit, now.nis, np.nan), before.arrivals, before.excess
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
             arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
-        return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
+            if not len(self._layout(now.instruments).variances):  # what lasts is no evidence twice
+                more = excess(more, nis[sure], now.nis_dof[sure])
+        return now._replace(learnt=learnt, nis=nis, arrivals=arrivals, excess=more)
 
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:
         """End the tracks that are over, broken, there twice, or too many."""
@@ -437,7 +464,15 @@ class DiverTracker:
             now = now._replace(broken=now.broken + int((~alive).sum()))
         hit, looked = now.nis_dof > 0, scan.complete & (now.target_id == NOBODY)
         # Nobody coasts while there are fixes that may be his own.
-        looked = looked | (now.refused[:, 0] == now.stamp_ns)
+        refused = now.refused[:, 0] == now.stamp_ns
+        if self._covered:
+            named = now.target_id != NOBODY
+            looked, refused = (
+                looked & (now.looks > 1.0 - 1e-9),
+                refused & ((now.looks > 0.5) | named),
+            )
+            now = now._replace(looks=np.where(hit | looked | refused, 0.0, now.looks))
+        looked = looked | refused
         by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked & ~by_existence)
         if self.models.mixing is not None and any(group.whole for group in scan.fixes):
@@ -509,6 +544,7 @@ class DiverTracker:
                 'refused': np.full((count, 6), np.nan),
                 'history': np.zeros((count, self._window), np.int64),
                 'came_from': np.full(count, -1),
+                'looks': np.zeros(count),
             },
         )
 

@@ -139,6 +139,9 @@ class Scored(DiverTracker):
             score -= density * self.area
         known = config.max_tracks == 1
         decay = 1.0
+        if found.seen is not None and len(found.tracks):
+            there = found.seen.fixes[found.detection] / found.seen.tracks[found.tracks]
+            log_f[found.tracks] += np.log(there)
         for track, track_id in enumerate(now.life.track_id.tolist()):
             hit = np.isfinite(log_f[track])
             ratio = math.exp(min(log_f[track] - math.log(density), 600.0)) if hit else 0.0
@@ -148,6 +151,7 @@ class Scored(DiverTracker):
                 continue
             r = 1.0 if known else self.existence.get(track_id, config.birth_density / density)
             r *= decay
+            p = p if found.seen is None else float(found.seen.tracks[track])
             total = 1.0 - r * p + r * p * ratio
             score += math.log(total)
             self.existence[track_id] = r * (1.0 - p + p * ratio) / total

@@ -196,6 +196,27 @@ def test_arrivals_that_miss_name_what_was_not_stated():
         assert ('sound_speed_std' in warning) == (not config)
 
 
+@pytest.mark.parametrize(
+    'name, seeds, stated',
+    [
+        ('at_depth', (0, 2, 4), {'dimensions': 3}),
+        ('misplaced_receivers', (0, 1, 3), OFF),
+        ('multistatic', (), {}),
+    ],
+)
+def test_arrivals_that_miss_are_known_within_a_minute(name, seeds, stated):
+    def warned(seed, config):
+        tracker = DiverTracker(DiverConfig(**config))
+        for scan in simulate(scenario(name, {'duration': 60.0}), seed).measurements:
+            tracker.process(scan.measurement)
+            if tracker.warnings():
+                return True
+        return False
+
+    assert all(warned(seed, {}) for seed in seeds)
+    assert not any(warned(seed, stated) for seed in range(3))
+
+
 def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
     """A diver who turns by up to 170 degrees: innovations of nine sigmas, true covariances."""
     tracker, farthest = DiverTracker(DiverConfig(max_tracks=1)), 0.0

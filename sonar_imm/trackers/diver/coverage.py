@@ -1,0 +1,313 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where a sensor sees: the probability of detection as a function of the place of a diver.
+
+A diver outside the sector of a sonar is not missed, one inside who is not seen is. So with a
+stated coverage
+
+* a track is missed with the probability that its whole density gives, ``p_t = E[p(x)]``, and has
+  caused a fix at z with the probability of detection there, ``p(z)`` (`Seen`);
+* of a track that was missed what remains is ``(1 - p(x)) N(x; m, P)``, model by model: its density
+  leaves what the sensor covers, as that of a diver who has left does (`missed`). Expectations are
+  means over `POINTS` of a normal distribution;
+* misses are counted by what they say: with the stated `detection_probability` p a miss is one,
+  where it was p_t it is ``ln(1 - p_t) / ln(1 - p)`` of one (`DiverState.looks`).
+
+The probability is a `Coverage`: `detection_probability` inside a sector, or a table over x and y
+or over the range, read from a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import csv
+import math
+from pathlib import Path
+from statistics import NormalDist
+from typing import NamedTuple
+
+from attrs import frozen
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.association import TENTATIVE
+from ...parameters import ConfigError
+from .config import DiverConfig
+from .state import DiverState
+
+POINTS_OF_MODEL = 64
+"""Places of a model at which the probability is asked for."""
+
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+LEAST = 0.01
+"""Probability of detection at a fix, however far outside it is: what is stated is not exact."""
+
+MOST = 0.9999
+"""Most probable detection of a track."""
+
+LEAST_LOOK = 0.25
+"""Of a miss that a miss of a tentative track counts at least: what is rarely seen is not confirmed
+for long."""
+
+FAR_OUT = 2.5
+"""By what the points of the whole track are stretched: where the probability is the same at all of
+them it is not asked of each model."""
+
+NOWHERE, NO_COVARIANCE = np.empty((0, 2)), np.empty((0, 2, 2))
+"""No fixes."""
+
+COLUMNS = (('x', 'y', 'probability'), ('range', 'probability'))
+"""Headers of a table."""
+
+
+def _points() -> FloatArray:
+    """(64, 2) points of equal weight, with the mean and covariance of a normal distribution: a
+    Fibonacci lattice, so that an edge from any side cuts them one by one."""
+    place = (np.arange(POINTS_OF_MODEL) + 0.5) / POINTS_OF_MODEL
+    other = (place + np.arange(POINTS_OF_MODEL) * GOLDEN) % 1.0
+    quantile = [[NormalDist().inv_cdf(u) for u in axis.tolist()] for axis in (place, other)]
+    points = np.array(quantile).T - np.mean(quantile, axis=1)
+    return np.asarray(
+        np.linalg.solve(np.linalg.cholesky(points.T @ points), points.T).T * POINTS_OF_MODEL**0.5
+    )
+
+
+POINTS = _points()
+
+
+class Table(NamedTuple):
+    """Probabilities (rows, columns) at x (rows,) and y (columns,), in between bilinear, 0 outside;
+    of a table over the range x is the range and y empty."""
+
+    x: FloatArray
+    y: FloatArray
+    probability: FloatArray
+
+    def at(self, place: FloatArray, distance: FloatArray) -> FloatArray:
+        """The probability (...,) at places (..., 2), so far (...,) from the sensor."""
+        if not len(self.y):
+            return np.interp(distance, self.x, self.probability[:, 0], right=0.0)
+        found = np.zeros(place.shape[:-1])
+        row, u, inside_x = _cell(self.x, place[..., 0])
+        column, v, inside_y = _cell(self.y, place[..., 1])
+        for a, weight_a in ((0, 1.0 - u), (1, u)):
+            for b, weight_b in ((0, 1.0 - v), (1, v)):
+                found += weight_a * weight_b * self.probability[row + a, column + b]
+        return np.where(inside_x & inside_y, found, 0.0)
+
+
+def _cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatArray, BoolArray]:
+    """The cell of each value on a rising axis, how far along it the value is, and whether it is on
+    the axis at all."""
+    cell = np.clip(np.searchsorted(axis, value, side='right') - 1, 0, len(axis) - 2)
+    along = np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)
+    return cell, along, (value >= axis[0]) & (value <= axis[-1])
+
+
+@frozen(eq=False)
+class Coverage:
+    """What a sensor covers: place (2,) of it; direction and half of the width of the sector, rad;
+    least and greatest range, m; table: None where the sector is all that is stated."""
+
+    place: FloatArray
+    direction: float
+    half_width: float
+    least: float
+    greatest: float
+    table: Table | None
+
+    def probability(self, place: FloatArray, detection_probability: float) -> FloatArray:
+        """The probability (...,) that a diver at `place` (..., 2) is detected."""
+        apart = place - self.place
+        distance = np.hypot(apart[..., 0], apart[..., 1])
+        inside = (distance >= self.least) & (distance <= self.greatest)
+        if self.half_width < math.pi:
+            turned = np.arctan2(apart[..., 1], apart[..., 0]) - self.direction
+            off = np.abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
+            inside &= off <= self.half_width
+        if self.table is None:
+            return np.where(inside, detection_probability, 0.0)
+        return np.where(inside, self.table.at(place, distance), 0.0)
+
+
+def stated(config: DiverConfig) -> dict[str, Coverage]:
+    """What is stated of each sensor by its name, of all others under ''; a sensor that sees
+    everywhere is not there. Raises ConfigError for a file that cannot be read."""
+    found = {}
+    for sensor in ('', *config.sensors):
+        own = config.of_sensor(sensor)
+        if own.coverage_sector or own.coverage_file:
+            found[sensor] = _coverage(own.coverage_sector, own.coverage_file)
+    return found
+
+
+def _coverage(sector: tuple[float, ...], file: str) -> Coverage:
+    x, y, direction, width, least, greatest = sector or (0.0, 0.0, 0.0, 360.0, 0.0, math.inf)
+    turn, half = math.radians(direction), 0.5 * math.radians(width)
+    table = _table(file) if file else None
+    return Coverage(np.array([x, y]), turn, half, least, greatest, table)
+
+
+def _table(file: str) -> Table:
+    """The table in a CSV file. Raises ConfigError with what is wrong with it."""
+    try:
+        with Path(file).expanduser().open(newline='', encoding='utf-8') as stream:
+            rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if row]
+        if not rows or tuple(rows[0]) not in COLUMNS:
+            headers = ' or '.join(','.join(names) for names in COLUMNS)
+            raise ValueError(f'its first line has to be {headers}')
+        table = np.array([[float(cell) for cell in row] for row in rows[1:]])
+        if table.ndim != 2 or table.shape[1] != len(rows[0]) or not np.isfinite(table).all():
+            raise ValueError('a line has not as many numbers as the first names')
+        if ((table[:, -1] < 0.0) | (table[:, -1] > MOST)).any():
+            raise ValueError(f'a probability is not between 0 and {MOST:g}')
+        return _arranged(table)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"coverage_file '{file}' cannot be used: {error}") from None
+
+
+def _arranged(table: FloatArray) -> Table:
+    """The rows (n, 2 or 3) of a file as a table, in whatever order they are."""
+    axes = [np.unique(column) for column in table[:, :-1].T]
+    shape = [len(axis) for axis in axes]
+    if math.prod(shape) != len(table) or min(shape) < 2:
+        raise ValueError('it is no grid of at least two values on each axis, each place once')
+    places = tuple(np.searchsorted(axis, column) for axis, column in zip(axes, table.T))
+    grid = np.full(shape, np.nan)
+    grid[places] = table[:, -1]
+    if np.isnan(grid).any():
+        raise ValueError('it has a place twice')
+    if len(axes) == 1:
+        return Table(axes[0], np.empty(0), grid[:, None])
+    return Table(axes[0], axes[1], grid)
+
+
+# -- what it says of tracks ----------------------------------------------------------------------
+
+
+class Seen(NamedTuple):
+    """Probability of detection by what `coverage` states: usual, as the parameters have it; tracks
+    (T,): of each track; fixes (D,): of a diver where each fix is."""
+
+    coverage: Coverage
+    usual: float
+    tracks: FloatArray
+    fixes: FloatArray
+
+    @property
+    def log_ratio(self) -> FloatArray:
+        """(T, D) what is to be added to the log densities of fixes, so that rules for the usual
+        probability hold for these."""
+        usual = math.log(self.usual) - math.log1p(-self.usual)
+        return np.log(self.fixes)[None] - np.log1p(-self.tracks)[:, None] - usual
+
+    @property
+    def looks(self) -> FloatArray:
+        """(T,) how many misses of the usual probability one of each track is worth, 1 at most."""
+        return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.usual), 1.0)
+
+
+def detectable(
+    stated: Mapping[str, Coverage],
+    sensor: str,
+    now: DiverState,
+    config: DiverConfig,
+    z: FloatArray = NOWHERE,
+    R: FloatArray = NO_COVARIANCE,
+) -> Seen | None:
+    """How probable detections by `sensor` are, by what is `stated`; None where it sees everywhere.
+    config: with the parameters of the sensor; the rest as in `seen`."""
+    coverage = stated.get(sensor if sensor in config.sensors else '')
+    return None if coverage is None else seen(now, coverage, config.detection_probability, z, R)
+
+
+def seen(now: DiverState, coverage: Coverage, p: float, z: FloatArray, R: FloatArray) -> Seen:
+    """How probable a detection is of the tracks, and of a diver where fixes z (D, 2), R (D, 2, 2)
+    are; p: where the sensor sees as it should."""
+    tracks = np.empty(len(now.x))
+    tentative = now.life.status == TENTATIVE
+    for t in range(len(tracks)):
+        constant = _constant(now, t, coverage, p, 1.0 if tentative[t] else FAR_OUT)
+        if constant is None:
+            at = coverage.probability(_places(now.x[t], now.P[t]), p)
+            constant = float(now.mu[t] @ at.mean(axis=1))
+        tracks[t] = min(constant, MOST)
+    there = coverage.probability(_places(z, R), p).mean(axis=1)
+    return Seen(coverage, p, tracks, np.clip(there, LEAST, MOST))
+
+
+def missed(now: DiverState, seen: Seen | None, share: FloatArray, mask: BoolArray) -> DiverState:
+    """The tracks after a look that did not show them, with the probability `share` (T,).
+
+    seen: None for a sensor that sees everywhere; mask (n,): True for what an update may move.
+    Where it may not move all, only the models are weighed.
+    """
+    if seen is None:
+        return now._replace(looks=now.looks + 1.0)
+    coverage, p = seen.coverage, seen.usual
+    tentative = now.life.status == TENTATIVE
+    looks = np.where(tentative, np.maximum(seen.looks, LEAST_LOOK), seen.looks)
+    now = now._replace(looks=now.looks + looks)
+    x, P, mu = now.x, now.P, now.mu
+    for t in np.flatnonzero((share > 0.0) & ~tentative).tolist():
+        if _constant(now, t, coverage, p, FAR_OUT) is not None:
+            continue
+        if x is now.x:
+            x, P, mu = x.copy(), P.copy(), mu.copy()
+        places = _places(x[t], P[t])
+        left = 1.0 - share[t] * coverage.probability(places, p)
+        kept = left.mean(axis=1)
+        mu[t] *= kept
+        mu[t] /= mu[t].sum()
+        if not mask.all():
+            continue
+        weight = left / left.sum(axis=1, keepdims=True)
+        mean = np.einsum('mk,mka->ma', weight, places)
+        apart = places - mean[:, None]
+        spread = np.einsum('mk,mka,mkb->mab', weight, apart, apart)
+        before = P[t, :, :2, :2]
+        # What is known of the place moves the rest by its regression on the place.
+        gain = np.swapaxes(np.linalg.solve(before, P[t, :, :2, :]), -1, -2)
+        x[t] += np.einsum('mna,ma->mn', gain, mean - x[t, :, :2])
+        grown = P[t] + gain @ (spread - before) @ np.swapaxes(gain, -1, -2)
+        P[t] = 0.5 * (grown + np.swapaxes(grown, -1, -2))
+    return now._replace(x=x, P=P, mu=mu)
+
+
+def _constant(
+    now: DiverState, track: int, coverage: Coverage, p: float, stretch: float
+) -> float | None:
+    """The probability of detection all over a track, `stretch` times as far as its points; None
+    where it is not the same there."""
+    place, weight = now.x[track, :, :2], now.mu[track]
+    mean = weight @ place
+    apart = place - mean
+    covariance = np.einsum('m,mab->ab', weight, now.P[track, :, :2, :2])
+    covariance += np.einsum('m,ma,mb->ab', weight, apart, apart)
+    at = coverage.probability(_places(mean[None], stretch**2 * covariance[None])[0], p)
+    return float(at[0]) if at.max() == at.min() else None
+
+
+def _places(mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(..., 64, 2) points of normal distributions, mean (..., n), covariance (..., n, n), of which
+    the first two are the place."""
+    # By the Cholesky factor, written out.
+    a = np.sqrt(np.maximum(covariance[..., 0, 0], 1e-12))
+    b = covariance[..., 1, 0] / a
+    c = np.sqrt(np.maximum(covariance[..., 1, 1] - b * b, 0.0))
+    x = mean[..., 0, None] + a[..., None] * POINTS[:, 0]
+    y = mean[..., 1, None] + b[..., None] * POINTS[:, 0] + c[..., None] * POINTS[:, 1]
+    return np.stack([x, y], axis=-1)
