@@ -87,8 +87,9 @@ def branched(
         believed = densities.whole > families.bound(config)
         # A track that nothing can be of is lost where two fixes agree that nobody takes.
         hit, left = np.asarray(believed.any(axis=1)), np.asarray(~believed.any(axis=0))
+        unseen = np.zeros(len(h), bool)
         now, again = families.reacquired(
-            now, fixes, hit, left, densities.whole, models, chain, layout
+            now, fixes, hit, left, densities.whole, models, chain, layout, unseen
         )
         if again:
             h = expected(now.x, layout.H)
