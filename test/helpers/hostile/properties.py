@@ -55,7 +55,7 @@ def check_numbers(estimate):
         assert wrong < ROUNDING, f'probabilities sum to one but for {wrong}'
     for name, column in estimate.extras.items():
         assert len(column) == len(estimate), name
-        if name in ('existence', 'label_probability'):
+        if name in ('existence', 'label_probability', 'label_confidence'):
             assert not ((column < 0.0) | (column > 1.0)).any(), f'{name} {column}'
 
 
