@@ -29,6 +29,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from . import family_kernels
+from .config import DiverConfig
 from .family_kernels import Mixing
 from .state_space import Instruments, ModelSet, Motion
 
@@ -56,6 +57,12 @@ sum of the logarithms of what was above it, over groups of fixes in turn, that i
 8 groups where the scale is 10, 17 where it is 4. Of true covariances the sum stayed below 4 in
 four hours of the scenes of `simulate`."""
 
+DOUBTED = 0.1
+"""Share of the heights of fixes from which what is doubted of them is said, after `MANY` of
+them."""
+
+MANY = 20
+
 MOST_STEPS = 300
 """A gap is crossed in no more steps than this, however long it is."""
 
@@ -74,6 +81,7 @@ ROWS = (
     'near_to',
     'near_for',
     'refused',
+    'refused_z',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -157,6 +165,33 @@ class FixConsistency(NamedTuple):
         return []
 
 
+class HeightCounts(NamedTuple):
+    """How many heights of fixes there were for tracks, how many of them were refused, and how many
+    lie outside `depth_min` to `depth_max`."""
+
+    seen: int = 0
+    refused: int = 0
+    outside: int = 0
+
+    def warnings(self, config: DiverConfig) -> list[str]:
+        """Sentences for the user."""
+        if self.seen < MANY:
+            return []
+        found = []
+        if self.outside > DOUBTED * self.seen:
+            found.append(
+                f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
+                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
+                'origin_height for positions in latitude and longitude'
+            )
+        if self.refused > DOUBTED * self.seen:
+            found.append(
+                f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
+                'than it states, or the divers go up and down faster than vertical_speed_std'
+            )
+        return found
+
+
 class DiverState(NamedTuple):
     """All that is known after a scan: T tracks with M models of n states, the errors of the
     `instruments` heard so far among them.
@@ -169,10 +204,11 @@ class DiverState(NamedTuple):
     target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
     track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
-    believed, NaN since it took another (`families`); scale (2, 2): for
-    fixes and for arrivals the sum of squared residuals in units of their stated variance, and
-    their number; fixes, arrivals: what innovations say of the stated covariances of either;
-    last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
+    believed, NaN since it took another (`families`); refused_z (T, 3): stamp, z and variance of
+    the last height of a fix that was not (`heights`); scale (2, 2): for fixes and for arrivals the
+    sum of squared residuals in units of their stated variance, and their number; fixes, arrivals:
+    what innovations say of the stated covariances of either; heights: how many z of fixes could be
+    used; last_named: names and the stamp of each one's last measurement; broken: tracks ended so
     because their numbers were not finite; not_started: starts so far for which there was no room;
     repairs: covariances repaired so far (`estimation.covariance`).
     """
@@ -193,9 +229,11 @@ class DiverState(NamedTuple):
     near_to: IntArray
     near_for: IntArray
     refused: FloatArray
+    refused_z: FloatArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
+    heights: HeightCounts = HeightCounts()
     instruments: Instruments = Instruments()
     last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
@@ -223,6 +261,7 @@ class DiverState(NamedTuple):
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
             refused=np.empty((0, 6)),
+            refused_z=np.empty((0, 3)),
             scale=np.zeros((2, 2)),
         )
 

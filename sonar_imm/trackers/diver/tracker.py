@@ -51,12 +51,12 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, families, fix_kernels, jipda, names, pings
+from . import births, families, fix_kernels, heights, jipda, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .models import build_models
-from .scan import Positions, Scan
+from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments, Layout
 
@@ -221,6 +221,7 @@ class DiverTracker:
         return [
             *self._georeferencer.warnings(),
             *state.fixes.warnings(self.config.fix_bias_std > 0.0),
+            *state.heights.warnings(self.config),
             *state.arrivals.warnings('arrivals', advice),
             *births.no_room(state, self.config),
         ]
@@ -248,6 +249,7 @@ class DiverTracker:
             if again:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
+            now = self._update_heights(now, fixes, association)
             if association.free.any():
                 found += births.births_from_fixes(fixes, association.free, association.existence)
         for ping in scan.pings:
@@ -387,6 +389,20 @@ class DiverTracker:
             now = self._with_scale(now, fixes, tracks, detection)
         return now
 
+    def _update_heights(
+        self, now: DiverState, fixes: Positions, association: Association
+    ) -> DiverState:
+        """The tracks after what the fixes that are theirs state of z."""
+        if fixes.heights is None or not len(association.tracks):
+            return now
+        tracks, row, weights = association.tracks, association.detection, association.weights
+        probability = np.ones(len(tracks))
+        if weights is not None:
+            share = weights.beta[tracks, row] / weights.existence[tracks]
+            probability = np.minimum(share, 1.0)
+        layout, place = self._layout(now.instruments), self.models.height
+        return heights.update(now, fixes, tracks, row, probability, layout, place, self.config)
+
     def _with_scale(
         self, now: DiverState, fixes: Positions, tracks: IndexArray, detection: IntArray
     ) -> DiverState:
@@ -463,7 +479,12 @@ class DiverTracker:
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
-                birth = Birth(start.position[:2], start.covariance, measured=False)
+                height = None
+                if config.dimensions == 3:
+                    stated = Heights.of(start.position[None], start.covariance[None], 1.0)
+                    height = stated and stated.row(0)
+                plane = start.position[:2], start.covariance[:2, :2]
+                birth = Birth(*plane, measured=False, height=height)
                 now = births.confirmed(self._with_tracks(now, [birth]))
         return now
 
@@ -491,6 +512,7 @@ class DiverTracker:
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
                 'refused': np.full((count, 6), np.nan),
+                'refused_z': np.full((count, 3), np.nan),
             },
         )
 
