@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What fixes say of z, where depth is a state (`dimensions: 3`).
+"""Depth as a state (`dimensions: 3`): what fixes say of z, and when its copies are spread anew.
 
-Association and the update by x and y are the same with it and without. Then z is one number more
-for the track that took the fix: z less what the errors of x and y, which are known by now, have
-to do with its own. With ``R`` the covariance of the fix, split into that of x and y, of z, and
-between them,
+*Fixes.* Association and the update by x and y are the same with z and without. Then z is one more
+number for the track that took the fix: z less what the errors of x and y, which are known by now,
+have to do with its own. With ``R`` the covariance of the fix, split into that of x and y, of z,
+and between them,
 
     z - g (x, y) = z_track - g (x, y)_track + e,    g = R_z,xy R_xy^-1,    var e = R_zz - g R_xy,z
 
@@ -27,6 +27,13 @@ three coordinates. It weighs the models too, and with them the copies of the dep
 z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
 z alone. What is refused is remembered; the next fix that agrees with it says that the depth was
 wrong, and z begins there.
+
+*Copies.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
+Far away all copies of the depth bank (`state_space`) may come to agree on a depth that is not well
+known. When the diver then comes near, one Gaussian cannot become two depths, and all copies may go
+to the wrong one. So copies that agree are spread over what they believe, before a ping that bends
+within it: the Gaussian becomes the sum of narrower ones with the same mean and variance, and the
+arrivals choose.
 """
 
 from __future__ import annotations
@@ -35,18 +42,29 @@ import math
 
 import numpy as np
 
-from ...estimation.arrays import FloatArray, IndexArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import gate_threshold
 from ...estimation.small_matrices import add_jitter_all
 from .config import DiverConfig
 from .fix_kernels import update_heights
-from .scan import Height, Positions
+from .scan import Height, Ping, Positions
 from .state import DiverState, HeightCounts
-from .state_space import Layout
+from .state_space import Layout, ModelSet
 
 BEYOND = 3.0
 """Standard deviations by which a fix lies above or below the water column, so that it was stated
 wrong."""
+
+AGREE = 0.5
+"""Copies agree whose means vary by less than this share of the variance that they have."""
+
+BENT = 0.5
+"""Standard deviations of an arrival by which the path may bend within what is believed of z,
+before the copies are spread."""
+
+APART, POSSIBLE = 2.0, 0.05
+"""Another depth is possible where copies that weigh more than `POSSIBLE` lie further from the
+heaviest one than `APART` times the standard deviations of both together."""
 
 
 def begin(
@@ -152,3 +170,86 @@ def update(
         heights=HeightCounts(seen + len(tracks), doubted, outside),
         repairs=now.repairs + repairs,
     )
+
+
+# -- copies --------------------------------------------------------------------------------------
+
+
+def _copies(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weight, mean and variance of z of each copy, (T, K) each."""
+    T, K, place = len(now.x), models.copies, models.height
+    mu = now.mu.reshape(T, K, -1)
+    weight = mu.sum(axis=2)
+    share = mu / np.where(weight > 0.0, weight, 1.0)[..., None]
+    z, variance = now.x[..., place], now.P[..., place, place]
+    mean = (share * z.reshape(mu.shape)).sum(axis=2)
+    square = (share * (variance + z * z).reshape(mu.shape)).sum(axis=2)
+    return weight, mean, np.maximum(square - mean * mean, 0.0)
+
+
+def ambiguous(now: DiverState, models: ModelSet) -> BoolArray:
+    """Which divers (T,) may be at another depth as well."""
+    weight, mean, variance = _copies(now, models)
+    std = np.sqrt(variance)
+    row = np.arange(len(mean))
+    best = weight.argmax(axis=1)
+    far = np.abs(mean - mean[row, best][:, None]) > APART * (std + std[row, best][:, None])
+    return np.asarray((weight * far).sum(axis=1) > POSSIBLE)
+
+
+def spread(now: DiverState, seen: Ping, layout: Layout, models: ModelSet) -> DiverState:
+    """The tracks as `seen` will find them: with the copies spread where they agree and the paths
+    bend within what they believe."""
+    echo = seen.echo
+    if models.height < 0 or models.copies == 1 or not len(now.x) or not echo.any():
+        return now
+    weight, mean, variance = _copies(now, models)
+    middle = (weight * mean).sum(axis=1)
+    between = (weight * (mean - middle[:, None]) ** 2).sum(axis=1)
+    within = (weight * variance).sum(axis=1)
+    measured = seen.measured
+    x, P, mu, spreads = now.x.copy(), now.P.copy(), now.mu.copy(), now.spreads.copy()
+    for track in np.flatnonzero(between < AGREE * within).tolist():
+        place = np.append(now.mu[track] @ now.x[track, :, :2], middle[track])
+        bend = _bend(place, measured.rx[echo])
+        if not seen.passive:
+            bend = bend + _bend(place, measured.tx[echo])
+        deviation = 0.5 * bend * (within + between)[track] / np.sqrt(measured.variance[echo])
+        if deviation.max() > BENT:
+            x[track], P[track], mu[track] = _spread(
+                x[track], P[track], mu[track], layout.mask, models
+            )
+            spreads[track] += 1
+    return now._replace(x=x, P=P, mu=mu, spreads=spreads)
+
+
+def _bend(place: FloatArray, instrument: FloatArray) -> FloatArray:
+    """Second derivative (C,) in z of the distance from `place` (3,) to instruments (C, 3), not
+    nearer than a metre, 1/m."""
+    apart = instrument - place
+    distance = np.maximum(np.sqrt((apart * apart).sum(axis=1)), 1.0)
+    return np.asarray((1.0 - np.minimum(apart[:, 2] / distance, 1.0) ** 2) / distance)
+
+
+def _spread(
+    x: FloatArray, P: FloatArray, mu: FloatArray, estimated: BoolArray, models: ModelSet
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """One diver, x (K M, n), P (K M, n, n), mu (K M,), with what all copies believe spread over
+    them; estimated (n,): see `estimation.consider`."""
+    K, M, n, place = models.copies, len(models.names), x.shape[-1], models.height
+    each = mu.reshape(K, M)
+    total = each.sum(axis=0)
+    share = np.where(total > 0.0, each / np.where(total > 0.0, total, 1.0), 1.0 / K)
+    x, P = x.reshape(K, M, n), P.reshape(K, M, n, n)
+    mean = np.einsum('km,kma->ma', share, x)
+    apart = x - mean
+    whole = np.einsum('km,kmab->mab', share, P + apart[..., :, None] * apart[..., None, :])
+    line = whole[:, place] / np.sqrt(whole[:, place, place])[:, None]
+    moved = estimated[:, None] | estimated[None, :]
+    # Standard deviations: what lies between the copies does not lie within them.
+    steps = np.linspace(-1.0, 1.0, K)
+    narrow = whole - (steps**2).mean() * line[:, :, None] * line[:, None, :] * moved
+    places = mean + steps[:, None, None] * np.where(estimated, line, 0.0)
+    covariance = np.tile(narrow, (K, 1, 1))
+    add_jitter_all(covariance)
+    return places.reshape(K * M, n), covariance, np.tile(total / K, K)

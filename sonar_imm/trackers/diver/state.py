@@ -82,6 +82,7 @@ ROWS = (
     'near_for',
     'refused',
     'refused_z',
+    'spreads',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -205,7 +206,8 @@ class DiverState(NamedTuple):
     track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
     believed, NaN since it took another (`families`); refused_z (T, 3): stamp, z and variance of
-    the last height of a fix that was not (`heights`); scale (2, 2): for fixes and for arrivals the
+    the last height of a fix that was not, spreads (T,): how often the copies of the models were
+    spread anew (`heights`); scale (2, 2): for fixes and for arrivals the
     sum of squared residuals in units of their stated variance, and their number; fixes, arrivals:
     what innovations say of the stated covariances of either; heights: how many z of fixes could be
     used; last_named: names and the stamp of each one's last measurement; broken: tracks ended so
@@ -230,6 +232,7 @@ class DiverState(NamedTuple):
     near_for: IntArray
     refused: FloatArray
     refused_z: FloatArray
+    spreads: IntArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
@@ -262,6 +265,7 @@ class DiverState(NamedTuple):
             near_for=np.empty(0, np.int64),
             refused=np.empty((0, 6)),
             refused_z=np.empty((0, 3)),
+            spreads=np.empty(0, np.int64),
             scale=np.zeros((2, 2)),
         )
 

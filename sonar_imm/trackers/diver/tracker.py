@@ -513,6 +513,7 @@ class DiverTracker:
                 'near_for': np.zeros(count, np.int64),
                 'refused': np.full((count, 6), np.nan),
                 'refused_z': np.full((count, 3), np.nan),
+                'spreads': np.zeros(count, np.int64),
             },
         )
 
@@ -533,6 +534,8 @@ class DiverTracker:
             'target_id': state.target_id.astype(np.int32),
             **families.columns(state.mu, self.models),
         }
+        if self.models.copies > 1 and self.models.height >= 0:
+            extras['depth_ambiguous'] = heights.ambiguous(state, self.models).astype(np.uint8)
         if self.origin is not None:
             place = self.origin.geodetic(xyz)
             extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
