@@ -45,9 +45,9 @@ Cells = list[tuple[str, str, str, Values, Values]]
 
 
 def score(scene: Scene, config: DiverConfig) -> np.ndarray:
-    """Rows (k, 5) of squared horizontal error, horizontal NEES, squared depth error, whole NEES and
-    `depth_ambiguous`; the last three NaN where depth is no state. A stamp without a track gives
-    NaN."""
+    """Rows (k, 5) of squared horizontal error, horizontal NEES, squared depth error, whole NEES
+    and `depth_ambiguous`; the last three NaN where depth is no state. A stamp without a track
+    gives NaN."""
     final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
     track = truths(scene, TrueTrack)[0]
     rows: list[list[Any]] = []

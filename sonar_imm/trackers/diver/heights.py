@@ -63,8 +63,8 @@ BENT = 0.5
 before the copies are spread."""
 
 APART, POSSIBLE = 2.0, 0.05
-"""Another depth is possible where copies that weigh more than `POSSIBLE` lie further from the
-heaviest one than `APART` times the standard deviations of both together."""
+"""There are two depths where the copies above a gap and those below weigh more than `POSSIBLE`
+each. A gap is wider than `APART` times the standard deviations of both its neighbours together."""
 
 
 def begin(
@@ -189,12 +189,15 @@ def _copies(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray, 
 
 def ambiguous(now: DiverState, models: ModelSet) -> BoolArray:
     """Which divers (T,) may be at another depth as well."""
-    weight, mean, variance = _copies(now, models)
-    std = np.sqrt(variance)
-    row = np.arange(len(mean))
-    best = weight.argmax(axis=1)
-    far = np.abs(mean - mean[row, best][:, None]) > APART * (std + std[row, best][:, None])
-    return np.asarray((weight * far).sum(axis=1) > POSSIBLE)
+    two = np.zeros(len(now.x), bool)
+    for track, (weight, mean, variance) in enumerate(zip(*_copies(now, models))):
+        counts = np.flatnonzero(weight > POSSIBLE / 10.0)
+        order = counts[np.argsort(mean[counts], kind='stable')]
+        reach = APART * np.sqrt(variance[order])
+        gap = np.diff(mean[order]) > reach[1:] + reach[:-1]
+        below = np.cumsum(weight[order])[:-1]
+        two[track] = (gap & (np.minimum(below, weight.sum() - below) > POSSIBLE)).any()
+    return two
 
 
 def spread(now: DiverState, seen: Ping, layout: Layout, models: ModelSet) -> DiverState:

@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong."""
+"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong; and copies
+the models that are spread over depth."""
 
 import math
 
@@ -21,9 +22,11 @@ import pytest
 
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.gauss_markov import gauss_markov
-from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start
+from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.heights import ambiguous, spread
 from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.tracker import DiverTracker
 
 CV = {'model_set': 'cv', 'max_tracks': 1, 'dimensions': 3, 'gate_probability': 0.999999}
@@ -265,3 +268,83 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
     relative = last(DiverTracker(DiverConfig(**settings)), seen)
     assert relative.state[0, Z] == pytest.approx(-12.0, abs=0.1)
     assert relative.covariance[0, Z, Z] < 2.0
+
+
+# -- copies --------------------------------------------------------------------------------------
+
+
+def banked(means, variances, weights, **settings):
+    """A state of one diver whose copies have these z, and its models."""
+    config = DiverConfig(dimensions=3, model_set='heading_speed', **settings)
+    tracker = DiverTracker(config)
+    last(tracker, [fix(1.0, 0.0, np.eye(2), 20.0, 5.0)])
+    state, models = tracker._stream.state, tracker.models
+    M, h = len(models.names), models.height
+    x, P = state.x.copy(), state.P.copy()
+    x[0, :, h], P[0, :, h, h] = np.repeat(means, M), np.repeat(variances, M)
+    P[0, :, 0, h] = P[0, :, h, 0] = 0.3 * np.sqrt(P[0, :, 0, 0] * P[0, :, h, h])
+    mu = np.repeat(weights, M)[None] / M
+    return state._replace(x=x, P=P, mu=mu), models, tracker
+
+
+def pings(path_std=0.3):
+    """A ping heard on one receiver beside the transmitter."""
+    nothing = [math.nan]
+    return Arrivals(
+        stamp_ns=2 * 10**9,
+        tx_id=[0],
+        rx_id=[0],
+        tx=[[18.0, 0.0, -3.0]],
+        rx=[[24.0, 0.0, -3.0]],
+        toa=[0.02],
+        var_toa=[(path_std / 1500.0) ** 2],
+        bearing=nothing,
+        var_bearing=nothing,
+    )
+
+
+def after_spread(state, models, tracker, path_std=0.3):
+    layout = tracker._layout(state.instruments)
+    seen = ping_measurements(pings(path_std), np.arange(1), tracker.config, 1.0, models, layout)
+    return spread(state, seen, layout, models)
+
+
+def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
+    state, models, tracker = banked([-9.5, -9.6, -2.0], [4.0, 3.5, 0.1], [0.6, 0.4, 0.0])
+    after = after_spread(state, models, tracker)
+    for before, now in zip(state.positions(models.E), after.positions(models.E)):
+        assert now == pytest.approx(before, abs=1e-9)
+    M, h = len(models.names), models.height
+    assert np.diff(after.x[0, ::M, h]) == pytest.approx([2.0, 2.0], abs=0.1)
+    assert after.mu[0].reshape(3, M).sum(axis=1) == pytest.approx(np.full(3, 1 / 3))
+    assert models.by_model(after.mu) == pytest.approx(models.by_model(state.mu))
+    assert (np.linalg.eigvalsh(after.P[0]) > 0.0).all() and after.spreads.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    'means, variances, path_std',
+    [
+        ([-3.0, -10.0, -17.0], [4.8, 4.8, 4.8], 0.3),  # they do not agree
+        ([-9.5, -9.6, -9.4], [0.1, 0.1, 0.1], 0.3),  # nothing bends within what they believe
+        ([-9.5, -9.6, -9.4], [4.0, 4.0, 4.0], 10.0),  # it does, but not to see
+    ],
+)
+def test_other_copies_stay(means, variances, path_std):
+    state, models, tracker = banked(means, variances, [0.4, 0.3, 0.3])
+    after = after_spread(state, models, tracker, path_std)
+    assert after.x.tobytes() == state.x.tobytes() and not after.spreads.any()
+
+
+@pytest.mark.parametrize(
+    'means, variances, weights, two',
+    [
+        ([-3.3, -10.0, -16.7], [4.8, 4.8, 4.8], [0.34, 0.33, 0.33], False),  # the whole column
+        ([-3.3, -10.0, -16.7], [4.8, 4.8, 4.8], [0.5, 0.0, 0.5], True),
+        ([-2.0, -2.1, -8.0], [0.2, 0.2, 0.2], [0.4, 0.4, 0.2], True),
+        ([-2.0, -2.1, -8.0], [0.2, 0.2, 0.2], [0.5, 0.49, 0.01], False),
+        ([-8.0, -2.0, -5.0], [0.2, 0.2, 2.0], [0.3, 0.3, 0.4], False),
+    ],
+)
+def test_two_depths_are_said_where_there_is_a_gap_between_them(means, variances, weights, two):
+    state, models, _ = banked(means, variances, weights)
+    assert ambiguous(state, models).tolist() == [two]
