@@ -87,6 +87,16 @@ def doubt_fix(message: Any) -> str | None:
     return 'zero_covariance' if block is not None and not block.any() else None
 
 
+def doubt_height(message: Any, fix: Fix) -> str | None:
+    """Give ``'bad_height'`` for a message that states the variance of z, in a covariance that
+    cannot be true, so that `fix` has none."""
+    stated = _covariance(message)
+    if stated is None or not LEAST_VARIANCE <= stated[2, 2] < UNKNOWN_VARIANCE:
+        return None
+    kept = fix.covariance is not None and np.isfinite(fix.covariance[2, 2])
+    return None if kept or not np.isfinite(message.pose.pose.position.z) else 'bad_height'
+
+
 def write_fix(fix: Fix, make: Make) -> Any:
     """Write a PoseWithCovarianceStamped, whose covariance starts with -1 when the fix has none."""
     covariance = np.zeros((6, 6))

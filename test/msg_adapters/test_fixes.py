@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from msg_adapters.fixes import doubt_fix, read_fix, write_fix
+from msg_adapters.fixes import doubt_fix, doubt_height, read_fix, write_fix
 from sonar_imm.measurements import Fix, Rejection
 from sonar_imm_tools.recordings.messages import ros_message
 
@@ -107,6 +107,7 @@ def test_the_height_is_read_where_its_variance_is_stated():
     assert fix.covariance.tolist() == [[4.0, 0.0, 0.5], [0.0, 9.0, -0.2], [0.5, -0.2, 0.25]]
     turned = read_fix(spatial(0.25, 0.5, -0.2), world_frame='ned')
     assert turned.covariance.tolist() == [[9.0, 0.0, 0.2], [0.0, 4.0, -0.5], [0.2, -0.5, 0.25]]
+    assert doubt_height(spatial(0.25, 0.5, -0.2), fix) is None
     alone = read_fix(spatial(0.25, flat=-np.eye(2)))
     assert np.isnan(alone.covariance[:2]).all() and alone.covariance[2, 2] == 0.25
 
@@ -132,6 +133,9 @@ def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message
     fix = read_fix(message)
     assert fix.covariance[:2, :2].tolist() == [[4.0, 0.0], [0.0, 9.0]]
     assert np.isnan(fix.covariance[2]).all() and np.isnan(fix.covariance[:, 2]).all()
+    variance, z = message.pose.covariance[14], message.pose.pose.position.z
+    doubted = 1e-12 <= variance < 1e6 and math.isfinite(z)
+    assert doubt_height(message, fix) == ('bad_height' if doubted else None)
 
 
 @pytest.mark.parametrize(
