@@ -58,6 +58,9 @@ it."""
 MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
 
+LOST = 1e-9
+"""A ping as improbable of a track as this says that the track was somewhere else."""
+
 MOST_FOUND = 10
 """Positions found by combining the echoes of one ping; those of others are found in later ones."""
 
@@ -265,6 +268,36 @@ def _new_track(
         covariance[..., moves, :] = P[..., moves, :]
         covariance[..., :, moves] = P[..., :, moves]
     return at, covariance, mu
+
+
+def begun_anew(
+    now: DiverState,
+    ping: Arrivals,
+    free: BoolArray,
+    models: ModelSet,
+    layout: Layout,
+    config: DiverConfig,
+) -> DiverState:
+    """The tracks after a ping, whose rows (n,) are taken but for those that are `free`. With depth
+    as a state, a track that took what was all but impossible begins anew where the ping alone puts
+    it: an update over such a way is far from linear, and what it makes of the depth is nothing
+    known."""
+    hit, rows = np.flatnonzero(now.nis_dof), np.flatnonzero(~free)
+    if models.height < 0 or len(hit) != 1:
+        return now
+    (track,) = hit
+    dof = int(now.nis_dof[track])
+    if dof < SEED_PAIRS or now.nis[track] <= gate_threshold(1.0 - LOST, dof):
+        return now
+    mean, covariance = now.positions(models.E[:, :2])
+    birth = Birth(mean[track], covariance[track], ping, rows)
+    parts = zip((now.x, now.P, now.mu), new_tracks([birth], models, layout, config))
+    x, P, mu = (np.concatenate([old[:track], new, old[track + 1 :]]) for old, new in parts)
+    if not (np.isfinite(x).all() and np.isfinite(P).all()):
+        return now
+    spreads = now.spreads.copy()
+    spreads[track] += 1
+    return now._replace(x=x, P=P, mu=mu, spreads=spreads)
 
 
 # -- starts --------------------------------------------------------------------------------------

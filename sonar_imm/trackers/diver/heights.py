@@ -58,9 +58,9 @@ wrong."""
 AGREE = 0.5
 """Copies agree whose means vary by less than this share of the variance that they have."""
 
-BENT = 0.5
+BENT = 0.1
 """Standard deviations of an arrival by which the path may bend within what is believed of z,
-before the copies are spread."""
+before the copies are spread. What one ping does not see many do: the bend is the same in all."""
 
 APART, POSSIBLE = 2.0, 0.05
 """There are two depths where the copies above a gap and those below weigh more than `POSSIBLE`
@@ -178,7 +178,7 @@ def update(
 def _copies(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weight, mean and variance of z of each copy, (T, K) each."""
     T, K, place = len(now.x), models.copies, models.height
-    mu = now.mu.reshape(T, K, -1)
+    mu = now.mu.reshape(T, K, len(models.names))
     weight = mu.sum(axis=2)
     share = mu / np.where(weight > 0.0, weight, 1.0)[..., None]
     z, variance = now.x[..., place], now.P[..., place, place]

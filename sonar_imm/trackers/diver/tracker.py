@@ -256,6 +256,8 @@ class DiverTracker:
             now, free = pings.associate_and_update(
                 now, ping, self.config, scan.factor, self.models
             )
+            layout = self._layout(now.instruments)
+            now = births.begun_anew(now, ping, free, self.models, layout, self.config)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
         now = self._learn(before, now, step, scan)
         now = self._prune(now, scan)

@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong; copies of the
-models that are spread over depth."""
+"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong; copies of
+the models that are spread over depth."""
 
 import math
 
