@@ -156,7 +156,8 @@ class DiverTracker:
         for second in (1, 2):
             for x in (0.0, 0.1):
                 position = np.array([x, 0.0, 0.0])
-                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
+                covariance = np.eye(self.config.dimensions)
+                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=covariance)
                 tracker.process(fix)
 
     def _warm_echoes(self) -> None:
