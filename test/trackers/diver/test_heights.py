@@ -27,7 +27,9 @@ from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.heights import ambiguous, spread
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.scan import ping_measurements
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 CV = {'model_set': 'cv', 'max_tracks': 1, 'dimensions': 3, 'gate_probability': 0.999999}
 Z, W = 2, 5
@@ -348,3 +350,54 @@ def test_other_copies_stay(means, variances, path_std):
 def test_two_depths_are_said_where_there_is_a_gap_between_them(means, variances, weights, two):
     state, models, _ = banked(means, variances, weights)
     assert ambiguous(state, models).tolist() == [two]
+
+
+def past_the_transmitter(seed):
+    """A scene whose diver comes near the transmitter from afar, and its places by stamp."""
+    changes = {
+        'receiver_depths': (2.0, 5.0, 8.0, 12.0),
+        'depth': (1.0, 19.0),
+        'swell_height': 1.0,
+        'random_rotation': False,
+        'start': (-40.0, 40.0),
+    }
+    scene = simulate(scenario('multistatic', changes), seed)
+    (track,) = scene.truth[:1]
+    return scene, dict(zip(track.stamp_ns.tolist(), track.position))
+
+
+def errors(estimates, places, settled):
+    """Errors in z and NEES of three coordinates, from `settled` stamps on."""
+    rows = []
+    for estimate in [each for each in estimates if len(each.state)][settled:]:
+        error = estimate.state[0, :3] - places[estimate.stamp_ns][:3]
+        rows.append([error[2], error @ np.linalg.solve(estimate.covariance[0, :3, :3], error)])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize('seed', [1017, 1035])
+def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
+    # Copies that had met went to the wrong side here: NEES 877 and 725.
+    scene, places = past_the_transmitter(seed)
+    settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
+    tracker = SmoothingDiverTracker(DiverConfig(**settings))
+    pings = [item.measurement for item in scene.measurements]
+    found = [estimate for ping in pings for estimate in tracker.process(ping)]
+    filtered, smoothed = (errors(each, places, 10) for each in (found, tracker.smoothed()))
+    assert filtered[:, 1].mean() < 6.0 and np.abs(filtered[-20:, 0]).max() < 3.0
+    assert np.isfinite(smoothed).all()
+    assert np.square(smoothed[:, 0]).mean() < 1.1 * np.square(filtered[:, 0]).mean()
+
+
+def test_a_track_that_was_somewhere_else_begins_anew_with_the_whole_bank():
+    # A ghost of two receivers, confirmed first, takes a ping 20 m away: z was then off by 6 m.
+    scene, places = past_the_transmitter(1043)
+    settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
+    tracker = DiverTracker(DiverConfig(**settings))
+    pings = [item.measurement for item in scene.measurements][:31]
+    found = [estimate for ping in pings for estimate in tracker.process(ping)]
+    nis = [float(np.nan_to_num(each.extras['nis']).max()) for each in found if len(each.state)]
+    lost = int(np.argmax(nis))
+    assert nis[lost] > 100.0
+    after = errors(found, places, lost)
+    assert after[:, 1].mean() < 8.0 and np.abs(after[:, 0]).max() < 2.5
