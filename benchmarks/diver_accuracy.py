@@ -87,7 +87,7 @@ def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.nda
         track = truths(scene, TrueTrack)[0]
         truth.append(np.column_stack([track.position[:, :2], track.velocity]))
         z.append([item.measurement.position[:2] for item in scene.measurements])
-        R.append([item.measurement.covariance for item in scene.measurements])
+        R.append([item.measurement.covariance[:2, :2] for item in scene.measurements])
     return np.array(truth), np.array(z), np.array(R)
 
 

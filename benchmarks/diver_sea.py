@@ -36,14 +36,18 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 SETTLED = 10.0
 """Seconds from the start that are not scored."""
 
+WRONG = 40.0
+"""Mean NEES of all three coordinates above which a run is at the wrong depth."""
+
 Values = Mapping[str, Any]
 Cells = list[tuple[str, str, str, Values, Values]]
 """Row, column, scenario, what it changes, parameters."""
 
 
 def score(scene: Scene, config: DiverConfig) -> np.ndarray:
-    """Rows (k, 4) of squared horizontal error, horizontal NEES, squared depth error, whole NEES;
-    the last two NaN where depth is no state. A stamp without a track gives NaN."""
+    """Rows (k, 5) of squared horizontal error, horizontal NEES, squared depth error, whole NEES
+    and `depth_ambiguous`; the last three NaN where depth is no state. A stamp without a track
+    gives NaN."""
     final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
     track = truths(scene, TrueTrack)[0]
     rows: list[list[Any]] = []
@@ -53,7 +57,7 @@ def score(scene: Scene, config: DiverConfig) -> np.ndarray:
         estimate = final[stamp]
         confirmed = np.flatnonzero(estimate.extras['track_state'] > 0)
         if not len(confirmed):
-            rows.append([np.nan] * 4)
+            rows.append([np.nan] * 5)
             continue
         row = confirmed[0]
         m = 3 if 'pz' in estimate.state_names else 2
@@ -62,7 +66,8 @@ def score(scene: Scene, config: DiverConfig) -> np.ndarray:
         flat = error[:2] @ np.linalg.solve(P[:2, :2], error[:2])
         whole = error @ np.linalg.solve(P, error) if m == 3 else np.nan
         deep = error[2] ** 2 if m == 3 else np.nan
-        rows.append([error[:2] @ error[:2], flat, deep, whole])
+        two = estimate.extras.get('depth_ambiguous', np.full(len(estimate), np.nan))[row]
+        rows.append([error[:2] @ error[:2], flat, deep, whole, two])
     return np.array(rows)
 
 
@@ -72,7 +77,8 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
     for seed in range(1000, 1000 + runs):
         made = simulate(scenario(name, scene), seed)
         values = {key: v(made) if callable(v) else v for key, v in config.items()}
-        rows.append(score(made, DiverConfig(model_set='heading_speed', max_tracks=1, **values)))
+        values = {'model_set': 'heading_speed', **values}
+        rows.append(score(made, DiverConfig(max_tracks=1, **values)))
     every = np.concatenate(rows)
     seen = np.isfinite(every[:, 0])
     mean = every[seen].mean(axis=0)
@@ -85,6 +91,20 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
         if np.isfinite(mean[2])
         else [],
         'without_track': float(1.0 - seen.mean()),
+        **wrong_depths(rows),
+    }
+
+
+def wrong_depths(rows: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Of runs with depth: how many have a whole NEES above `WRONG`, how many of these never say
+    that there are two depths, and the share of estimates that do."""
+    if not np.isfinite(rows[0][:, 4]).any():
+        return {}
+    wrong = [each for each in rows if np.nanmean(each[:, 3]) > WRONG]
+    return {
+        'wrong_runs': len(wrong),
+        'silent_runs': sum(not np.nanmax(each[:, 4]) > 0.0 for each in wrong),
+        'ambiguous': float(np.nanmean(np.concatenate(rows)[:, 4])),
     }
 
 
@@ -98,6 +118,11 @@ def text_of(found: Mapping[str, Any]) -> str:
     if depths := found.get('rmse_depth_of_runs'):
         text += f' (depth: half of the runs below {np.median(depths):.2f}'
         text += f', nine tenths below {np.percentile(depths, 90):.2f})'
+    if 'wrong_runs' in found:
+        text += (
+            f' ({found["wrong_runs"]} runs wrong, {found["silent_runs"]} silent, two depths in '
+        )
+        text += f'{found["ambiguous"]:.0%})'
     if found['without_track'] > 0.005:
         text += f' ({found["without_track"]:.0%} no track)'
     return text
@@ -145,6 +170,21 @@ def depth_cells() -> Cells:
     return cells
 
 
+def fix_cells() -> Cells:
+    fixes: Values = {'sensor': 'positions', 'fix_std': 1.0, 'swell_height': 1.0}
+    return [
+        (
+            f'diver at {where}',
+            column,
+            'multistatic',
+            {**fixes, 'depth': depth, 'fix_height_std': std},
+            {'model_set': 'families', 'dimensions': 3},
+        )
+        for where, depth in {'U(1, 19) m': (1.0, 19.0), '25 m': (25.0, 25.0)}.items()
+        for column, std in {'z not stated': 0.0, 'z to 2 m': 2.0, 'z to .5 m': 0.5}.items()
+    ]
+
+
 def systematic_cells() -> Cells:
     off: dict[str, Values] = {
         'receivers': {'receiver_position_std': 1.0},
@@ -185,7 +225,12 @@ def lasting_cells() -> Cells:
     return cells
 
 
-TABLES = {'depth': depth_cells, 'systematic': systematic_cells, 'lasting': lasting_cells}
+TABLES = {
+    'depth': depth_cells,
+    'fixes': fix_cells,
+    'systematic': systematic_cells,
+    'lasting': lasting_cells,
+}
 
 
 def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:

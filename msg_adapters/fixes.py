@@ -14,10 +14,11 @@
 
 """Position fixes: geometry_msgs PoseWithCovarianceStamped or PointStamped.
 
-Publishers fill in covariances in different ways. Of the x-y block, which alone is used, a negative
-variance means unknown. All zeros mean that it was not filled in: unknown too, and worth a warning
-(see `doubt_fix`). Anything else has to be finite, symmetric and positive definite, or the fix is
-refused.
+Publishers fill in covariances in different ways. Of the x-y block a negative variance means
+unknown. All zeros mean that it was not filled in: unknown too, and worth a warning (see
+`doubt_fix`). Anything else has to be finite, symmetric and positive definite, or the fix is
+refused. What is stated of z is used with it, or left out where it cannot be true
+(`measurements.in_space`).
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from numpy.typing import NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Fix, Rejection, RelativeFix, Start
+from sonar_imm.measurements.checks import check_covariance
+from sonar_imm.measurements.diver import UNKNOWN_VARIANCE
 
-from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
+from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, swap_covariance, to_enu
 
-UNKNOWN_VARIANCE = 1e6
-"""Variance written for what is not estimated (m^2 or rad^2); zero would claim certainty."""
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
 """Limits of the variance of a fix, m^2: a micrometre and 100,000 km squared."""
 
@@ -42,17 +43,18 @@ LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
 def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
     """Read a PoseWithCovarianceStamped or a PointStamped; `world_frame` is ``'enu'`` or ``'ned'``.
 
-    A z that is not finite is read as 0, because only x and y are tracked. Raises `Rejection`.
+    A z that is not finite is read as 0 and as not stated. Raises `Rejection`.
     """
     point = message.point if hasattr(message, 'point') else message.pose.pose.position
     x, y, z = float(point.x), float(point.y), float(point.z)
-    block = xy_covariance(message)
-    if block is not None and (not block.any() or (np.diag(block) < 0.0).any()):
-        block = None
+    covariance = known_covariance(message)
+    if covariance is not None and not np.isfinite(z):
+        covariance[2, 2] = np.nan
+        covariance = None if np.isnan(covariance).all() else covariance
     fix = Fix(
         stamp_ns=stamp_ns(message),
         position=(x, y, z if np.isfinite(z) else 0.0),
-        covariance=block,
+        covariance=covariance,
         frame_id=str(message.header.frame_id),
     )
     check_size(fix)
@@ -61,15 +63,15 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
 
 def _turned(fix: Fix) -> Fix:
     """The same place in ENU, of a fix in NED."""
-    covariance = None if fix.covariance is None else fix.covariance[::-1, ::-1]
+    covariance = None if fix.covariance is None else swap_covariance(fix.covariance)
     return evolve(fix, position=swap_axes(fix.position), covariance=covariance)
 
 
 def check_size(fix: Fix) -> None:
     """Raise `Rejection` for a covariance so small or large that arithmetic with it breaks down."""
-    if fix.covariance is None:
+    if fix.covariance is None or np.isnan(fix.covariance[0, 0]):
         return
-    least, most = np.linalg.eigvalsh(fix.covariance)
+    least, most = np.linalg.eigvalsh(fix.covariance[:2, :2])
     if least < LEAST_VARIANCE or most > MOST_VARIANCE:
         raise Rejection(
             'out_of_range',
@@ -80,8 +82,19 @@ def check_size(fix: Fix) -> None:
 
 def doubt_fix(message: Any) -> str | None:
     """Give ``'zero_covariance'`` for a covariance that was not filled in: all zero in x and y."""
-    block = xy_covariance(message)
+    covariance = _covariance(message)
+    block = None if covariance is None else covariance[:2, :2]
     return 'zero_covariance' if block is not None and not block.any() else None
+
+
+def doubt_height(message: Any, fix: Fix) -> str | None:
+    """Give ``'bad_height'`` for a message that states the variance of z, in a covariance that
+    cannot be true, so that `fix` has none."""
+    stated = _covariance(message)
+    if stated is None or not LEAST_VARIANCE <= stated[2, 2] < UNKNOWN_VARIANCE:
+        return None
+    kept = fix.covariance is not None and np.isfinite(fix.covariance[2, 2])
+    return None if kept or not np.isfinite(message.pose.pose.position.z) else 'bad_height'
 
 
 def write_fix(fix: Fix, make: Make) -> Any:
@@ -91,7 +104,10 @@ def write_fix(fix: Fix, make: Make) -> Any:
         np.fill_diagonal(covariance, -1.0)
     else:
         np.fill_diagonal(covariance, UNKNOWN_VARIANCE)
-        covariance[:2, :2] = fix.covariance
+        if np.isnan(fix.covariance[0, 0]):
+            covariance[:2, :2] = -np.eye(2)
+        stated = np.isfinite(fix.covariance)
+        covariance[:3, :3][stated] = fix.covariance[stated]
     return make_position(fix, fix.position, covariance, make)
 
 
@@ -111,8 +127,24 @@ def make_position(
     )
 
 
-def xy_covariance(message: Any) -> NDArray[np.float64] | None:
-    """Cut the x-y block (2, 2) out of the 6 x 6 covariance; None for a message without one."""
+def known_covariance(message: Any) -> NDArray[np.float64] | None:
+    """The covariance (3, 3) of x, y and z, NaN where it is unknown; None where it is throughout.
+
+    Raises `Rejection` where that of x and y cannot be used."""
+    covariance = _covariance(message)
+    if covariance is None:
+        return None
+    block = covariance[:2, :2]
+    if block.any() and not (np.diag(block) < 0.0).any():
+        check_covariance(block, 'a fix')
+        return covariance
+    covariance[:2], covariance[:, :2] = np.nan, np.nan
+    stated = 0.0 < covariance[2, 2] < UNKNOWN_VARIANCE
+    return covariance if stated else None
+
+
+def _covariance(message: Any) -> NDArray[np.float64] | None:
+    """Cut x, y and z (3, 3) out of the 6 x 6 covariance; None for a message without one."""
     if hasattr(message, 'point'):
         return None
     covariance = np.array(message.pose.covariance, np.float64)
@@ -120,4 +152,4 @@ def xy_covariance(message: Any) -> NDArray[np.float64] | None:
         raise Rejection(
             'bad_shape', f'the covariance of a pose has {covariance.size} numbers, 36 are needed'
         )
-    return covariance.reshape(6, 6)[:2, :2].copy()
+    return covariance.reshape(6, 6)[:3, :3].copy()

@@ -111,3 +111,8 @@ def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:
 def swap_axes(vector: Any) -> Any:
     """Turn coordinates (..., 3) of NED into ENU or back: x and y change places, z its sign."""
     return vector[..., [1, 0, 2]] * (1.0, 1.0, -1.0)
+
+
+def swap_covariance(covariance: Any) -> Any:
+    """Turn covariances (..., 3, 3) as `swap_axes` turns coordinates."""
+    return swap_axes(swap_axes(covariance).swapaxes(-1, -2))

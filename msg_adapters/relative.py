@@ -41,7 +41,7 @@ import numpy as np
 from sonar_imm.measurements import nanoseconds, NOBODY, Rejection, RelativeFix
 
 from .fixes import make_position
-from .headers import Make, stamp_ns, swap_axes
+from .headers import Make, stamp_ns, swap_axes, swap_covariance
 
 AXES = ('flu', 'frd', 'enu', 'ned')
 _FRD = np.array([1.0, -1.0, -1.0])
@@ -166,7 +166,7 @@ def _turned(
         turned = None if covariance is None else covariance * np.outer(_FRD, _FRD)
         return offset * _FRD, turned, False
     if axes == 'ned':
-        turned = None if covariance is None else swap_axes(swap_axes(covariance).T)
+        turned = None if covariance is None else swap_covariance(covariance)
         return swap_axes(offset), turned, True
     return offset, covariance, axes == 'enu'
 

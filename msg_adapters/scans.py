@@ -15,11 +15,11 @@
 """Scans of fixes: one message with all positions that were found at a stamp, also without any.
 
 Our own message is a table with one row per fix. Columns: ``x``, ``y`` f8 [m]; ``cov_x_x``,
-``cov_x_y``, ``cov_y_y`` f4 [m^2]; optional ``z`` f8 [m], ``cov_z_z`` f4, ``id`` i4, whose
-position it is, and ``valid`` u1, 0 for a fix that its sender flags as invalid. The columns are
-there in an empty scan too: a table of something else that happens to be empty is no scan. As in
-`fixes`, a negative variance or NaN means unknown, and all zeros that the covariance was not filled
-in. A negative ``id`` is nobody's.
+``cov_x_y``, ``cov_y_y`` f4 [m^2]; optional ``z`` f8 [m], ``cov_z_z`` f4 and with it ``cov_x_z``,
+``cov_y_z`` f4, ``id`` i4, whose position it is, and ``valid`` u1, 0 for a fix that its sender
+flags as invalid. The columns are there in an empty scan too: a table of something else that
+happens to be empty is no scan. As in `fixes`, a negative variance or NaN means unknown, and all
+zeros that the covariance was not filled in. A negative ``id`` is nobody's.
 
 Rows that cannot be used are left out, so that ``message.height * message.width - len(scan)``
 counts them (see `doubt_scan`).
@@ -35,14 +35,15 @@ from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Fixes, NOBODY, Rejection, usable_fixes
+from sonar_imm.measurements import Fixes, in_space, NOBODY, Rejection, usable_fixes
 
 from .fixes import LEAST_VARIANCE, MOST_VARIANCE
-from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
+from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, swap_covariance, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
-COLUMNS = (*REQUIRED, 'z', 'id', 'valid')
+OF_Z = {'cov_x_z': (0, 2), 'cov_y_z': (1, 2), 'cov_z_z': (2, 2)}
+COLUMNS = (*REQUIRED, 'z', *OF_Z, 'id', 'valid')
 MAX_FIXES = 10_000
 
 
@@ -59,9 +60,14 @@ def read_scan(message: Any, *, world_frame: str = 'enu') -> Fixes:
     rows = len(values['x'])
     z = values.get('z', np.zeros(rows))
     position = np.column_stack([values['x'], values['y'], np.where(np.isfinite(z), z, 0.0)])
-    covariance = np.stack(
+    covariance = np.full((rows, 3, 3), np.nan)
+    covariance[:, :2, :2] = np.stack(
         [values[name] for name in ('cov_x_x', 'cov_x_y', 'cov_x_y', 'cov_y_y')], axis=-1
     ).reshape(rows, 2, 2)
+    if 'z' in values and 'cov_z_z' in values:
+        for name, (i, j) in OF_Z.items():
+            covariance[:, i, j] = covariance[:, j, i] = values.get(name, np.zeros(rows))
+        covariance[~np.isfinite(z), 2, 2] = np.nan
     return _scan(message, position, covariance, _names(values.get('id')), world_frame)
 
 
@@ -92,11 +98,15 @@ def doubt_scan(message: Any, scan: Fixes) -> str | None:
 
 
 def write_scan(scan: Fixes, make: Make) -> Any:
-    """Write our table; the column ``id`` only when a row says whose it is."""
+    """Write our table; the column ``id`` only when a row says whose it is, the covariances of z
+    only when a row states it."""
     n = len(scan)
-    covariance = np.full((n, 2, 2), np.nan) if scan.covariance is None else scan.covariance
+    covariance = np.full((n, 3, 3), np.nan) if scan.covariance is None else scan.covariance
     columns: dict[str, NDArray] = dict(zip('xyz', scan.position.T))
-    for name, (i, j) in {'cov_x_x': (0, 0), 'cov_x_y': (0, 1), 'cov_y_y': (1, 1)}.items():
+    places = {'cov_x_x': (0, 0), 'cov_x_y': (0, 1), 'cov_y_y': (1, 1)}
+    if np.isfinite(covariance[:, 2, 2]).any():
+        places |= OF_Z
+    for name, (i, j) in places.items():
         columns[name] = covariance[:, i, j].astype(np.float32)
     if scan.target_id is not None:
         columns['id'] = scan.target_id
@@ -119,7 +129,7 @@ def _scan(
 ) -> Fixes:
     """The scan of the rows (n,) that can be used."""
     if covariance is not None:
-        covariance = _known(covariance)
+        covariance = in_space(_known(covariance), position)
     sized = _sized(covariance, len(position))
     try:
         # A scan looks at its rows itself: where all are good, once is enough.
@@ -152,16 +162,18 @@ def _of_rows(
 
 def _turned(scan: Fixes) -> Fixes:
     """The same scan in ENU, of one in NED."""
-    covariance = None if scan.covariance is None else scan.covariance[:, ::-1, ::-1]
+    covariance = None if scan.covariance is None else swap_covariance(scan.covariance)
     return evolve(scan, position=swap_axes(scan.position), covariance=covariance)
 
 
 def _known(covariance: NDArray) -> NDArray:
-    """Covariances (n, 2, 2) with NaN throughout where they are said to be unknown."""
-    variance = covariance[:, (0, 1), (0, 1)]
+    """Covariances (n, 3, 3) with NaN for those of x and y that are said to be unknown."""
+    flat = covariance[:, :2, :2]
+    variance = flat[:, (0, 1), (0, 1)]
     unknown = (variance < 0.0).any(axis=1) | np.isnan(variance).any(axis=1)
-    unknown |= ~covariance.any(axis=(1, 2))
-    return np.where(unknown[:, None, None], np.nan, covariance)
+    unknown |= ~flat.any(axis=(1, 2))
+    covariance[:, :2, :2] = np.where(unknown[:, None, None], np.nan, flat)
+    return covariance
 
 
 def _sized(covariance: NDArray | None, rows: int) -> NDArray[np.bool_]:

@@ -23,15 +23,21 @@ import numpy as np
 
 from sonar_imm.measurements import Rejection, Start
 
-from .fixes import LEAST_VARIANCE, make_position, MOST_VARIANCE, UNKNOWN_VARIANCE, xy_covariance
-from .headers import Make, stamp_ns, swap_axes, to_enu
+from .fixes import (
+    known_covariance,
+    LEAST_VARIANCE,
+    make_position,
+    MOST_VARIANCE,
+    UNKNOWN_VARIANCE,
+)
+from .headers import Make, stamp_ns, swap_axes, swap_covariance, to_enu
 
 
 def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
     """Read a PoseWithCovarianceStamped; the orientation is not used. Raises `Rejection`, also
     without a covariance of x and y: how far off the place may be is what a start has to say."""
-    point, block = message.pose.pose.position, xy_covariance(message)
-    if block is None or not block.any() or (np.diag(block) < 0.0).any():
+    point, covariance = message.pose.pose.position, known_covariance(message)
+    if covariance is None or np.isnan(covariance[0, 0]):
         raise Rejection(
             'no_covariance',
             'the start has no covariance of x and y: state how far off it may be, in m^2',
@@ -39,10 +45,10 @@ def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
     start = Start(
         stamp_ns=stamp_ns(message),
         position=(float(point.x), float(point.y), float(point.z)),
-        covariance=block,
+        covariance=covariance,
         frame_id=str(message.header.frame_id),
     )
-    least, most = np.linalg.eigvalsh(start.covariance)
+    least, most = np.linalg.eigvalsh(start.covariance[:2, :2])
     if least < LEAST_VARIANCE or most > MOST_VARIANCE:
         raise Rejection(
             'out_of_range',
@@ -55,11 +61,12 @@ def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
 def write_start(start: Start, make: Make) -> Any:
     """Write a PoseWithCovarianceStamped."""
     covariance = np.diag(np.full(6, UNKNOWN_VARIANCE))
-    covariance[:2, :2] = start.covariance
+    stated = np.isfinite(start.covariance)
+    covariance[:3, :3][stated] = start.covariance[stated]
     return make_position(start, start.position, covariance, make)
 
 
 def _turned(start: Start) -> Start:
     """The same start in ENU, of one in NED."""
-    turned = start.covariance[::-1, ::-1]
+    turned = swap_covariance(start.covariance)
     return evolve(start, position=swap_axes(start.position), covariance=turned)

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from sonar_imm.measurements import (
     Arrivals,
@@ -31,7 +31,7 @@ from sonar_imm.measurements import (
 )
 
 from ..arrivals import read_arrivals, write_arrivals
-from ..fixes import doubt_fix, read_fix, write_fix
+from ..fixes import doubt_fix, doubt_height, read_fix, write_fix
 from ..geodetic import doubt_geodetic, is_geodetic, read_geodetic, read_vessel_fix, write_geodetic
 from ..headers import Make
 from ..navigation import write_navigation
@@ -57,7 +57,9 @@ RELATIVE = (
 
 
 def _doubt(message: Any, fix: Fix | GeodeticFix) -> str | None:
-    return doubt_geodetic(message) if is_geodetic(message) else doubt_fix(message)
+    if is_geodetic(message):
+        return doubt_geodetic(message)
+    return doubt_fix(message) or doubt_height(message, cast(Fix, fix))
 
 
 def _write(fix: Fix | GeodeticFix, make: Make) -> Any:

@@ -30,6 +30,7 @@ Doubt = Callable[[Any, Any], str | None]
 
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
+    'bad_height': 'state a covariance of z that cannot be true; x and y are used without z',
     'no_frame': 'have no frame_id',
     'flagged_invalid': 'have rows flagged as invalid, which are left out',
     'unusable_rows': 'have rows that cannot be used, which are left out',

@@ -89,8 +89,8 @@ class TransformTree:
 def moved(measurement: Any, frame_id: str, pose: Pose) -> Any:
     """`measurement`, whose own frame has `pose` in `frame_id`, in that.
 
-    Raises `Rejection` for what cannot be turned: a frame that is tilted, because variances of x
-    and y alone are known, and what a sensor measures from itself.
+    Raises `Rejection` for what cannot be turned: a frame that is tilted, because the variance of z
+    need not be known, and what a sensor measures from itself.
     """
     if pose.R[2, 2] < UPRIGHT:
         raise Rejection(
@@ -156,9 +156,12 @@ def _placed(points: FloatArray, pose: Pose) -> FloatArray:
 
 
 def _turned(covariance: FloatArray, pose: Pose) -> FloatArray:
-    """Covariances (..., 2, 2) of x and y."""
-    R = pose.R[:2, :2]
-    return np.asarray(R @ covariance @ R.T)
+    """Covariances (..., 3, 3); NaN of what is not stated stays where it is, as z stays z."""
+    R, turned = pose.R[:2, :2], covariance.copy()
+    turned[..., :2, :2] = R @ covariance[..., :2, :2] @ R.T
+    turned[..., :2, 2] = covariance[..., :2, 2] @ R.T
+    turned[..., 2, :2] = turned[..., :2, 2]
+    return np.asarray(turned)
 
 
 def _after(yaw: float, q: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
 from .checks import check_covariance, check_stamp, nanoseconds, Rejection
-from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, Start, usable_fixes
+from .diver import Arrivals, Fix, Fixes, in_space, NOBODY, scan_of, Start, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .obstacle import (
     Altitude,
@@ -59,6 +59,7 @@ __all__ = [
     'GeodeticFix',
     'Ground',
     'IMAGE_ORDERS',
+    'in_space',
     'MAX_BINS',
     'MAX_IMAGE_CELLS',
     'Measurement',

@@ -44,15 +44,58 @@ def _ids(value: Any) -> NDArray[np.uint16]:
 NOBODY = -1
 """The `target_id` of a fix that does not say whose it is."""
 
+FARTHEST_FIX = 1e8
+"""Most metres of a fix from the origin on each axis."""
+
+UNKNOWN_VARIANCE = 1e6
+"""Variance, m^2, that senders write for what they do not know: from it on z is not stated."""
+
+LEAST_VARIANCE = 1e-12
+"""Least variance of z, m^2, that can be meant."""
+
+LEAST_REST = 1e-9
+"""Least share of the variance of z that may be left when x and y are known."""
+
+
+def in_space(covariance: Any, position: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) at `position` (n, 3) of those of x and y (n, 2, 2) or of all.
+
+    The row and the column of z are NaN where z is not stated: it has no variance, one that is not
+    positive, or `UNKNOWN_VARIANCE` and more; it goes together with x and y as no errors can; or z
+    itself is not finite. x and y are then used without it. Where x and y are unknown (NaN), z may
+    be stated all the same. Raises `Rejection` for other shapes.
+    """
+    given, n = np.array(covariance, np.float64), len(position)
+    whole = np.full((n, 3, 3), np.nan)
+    if given.shape == (n, 2, 2):
+        whole[:, :2, :2] = given
+        return whole
+    whole[:] = floats(given, n, 3, 3)
+    with np.errstate(all='ignore'):
+        variance, across = whole[:, 2, 2], 0.5 * (whole[:, 2, :2] + whole[:, :2, 2])
+        a, b, d = whole[:, 0, 0], 0.5 * (whole[:, 0, 1] + whole[:, 1, 0]), whole[:, 1, 1]
+        x, y = across.T
+        taken = (x * x * d - 2.0 * x * y * b + y * y * a) / (a * d - b * b)
+        apart = np.abs(whole[:, 2, :2] - whole[:, :2, 2]).max(axis=1, initial=0.0)
+        real = (taken >= 0.0) & (taken <= (1.0 - LEAST_REST) * variance)
+        real &= apart <= 1e-6 * np.sqrt(variance * np.maximum(a, d))
+    flat = np.isnan(whole[:, :2, :2]).all(axis=(1, 2))
+    stated = (variance >= LEAST_VARIANCE) & (variance < UNKNOWN_VARIANCE) & (real | flat)
+    stated &= np.abs(position[:, 2]) <= FARTHEST_FIX
+    whole[flat, 2, :2] = whole[flat, :2, 2] = np.nan
+    whole[~stated, 2, :] = whole[~stated, :, 2] = np.nan
+    return whole
+
 
 @frozen(eq=False, kw_only=True)
 class Fix:
     """A position found elsewhere: multistatic fusion, USBL, GPS.
 
     position: (3,) x, y, z in `frame_id`, metres (ENU by default; z may be 0).
-    covariance: (2, 2) of x and y in m^2, or None when the sender does not know it.
-    target_id: whose position it is, `NOBODY` when that is not known; sensor: which of several
-    sensors it is from, by a name of the parameter `sensors`.
+    covariance: (3, 3) in m^2, or None when the sender does not know it; NaN in the row and column
+    of z where z is not stated, NaN in the block of x and y where only z is (`in_space`). Also
+    taken: (2, 2) of x and y. target_id: whose position it is, `NOBODY` when that is not known;
+    sensor: which of several sensors it is from, by a name of the parameter `sensors`.
     """
 
     stamp_ns: int
@@ -72,15 +115,23 @@ class Fix:
                 f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin',
             )
         if self.covariance is not None:
-            covariance = floats(self.covariance, 2, 2)
-            check_covariance(covariance, 'a fix')
-            covariance = 0.5 * covariance + 0.5 * covariance.T
-            covariance.flags.writeable = False
+            covariance = _checked(self.covariance, self.position, 'a fix')
             object.__setattr__(self, 'covariance', covariance)
 
     def key(self) -> bytes:
         """See `content_key`."""
         return content_key('fix' + self.sensor, self.position, self.covariance, _target_ids(self))
+
+
+def _checked(covariance: Any, position: FloatArray, what: str) -> FloatArray:
+    """A read-only covariance (3, 3), see `in_space`, of one whose part of x and y is good or,
+    where z is stated, unknown. Raises `Rejection`."""
+    whole = in_space(np.array(covariance, np.float64)[None], position[None])[0]
+    if np.isnan(whole[2, 2]) or not np.isnan(whole[:2, :2]).all():
+        check_covariance(whole[:2, :2], what)
+    whole = 0.5 * whole + 0.5 * whole.T
+    whole.flags.writeable = False
+    return np.asarray(whole)
 
 
 def _target_ids(fix: Fix) -> NDArray | None:
@@ -100,10 +151,10 @@ def _names(value: Any) -> NDArray[np.int32] | None:
 class Fixes:
     """A scan: all positions that were found at one stamp, also when there are none.
 
-    position: (n, 3) x, y, z in `frame_id`, metres; covariance: (n, 2, 2) of x and y in m^2, a row
-    of NaN where the sender does not know it, None when no row has one; target_id: (n,) whose
-    position it is, `NOBODY` where that is not known, None when no row says so; sensor: as of
-    `Fix`.
+    position: (n, 3) x, y, z in `frame_id`, metres; covariance: (n, 3, 3) in m^2, each as of `Fix`,
+    NaN throughout where the sender does not know it, None when no row has one; also taken:
+    (n, 2, 2); target_id: (n,) whose position it is, `NOBODY` where that is not known, None when no
+    row says so; sensor: as of `Fix`.
     """
 
     stamp_ns: int
@@ -121,7 +172,8 @@ class Fixes:
                 'bad_shape', f'fixes: {len(self.target_id)} identities for {n} positions'
             )
         if self.covariance is not None:
-            covariance = floats(self.covariance, n, 2, 2)
+            covariance = in_space(self.covariance, self.position)
+            covariance.flags.writeable = False
             object.__setattr__(self, 'covariance', covariance)
         if not usable_fixes(self.position, self.covariance).all():
             raise Rejection(
@@ -150,17 +202,15 @@ def scan_of(measurement: Fix | Fixes) -> Fixes:
     )
 
 
-FARTHEST_FIX = 1e8
-"""Most metres of a fix from the origin on each axis."""
-
-
 def usable_fixes(position: FloatArray, covariance: FloatArray | None) -> NDArray[np.bool_]:
-    """Which of the positions (n, 3), with covariances (n, 2, 2) or None, can be used: finite x and
-    y, and a covariance that is unknown (NaN throughout) or symmetric and positive definite."""
+    """Which of the positions (n, 3), with covariances (n, 3, 3) or None, can be used: finite x and
+    y, and a covariance of these that is unknown (NaN throughout) or symmetric and positive
+    definite."""
     with np.errstate(invalid='ignore', over='ignore'):
         usable = (np.abs(position[:, :2]) <= FARTHEST_FIX).all(axis=1)
         if covariance is None:
             return np.asarray(usable)
+        covariance = covariance[:, :2, :2]
         a, b, c, d = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
         scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
         # Relative to the largest entry, so that nothing overflows; as `check_covariance`.
@@ -259,22 +309,18 @@ class Arrivals:
         return len(self) > 0 and bool(np.isnan(self.tx).all())
 
 
-def plane_covariance(value: Any) -> FloatArray:
-    """Read-only (2, 2)."""
-    return floats(value, 2, 2)
-
-
 @frozen(eq=False, kw_only=True)
 class Start:
     """Where somebody says that a diver is: not measured, but from a person or another program.
 
     position: (3,) x, y, z in `frame_id`, the frame of the tracks, m; z is not used by a tracker of
-    two dimensions. covariance: (2, 2) of x and y, m^2; there is no start without one.
+    two dimensions. covariance: (3, 3) or (2, 2) in m^2 as of `Fix`; there is no start without one
+    of x and y.
     """
 
     stamp_ns: int
     position: FloatArray = field(converter=point)
-    covariance: FloatArray = field(converter=plane_covariance)
+    covariance: FloatArray
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
@@ -286,7 +332,9 @@ class Start:
                 'out_of_range',
                 f'the start lies at {self.position[:2]}, further than 100,000 km from the origin',
             )
-        check_covariance(self.covariance, 'a start')
+        covariance = _checked(self.covariance, self.position, 'a start')
+        check_covariance(covariance[:2, :2], 'a start')
+        object.__setattr__(self, 'covariance', covariance)
 
     def key(self) -> bytes:
         """See `content_key`."""

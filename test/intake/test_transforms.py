@@ -88,8 +88,11 @@ def test_positions_are_turned_with_their_covariances():
         place = kind(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='a')
         made = moved(place, 'map', TURNED)
         assert made.frame_id == 'map' and made.stamp_ns == STAMP
-        check_turned(place.position, made.position, covariance, made.covariance)
+        check_turned(place.position, made.position, covariance, made.covariance[:2, :2])
     assert moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0]), 'map', TURNED).covariance is None
+    whole = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, -0.4], [0.5, -0.4, 0.25]])
+    made = moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0], covariance=whole), 'map', TURNED)
+    assert made.covariance == pytest.approx(TURNED.R @ whole @ TURNED.R.T, abs=1e-12)
     unknown = np.full((2, 2), np.nan)
     scan = Fixes(
         stamp_ns=STAMP,
@@ -97,7 +100,7 @@ def test_positions_are_turned_with_their_covariances():
         covariance=np.array([covariance, unknown]),
     )
     made = moved(scan, 'map', TURNED)
-    check_turned(scan.position[0], made.position[0], covariance, made.covariance[0])
+    check_turned(scan.position[0], made.position[0], covariance, made.covariance[0, :2, :2])
     assert np.isnan(made.covariance[1]).all()
 
 

@@ -19,11 +19,16 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from msg_adapters.fixes import doubt_fix, read_fix, write_fix
+from msg_adapters.fixes import doubt_fix, doubt_height, read_fix, write_fix
 from sonar_imm.measurements import Fix, Rejection
 from sonar_imm_tools.recordings.messages import ros_message
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+WHOLE = [[4.0, 0.1, 0.2], [0.1, 9.0, 0.3], [0.2, 0.3, 0.25]]
+ONLY_Z = np.full((3, 3), np.nan)
+ONLY_Z[2, 2] = 0.25
 
 
 def header(sec=100, nanosec=5, frame_id='map'):
@@ -56,7 +61,8 @@ def test_a_pose_and_a_point_are_read():
     fix = read_fix(pose(block(4.0, 0.5, 0.5, 9.0)))
     assert fix.stamp_ns == 100_000_000_005 and fix.frame_id == 'map'
     assert fix.position.tolist() == [1.0, 2.0, 3.0]
-    assert fix.covariance.tolist() == [[4.0, 0.5], [0.5, 9.0]]
+    assert fix.covariance[:2, :2].tolist() == [[4.0, 0.5], [0.5, 9.0]]
+    assert np.isnan(fix.covariance[2]).all()
     point = ros_message(
         'geometry_msgs/msg/PointStamped',
         header=header(),
@@ -84,7 +90,52 @@ def test_what_is_not_used_may_be_nonsense():
     covariance = block(4.0, 0.0, 0.0, 9.0)
     covariance[2:, 2:] = np.nan
     fix = read_fix(pose(covariance, z=math.nan))
-    assert fix.covariance.tolist() == [[4.0, 0.0], [0.0, 9.0]] and fix.position[2] == 0.0
+    assert fix.covariance[:2, :2].tolist() == [[4.0, 0.0], [0.0, 9.0]]
+    assert np.isnan(fix.covariance[2]).all() and fix.position[2] == 0.0
+
+
+def spatial(variance, *across, z=3.0, flat=((4.0, 0.0), (0.0, 9.0))):
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2], covariance[2, 2] = flat, variance
+    for axis, value in enumerate(across):
+        covariance[2, axis] = covariance[axis, 2] = value
+    return pose(covariance, z=z)
+
+
+def test_the_height_is_read_where_its_variance_is_stated():
+    fix = read_fix(spatial(0.25, 0.5, -0.2))
+    assert fix.covariance.tolist() == [[4.0, 0.0, 0.5], [0.0, 9.0, -0.2], [0.5, -0.2, 0.25]]
+    turned = read_fix(spatial(0.25, 0.5, -0.2), world_frame='ned')
+    assert turned.covariance.tolist() == [[9.0, 0.0, 0.2], [0.0, 4.0, -0.5], [0.2, -0.5, 0.25]]
+    assert doubt_height(spatial(0.25, 0.5, -0.2), fix) is None
+    alone = read_fix(spatial(0.25, flat=-np.eye(2)))
+    assert np.isnan(alone.covariance[:2]).all() and alone.covariance[2, 2] == 0.25
+
+
+@pytest.mark.parametrize(
+    'message',
+    [
+        spatial(0.0),
+        spatial(-1.0),
+        spatial(math.nan),
+        spatial(math.inf),
+        spatial(1e-300),
+        spatial(1e6),
+        spatial(0.25, math.nan),
+        spatial(0.25, 1.0, 0.0),  # as good as singular with x: the correlation is 1
+        spatial(0.25, 0.9, 0.9),
+        spatial(0.25, 1e300, -1e300),
+        spatial(0.25, z=math.nan),
+        spatial(0.25, z=1e9),
+    ],
+)
+def test_a_height_that_is_not_stated_or_cannot_be_true_is_left_out_alone(message):
+    fix = read_fix(message)
+    assert fix.covariance[:2, :2].tolist() == [[4.0, 0.0], [0.0, 9.0]]
+    assert np.isnan(fix.covariance[2]).all() and np.isnan(fix.covariance[:, 2]).all()
+    variance, z = message.pose.covariance[14], message.pose.pose.position.z
+    doubted = 1e-12 <= variance < 1e6 and math.isfinite(z)
+    assert doubt_height(message, fix) == ('bad_height' if doubted else None)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +166,7 @@ def test_a_covariance_of_another_size_is_refused():
     assert reason(message) == 'bad_shape'
 
 
-@pytest.mark.parametrize('covariance', [None, [[4.0, 0.1], [0.1, 9.0]]])
+@pytest.mark.parametrize('covariance', [None, [[4.0, 0.1], [0.1, 9.0]], WHOLE, ONLY_Z])
 def test_writing_and_reading_gives_the_same_fix(covariance):
     fix = Fix(
         stamp_ns=1700000000123456789,
@@ -130,7 +181,7 @@ def test_writing_and_reading_gives_the_same_fix(covariance):
     assert (
         (again.covariance is None)
         if covariance is None
-        else (again.covariance == fix.covariance).all()
+        else again.covariance.tobytes() == fix.covariance.tobytes()
     )
 
 
@@ -156,7 +207,7 @@ NASTY = (
 
 
 @given(
-    values=st.binary(min_size=7, max_size=7),
+    values=st.binary(min_size=10, max_size=10),
     symmetric=st.booleans(),
     sec=st.sampled_from((1, 0, -1, 1700000000, 2**31 - 1, -(2**31))),
     nanosec=st.sampled_from((0, 5, 999999999, 10**9, 2**32 - 1)),
@@ -165,10 +216,12 @@ NASTY = (
 )
 @settings(max_examples=1_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, frame_id, world):
-    x, y, z, a, b, c, d = (NASTY[value % len(NASTY)] for value in values)
-    message = pose(
-        block(a, b, b if symmetric else c, d), x, y, z, sec=sec, nanosec=nanosec, frame_id=frame_id
-    )
+    x, y, z, a, b, c, d, *of_z = (NASTY[value % len(NASTY)] for value in values)
+    covariance = block(a, b, b if symmetric else c, d)
+    covariance[2, :3] = of_z
+    if symmetric:
+        covariance[:2, 2] = covariance[2, :2]
+    message = pose(covariance, x, y, z, sec=sec, nanosec=nanosec, frame_id=frame_id)
     try:
         fix = read_fix(message, world_frame=world)
     except Rejection as rejection:
@@ -176,6 +229,10 @@ def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, fr
         return
     assert np.isfinite(fix.position).all() and fix.stamp_ns > 0
     if fix.covariance is not None:
-        assert np.isfinite(fix.covariance).all()
-        assert (np.linalg.eigvalsh(fix.covariance) >= 0.99e-12).all()
-        assert fix.covariance.max() <= 1e16
+        flat, z = fix.covariance[:2, :2], fix.covariance[2, 2]
+        assert np.isnan(z) or 1e-12 <= z < 1e6
+        if np.isfinite(z) and np.isnan(flat).all():
+            return
+        assert np.isfinite(flat).all()
+        assert (np.linalg.eigvalsh(flat) >= 0.99e-12).all()
+        assert flat.max() <= 1e16

@@ -26,6 +26,7 @@ from sonar_imm.measurements import Fixes, Rejection
 from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 1_700_000_000_123_456_789
+FLAT = [[4.0, 0.5], [0.5, 9.0]]
 
 
 def scan(**columns):
@@ -56,7 +57,9 @@ def test_a_table_is_read():
     got = read_scan(scan(z=[5.0, math.nan], id=np.array([7, -1], np.int32)))
     assert got.stamp_ns == STAMP and got.frame_id == 'map' and len(got) == 2
     assert got.position.tolist() == [[1.0, 2.0, 5.0], [3.0, 4.0, 0.0]]
-    assert got.covariance.tolist() == [[[1.0, 0.5], [0.5, 1.0]], [[4.0, 0.0], [0.0, 9.0]]]
+    flat = got.covariance[:, :2, :2]
+    assert flat.tolist() == [[[1.0, 0.5], [0.5, 1.0]], [[4.0, 0.0], [0.0, 9.0]]]
+    assert np.isnan(got.covariance[:, 2]).all()
     assert got.target_id.tolist() == [7, -1]
     assert read_scan(scan()).target_id is None
 
@@ -70,7 +73,8 @@ def test_an_empty_scan_is_a_scan_and_an_empty_table_of_something_else_is_none():
 
 def test_unknown_covariances_are_nan_in_their_rows():
     got = read_scan(scan(cov_x_x=[-1.0, 4.0]))
-    assert np.isnan(got.covariance[0]).all() and got.covariance[1].tolist() == [[4, 0], [0, 9]]
+    assert np.isnan(got.covariance[0]).all()
+    assert got.covariance[1, :2, :2].tolist() == [[4, 0], [0, 9]]
     zero = [0.0, 0.0]
     assert read_scan(scan(cov_x_x=zero, cov_x_y=zero, cov_y_y=zero)).covariance is None
 
@@ -109,23 +113,28 @@ def test_north_east_down_is_turned():
     message = scan(z=[5.0, 6.0])
     got = read_scan(message, world_frame='ned')
     assert got.position.tolist() == [[2.0, 1.0, -5.0], [4.0, 3.0, -6.0]]
-    assert got.covariance[1].tolist() == [[9.0, 0.0], [0.0, 4.0]]
+    assert got.covariance[1, :2, :2].tolist() == [[9.0, 0.0], [0.0, 4.0]]
 
 
 @pytest.mark.parametrize('n', [0, 1, 5])
 @pytest.mark.parametrize('named', [False, True])
-def test_writing_and_reading_gives_the_same_scan(n, named):
+@pytest.mark.parametrize('deep', [False, True])
+def test_writing_and_reading_gives_the_same_scan(n, named, deep):
     rng = np.random.default_rng(n)
     one = Fixes(
         stamp_ns=STAMP,
         position=rng.normal(size=(n, 3)) * 1e5,
-        covariance=np.tile([[4.0, 0.5], [0.5, 9.0]], (n, 1, 1)),
+        covariance=np.tile(
+            [[4.0, 0.5, 0.25], [0.5, 9.0, 0.5], [0.25, 0.5, 1.0]] if deep else FLAT, (n, 1, 1)
+        ),
         target_id=np.arange(n) if named else None,
         frame_id='map',
     )
-    again = read_scan(write_scan(one, ros_message))
+    message = write_scan(one, ros_message)
+    assert ('cov_z_z' in [each.name for each in message.fields]) == (deep and n > 0)
+    again = read_scan(message)
     assert again.stamp_ns == one.stamp_ns and (again.position == one.position).all()
-    assert n == 0 or (again.covariance == one.covariance).all()
+    assert n == 0 or again.covariance.tobytes() == one.covariance.tobytes()
     assert (again.target_id is None) == (not named or n == 0)
 
 
@@ -143,16 +152,29 @@ def test_poses_are_fixes_without_covariance():
     )
 
 
+def test_heights_are_read_where_they_are_stated():
+    z = {'z': [5.0, math.nan], 'cov_z_z': [0.25, 0.25]}
+    got = read_scan(scan(**z)).covariance
+    assert got[0].tolist() == [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.25]]
+    assert np.isnan(got[1, 2]).all()
+    turned = read_scan(scan(**z, cov_x_z=[0.1, 0.0], cov_y_z=[0.2, 0.0]), world_frame='ned')
+    assert turned.covariance[0, 2] == pytest.approx([-0.2, -0.1, 0.25])
+    only = read_scan(scan(**z, cov_x_x=[-1.0, 4.0])).covariance[0]
+    assert np.isnan(only[:2]).all() and only[2, 2] == 0.25
+    assert np.isnan(read_scan(scan(cov_z_z=[1.0, 1.0])).covariance[:, 2]).all()
+
+
 NASTY = (1.0, 4.0, 0.5, 0.0, -1.0, 1e-300, 1e9, 1e300, math.nan, math.inf, -math.inf, 1 / 3)
 
 
 @given(
-    values=st.lists(st.sampled_from(NASTY), min_size=14, max_size=14),
+    values=st.lists(st.sampled_from(NASTY), min_size=20, max_size=20),
     world=st.sampled_from(['enu', 'ned']),
 )
 @settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_scans_are_refused_or_finite(values, world):
-    names = ('x', 'y', 'z', 'cov_x_x', 'cov_x_y', 'cov_y_y', 'id')
+    deep = ('cov_x_z', 'cov_y_z', 'cov_z_z')
+    names = ('x', 'y', 'z', 'cov_x_x', 'cov_x_y', 'cov_y_y', 'id', *deep)
     columns = {name: values[2 * k : 2 * k + 2] for k, name in enumerate(names)}
     try:
         got = read_scan(scan(**columns), world_frame=world)
@@ -161,5 +183,9 @@ def test_hostile_scans_are_refused_or_finite(values, world):
         return
     assert np.isfinite(got.position).all()
     if got.covariance is not None:
-        known = got.covariance[~np.isnan(got.covariance).any(axis=(1, 2))]
+        flat = got.covariance[:, :2, :2]
+        known = flat[~np.isnan(flat).any(axis=(1, 2))]
+        assert len(known) + np.isnan(flat).all(axis=(1, 2)).sum() == len(flat)
+        whole = got.covariance[~np.isnan(got.covariance).any(axis=(1, 2))]
+        assert (np.linalg.det(whole / np.abs(whole).max(axis=(1, 2))[:, None, None]) > 0.0).all()
         assert (np.linalg.eigvalsh(known) > 0.0).all() and (known <= 1e10 * UNKNOWN_VARIANCE).all()

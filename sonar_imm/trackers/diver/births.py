@@ -36,9 +36,11 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import Arrivals, NOBODY, Start
 from .config import DiverConfig
+from .heights import begin
 from .pings import begin_from_ping, FAR
 from .scan import (
     bearing_variance,
+    Height,
     name_of,
     ping_measurements,
     Positions,
@@ -56,6 +58,9 @@ it."""
 MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
 
+LOST = 1e-9
+"""A ping as improbable of a track as this says that the track was somewhere else."""
+
 MOST_FOUND = 10
 """Positions found by combining the echoes of one ping; those of others are found in later ones."""
 
@@ -63,7 +68,7 @@ MOST_FOUND = 10
 class Birth(NamedTuple):
     """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
     which it is, None for a fix; the probability that there is a diver, NaN where its hits will
-    tell; whose track it is; whether it is measured, and no start."""
+    tell; whose track it is; whether it is measured, and no start; what is stated of z there."""
 
     position: FloatArray
     covariance: FloatArray
@@ -72,6 +77,7 @@ class Birth(NamedTuple):
     existence: float = math.nan
     target_id: int = NOBODY
     measured: bool = True
+    height: Height | None = None
 
 
 def births_from_fixes(
@@ -83,7 +89,10 @@ def births_from_fixes(
     for d in np.flatnonzero(free).tolist():
         known = math.nan if existence is None else float(existence[d])
         name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
-        births.append(Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name))
+        height = None if fixes.heights is None else fixes.heights.row(d)
+        births.append(
+            Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name, height=height)
+        )
     return births
 
 
@@ -209,6 +218,17 @@ def new_tracks(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """x (B, M, n + q), P (B, M, n + q, n + q) and mu (B, M) of tracks that begin."""
+    x, P, mu = _new_tracks(births, models, layout, config)
+    if models.height >= 0:
+        for row, birth in enumerate(births):
+            if birth.height is not None:
+                begin(x[row], P[row], birth.height, birth.covariance, models.height, config)
+    return x, P, mu
+
+
+def _new_tracks(
+    births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     plain = models.height < 0 and layout.size == models.n
     if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
         position = np.array([birth.position for birth in births])
@@ -250,6 +270,36 @@ def _new_track(
     return at, covariance, mu
 
 
+def begun_anew(
+    now: DiverState,
+    ping: Arrivals,
+    free: BoolArray,
+    models: ModelSet,
+    layout: Layout,
+    config: DiverConfig,
+) -> DiverState:
+    """The tracks after a ping, whose rows (n,) are taken but for those that are `free`. With depth
+    as a state, a track that took what was all but impossible begins anew where the ping alone puts
+    it: an update over such a way is far from linear, and what it makes of the depth is nothing
+    known."""
+    hit, rows = np.flatnonzero(now.nis_dof), np.flatnonzero(~free)
+    if models.height < 0 or len(hit) != 1:
+        return now
+    (track,) = hit
+    dof = int(now.nis_dof[track])
+    if dof < SEED_PAIRS or now.nis[track] <= gate_threshold(1.0 - LOST, dof):
+        return now
+    mean, covariance = now.positions(models.E[:, :2])
+    birth = Birth(mean[track], covariance[track], ping, rows)
+    parts = zip((now.x, now.P, now.mu), new_tracks([birth], models, layout, config))
+    x, P, mu = (np.concatenate([old[:track], new, old[track + 1 :]]) for old, new in parts)
+    if not (np.isfinite(x).all() and np.isfinite(P).all()):
+        return now
+    spreads = now.spreads.copy()
+    spreads[track] += 1
+    return now._replace(x=x, P=P, mu=mu, spreads=spreads)
+
+
 # -- starts --------------------------------------------------------------------------------------
 
 
@@ -289,6 +339,8 @@ def _agree(now: DiverState, start: Start, config: DiverConfig, E: FloatArray) ->
     mean, covariance = now.positions(E)
     apart = start.position[:2] - mean
     squared = np.einsum(
-        'ta,ta->t', apart, np.linalg.solve(covariance + start.covariance, apart[..., None])[..., 0]
+        'ta,ta->t',
+        apart,
+        np.linalg.solve(covariance + start.covariance[:2, :2], apart[..., None])[..., 0],
     )
     return np.asarray(squared <= gate_threshold(config.gate_probability, 2))

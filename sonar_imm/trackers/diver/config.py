@@ -230,7 +230,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # -- depth -----------------------------------------------------------------------------------
     dimensions: int = parameter(2, '',
         'number of coordinates estimated: 2 (the diver is at target_z) or 3 (depth is a state, '
-        'from arrivals)', range=(2, 3))
+        'from arrivals, and from fixes that state a variance of z)', range=(2, 3))
     depth_min: float = parameter(0.0, 'm',
         'least depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
     depth_max: float = parameter(20.0, 'm',

@@ -27,6 +27,7 @@ import numpy as np
 from ...estimation import imm_kernels
 from ...estimation.adaptation import row_sum
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.consider import consider_scalar
 from ...estimation.consistency import FARTHEST
 from ...estimation.jit import kernel
 
@@ -181,3 +182,83 @@ def watch(
         (sums[3] + row_sum(cross)) * kept,
         (sums[4] + 0.5 * row_sum(paired[:pairs])) * kept,
     )
+
+
+@kernel
+def update_heights(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    H: FloatArray,
+    place: int,
+    value: FloatArray,
+    gain: FloatArray,
+    rest: FloatArray,
+    tracks: IntArray,
+    weight: FloatArray,
+    estimated: BoolArray,
+    threshold: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Update `tracks` (t,), each by one number: `value` (t,) is z, at `place` in the state, less
+    `gain` (t, 2) times x and y as H (1, M, 2, n) measures them, with variance `rest` (t,). Gives x
+    (T, M, n), P (T, M, n, n), mu (T, M) and the NIS (t,) of the mixture, by which nothing changes
+    where it is above `threshold`.
+
+    weight (t,): probability that the number is the track's. Below 1 each model becomes the mixture
+    of what it is with it and without. estimated (n,): see `estimation.consider`."""
+    x, P, mu = x.copy(), P.copy(), mu.copy()
+    M, n = x.shape[1], x.shape[2]
+    h, innovation = np.empty((M, n)), np.empty(M)
+    density, scratch = np.empty(M), np.empty(n)
+    nis = np.empty(len(tracks))
+    for k in range(len(tracks)):
+        t = tracks[k]
+        mean, square = 0.0, 0.0
+        for j in range(M):
+            innovation[j] = value[k]
+            for a in range(n):
+                h[j, a] = -gain[k, 0] * H[0, j, 0, a] - gain[k, 1] * H[0, j, 1, a]
+                if a == place:
+                    h[j, a] += 1.0
+                innovation[j] -= h[j, a] * x[t, j, a]
+            S = rest[k]
+            for a in range(n):
+                for b in range(n):
+                    S += h[j, a] * P[t, j, a, b] * h[j, b]
+            mean += mu[t, j] * innovation[j]
+            square += mu[t, j] * (S + innovation[j] * innovation[j])
+        nis[k] = mean * mean / (square - mean * mean)
+        if not nis[k] <= threshold:
+            continue
+        without_x, without_P = x[t].copy(), P[t].copy()
+        most = -math.inf
+        for j in range(M):
+            density[j] = consider_scalar(
+                x[t, j], P[t, j], h[j], rest[k], innovation[j], estimated, scratch
+            )
+            if mu[t, j] > 0.0:
+                most = max(most, density[j])
+        if most == -math.inf:
+            nis[k] = math.inf
+            continue
+        total = 0.0
+        for j in range(M):
+            density[j] = math.exp(density[j] - most) if mu[t, j] > 0.0 else 0.0
+            total += mu[t, j] * density[j]
+        for j in range(M):
+            own = weight[k] * density[j] / total
+            none = 1.0 - weight[k]
+            mu[t, j] *= own + none
+            if weight[k] < 1.0:
+                own /= own + none
+                for a in range(n):
+                    for b in range(n):
+                        spread = (x[t, j, a] - without_x[j, a]) * (x[t, j, b] - without_x[j, b])
+                        P[t, j, a, b] = (
+                            own * P[t, j, a, b]
+                            + (1.0 - own) * without_P[j, a, b]
+                            + own * (1.0 - own) * spread
+                        )
+                for a in range(n):
+                    x[t, j, a] = own * x[t, j, a] + (1.0 - own) * without_x[j, a]
+    return x, P, mu, nis

@@ -212,10 +212,12 @@ class Georeferencer:
 
     def _fix_of(self, fix: GeodeticFix) -> Fix:
         position, covariance = self._local(fix)
+        if covariance is not None and np.isnan(fix.height):
+            covariance[2, 2] = np.nan
         return Fix(
             stamp_ns=fix.stamp_ns,
             position=position,
-            covariance=None if covariance is None else covariance[:2, :2],
+            covariance=covariance,
             target_id=fix.target_id,
             sensor=fix.sensor,
             frame_id=self.config.map_frame,
@@ -339,7 +341,7 @@ class Georeferencer:
         return Fix(
             stamp_ns=fix.stamp_ns,
             position=placed.position,
-            covariance=placed.covariance[:2, :2],
+            covariance=placed.covariance,
             target_id=fix.target_id,
             sensor=fix.sensor,
             frame_id=vessel.frame_id,

@@ -43,6 +43,7 @@ from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
 from . import coverage
 from .config import DiverConfig
+from .heights import spread
 from .ping_kernels import (
     DEGREES,
     expect_measurements,
@@ -172,6 +173,7 @@ def _by_ping(
     seen = ping_measurements(ping, rows, config, factor, models, layout)
     if not len(x) or seen.pairs <= int(ping.passive):
         return now, free & (name == NOBODY)
+    now = spread(now, seen, layout, models)
     if name != NOBODY:
         taking = _taking(now, int(own[0]), seen, config, layout, factor)
         takings = {} if taking is None else {int(own[0]): taking}

@@ -24,6 +24,7 @@ A ping is a table of measurements (`Ping`). Its rows come in the order of their 
 from __future__ import annotations
 
 from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 from attrs import frozen
@@ -48,6 +49,50 @@ OUTLIER_DENSITY = 1.0 / 50.0
 """Density of a wild path length, 1/m: late by anything up to 50 m."""
 
 
+class Height(NamedTuple):
+    """What a fix states of z: the value, how its error goes with those of x and y (2,), and the
+    variance of the rest."""
+
+    value: float
+    gain: FloatArray
+    rest: float
+
+    def variance(self, covariance: FloatArray) -> float:
+        """Of z itself, beside x and y with `covariance` (2, 2)."""
+        return self.rest + float(self.gain @ covariance @ self.gain)
+
+
+class Heights(NamedTuple):
+    """`Height` of D fixes: value (D,), NaN for none; gain (D, 2); rest (D,)."""
+
+    value: FloatArray
+    gain: FloatArray
+    rest: FloatArray
+
+    @classmethod
+    def of(cls, position: FloatArray, covariance: FloatArray, factor: float) -> Heights | None:
+        """Of fixes at `position` (D, 3) with `covariance` (D, 3, 3) times `factor`; None where no
+        one states z."""
+        variance = covariance[:, 2, 2]
+        stated = np.isfinite(variance)
+        if not stated.any():
+            return None
+        flat, across = covariance[:, :2, :2], covariance[:, :2, 2]
+        both = stated & np.isfinite(across).all(axis=1)
+        gain = np.zeros((len(position), 2))
+        gain[both] = np.linalg.solve(flat[both], across[both][..., None])[..., 0]
+        rest = variance - np.where(
+            both, (gain * np.where(both[:, None], across, 0.0)).sum(axis=1), 0.0
+        )
+        return cls(np.where(stated, position[:, 2], np.nan), gain, rest * factor)
+
+    def row(self, d: int) -> Height | None:
+        """Of one fix, None where it states no z."""
+        if not math.isfinite(self.value[d]):
+            return None
+        return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
+
+
 @frozen(eq=False)
 class Positions:
     """D fixes of one stamp and sensor, of which each diver causes at most one: z (D, 2), R
@@ -56,7 +101,8 @@ class Positions:
     config: the parameters, with those of the sensor; factor: what the stated covariances were
     multiplied by to give R; target_id: (D,) whose fixes they are, None when that is not known of
     any; whole: whether they are all that there was to see, so that a diver without a fix was
-    missed; sensor: its name.
+    missed; heights: what they state of z, None where nothing, or depth is no state; sensor: its
+    name.
     """
 
     z: FloatArray
@@ -65,6 +111,7 @@ class Positions:
     factor: float
     target_id: IntArray | None
     whole: bool
+    heights: Heights | None = None
     sensor: str = ''
 
 
@@ -169,12 +216,17 @@ def _group(
 ) -> Positions:
     """The rows of a scan, with their names or as all that there was to see."""
     R = np.tile(np.eye(2) * config.fix_std**2, (len(scan), 1, 1))
+    heights = None
     if scan.covariance is not None:
-        stated = np.asarray(np.isfinite(scan.covariance).all(axis=(1, 2)))
-        R = np.where(stated[:, None, None], scan.covariance, R)
+        flat = scan.covariance[:, :2, :2]
+        stated = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
+        R = np.where(stated[:, None, None], flat, R)
+        if config.dimensions == 3:
+            heights = Heights.of(scan.position[rows], scan.covariance[rows], factor)
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(scan.position[rows, :2])
-    return Positions(z, R[rows] * factor, config, factor, target_id, not named, scan.sensor)
+    named_rows = target_id, not named, heights, scan.sensor
+    return Positions(z, R[rows] * factor, config, factor, *named_rows)
 
 
 def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
@@ -184,9 +236,15 @@ def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Posit
     R = np.empty((len(fixes), 2, 2))
     for row, fix in enumerate(fixes):
         z[row] = fix.position[:2]
-        R[row] = unknown if fix.covariance is None else fix.covariance
-    whole, sensor = config.fixes_are_scans, fixes[0].sensor
-    return Positions(z, R * factor, config, factor, None, whole, sensor)
+        stated = None if fix.covariance is None else fix.covariance[:2, :2]
+        R[row] = unknown if stated is None or math.isnan(stated[0, 0]) else stated
+    heights = None
+    if config.dimensions == 3:
+        nothing = np.full((3, 3), np.nan)
+        whole = [nothing if fix.covariance is None else fix.covariance for fix in fixes]
+        heights = Heights.of(np.array([fix.position for fix in fixes]), np.array(whole), factor)
+    more = None, config.fixes_are_scans, heights, fixes[0].sensor
+    return Positions(z, R * factor, config, factor, *more)
 
 
 # -- pings ---------------------------------------------------------------------------------------

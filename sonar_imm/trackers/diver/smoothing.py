@@ -170,6 +170,8 @@ class SmoothingDiverTracker(DiverTracker):
             for row, track_id in enumerate(now.life.track_id.tolist()):
                 came = np.flatnonzero(before.life.track_id == track_id)
                 cut = len(between) >= LONGEST_GAP and len(self.models.names) > 1
+                # Copies that were spread anew have no past of their own.
+                cut |= any(before.spreads[came] != now.spreads[row])
                 if not number or not len(came) or cut:
                     newest[track_id] = _Pass()
                     passes.append((track_id, newest[track_id]))

@@ -30,6 +30,7 @@ from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from ...estimation.hypotheses import Hypotheses
 from . import family_kernels
+from .config import DiverConfig
 from .family_kernels import Mixing
 from .state_space import Instruments, ModelSet, Motion
 
@@ -57,6 +58,12 @@ sum of the logarithms of what was above it, over groups of fixes in turn, that i
 8 groups where the scale is 10, 17 where it is 4. Of true covariances the sum stayed below 4 in
 four hours of the scenes of `simulate`."""
 
+DOUBTED = 0.1
+"""Share of the heights of fixes from which what is doubted of them is said, after `MANY` of
+them."""
+
+MANY = 20
+
 MOST_STEPS = 300
 """A gap is crossed in no more steps than this, however long it is."""
 
@@ -78,6 +85,8 @@ ROWS = (
     'history',
     'came_from',
     'looks',
+    'refused_z',
+    'spreads',
 )
 """What of `DiverState` has a row for each track."""
 
@@ -161,6 +170,33 @@ class FixConsistency(NamedTuple):
         return []
 
 
+class HeightCounts(NamedTuple):
+    """How many heights of fixes there were for tracks, how many of them were refused, and how many
+    lie outside `depth_min` to `depth_max`."""
+
+    seen: int = 0
+    refused: int = 0
+    outside: int = 0
+
+    def warnings(self, config: DiverConfig) -> list[str]:
+        """Sentences for the user."""
+        if self.seen < MANY:
+            return []
+        found = []
+        if self.outside > DOUBTED * self.seen:
+            found.append(
+                f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
+                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
+                'origin_height for positions in latitude and longitude'
+            )
+        if self.refused > DOUBTED * self.seen:
+            found.append(
+                f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
+                'than it states, or the divers go up and down faster than vertical_speed_std'
+            )
+        return found
+
+
 class DiverState(NamedTuple):
     """All that is known after a scan: T tracks with M models of n states, the errors of the
     `instruments` heard so far among them.
@@ -173,16 +209,18 @@ class DiverState(NamedTuple):
     target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
     track it is near, 0 for none, and for how many scans (`jipda`, `names`); refused (T, 6): stamp,
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
-    believed, NaN since it took another (`families`); history (T, w): the numbers of its last
+    believed, NaN since it took another (`families`); refused_z (T, 3): stamp, z and variance of
+    the last height of a fix that was not, spreads (T,): how often the copies of the models were
+    spread anew (`heights`); history (T, w): the numbers of its last
     fixes, came_from (T,): which row it was before this scan, -1 for none, hypotheses: which rows
     belong together, and serial: of the last fix (`kbest`; nothing elsewhere); looks (T,): parts
     of a miss that have not been counted yet, where the sensor does not see everywhere
-    (`coverage`); scale (2, 2): for
-    fixes and for arrivals the sum of squared residuals in units of their stated variance, and
-    their number; fixes, arrivals: what innovations say of the stated covariances of either;
-    excess: of `estimation.consistency`, that those of arrivals are too small; last_named: names
-    and the stamp of each one's last measurement; broken: tracks ended so far because their numbers
-    were not finite; not_started: starts so far for which there was no room;
+    (`coverage`); scale (2, 2): for fixes and for arrivals the sum of squared residuals in units
+    of their stated variance, and their number; fixes, arrivals: what innovations say of the
+    stated covariances of either; excess: of `estimation.consistency`, that those of arrivals are
+    too small; heights: how many z of fixes could be used; last_named: names and the stamp of each
+    one's last measurement; broken: tracks ended so far because their numbers were not finite;
+    not_started: starts so far for which there was no room;
     repairs: covariances repaired so far (`estimation.covariance`).
     """
 
@@ -202,6 +240,8 @@ class DiverState(NamedTuple):
     near_to: IntArray
     near_for: IntArray
     refused: FloatArray
+    refused_z: FloatArray
+    spreads: IntArray
     history: IntArray
     came_from: IntArray
     looks: FloatArray
@@ -209,6 +249,7 @@ class DiverState(NamedTuple):
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
     excess: float = 0.0
+    heights: HeightCounts = HeightCounts()
     instruments: Instruments = Instruments()
     hypotheses: Hypotheses = Hypotheses.none()
     serial: int = 0
@@ -241,6 +282,8 @@ class DiverState(NamedTuple):
             history=np.empty((0, 0), np.int64),
             came_from=np.empty(0, np.int64),
             looks=np.empty(0),
+            refused_z=np.empty((0, 3)),
+            spreads=np.empty(0, np.int64),
             scale=np.zeros((2, 2)),
         )
 

@@ -50,13 +50,13 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, coverage, families, fix_kernels, jipda, kbest, names, pings
+from . import births, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .jipda import Association
 from .models import build_models
-from .scan import Positions, Scan
+from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments
 
@@ -145,8 +145,10 @@ class DiverTracker:
         tracker = self._for_warming()
         for second in (1, 2):
             for x in (0.0, 0.1):
-                at = np.array([x, 0.0, 0.0])
-                tracker.process(Fix(stamp_ns=second * 10**9, position=at, covariance=np.eye(2)))
+                position = np.array([x, 0.0, 0.0])
+                covariance = np.eye(self.config.dimensions)
+                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=covariance)
+                tracker.process(fix)
 
     def _warm_echoes(self) -> None:
         self._warm_pings(np.zeros(3))
@@ -212,6 +214,7 @@ class DiverTracker:
         return [
             *self._georeferencer.warnings(),
             *state.fixes.warnings(self.config.fix_bias_std > 0.0),
+            *state.heights.warnings(self.config),
             *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
             *births.no_room(state, self.config),
         ]
@@ -242,6 +245,7 @@ class DiverTracker:
             if again:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
+            now = self._update_heights(now, fixes, association)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
             if association.free.any():
@@ -251,6 +255,8 @@ class DiverTracker:
         for ping in scan.pings:
             of_ping = ping, self.config, scan.factor, self.models, self._covered
             now, free = pings.associate_and_update(now, *of_ping)
+            layout = self._layout(now.instruments)
+            now = births.begun_anew(now, ping, free, self.models, layout, self.config)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
         now = self._learn(before, now, step, scan)
         now = self._prune(now, scan)
@@ -344,6 +350,7 @@ class DiverTracker:
         layout = self._layout(now.instruments)
         found = kbest.branched(now, fixes, self.models, self._chain, layout)
         now = self._update(found.state, fixes, found.association)
+        now = self._update_heights(now, fixes, found.association)
         new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
         now = self._with_tracks(now, new)
         return kbest.begun(now, found)
@@ -417,6 +424,20 @@ class DiverTracker:
                 tracks, detection = tracks[counts], detection[counts]
             now = self._with_scale(now, fixes, tracks, detection)
         return now
+
+    def _update_heights(
+        self, now: DiverState, fixes: Positions, association: Association
+    ) -> DiverState:
+        """The tracks after what the fixes that are theirs state of z."""
+        if fixes.heights is None or not len(association.tracks):
+            return now
+        tracks, row, weights = association.tracks, association.detection, association.weights
+        probability = np.ones(len(tracks))
+        if weights is not None:
+            share = weights.beta[tracks, row] / weights.existence[tracks]
+            probability = np.minimum(share, 1.0)
+        layout, place = self._layout(now.instruments), self.models.height
+        return heights.update(now, fixes, tracks, row, probability, layout, place, self.config)
 
     def _with_scale(
         self, now: DiverState, fixes: Positions, tracks: IndexArray, detection: IntArray
@@ -512,7 +533,12 @@ class DiverTracker:
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
-                birth = Birth(start.position[:2], start.covariance, measured=False)
+                height = None
+                if config.dimensions == 3:
+                    stated = Heights.of(start.position[None], start.covariance[None], 1.0)
+                    height = stated and stated.row(0)
+                plane = start.position[:2], start.covariance[:2, :2]
+                birth = Birth(*plane, measured=False, height=height)
                 now = births.confirmed(self._with_tracks(now, [birth]))
         return now
 
@@ -545,6 +571,8 @@ class DiverTracker:
                 'history': np.zeros((count, self._window), np.int64),
                 'came_from': np.full(count, -1),
                 'looks': np.zeros(count),
+                'refused_z': np.full((count, 3), np.nan),
+                'spreads': np.zeros(count, np.int64),
             },
         )
 
@@ -567,6 +595,8 @@ class DiverTracker:
             'target_id': state.target_id.astype(np.int32),
             **families.columns(state.mu, self.models),
         }
+        if self.models.copies > 1 and self.models.height >= 0:
+            extras['depth_ambiguous'] = heights.ambiguous(state, self.models).astype(np.uint8)
         if self.origin is not None:
             place = self.origin.geodetic(xyz)
             extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}

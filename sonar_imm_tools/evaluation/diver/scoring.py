@@ -129,7 +129,7 @@ def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
         rows = slice(start, start + len(scan))
         state[rows, :2] = scan.position[:, :2]
         if scan.covariance is not None:
-            covariance[rows, :2, :2] = scan.covariance
+            covariance[rows, :2, :2] = scan.covariance[:, :2, :2]
     return Series(
         scan_ns=np.unique(stamps),
         stamp_ns=np.repeat(stamps, counts),

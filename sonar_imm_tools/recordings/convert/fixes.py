@@ -46,7 +46,8 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
     """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
 
     Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
-    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
+    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; for z
+    ``var_z`` (and ``cov_xz cov_yz``) or ``std_z``, else its variance is not stated; ``id``: whose
     position it is, a number or a name. In place of x and y ``range`` [m] and ``bearing`` from a
     sensor at the origin, see `PolarRows`. A row with empty uncertainties becomes a fix without
     covariance, one with a time and no position an empty scan: then all rows become scans,
@@ -99,7 +100,10 @@ def write_fixes(
             flat, covariance = polar.place(row)
             position = (*flat.tolist(), row.height())
         fix = Fix(
-            stamp_ns=stamp_ns, position=position, covariance=covariance, frame_id=how.frame_id
+            stamp_ns=stamp_ns,
+            position=position,
+            covariance=_with_height(row, covariance),
+            frame_id=how.frame_id,
         )
         check_size(fix)
         try:
@@ -185,7 +189,7 @@ def _scans(
             report.bad_row(row.table.path, f'line {row.line}', f'{name} is there at this time')
             continue
         scan.append((fix, number))
-    unknown = np.full((2, 2), np.nan)
+    unknown = np.full((3, 3), np.nan)
     return [
         (
             stamp_ns,
@@ -196,7 +200,7 @@ def _scans(
                     position=np.array([fix.position for fix, _ in scan]).reshape(-1, 3),
                     covariance=np.array(
                         [unknown if fix.covariance is None else fix.covariance for fix, _ in scan]
-                    ).reshape(-1, 2, 2),
+                    ).reshape(-1, 3, 3),
                     target_id=[number for _, number in scan] if named else None,
                     frame_id=frame_id,
                 ),
@@ -223,3 +227,19 @@ def _covariance(row: Row) -> np.ndarray | None:
     if var_x == var_y == cov_xy == 0.0:
         return None
     return np.array([[var_x, cov_xy], [cov_xy, var_y]])
+
+
+def _with_height(row: Row, covariance: np.ndarray | None) -> np.ndarray | None:
+    """`covariance` (2, 2) with what the row states of z, (3, 3); as it is where nothing."""
+    variance = row.optional('var_z') if row.table.has('var_z') else row.optional('std_z')
+    variance = variance if row.table.has('var_z') else variance * abs(variance)
+    if not variance > 0.0 or row.empty('z') and row.empty('depth') and row.empty('height'):
+        return covariance
+    whole = np.full((3, 3), np.nan)
+    whole[2, 2] = variance
+    if covariance is not None:
+        whole[:2, :2] = covariance
+        for axis, name in enumerate(('cov_xz', 'cov_yz')):
+            across = row.optional(name) if row.table.has(name) else 0.0
+            whole[2, axis] = whole[axis, 2] = across
+    return whole

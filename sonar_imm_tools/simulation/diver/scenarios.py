@@ -101,6 +101,9 @@ class DiverScenario(Scenario):
     fix_std: float = parameter(1.0, 'm',
         'standard deviation on each axis of the white error of the sensors positions, scans and '
         'geodetic', range=(1e-6, None))
+    fix_height_std: float = parameter(0.0, 'm',
+        'standard deviation of the height of a fix of the sensor positions, stated then; 0: '
+        'no height is', range=(0.0, None))
     fix_bias_std: float = parameter(0.0, 'm',
         'standard deviation on each axis of the lasting error of the sensor positions',
         range=(0.0, None))

@@ -176,16 +176,20 @@ def _sense_positions(
     rng: np.random.Generator,
 ) -> list[Fix]:
     """Positions with a white and a lasting error; the covariance states the white one."""
-    seen = present[rng.uniform(size=len(present)) < config.detection_probability, :2]
-    places = seen + errors.fix_bias + config.fix_std * rng.normal(size=seen.shape)
+    seen = present[rng.uniform(size=len(present)) < config.detection_probability]
+    places = seen[:, :2] + errors.fix_bias + config.fix_std * rng.normal(size=(len(seen), 2))
+    heights, variances = np.zeros(len(seen)), [config.fix_std**2] * 2
+    if config.fix_height_std:
+        heights = seen[:, 2] + config.fix_height_std * rng.normal(size=len(seen))
+        variances.append(config.fix_height_std**2)
     return [
         Fix(
             stamp_ns=stamp_ns,
-            position=np.append(place, 0.0),
-            covariance=np.eye(2) * config.fix_std**2,
+            position=np.append(place, height),
+            covariance=np.diag(variances),
             frame_id='map',
         )
-        for place in places
+        for place, height in zip(places, heights)
     ]
 
 

@@ -13,6 +13,7 @@
 # limitations under the License.
 
 import csv
+import math
 
 import numpy as np
 import pymap3d
@@ -96,7 +97,7 @@ def test_numbers_of_divers_stay_and_numbers_of_rows_name_nobody(convert, tmp_pat
     report = convert('stamp,x,y,id,std\n5,1,2,17,.5\n6,1,2,17,.5\n7,3,4,4,\n8,3,4,4,.5\n')
     scans = fixes_of(report.path)
     assert [scan.target_id.tolist() for scan in scans] == [[17], [17], [4], [4]]
-    assert scans[0].covariance.tolist() == [[[0.25, 0.0], [0.0, 0.25]]]
+    assert scans[0].covariance[:, :2, :2].tolist() == [[[0.25, 0.0], [0.0, 0.25]]]
     assert scans[2].covariance is None and 'id' not in report.notes
     (tmp_path / 'rows.csv').write_text('stamp,x,y,id\n5,1,2,1\n6,1,2,2\n7,3,4,3\n')
     rows = convert_fixes(tmp_path / 'rows.csv', tmp_path / 'other')
@@ -134,7 +135,31 @@ def test_nothing_good_is_an_error_and_leaves_no_bag(convert, tmp_path):
 )
 def test_uncertainty_in_every_form(convert, header, cells, covariance):
     (fix,) = fixes_of(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
-    assert (None if fix.covariance is None else fix.covariance.tolist()) == covariance
+    assert (None if fix.covariance is None else fix.covariance[:2, :2].tolist()) == covariance
+
+
+@pytest.mark.parametrize(
+    'header, cells, of_z',
+    [
+        ('std,depth,std_z', '3,7,0.5', [0, 0, 0.25]),
+        ('std,z,sigma_depth', '3,-7,0.5', [0, 0, 0.25]),
+        ('std,z,var_z', '3,-7,0.25', [0, 0, 0.25]),
+        ('std,z,cov_x_z,cov_y_z,cov_z_z', '3,-7,0.5,-0.25,1', [0.5, -0.25, 1]),
+        ('z,std_z', '-7,0.5', [math.nan, math.nan, 0.25]),
+        ('std,z,std_z', '3,,0.5', None),
+        ('std,z,std_z', '3,-7,', None),
+        ('std,z,std_z', '3,-7,-0.5', None),
+        ('std,z,cov_x_z,var_z', '3,-7,9,1', None),
+    ],
+)
+def test_the_uncertainty_of_z(convert, tmp_path, header, cells, of_z):
+    (fix,) = fixes_of(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
+    expected = [math.nan] * 3 if of_z is None else of_z
+    assert fix.covariance[2] == pytest.approx(expected, nan_ok=True)
+    rows = ''.join(f'{second},{second},2,A,{cells}\n' for second in (5, 6))
+    (tmp_path / 'named.csv').write_text(f'stamp,x,y,id,{header}\n{rows}')
+    scans = fixes_of(convert_fixes(tmp_path / 'named.csv', tmp_path / 'named').path)
+    assert scans[0].covariance[0, 2] == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.parametrize('cells', ['4,7,9', '1e300,0,1e308', '1e-300,0,1e-300', '1e-300,0,1'])

@@ -110,7 +110,7 @@ def test_fixes_from_arrivals_are_as_accurate_as_they_say():
         at = dict(zip(scene.truth[0].stamp_ns.tolist(), scene.truth[0].position[:, :2]))
         for one in scene.measurements:
             error = one.measurement.position[:2] - at[one.measurement.stamp_ns]
-            squared.append(error @ np.linalg.solve(one.measurement.covariance, error))
+            squared.append(error @ np.linalg.solve(one.measurement.covariance[:2, :2], error))
     assert len(squared) > 450
     assert np.mean(squared) == pytest.approx(2.0, abs=4.0 * 2.0 / np.sqrt(len(squared)))
 
