@@ -64,6 +64,7 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, grid_cells, TerrainModels
+from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 FEWEST_BINS = 100
 """Of fewer bins `residual_ratio` says nothing."""
@@ -113,7 +114,7 @@ class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
     of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
     where layover is ignored; how many bins from the depth of the floor on are usable, and how many
-    of these are passed over."""
+    of these are passed over; whether there were too few staves for the two surfaces of a bin."""
 
     bins: int
     silent: int
@@ -121,6 +122,7 @@ class LoudBins(NamedTuple):
     array_error: float = math.nan
     beyond: int = 0
     beyond_silent: int = 0
+    unresolved: bool = False
 
 
 class Answer(NamedTuple):
@@ -261,7 +263,7 @@ def _with_constants(track: Track, ping: PingLikelihood) -> Track:
 
 def summarise(seen: Look, track: Track) -> Answer:
     """The answer of a ping whose models were run."""
-    snapshot, likelihood = seen.ping.snapshot, seen.likelihood
+    config, snapshot, likelihood = seen.config, seen.ping.snapshot, seen.likelihood
     echo, usable = likelihood.echo, snapshot.usable
     counts = Counter(
         used=1,
@@ -287,13 +289,15 @@ def summarise(seen: Look, track: Track) -> Answer:
         math.nan if seen.layover is None else seen.layover.array_error,
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
+        config.layover_used == 'resolved' and snapshot.staves < FEWEST_STAVES,
     )
+    made = estimate_of(seen, track)
     if seen.layover is not None:
-        counts['bins_two'] = int((echo & (seen.layover.existence > GATE)).sum())
+        counts['bins_two'] = int((made.extras['surfaces'] == 2).sum())
         health['array_error'] = loud.array_error
     health['decorrelation'] = loud.decorrelation
     health['residual_ratio'] = _residual(seen, track)
-    return Answer(estimate_of(seen, track), counts, health, loud, health['residual_ratio'])
+    return Answer(made, counts, health, loud, health['residual_ratio'])
 
 
 def _residual(seen: Look, track: Track) -> float:
@@ -313,31 +317,66 @@ def floor_of(seen: Look, track: Track) -> Floor:
     return seen.swath.floor(track.mean[:, 0], track.covariance[:, 0, 0])
 
 
+def _resolved(seen: Look, track: Track) -> Surfaces | None:
+    """Both surfaces where a bin may hold two; None where `layover` does not ask for them, or where
+    there are too few staves."""
+    config, snapshot, geometry = seen.config, seen.ping.snapshot, seen.swath.of_heights.geometry
+    few = snapshot.staves < FEWEST_STAVES
+    if config.layover_used != 'resolved' or seen.layover is None or few:
+        return None
+    floor = floor_of(seen, track).height
+    return resolve(snapshot.iq, seen.likelihood, geometry, seen.layover, floor)
+
+
+def _with_lower(seen: Look, track: Track, surfaces: Surfaces, two: BoolArray) -> Track:
+    """The track with the lower surface in bins `two` (T,)."""
+    mean, covariance = track.mean.copy(), track.covariance.copy()
+    height, variance = surfaces.height[two, 0], surfaces.variance[two, 0]
+    if not seen.swath.geometry.of_heights:
+        reach, tilt = seen.swath.geometry.reach[two], seen.swath.geometry.tilt[two]
+        filled = np.where(two, surfaces.height[:, 0], 0.0)
+        height = seen.swath.of_heights.floor(filled, filled).angle[two]
+        variance = variance / np.square(np.maximum(np.cos(height + tilt), 1e-3) * reach)
+    mean[two, 0] = height
+    covariance[two, 0, :] = covariance[two, :, 0] = 0.0
+    covariance[two, 0, 0] = variance
+    return track._replace(mean=mean, covariance=covariance)
+
+
 def estimate_of(seen: Look, track: Track) -> Estimate:
     """A row for each bin."""
-    config, covariance = seen.config, track.covariance
-    snapshot, posed = seen.ping.snapshot, seen.ping.posed
+    config, snapshot, posed = seen.config, seen.ping.snapshot, seen.ping.posed
     swath, models, ping = seen.swath, seen.models, seen.likelihood
-    floor = floor_of(seen, track)
+    label = track.probability.argmax(axis=1)
+    doubt = ~ping.echo
+    second: dict[str, np.ndarray] = {}
+    if seen.layover is not None:
+        surfaces = _resolved(seen, track)
+        found = seen.layover.existence if surfaces is None else surfaces.existence
+        existence = np.where(ping.echo, found, 0.0)
+        two = existence > GATE if surfaces is None else existence >= EXISTS
+        doubt = doubt | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
+        second = {
+            'existence_2': existence.astype(np.float32),
+            'surfaces': np.where(ping.echo, 1 + two, 0).astype(np.uint8),
+        }
+        if surfaces is not None:
+            second |= _upper(seen, surfaces, two)
+            track = _with_lower(seen, track, surfaces, two)
+    floor, covariance = floor_of(seen, track), track.covariance
     of_heights = models.state_names[0] == 'height'
     other = ('angle', floor.angle) if of_heights else ('height', floor.height)
-    label = track.probability.argmax(axis=1)
     extras = {
         'range': ping.ranges,
         other[0]: other[1],
-        'valid': ping.echo.astype(np.uint8),
+        'valid': (~doubt).astype(np.uint8),
         'log_likelihood': track.log_likelihood,
         'label': label.astype(np.uint8),
         'label_probability': track.probability[np.arange(len(label)), label],
     }
     if config.in_bank:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
-    if seen.layover is not None:
-        second = np.where(ping.echo, seen.layover.existence, 0.0)
-        two = second > GATE
-        extras['valid'] = (ping.echo & ~two).astype(np.uint8)
-        extras['existence_2'] = second.astype(np.float32)
-        extras['surfaces'] = np.where(ping.echo, 1 + two, 0).astype(np.uint8)
+    extras |= second
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         extras |= {
@@ -364,6 +403,28 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         probabilities=track.probability,
         extras=extras,
     )
+
+
+def _upper(seen: Look, surfaces: Surfaces, two: BoolArray) -> dict[str, np.ndarray]:
+    """Columns (T,) of the upper surface, NaN in bins that are not `two` (T,)."""
+    config, swath = seen.config, seen.swath
+    height, variance = (np.where(two, part[:, 1], 0.0) for part in surfaces[1:])
+    unposed = seen.ping.posed is None
+    std = np.sqrt(variance + (config.sonar_height_std**2 if unposed else 0.0))
+    columns: dict[str, np.ndarray] = {
+        'height_2': height.astype(np.float32),
+        'height_2_std': std.astype(np.float32),
+    }
+    if not unposed:
+        floor = swath.of_heights.floor(height, variance)
+        vertical, horizontal = swath.uncertainties(floor, config.budget())
+        columns |= {
+            'vertical_uncertainty_2': vertical,
+            'horizontal_uncertainty_2': horizontal,
+            'beam_angle_2': swath.beam_angle(floor.angle),
+            **{f'{name}_2': part for name, part in places(floor.xyz).items()},
+        }
+    return {name: np.where(two, part, part.dtype.type(np.nan)) for name, part in columns.items()}
 
 
 def _swath(ping: Ping) -> tuple[Swath, float]:

@@ -175,6 +175,10 @@ class BathymetryTracker:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
         stated = [*self._silence(), *noise_warnings(self._residuals)]
+        if any(ping.unresolved for ping in self._loud):
+            stated.append(
+                'layover: resolved needs four staves: bins with two surfaces are only gated'
+            )
         if loud < FEWEST_LOUD:
             return stated
         silent = sum(ping.silent for ping in self._loud) / loud

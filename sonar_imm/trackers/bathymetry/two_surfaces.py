@@ -46,7 +46,7 @@ from ...acoustics.likelihood_kernels import horner
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import exponentials, phasors
 from ...estimation.jit import kernel
-from .kernels import Geometry, sines_of
+from .kernels import Geometry, PingLikelihood, sines_of
 
 POSSIBLE, MARGIN = 0.05, 10
 """A stretch is where the chain says more than this, and so many bins around it."""
@@ -68,7 +68,8 @@ NOISE = 1.3
 """By this factor noise is larger than stated: there are more than two echoes in many bins."""
 WIDER, WIDEST = 1.5, 0.05
 """Standard deviations are larger than those of the grid by this factor, and by so many metres."""
-LEAST_START_STD = 0.05
+START_STD, LEAST_START = 0.1, 1e-9
+"""How near the floor a stretch begins, m; and what cells have that lie further away."""
 
 
 class Surfaces(NamedTuple):
@@ -105,46 +106,40 @@ def stretches(existence: FloatArray) -> list[tuple[int, int]]:
 
 
 def resolve(
-    iq: ComplexArray,
-    signal: FloatArray,
-    noise: FloatArray,
-    usable: BoolArray,
-    geometry: Geometry,
-    second: Layover,
-    floor: FloatArray,
-    floor_variance: FloatArray,
+    iq: np.ndarray, ping: PingLikelihood, geometry: Geometry, second: Layover, floor: FloatArray
 ) -> Surfaces:
-    """Both surfaces in the stretches of a ping: iq (T, P), local variance of signal and noise (T,)
-    at a stave, bins that are usable (T,), the chain of `layover`, and the height of the floor (T,)
-    as a single surface has it, with its variance."""
-    T = len(existence := np.array(second.existence))
-    height, variance = np.full((T, 2), np.nan), np.full((T, 2), np.nan)
-    snr = signal / noise
+    """Both surfaces in the stretches of a ping: iq (T, P), how heights become directions, what
+    `acoustics.layover` says, and the height of the floor (T,) as a single surface has it."""
+    existence = np.array(second.existence)
+    height, variance = np.full((2, len(existence), 2), np.nan)
+    snr = ping.signal / ping.noise
     larger = NOISE * (1.0 + second.array_error * snr)
-    y = np.ascontiguousarray(iq / np.sqrt(noise * larger)[:, None], np.complex128)
-    ratio = snr / larger
-    geometry = geometry._replace(of_heights=True)
-    moves = Moves(BIRTH, END, ANYWHERE, _taps(WALK), _taps(WALK_OF_TWO), round(APART / STEP))
+    moves = Moves(
+        BIRTH,
+        END,
+        ANYWHERE,
+        _taps(WALK),
+        _taps(WALK_OF_TWO).astype(np.float32),
+        round(APART / STEP),
+    )
     for first, end in stretches(existence):
-        cells = _cells(floor, first, end)
-        start = max(math.sqrt(floor_variance[first]), LEAST_START_STD)
-        one = np.exp(-0.5 * np.square((cells - floor[first]) / start))
         here = slice(first, end)
+        cells = _cells(floor, first, end)
+        start = np.exp(-0.5 * np.square((cells - floor[first]) / START_STD)) + LEAST_START
         smooth_stretch(
             first,
-            one / one.sum(),
+            start / start.sum(),
             cells,
-            y[here],
-            ratio[here],
-            usable[here],
+            (iq[here] / np.sqrt(ping.noise * larger)[here, None]).astype(np.complex128),
+            (snr / larger)[here],
+            ping.echo[here],
             geometry,
             moves,
             existence[here],
             height[here],
             variance[here],
         )
-    variance = WIDER**2 * (variance + STEP**2 / 12.0) + WIDEST**2
-    return Surfaces(existence, height, variance)
+    return Surfaces(existence, height, WIDER**2 * (variance + STEP**2 / 12.0) + WIDEST**2)
 
 
 def _cells(floor: FloatArray, first: int, end: int) -> FloatArray:
@@ -154,7 +149,7 @@ def _cells(floor: FloatArray, first: int, end: int) -> FloatArray:
     low, high = min(before, behind), max(before, behind)
     top = max(low + ABOVE, high + ABOVE_HIGHER)
     count = min(round((top - low + BELOW) / STEP) + 1, MOST_CELLS)
-    return low - BELOW + STEP * np.arange(count)
+    return np.asarray(low - BELOW + STEP * np.arange(count, dtype=np.float64))
 
 
 def _taps(walk: tuple[tuple[float, float], ...]) -> FloatArray:
@@ -179,10 +174,11 @@ def pair_likelihoods(
     price: FloatArray,
     one: FloatArray,
     two: FloatArray,
-) -> None:
+) -> bool:
     """Likelihoods of one height, into one (G,), and of pairs i, j >= i + gap, into two (G, G), up
     to a common factor, of a bin y (P,) in units of the noise; sines (G,) of the heights, NaN
-    where no echo can come from. work (8, G or more) and price (G, G) are scratch."""
+    where no echo can come from. False if that is everywhere. work (8, G or more) and price (G, G)
+    are scratch."""
     P, G = y.shape[0], sines.shape[0]
     c, s, C, S = work[0, :G], work[1, :G], work[2, :G], work[3, :G]
     re, im, power = work[4, :G], work[5, :G], work[6, :G]
@@ -202,22 +198,27 @@ def pair_likelihoods(
         one[i] = power[i] / d
         top = one[i] if one[i] > top else top
     for i in range(G):
-        row, cost = two[i], price[i]
+        near = min(i + gap, G)
+        row, cost = two[i, near:], price[i, near:]
         c_i, s_i, C_i, S_i, re_i, im_i, power_i = c[i], s[i], C[i], S[i], re[i], im[i], power[i]
-        for j in range(i + gap, G):
-            m = s[j] * c_i - c[j] * s_i
-            n = S[j] * C_i - C[j] * S_i
+        c_j, s_j, C_j, S_j = c[near:], s[near:], C[near:], S[near:]
+        re_j, im_j, power_j = re[near:], im[near:], power[near:]
+        for j in range(row.shape[0]):
+            m = s_j[j] * c_i - c_j[j] * s_i
+            n = S_j[j] * C_i - C_j[j] * S_i
             r = m / (d * d * m * m - n * n)
-            cross = re_i * re[j] + im_i * im[j]
-            row[j] = (d * m * (power_i + power[j]) - 2.0 * n * cross) * r
+            cross = re_i * re_j[j] + im_i * im_j[j]
+            row[j] = (d * m * (power_i + power_j[j]) - 2.0 * n * cross) * r
             cost[j] = m * r
-        for j in range(i + gap, G):
+        for j in range(row.shape[0]):
             top = row[j] if row[j] > top else top
     single, double = 1.0 / (1.0 + v * P), 1.0 / (v * v)
     for i in range(G):
         c[i] = one[i] - top
     exponentials(c, s, one)
+    reached = False
     for i in range(G):
+        reached = reached or sines[i] == sines[i]
         one[i] = one[i] * single if sines[i] == sines[i] else 0.0
     for i in range(G - gap):
         row, cost = two[i, i + gap :], price[i, i + gap :]
@@ -228,6 +229,7 @@ def pair_likelihoods(
         for j in range(n):
             x = row[j] * cost[j] * double
             row[j] = x if x == x else 0.0
+    return reached
 
 
 @kernel
@@ -235,24 +237,30 @@ def walk_of_two(p: FloatArray, taps: FloatArray, gap: int, half: FloatArray) -> 
     """Move both heights of pairs by themselves: p (G + 2K, G + 2K), whose outer K rows and columns
     are zero, as everything nearer to the diagonal than `gap`. What would get there is lost. half:
     scratch like p, its outer rows zero."""
-    K, n = taps.shape[0] - 1, p.shape[0]
-    for i in range(K, n - K):
-        row, out = p[i], half[i]
-        first = max(i + gap - K, K)
-        for j in range(first, n - K):
-            out[j] = taps[0] * row[j]
-        for k in range(1, K + 1):
-            tap = taps[k]
-            for j in range(first, n - K):
-                out[j] += tap * (row[j - k] + row[j + k])
-    for i in range(K, n - K):
-        row, out = half[i], p[i]
-        for j in range(i + gap, n - K):
-            out[j] = taps[0] * row[j]
-        for k in range(1, K + 1):
-            tap, above, below = taps[k], half[i - k], half[i + k]
-            for j in range(i + gap, n - K):
-                out[j] += tap * (above[j] + below[j])
+    K, width = taps.shape[0] - 1, p.shape[0]
+    first, last = K * width, (width - K) * width
+    # The zeros between two rows are as many as a height can go to both sides.
+    spread(p.ravel(), 1, taps, first, last, half.ravel())
+    spread(half.ravel(), width, taps, first, last, p.ravel())
+    for i in range(K, width - K):
+        p[i, : min(i + gap, width)] = 0.0
+        p[i, width - K :] = 0.0
+
+
+@kernel
+def spread(
+    values: FloatArray, stride: int, taps: FloatArray, first: int, last: int, out: FloatArray
+) -> None:
+    """Sum of taps[k] times what lies k strides before and behind, of [first, last), into out."""
+    n, there = last - first, out[first:last]
+    here = values[first:last]
+    for x in range(n):
+        there[x] = taps[0] * here[x]
+    for k in range(1, taps.shape[0]):
+        tap, away = taps[k], k * stride
+        before, behind = values[first - away : last - away], values[first + away : last + away]
+        for x in range(n):
+            there[x] += tap * (before[x] + behind[x])
 
 
 @kernel
@@ -285,13 +293,15 @@ def step_orders(
     rows, columns, moved = sums[0], sums[1], sums[2]
     total = 0.0
     for i in range(G):
-        rows[i] = columns[i] = 0.0
+        columns[i] = 0.0
         total += one[i]
     for i in range(G):
-        row = two[K + i]
-        for j in range(i + gap, G):
-            rows[i] += row[K + j]
-            columns[j] += row[K + j]
+        near, here = min(i + gap, G), 0.0
+        row, column = two[K + i, K + near : K + G], columns[near:]
+        for j in range(row.shape[0]):
+            here += row[j]
+            column[j] += row[j]
+        rows[i] = here
     walk_of_single(one, moves.walk, moved)
     # What changes order: forward by birth and end, backward the other way round.
     birth, end = moves.birth * any_height, 0.5 * moves.end
@@ -304,9 +314,10 @@ def step_orders(
     walk_of_two(two, moves.walk_of_two, gap, half)
     kept = (1.0 - moves.end) * stay
     for i in range(G):
-        row, more = two[K + i], rows[i]
-        for j in range(i + gap, G):
-            row[K + j] = kept * row[K + j] + more + rows[j]
+        near, more = min(i + gap, G), rows[i]
+        row, other = two[K + i, K + near : K + G], rows[near:]
+        for j in range(row.shape[0]):
+            row[j] = kept * row[j] + more + other[j]
     for i in range(G):
         one[i] = moved[i]
 
@@ -338,9 +349,9 @@ def smooth_stretch(
     # Of each bin: what it says itself, and what it and those before say; pairs row after row.
     said_one, said_two = np.ones((n, G)), np.ones((n, pairs), np.float32)
     kept_one, kept_two = np.empty((n, G)), np.empty((n, pairs), np.float32)
-    one, two = np.empty(G), np.zeros((G + 2 * K, G + 2 * K))
-    half = np.zeros((G + 2 * K, G + 2 * K))
-    sines, work, sums = np.empty(G), np.empty((8, G)), np.empty((3, G))
+    one, two = np.empty(G), np.zeros((G + 2 * K, G + 2 * K), np.float32)
+    half = np.zeros((G + 2 * K, G + 2 * K), np.float32)
+    alone, sines, work, sums = np.empty(G), np.empty(G), np.empty((8, G)), np.empty((3, G))
     likelihood, price = np.empty((G, G)), np.empty((G, G))
     for i in range(G):
         one[i] = start[i]
@@ -349,10 +360,12 @@ def smooth_stretch(
             step_orders(one, two, moves, False, sums, half)
         if usable[t]:
             sines_of(cells, first + t, geometry, work, sines)
-            pair_likelihoods(
-                y[t], ratio[t], sines, geometry.spacing, gap, work, price, said_one[t], likelihood
+            reached = pair_likelihoods(
+                y[t], ratio[t], sines, geometry.spacing, gap, work, price, alone, likelihood
             )
-            pack(likelihood, 0, gap, said_two[t])
+            if reached:
+                said_one[t] = alone
+                pack(likelihood, 0, gap, said_two[t])
         weigh_orders(one, two, said_one[t], said_two[t], K, gap)
         for i in range(G):
             kept_one[t, i] = one[i]
@@ -380,7 +393,8 @@ def smooth_stretch(
             low_square += row * cells[i] * cells[i]
             high += here
             high_square += here_square
-        existence[t] = double / (single + double)
+        if single + double > 0.0:
+            existence[t] = double / (single + double)
         if double > 0.0:
             low, high = low / double, high / double
             height[t, 0], height[t, 1] = low, high
@@ -423,8 +437,9 @@ def weigh_orders(
             total += row[j]
             k += 1
     share = 1.0 / total
+    factor = np.float32(share)
     for i in range(G):
         one[i] *= share
         row = two[border + i]
         for j in range(border + i + gap, border + G):
-            row[j] *= share
+            row[j] *= factor
