@@ -28,7 +28,7 @@ import numpy as np
 
 from sonar_imm.estimates import PLACES
 from sonar_imm.estimation.arrays import FloatArray, IntArray
-from sonar_imm.soundings import COLUMNS
+from sonar_imm.soundings import COLUMNS, LATER
 
 from ..sources import BagError
 
@@ -40,6 +40,8 @@ _LAS_EXTRAS = (
     'beam_angle',
     'label_probability',
     'range',
+    'surface',
+    'existence',
 )
 
 
@@ -66,7 +68,7 @@ class Points:
 def read_points(path: Path) -> Points:
     """The soundings of a soundings.csv or soundings.parquet, which needs pyarrow. Raises
     `BagError` for a file that is none."""
-    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
+    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in (*PLACES, *LATER))]
     if path.suffix == '.parquet':
         return _read_parquet(path, wanted)
     try:
@@ -112,6 +114,8 @@ def _read_parquet(path: Path, wanted: list[str]) -> Points:
 def _exact(stamps: IntArray, columns: dict[str, FloatArray]) -> Points:
     for name, exact in zip('xyz', PLACES):
         columns[name] = columns.pop(exact, columns[name])  # older tables have the coarse ones only
+    for name, value in LATER.items():
+        columns.setdefault(name, np.full(len(stamps), float(value)))
     return Points(stamps, columns)
 
 
