@@ -57,6 +57,7 @@ from typing import Any, NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
+from ...acoustics.layover import Layover
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
@@ -79,6 +80,7 @@ from .ping import (
     summarise,
     track_ping,
 )
+from .two_surfaces import resolve
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
 
@@ -160,6 +162,11 @@ class BathymetryTracker:
             for posed in tracker._queue.ready(gap):
                 track_ping(Ping(tracker.config, posed.snapshot, posed))
         track_ping(Ping(tracker.config, snapshot, None))
+        if self.config.layover_used == 'resolved':
+            seen = look(Ping(tracker.config, snapshot, None))
+            everywhere = Layover(np.ones(T), 0.0)
+            geometry = seen.swath.of_heights.geometry
+            resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(T))
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size

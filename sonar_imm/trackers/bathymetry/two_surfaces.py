@@ -96,7 +96,7 @@ class Moves(NamedTuple):
 
 def stretches(existence: FloatArray) -> list[tuple[int, int]]:
     """First bin and end of each stretch in which a second surface is possible."""
-    near = np.convolve(existence > POSSIBLE, np.ones(2 * MARGIN + 1), 'same') > 0.5
+    near = np.convolve(existence > POSSIBLE, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0.5
     edges = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]]).astype(np.int8)))
     return [
         (low, min(low + LONGEST, end))
@@ -145,7 +145,7 @@ def resolve(
 def _cells(floor: FloatArray, first: int, end: int) -> FloatArray:
     """The grid (G,) of a stretch, by the floors before and behind it."""
     before = float(np.median(floor[max(first - MARGIN, 0) : first + MARGIN]))
-    behind = float(np.median(floor[end - MARGIN : end + MARGIN]))
+    behind = float(np.median(floor[max(end - MARGIN, 0) : end + MARGIN]))
     low, high = min(before, behind), max(before, behind)
     top = max(low + ABOVE, high + ABOVE_HIGHER)
     count = min(round((top - low + BELOW) / STEP) + 1, MOST_CELLS)
