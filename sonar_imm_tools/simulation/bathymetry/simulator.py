@@ -154,7 +154,8 @@ class BathymetryScenario(ShipScenario):
     def instruments(self) -> dict[str, Any]:
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
-        return {**super().instruments(), **mounted}
+        second = {} if self.object == 'none' else {'layover': 'resolved'}
+        return {**super().instruments(), **mounted, **second}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)

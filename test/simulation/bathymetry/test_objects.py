@@ -88,7 +88,8 @@ def test_a_wall_is_gated_and_scored():
         'ledge', {'object': 'wall', 'object_size': 4.0, 'object_distance': 26.0, 'pings': 4}
     )
     scene = simulate(config, 5)
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping(config.instruments()))
+    values = {**config.instruments(), 'layover': 'gated'}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     estimates = [made for item in scene.measurements for made in tracker.process(item.measurement)]
     metrics = score(profiles_of(estimates, truth_of(scene)))
     assert metrics['layover']['bins'] > 80
@@ -119,7 +120,7 @@ def test_facets_below_a_ship_lie_where_the_geometry_of_soundings_puts_them(side)
 def test_a_ledge_below_a_ship_becomes_soundings_of_both_surfaces():
     config = scenario('moving_ledge', {'pings': 3, 'object_size': 2.5})
     scene = simulate(config, 4)
-    values = {**config.instruments(), 'navigation': 'required', 'layover': 'resolved'}
+    values = {**config.instruments(), 'navigation': 'required'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     estimates = [made for item in scene.measurements for made in tracker.process(item.measurement)]
     off, upper = [], 0
