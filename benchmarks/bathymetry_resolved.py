@@ -24,27 +24,25 @@ standard deviations, the median `sd`, and `outer`: both the lowest and the highe
 within .6 m. `existence`: how often there are two where the tracker says so, over all objects.
 `ship`: the same below a ship in a swell, from the soundings and the two strongest surfaces.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
-what the tracker reaches along 60 bins. `cost`: CPU time, all settings in turn in one run.
+what the tracker reaches along 60 bins. `cost`: CPU time, see `benchmarks.speed.bathymetry`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 import math
-import time
 from typing import Any
 
 import numpy as np
 
 from benchmarks.bathymetry_layover import FLAT, objects, SIZES
+from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, study
 from sonar_imm.acoustics import array
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.ping import look, Ping
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm.trackers.bathymetry.two_surfaces import stretches
 from sonar_imm.truth import TrueProfile
 from sonar_imm_tools.simulation.bathymetry.objects import second_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
@@ -239,44 +237,9 @@ def circular(rng: np.random.Generator, *shape: int) -> FloatArray:
     return np.asarray(rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5))
 
 
-def cost(seed: int, rounds: int = 7) -> dict[str, float]:
-    """CPU time of pings with an object and without, the settings in turn, the best round."""
-    kinds = {kind: [next(iter(objects(kind, 1, seed, {})))[0]] for kind in SIZES}
-    pings = {'object': [shot for shots in kinds.values() for shot in shots]}
-    flat = scenario('thermal', {'pings': 2, 'patch_std': 0.0})
-    pings['flat'] = [item.measurement for item in simulate(flat, seed).measurements]
-    trackers = {
-        (engine, layover): BathymetryTracker(
-            BathymetryConfig(layover=layover, engine=engine, seed=1)
-        )
-        for engine in ('particles', 'grid')
-        for layover in ('ignored', 'gated', 'resolved')
-    }
-    best: dict[str, float] = {}
-    for _ in range(rounds):
-        for (engine, layover), tracker in trackers.items():
-            for name, shots in pings.items():
-                begin = time.process_time()
-                for shot in shots:
-                    tracker.process(shot)
-                took = (time.process_time() - begin) / sum(map(len, shots))
-                key = f'{name}, {engine}, {layover}'
-                best[key] = min(best.get(key, math.inf), took)
-    inside = 0
-    for shot in pings['object']:
-        second = look(Ping(BathymetryConfig(), shot, None)).layover
-        assert second is not None
-        inside += sum(end - first for first, end in stretches(second.existence))
-    bins = sum(map(len, pings['object']))
-    extra = best['object, particles, resolved'] - best['object, particles, gated']
-    rates = {f'{key}, bins_per_second': 1.0 / took for key, took in best.items()}
-    each = {'stretch_share': inside / bins, 'us_per_stretch_bin': 1e6 * extra * bins / inside}
-    return {**rates, **each}
-
-
 def main(pings: int = 40, seed: int = 2) -> Parts:
     yield {'pings': pings, 'seed': seed}
-    yield {'cost': cost(seed)}
+    yield {'cost': bench_layover()}
     stated: list[FloatArray] = []
     true: list[BoolArray] = []
     for name, changes in SETTINGS.items():
