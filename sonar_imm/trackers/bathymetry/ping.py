@@ -66,6 +66,8 @@ from .likelihood import (
 from .models import build_models, grid_cells, TerrainModels
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
+LOUD = 10.0
+"""So many times the noise is much power."""
 FEWEST_BINS = 100
 """Of fewer bins `residual_ratio` says nothing."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.
@@ -154,12 +156,23 @@ def look(ping: Ping) -> Look:
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
-    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two."""
+    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two. To
+    resolve them, also of bins with much power, which the gate for one wave passes over."""
     if ping.config.layover_used == 'ignored':
         return None
-    iq = np.where(likelihood.echo[:, None], ping.snapshot.iq, 0.0)
+    snapshot, echo, loud = ping.snapshot, likelihood.echo, None
+    if _resolves(ping):
+        loud = snapshot.usable & ~echo & np.logical_or.accumulate(echo)
+        loud &= variances.mean_power(snapshot.iq) > LOUD * likelihood.noise
+    heard = echo if loud is None else echo | loud
+    iq = np.where(heard[:, None], snapshot.iq, 0.0)
     spacing = swath.geometry.spacing
-    return layover(iq, likelihood.signal, likelihood.noise, likelihood.echo, spacing)
+    return layover(iq, likelihood.signal, likelihood.noise, echo, spacing, loud)
+
+
+def _resolves(ping: Ping) -> bool:
+    """Whether both surfaces of bins are wanted, and the staves are enough."""
+    return ping.config.layover_used == 'resolved' and ping.snapshot.staves >= FEWEST_STAVES
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:
@@ -289,7 +302,7 @@ def summarise(seen: Look, track: Track) -> Answer:
         math.nan if seen.layover is None else seen.layover.array_error,
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
-        config.layover_used == 'resolved' and snapshot.staves < FEWEST_STAVES,
+        config.layover_used == 'resolved' and not _resolves(seen.ping),
     )
     made = estimate_of(seen, track)
     if seen.layover is not None:
@@ -320,12 +333,10 @@ def floor_of(seen: Look, track: Track) -> Floor:
 def _resolved(seen: Look, track: Track) -> Surfaces | None:
     """Both surfaces where a bin may hold two; None where `layover` does not ask for them, or where
     there are too few staves."""
-    config, snapshot, geometry = seen.config, seen.ping.snapshot, seen.swath.of_heights.geometry
-    few = snapshot.staves < FEWEST_STAVES
-    if config.layover_used != 'resolved' or seen.layover is None or few:
+    if seen.layover is None or not _resolves(seen.ping):
         return None
-    floor = floor_of(seen, track).height
-    return resolve(snapshot.iq, seen.likelihood, geometry, seen.layover, floor)
+    iq, geometry = seen.ping.snapshot.iq, seen.swath.of_heights.geometry
+    return resolve(iq, seen.likelihood, geometry, seen.layover, floor_of(seen, track).height)
 
 
 def _with_lower(seen: Look, track: Track, surfaces: Surfaces, two: BoolArray) -> Track:
@@ -353,12 +364,15 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     if seen.layover is not None:
         surfaces = _resolved(seen, track)
         found = seen.layover.existence if surfaces is None else surfaces.existence
-        existence = np.where(ping.echo, found, 0.0)
+        heard = ping.echo
+        if surfaces is not None:
+            heard = heard | seen.layover.usable & (found >= EXISTS)
+        existence = np.where(heard, found, 0.0)
         two = existence > GATE if surfaces is None else existence >= EXISTS
-        doubt = doubt | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
+        doubt = ~heard | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
         second = {
             'existence_2': existence.astype(np.float32),
-            'surfaces': np.where(ping.echo, 1 + two, 0).astype(np.uint8),
+            'surfaces': np.where(heard, 1 + two, 0).astype(np.uint8),
         }
         if surfaces is not None:
             second |= _upper(seen, surfaces, two)

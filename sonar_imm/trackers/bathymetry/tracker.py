@@ -164,7 +164,7 @@ class BathymetryTracker:
         track_ping(Ping(tracker.config, snapshot, None))
         if self.config.layover_used == 'resolved':
             seen = look(Ping(tracker.config, snapshot, None))
-            everywhere = Layover(np.ones(T), 0.0)
+            everywhere = Layover(np.ones(T), 0.0, np.ones(T, bool))
             geometry = seen.swath.of_heights.geometry
             resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(T))
 

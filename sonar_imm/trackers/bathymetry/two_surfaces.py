@@ -132,7 +132,7 @@ def resolve(
             cells,
             (iq[here] / np.sqrt(ping.noise * larger)[here, None]).astype(np.complex128),
             (snr / larger)[here],
-            ping.echo[here],
+            second.usable[here],
             geometry,
             moves,
             existence[here],
