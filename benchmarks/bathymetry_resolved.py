@@ -132,7 +132,7 @@ def calibration(stated: FloatArray, true: BoolArray) -> Iterator[tuple[str, dict
     for low, high in zip(CLASSES[:-1], CLASSES[1:]):
         chosen = (stated >= low) & (stated < high)
         if chosen.any():
-            row = {'stated': stated[chosen].mean(), 'right': true[chosen].mean()}
+            row = {'stated': float(stated[chosen].mean()), 'right': float(true[chosen].mean())}
             yield f'{low:g} to {min(high, 1.0):g}', {'bins': int(chosen.sum()), **row}
 
 
