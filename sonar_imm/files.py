@@ -24,12 +24,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import fcntl
+import errno
 import glob
 import os
 from pathlib import Path
 import shutil
 import tempfile
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 UNFINISHED = '.unfinished-'
 
@@ -59,7 +64,7 @@ def on_disk(path: Path) -> None:
     """Wait until a file, or a folder with all that is in it, is on the disk. Without that a rename
     may be there after a power cut, and what was renamed may not. Raises OSError."""
     if not path.is_dir():
-        with path.open('rb') as file:
+        with path.open('rb') as file, _where_it_can():
             os.fsync(file.fileno())
         return
     for item in path.iterdir():
@@ -70,25 +75,46 @@ def on_disk(path: Path) -> None:
 
 def sync_folder(path: Path) -> None:
     """Wait until the names in a folder are on the disk, where the file system can."""
-    handle = os.open(path, os.O_RDONLY)
+    with _folder(path) as handle, contextlib.suppress(OSError):  # some sync files only
+        os.fsync(handle)
+
+
+@contextlib.contextmanager
+def _folder(path: Path) -> Iterator[int]:
+    """An open folder; -1, which no call takes, where folders cannot be opened (Windows)."""
     try:
-        with contextlib.suppress(OSError):  # some file systems sync files only
-            os.fsync(handle)
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if fcntl is not None:
+            raise
+        yield -1
+        return
+    try:
+        yield handle
     finally:
         os.close(handle)
+
+
+def _where_it_can() -> contextlib.AbstractContextManager[None]:
+    """Windows syncs only what is open for writing."""
+    return contextlib.nullcontext() if fcntl is not None else contextlib.suppress(OSError)
+
+
+def _lock(handle: int) -> None:
+    """Lock an open file or folder for this process. Raises BlockingIOError where another one has
+    it, and another OSError where there are no locks."""
+    if fcntl is None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def remove_leftovers(path: Path) -> None:
     """Remove what killed processes left of `path`. What a living one is writing is left alone."""
     for place in path.parent.glob(f'{glob.escape(path.name)}{UNFINISHED}*'):
-        with contextlib.suppress(OSError):
-            handle = os.open(place, os.O_RDONLY)
-            try:
-                # Nobody holds it: the process that made it is gone.
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(place, ignore_errors=True)
-            finally:
-                os.close(handle)
+        with contextlib.suppress(OSError), _folder(place) as handle:
+            # Nobody holds it: the process that made it is gone.
+            _lock(handle)
+            shutil.rmtree(place, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -96,22 +122,22 @@ def beside(target: Path) -> Iterator[Path]:
     """A new folder beside `target` for what is not finished, removed at the end. It is locked
     while this process lives."""
     remove_leftovers(target)
-    while True:
-        place = Path(tempfile.mkdtemp(prefix=target.name + UNFINISHED, dir=target.parent))
+    with contextlib.ExitStack() as stack:
+        while True:
+            place = Path(tempfile.mkdtemp(prefix=target.name + UNFINISHED, dir=target.parent))
+            try:
+                handle = stack.enter_context(_folder(place))
+            except FileNotFoundError:
+                continue  # taken for a leftover by another process, before the lock
+            with contextlib.suppress(OSError):  # without locks: leftovers stay there
+                _lock(handle)
+            if place.exists():
+                break
+            stack.close()
         try:
-            handle = os.open(place, os.O_RDONLY)
-        except FileNotFoundError:
-            continue  # taken for a leftover by another process, before the lock
-        with contextlib.suppress(OSError):  # file systems without locks: leftovers stay there
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if place.exists():
-            break
-        os.close(handle)
-    try:
-        yield place
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
-        os.close(handle)
+            yield place
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
 
 
 def hold(path: Path) -> Callable[[], None] | None:
@@ -122,7 +148,7 @@ def hold(path: Path) -> Callable[[], None] | None:
     while True:
         handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(handle)
         except BlockingIOError:
             os.close(handle)
             return None

@@ -23,7 +23,8 @@ import sys
 
 import pytest
 
-from sonar_imm.files import beside, UNFINISHED, whole
+from sonar_imm import files
+from sonar_imm.files import beside, hold, UNFINISHED, whole
 
 
 def test_a_file_is_there_at_the_end_only_and_replaces_an_older_one(tmp_path):
@@ -102,6 +103,52 @@ def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
     with whole(tmp_path / 'out') as path:
         path.touch()
     assert sorted(path.name for path in tmp_path.iterdir()) == ['out', f'out{UNFINISHED}abc']
+
+
+def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
+    """As on Windows: no fcntl, folders cannot be opened, files not synced that are read only."""
+    opened, synced = os.open, os.fsync
+
+    def open_files_only(path, *arguments, **options):
+        if 'dir_fd' not in options and os.path.isdir(path):  # shutil.rmtree names it
+            raise PermissionError(13, 'a folder')
+        return opened(path, *arguments, **options)
+
+    def sync_written_only(handle):
+        if handle < 0 or fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(9, 'bad handle')
+        synced(handle)
+
+    monkeypatch.setattr(files, 'fcntl', None)
+    monkeypatch.setattr(os, 'open', open_files_only)
+    monkeypatch.setattr(os, 'fsync', sync_written_only)
+    with whole(tmp_path / 'run') as path:
+        path.mkdir()
+        (path / 'a').write_text('a')
+    with whole(tmp_path / 'file') as path:
+        path.write_text('b')
+    assert (tmp_path / 'run' / 'a').read_text() == 'a'
+    assert (tmp_path / 'file').read_text() == 'b'
+    assert {place.name for place in tmp_path.iterdir()} == {'run', 'file'}
+    release = hold(tmp_path / 'state')
+    release()
+    assert not (tmp_path / 'state.lock').exists()
+
+
+def test_the_command_runs_without_the_modules_of_unix(tmp_path):
+    blocked = ('fcntl', 'grp', 'pwd', 'resource', 'termios')
+    program = (
+        'import sys\n'
+        f'sys.modules.update(dict.fromkeys({blocked!r}))\n'
+        'from sonar_imm_tools.cli import main\n'
+        f"sys.exit(main(['track', 'bags/diver_table1', {str(tmp_path / 'run')!r}]))"
+    )
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run(
+        [sys.executable, '-c', program], cwd=root, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / 'run' / 'estimate.csv').stat().st_size > 0
 
 
 def test_what_is_renamed_is_on_the_disk_before_and_the_rename_after(tmp_path, monkeypatch):

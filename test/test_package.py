@@ -34,6 +34,7 @@ from helpers.source import (
     tree_of,
 )
 import pytest
+import yaml
 
 import msg_adapters
 import sonar_imm
@@ -71,10 +72,13 @@ PEERS = {
     'sonar_imm_tools.viewing.rerun_file': {'rerun'},
     'sonar_imm_tools.viewing.server': {'foxglove'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},
+    'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
+    'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
     'sonar_imm_tools.recordings.export.horizons': {'rasterio'},
     'sonar_imm_tools.recordings.export.picks': {'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
+    'sonar_imm_tools.recordings.export.tracks': {'pyarrow'},
     'sonar_imm_tools.survey.chart': {'rasterio'},
     'sonar_imm_tools.survey.products': {'pyarrow', 'rasterio'},
 }
@@ -160,7 +164,9 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'segyio'}
+    without_key = {
+        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'segyio', 'soundfile')
+    }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 
@@ -176,6 +182,13 @@ def test_every_import_is_declared(
     for path in MODULES:
         used = {name.split('.')[0] for name in imports(path)}
         assert used - declared <= PEERS.get(module_name(path), set()), path
+
+
+def test_the_citation_names_this_version() -> None:
+    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    assert cited['version'] == sonar_imm.__version__
+    dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert dated and dated.groups() == (cited['version'], str(cited['date-released']))
 
 
 def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:

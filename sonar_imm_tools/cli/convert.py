@@ -24,6 +24,7 @@ from typing import Any
 import attrs
 import click
 
+from sonar_imm.texts import visible
 from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.convert_options import FROM_BAGS, OPTIONS
@@ -38,16 +39,49 @@ from .common import (
     say,
     typed_overrides,
 )
+from .info import track_line
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.group(invoke_without_command=True)
+class Convert(click.Group):
+    """A group whose subcommand may be left out: it is then the one that fits the file."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        named = bool(args) and args[0] not in self.commands
+        if named and not Path(args[0]).exists() and Path(args[0]).suffix:
+            ctx.fail(f'{args[0]} does not exist')
+        if named and Path(args[0]).exists():
+            from ..recordings.sniffing import sniff
+
+            guess = sniff(Path(args[0]))
+            taken = f'{args[0]} is taken for {guess.why}: convert {guess.kind}'
+            click.echo(visible(taken), err=True)
+            args = [guess.kind, *(args if len(args) > 1 else (*args, _beside(args[0])))]
+        return super().resolve_command(ctx, args)
+
+
+def _beside(source: str) -> str:
+    """The bag that is made where none is named: beside the file, or in this folder."""
+    return f'{Path(source).stem}.bag'
+
+
+@click.group(
+    cls=Convert,
+    invoke_without_command=True,
+    epilog=example(
+        'sonar-imm convert usbl.csv dive.bag',
+        'sonar-imm convert fixes usbl.csv dive.bag --column x=easting --column y=northing',
+    ),
+)
 @click.pass_context
 def command(ctx: click.Context) -> None:
-    """Turn recordings in other formats into a rosbag2 bag.
+    """Turn recordings in other formats into a rosbag2 bag: convert [KIND] IN OUT.
 
-    Rows that cannot be used are left out, counted and listed by line.
+    Without KIND it is found out from the content of the file, and said. Rows that cannot be used
+    are left out, counted and listed by line.
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
@@ -161,6 +195,8 @@ def _convert(
     kind: str, source: Path, out_bag: Path, as_json: bool, options: dict[str, Any]
 ) -> None:
     from ..recordings.convert import KINDS
+    from ..recordings.reader import BagReader
+    from ..recordings.topics import fitting_systems
 
     report = KINDS[kind](source, out_bag, **options)
     if as_json:
@@ -185,6 +221,9 @@ def _convert(
     if report.bad_rows:
         why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
         say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))
+    with BagReader(report.path) as bag:
+        for system in fitting_systems(bag)[:1]:
+            say(f'to track it: {track_line(str(report.path), system, {})}')
 
 
 for _kind, _options in OPTIONS.items():

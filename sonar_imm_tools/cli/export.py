@@ -27,6 +27,7 @@ from .common import example, json_option, place_options, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
 HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
+TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
 
 
 @click.command(
@@ -36,6 +37,8 @@ HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
         'sonar-imm export out survey.xyz',
         'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg',
+        'sonar-imm export out tracks.gpx',
+        'sonar-imm export out tracks.geojson --epsg 32632 --origin 500000,6000000',
     )
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
@@ -66,7 +69,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the soundings or horizons of a tracked RUN to OUT for charts and other programs.
+    """Write the soundings, horizons or tracks of a RUN to OUT for charts and other programs.
 
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
     its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
@@ -74,7 +77,9 @@ def command(
     with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
     the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
     Where the recording has no fixes by satellite, the places of horizons come from its navigation,
-    with --crs and --origin.
+    with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml, .geojson (lines and points
+    with uncertainty and model), .csv and .parquet; --crs and --origin say where they lie where the
+    run does not.
     """
     from ..offline.run_folder import RunFolder, SOUNDINGS
     from ..recordings.export.points import read_points, write_las, write_xyz
@@ -83,13 +88,17 @@ def command(
     from ..survey.line import budget_of
 
     kind = out.suffix.lower().lstrip('.')
-    if kind not in FORMATS + HORIZON_FORMATS:
-        known = ', '.join(f'.{name}' for name in FORMATS + HORIZON_FORMATS)
+    every = dict.fromkeys(FORMATS + HORIZON_FORMATS + TRACK_FORMATS)
+    if kind not in every:
+        known = ', '.join(f'.{name}' for name in every)
         raise click.UsageError(f"'{out.name}' ends in none of {known}")
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     record = RunFolder(run).read_run()
-    if kind in HORIZON_FORMATS:
+    if kind in TRACK_FORMATS and record['system'] != 'fathometer':
+        _export_tracks(run, out, kind, epsg, origin, as_json)
+        return
+    if kind in HORIZON_FORMATS + TRACK_FORMATS:
         _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
         return
     if not (run / SOUNDINGS).is_file():
@@ -115,6 +124,40 @@ def command(
     say(f'{out}: {len(points)} soundings{shape}')
 
 
+def _export_tracks(
+    run: Path,
+    out: Path,
+    kind: str,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    as_json: bool,
+) -> None:
+    """Tracks of a run of divers or obstacles."""
+    import numpy as np
+
+    from ..offline.run_folder import RunFolder
+    from ..recordings.export.points import degrees_of
+    from ..recordings.export.tracks import tracks_of, write_tracks
+
+    degrees = None
+    if epsg is not None:
+        number = epsg
+
+        def degrees(places: Any) -> Any:
+            return degrees_of(places + np.array(origin[:2]), number)
+
+    tracks = tracks_of(RunFolder(run).read_estimates(), degrees)
+    with whole(out) as unfinished:
+        left_out = write_tracks(unfinished, tracks, kind, run.name)
+    result = {'out': str(out), 'rows': len(tracks), 'left_out': left_out}
+    result['tracks'] = sum(1 for _ in tracks.each())
+    if as_json:
+        print_json(result)
+        return
+    left = f', {left_out} left out that have no place on Earth' if left_out else ''
+    say(f'{out}: {result["tracks"]} tracks, {len(tracks)} rows{left}')
+
+
 def _export_horizons(
     run: Path,
     record: dict[str, Any],
@@ -137,7 +180,10 @@ def _export_horizons(
     from ..recordings.sources import BagError
 
     if record['system'] != 'fathometer':
-        raise BagError(f'{run} is of {record["system"]}: only the fathometer has horizons')
+        raise BagError(
+            f'{run} is of {record["system"]}: .{out.suffix[1:]} is for the tracks of divers and '
+            'obstacles and the horizons of the fathometer'
+        )
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
         raise click.UsageError(

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -122,7 +122,7 @@ def command(
         require_parquet()
     plan = Plan(parquet=parquet, **options)
     if len(bags) == 1:
-        runs = plan.jobs(bags[0], out_dir)
+        runs = plan.jobs(bags[0], out_dir, lambda sentence: say(sentence, quiet=as_json))
         say_parameters(bags[0], plan, quiet=as_json)
         if len(runs) == 1 and scheduler is None:
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
@@ -154,18 +154,23 @@ class Plan:
 
         return self.params if self.params is not None else own_parameters(bag)
 
-    def jobs(self, bag: Path, folder: Path) -> list[Job]:
+    def jobs(
+        self, bag: Path, folder: Path, note: Callable[[str], object] = lambda sentence: None
+    ) -> list[Job]:
         """The runs that one bag takes: one into `folder`, or, of several instruments, one each
-        into a folder below it. Raises `BagError` and `ConfigError`."""
+        into a folder below it. note: is told which topics are taken for what. Raises `BagError`
+        and `ConfigError`."""
         from ..offline.batch import Job
         from ..offline.tracking import InputOptions
         from ..recordings.reader import BagReader
-        from ..recordings.topics import instruments
+        from ..recordings.topics import instruments, said_of_topics
 
         wanted = inputs_by_topic(self.topics)
         with BagReader(bag, strict=self.strict) as reader:
             system = choose_system(reader, self.system, wanted)
             found = instruments(reader, system.name, wanted)
+            for sentence in said_of_topics(reader, system.name, found):
+                note(sentence)
         params = self.parameters_of(bag)
         config, node = load_config(system, params, self.overrides)
         detector = load_detector(system, params, self.overrides)

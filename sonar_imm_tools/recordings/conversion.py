@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from msg_adapters.inputs import InputTopic
 from sonar_imm.measurements import Rejection
 
-from .csv_table import BadRow, CsvTable, Row
+from .csv_table import BadRow, Row, Table
 from .mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from .messages import ros_message
 from .reader import BagMessage, BagReader
@@ -73,7 +73,7 @@ class ConversionReport:
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
 
-    def read_rows(self, table: CsvTable, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
+    def read_rows(self, table: Table, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
         """Yield the rows of `table` that `parse` accepts; count and name the others."""
         for row in table:
             self.rows += 1
@@ -83,7 +83,7 @@ class ConversionReport:
                 self.bad_row(table.path, f'line {row.line}', error)
         self.note_columns(table)
 
-    def note_columns(self, table: CsvTable) -> None:
+    def note_columns(self, table: Table) -> None:
         """Note which columns of a file were taken for what, and which were not."""
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken

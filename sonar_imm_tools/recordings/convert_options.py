@@ -46,6 +46,13 @@ def _sensor_offsets(text: str) -> int | dict[str, int]:
     return {name.strip(): nanoseconds(seconds) for name, seconds in pairs.items()}
 
 
+def _whole_numbers(text: str) -> list[int]:
+    try:
+        return [int(number) for number in text.split(',')]
+    except ValueError:
+        raise ValueError(f"'{text}' is not of the form 3,2,1,0") from None
+
+
 def _staves(text: str) -> list[list[int]]:
     try:
         return [[int(channel) for channel in stave.split('+')] for stave in text.split(',')]
@@ -143,6 +150,28 @@ class RelativeOptions:
 
 
 @frozen(kw_only=True)
+class NmeaOptions:
+    """Log of NMEA 0183 sentences and AIS messages to /fixes, /nav_fix and /heading. Needs pyais
+    and pynmea2.
+
+    Fixes are the targets of AIS (by MMSI), TLL and TTM; the vessel's own GGA, RMC, GLL, GNS, HDT
+    and THS are its navigation, or the fixes where there are no targets. Times stand before a
+    sentence, in its tag block, or are the vessel's clock with the date of ZDA or RMC.
+    """
+
+    EXAMPLES: ClassVar = ('harbour.nmea harbour.bag', 'gps.log buoy.bag --date 2024-05-31')
+    date: str = option('', 'DATE', 'Date of the first line (UTC), where no sentence says it.')
+    own: str = option('auto', '',
+        'What the positions of the receiver itself are; auto: of the vessel, where there are '
+        'targets, else the fixes.', choices=('auto', 'vessel', 'fixes'))
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
 class ArrivalsOptions:
     """CSV of arrival times to /arrivals, one message per ping.
 
@@ -155,6 +184,44 @@ class ArrivalsOptions:
         'CSV of transmitter positions.', kind='file')
     toa_std: float | None = option(None, 'SECONDS',
         'Standard deviation of arrival times, for rows that state none.', kind='float', above=0.0)
+    options: CsvOptions = group(CsvOptions)
+    receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class DetectionsOptions:
+    """Detections of tags by telemetry receivers, a row for each, to /arrivals.
+
+    Columns: stamp (or date and time), receiver and tag; the usual names of exports are recognised.
+    Detections of one tag within --window are one ping. With --sync, tags that lie at known places,
+    the clocks of the receivers are compared first: offset and drift of each against the first
+    receiver, by least squares, linear between knots --clock-interval apart; what is left is said.
+    """
+
+    EXAMPLES: ClassVar = (
+        'vue.csv fish.bag --receivers stations.csv --sync synctags.csv',
+        'detections.csv fish.bag --receivers stations.csv --toa-std 0.001',
+    )
+    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
+    sync: Path | str | None = option(None, '',
+        'CSV of the positions of fixed tags, with the column tag.', kind='file')
+    window: float = option(1.0, 'SECONDS',
+        'Longest time between the first and the last detection of a ping.', kind='float',
+        range=(1e-3, 600.0))
+    clock_interval: float = option(12.0, 'HOURS',
+        'Time over which the clock of a receiver drifts evenly.', kind='float',
+        range=(0.1, 1e4))
+    sound_speed: float = option(1500.0, '',
+        'Speed of sound in m/s, for the travel times from fixed tags.', kind='float',
+        range=(1300.0, 1700.0))
+    toa_std: float | None = option(None, 'SECONDS',
+        'Standard deviation of arrival times; by default that of the clocks after --sync.',
+        kind='float', above=0.0)
     options: CsvOptions = group(CsvOptions)
     receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
     truth: Path | str | None = _truth_file()
@@ -273,6 +340,33 @@ class InterferometerOptions:
 
 
 @frozen(kw_only=True)
+class HydrophonesOptions:
+    """Sound of a vertical array, WAV or FLAC with a channel for each hydrophone, to /pressure.
+    Needs soundfile.
+
+    The deepest hydrophone comes first; --channels says another order. The first sample is taken at
+    --start, or when the name of the file says, as in 20240531_100000.wav.
+    """
+
+    EXAMPLES: ClassVar = (
+        '20240531_100000.wav drift.bag', 'array.wav drift.bag --channels 3,2,1,0 --depth 120',
+    )
+    start: str = option('', 'TIME', 'Time of the first sample, e.g. 2024-05-31T10:00:00Z.')
+    time_zone: str = option('UTC', 'ZONE', 'Zone of a time that does not say it.')
+    channels: Sequence[int] | None = option(None, 'CHANNELS',
+        'Channels of the hydrophones, from 0, the deepest first; all in their order by default.',
+        parse=_whole_numbers)
+    full_scale: float = option(1.0, 'PASCALS',
+        'Pressure of the full scale. The tracker needs ratios only.', kind='float', above=0.0)
+    depth: float | None = option(None, 'METRES',
+        'Depth of the deepest hydrophone, to be stated with each block.', kind='float')
+    block: float = option(1.0, 'SECONDS',
+        'Length of a message.', kind='float', range=(0.01, 600.0))
+    frame_id: str = option('array', '', 'Frame of the array.')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
 class SegyOptions:
     """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
 
@@ -323,13 +417,16 @@ class TracesOptions:
 OPTIONS: dict[str, type] = {
     'fixes': FixesOptions,
     'relative': RelativeOptions,
+    'nmea': NmeaOptions,
     'arrivals': ArrivalsOptions,
+    'detections': DetectionsOptions,
     'truth': TruthOptions,
     'autoferry': AutoferryOptions,
     'snapshots': SnapshotsOptions,
     'images': ImagesOptions,
     'interferometer': InterferometerOptions,
     'segy': SegyOptions,
+    'hydrophones': HydrophonesOptions,
     'traces': TracesOptions,
 }
 """The options by the kind of conversion."""

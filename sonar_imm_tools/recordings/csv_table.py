@@ -20,7 +20,7 @@ Columns with other names are mapped by hand. A row that cannot be read raises `B
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import csv
 from datetime import datetime, timedelta, timezone, tzinfo
@@ -49,7 +49,7 @@ LOOKED_AT = 1000
 USUAL_NAMES = {
     'stamp': (
         'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
-        'epoch unix_time'
+        'epoch unix_time date_and_time device_time'
     ),
     'date': 'utc_date gps_date date_utc day',
     'x': 'east easting px pos_x position_x utm_e utm_x e',
@@ -84,9 +84,9 @@ USUAL_NAMES = {
     'vy': 'v_north vn vel_y velocity_y',
     'id': 'track_id target target_id tag diver name',
     'valid': 'position_valid is_valid fix_valid validity',
-    'tag': 'tag_id transmitter transmitter_id tx tx_id',
+    'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
     'ping': 'ping_id ping_number',
-    'receiver': 'rx rx_id receiver_id hydro hydrophone station name id',
+    'receiver': 'rx rx_id receiver_id hydro hydrophone serial_number station name id',
     'transmitter': 'tx tx_id transmitter_id source name id',
     'arrival': 'arrival_time time_of_arrival detection_time',
     'toa': 'travel_time delay tof time_of_flight',
@@ -150,6 +150,8 @@ class CsvOptions:
         'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
     delimiter: str = option('', '',
         'Delimiter between the columns of {what}; found automatically by default.')
+    ignore: Sequence[str] = option((), 'NAME',
+        'Quantity of {what} to leave out though a column has its name, e.g. id.', many=True)
     # fmt: on
 
     def __attrs_post_init__(self) -> None:
@@ -159,7 +161,7 @@ class CsvOptions:
             )
         if self.time_zone:
             zone_of(self.time_zone)
-        for name in self.columns:
+        for name in (*self.columns, *self.ignore):
             if name not in ALIASES:
                 raise BagError(
                     f"there is no quantity '{name}' to map a column to"
@@ -171,7 +173,7 @@ class CsvOptions:
 class Row:
     """One line of data; the methods raise `BadRow`."""
 
-    table: CsvTable
+    table: Table
     line: int
     cells: list[str]
 
@@ -281,51 +283,26 @@ class Row:
         )
 
 
-class CsvTable:
-    """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
+class Table:
+    """Named columns and an iterator over the rows of a file of any kind."""
 
-    def __init__(self, path: str | Path, options: CsvOptions | None = None):
+    delimiter = ','
+
+    def __init__(self, path: str | Path, options: CsvOptions | None, headers: Sequence[str]):
         self.path = Path(path)
         self.options = options or CsvOptions()
-        try:
-            with self._open() as file:
-                lines = (line for line in file if line.strip() and not line.startswith('#'))
-                first = next(lines, '')
-        except OSError as error:
-            raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
-        if _wide(self.path):
-            raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
-        if not first or '\0' in first:
-            raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
-        if _binary(self.path):
-            raise BagError(f'{self.path} is no text, not a CSV file')
-        likely = max(',;\t|', key=first.count)
-        self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
-        self.headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        self.headers = list(headers)
         self.index = self._find_columns()
         self.used: set[str] = set()
         self._from_zero: dict[str, bool] = {}
 
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """The number of its line, or of its record, and the cells of each row."""
+        raise NotImplementedError
+
     def __iter__(self) -> Iterator[Row]:
-        with self._open() as file:
-            reader = csv.reader(file, **self._dialect)
-            header_seen = False
-            while True:
-                try:
-                    cells = next(reader)
-                except StopIteration:
-                    return
-                except csv.Error:
-                    raise BagError(
-                        f'{self.path}, line {reader.line_num} is no line of a CSV file: it holds '
-                        f'more than {csv.field_size_limit()} characters in a cell, or bytes that '
-                        'are no text'
-                    ) from None
-                if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
-                    continue
-                if header_seen:
-                    yield Row(self, reader.line_num, cells)
-                header_seen = True
+        for line, cells in self.rows():
+            yield Row(self, line, cells)
 
     def has(self, *names: str) -> bool:
         """Say whether every one of these quantities has a column."""
@@ -337,7 +314,7 @@ class CsvTable:
             raise BagError(
                 f'{self.path} has no column for {" and ".join(missing)}; it has '
                 f'{", ".join(self.headers)}; say which column holds '
-                f'{"it" if len(missing) == 1 else "them"}'
+                f'{"it" if len(missing) == 1 else "them"}, as in --column {missing[0]}=HEADER'
             )
 
     def counts_from_zero(self, name: str) -> bool:
@@ -372,13 +349,6 @@ class CsvTable:
         suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
         return TIME_UNITS[suffix.group(1) if suffix else 's']
 
-    @property
-    def _dialect(self) -> dict[str, Any]:
-        return {'delimiter': self.delimiter, 'skipinitialspace': True}
-
-    def _open(self) -> TextIO:
-        return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
-
     def _find_columns(self) -> dict[str, int]:
         """Match headers with quantities: mapped by hand first, then by their usual names."""
         by_hand = {}
@@ -393,9 +363,61 @@ class CsvTable:
         for name, aliases in ALIASES.items():
             matches = [plain.index(alias) for alias in aliases if alias in plain]
             matches = [index for index in matches if index not in by_hand.values()]
-            if name not in found and matches:
+            if name not in found and matches and name not in self.options.ignore:
                 found[name] = matches[0]
         return found
+
+
+class CsvTable(Table):
+    """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
+
+    def __init__(self, path: str | Path, options: CsvOptions | None = None):
+        self.path = Path(path)
+        self.options = options or CsvOptions()
+        try:
+            with self._open() as file:
+                lines = (line for line in file if line.strip() and not line.startswith('#'))
+                first = next(lines, '')
+        except OSError as error:
+            raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
+        if _wide(self.path):
+            raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
+        if not first or '\0' in first:
+            raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
+        if _binary(self.path):
+            raise BagError(f'{self.path} is no text, not a CSV file')
+        likely = max(',;\t|', key=first.count)
+        self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
+        headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        super().__init__(path, options, headers)
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        with self._open() as file:
+            reader = csv.reader(file, **self._dialect)
+            header_seen = False
+            while True:
+                try:
+                    cells = next(reader)
+                except StopIteration:
+                    return
+                except csv.Error:
+                    raise BagError(
+                        f'{self.path}, line {reader.line_num} is no line of a CSV file: it holds '
+                        f'more than {csv.field_size_limit()} characters in a cell, or bytes that '
+                        'are no text'
+                    ) from None
+                if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
+                    continue
+                if header_seen:
+                    yield reader.line_num, cells
+                header_seen = True
+
+    @property
+    def _dialect(self) -> dict[str, Any]:
+        return {'delimiter': self.delimiter, 'skipinitialspace': True}
+
+    def _open(self) -> TextIO:
+        return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
 
 
 def _wide(path: Path) -> bool:

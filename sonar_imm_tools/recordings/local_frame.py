@@ -21,7 +21,7 @@ import math
 from msg_adapters.arrivals import FARTHEST
 from sonar_imm.acoustics.geodesy import Origin
 
-from .csv_table import BadRow, CsvTable, Row
+from .csv_table import BadRow, Row, Table
 from .sources import BagError
 
 
@@ -33,7 +33,7 @@ class LocalFrame:
     positions.
     """
 
-    def __init__(self, table: CsvTable, origin: tuple[float, ...] | None = None):
+    def __init__(self, table: Table, origin: tuple[float, ...] | None = None):
         self.geodetic = not table.has('x', 'y') and table.has('latitude', 'longitude')
         if not self.geodetic:
             if not any(table.has(name) for name in ('x', 'y')):
@@ -42,7 +42,8 @@ class LocalFrame:
                         table.require(other)
                 raise BagError(
                     f'{table.path} has no column for x and y, nor for latitude and longitude; it '
-                    f'has {", ".join(table.headers)}; say which columns hold the position'
+                    f'has {", ".join(table.headers)}; say which columns hold the position, as in '
+                    '--column x=HEADER'
                 )
             table.require('x', 'y')
         self.origin = checked_origin(origin) if self.geodetic else None
@@ -65,10 +66,12 @@ class LocalFrame:
     def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
         latitude, longitude = row.number('latitude'), row.number('longitude')
         if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+            swapped = '; are the two swapped?' if abs(longitude) <= 90.0 else ''
             raise BadRow(
                 f'latitude {latitude:g}, longitude {longitude:g} is not a position on Earth'
+                f'{swapped}'
             )
-        height = row.optional('height') if row.table.has('height') else -row.optional('depth')
+        height = row.optional('height') if row.table.has('height') else row.height()
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:
             self.origin = (latitude, longitude, 0.0)

@@ -24,7 +24,7 @@ import numpy as np
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .csv_table import BadRow, CsvTable, Row
+from .csv_table import BadRow, Row, Table
 from .sources import BagError
 
 BEARINGS = ('bow', 'north', 'east')
@@ -42,7 +42,7 @@ class PolarRows:
 
     def __init__(
         self,
-        table: CsvTable,
+        table: Table,
         counted_from: str,
         range_std: float | None = None,
         bearing_std_deg: float | None = None,

@@ -95,6 +95,38 @@ def _free_name(place: str, own: Mapping[str, InputTopic], used: Collection[str])
     return name if name not in used else next(free for free in further if free not in used)
 
 
+def said_of_topics(
+    bag: BagReader, system: str, found: Mapping[str, Mapping[str, InputTopic]]
+) -> list[str]:
+    """A sentence for each topic that feeds the tracker, and for each that could and does not.
+
+    found: as `instruments` gives it.
+    """
+    counts = {topic.name: topic.count for topic in bag.topics}
+    sentences = []
+    for instrument, inputs in found.items():
+        name = f'{system} {instrument}'.strip()
+        sentences += [
+            f'{name} <- {topic} as {entry.name} ({counts[topic]} messages)'
+            for topic, entry in inputs.items()
+        ]
+    used = {topic for inputs in found.values() for topic in inputs}
+    for topic in bag.topics:
+        if topic.name in used or 'truth' in topic.name.split('/'):
+            continue
+        if any(f'topic {topic.name} ' in problem for problem in bag.problems):
+            continue  # it was said why
+        entries = [entry for entry in inputs_of(system) if _can_read(topic, entry)]
+        could = [e.name for e in entries if e.may_be(topic.name, topic.type_name)]
+        # What has the name of an input and is not used would only help what is not there.
+        if could and not any(entry.is_named(topic.name) for entry in entries):
+            sentences.append(
+                f'ignored: {topic.name} ({topic.count} messages); --topic {could[0]}={topic.name} '
+                'would take it'
+            )
+    return sentences
+
+
 def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> list[str]:
     """The trackers that find their inputs in `bag`, the one with the best evidence first.
 

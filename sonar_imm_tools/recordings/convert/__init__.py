@@ -27,9 +27,12 @@ from ..conversion import ConversionReport
 from ..csv_table import CsvOptions
 from .arrivals import convert_arrivals
 from .autoferry import convert_autoferry
+from .detections import convert_detections
 from .fixes import convert_fixes
+from .hydrophones import convert_hydrophones
 from .images import convert_images
 from .interferometer import convert_interferometer
+from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
 from .snapshots import convert_snapshots
@@ -39,9 +42,12 @@ from .truth import convert_truth
 __all__ = [
     'convert_arrivals',
     'convert_autoferry',
+    'convert_detections',
     'convert_fixes',
+    'convert_hydrophones',
     'convert_images',
     'convert_interferometer',
+    'convert_nmea',
     'convert_relative',
     'convert_segy',
     'convert_snapshots',
@@ -55,13 +61,16 @@ __all__ = [
 KINDS: dict[str, Callable[..., ConversionReport]] = {
     'fixes': convert_fixes,
     'relative': convert_relative,
+    'nmea': convert_nmea,
     'arrivals': convert_arrivals,
+    'detections': convert_detections,
     'truth': convert_truth,
     'autoferry': convert_autoferry,
     'snapshots': convert_snapshots,
     'images': convert_images,
     'interferometer': convert_interferometer,
     'segy': convert_segy,
+    'hydrophones': convert_hydrophones,
     'traces': convert_traces,
 }
 """The converters by the name that the command gives them."""

@@ -43,8 +43,8 @@ from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
-from ..convert_options import ArrivalsOptions
-from ..csv_table import BadRow, CsvOptions, CsvTable, Row
+from ..convert_options import ArrivalsOptions, DetectionsOptions
+from ..csv_table import BadRow, CsvOptions, CsvTable, Row, Table
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
 from ..sources import BagError
@@ -54,7 +54,7 @@ _NOWHERE = (math.nan, math.nan, math.nan)
 Places = Mapping[str, tuple[float, float, float]]
 
 
-class _Arrival(NamedTuple):
+class Arrival(NamedTuple):
     """One line; `time_ns` is the absolute arrival, or the transmission when `toa` is a number."""
 
     ping: str
@@ -83,20 +83,43 @@ def convert_arrivals(
     """
     how = ArrivalsOptions(receivers=receivers, **values)
     report = ConversionReport(Path(out))
-    places, origin = _read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
+    places, origin = read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
     senders = (
         places
         if how.transmitters is None
-        else _read_places(how.transmitters, report, how.receiver_options, origin, 'transmitter')[0]
+        else read_places(how.transmitters, report, how.receiver_options, origin, 'transmitter')[0]
     )
     default = math.nan if how.toa_std is None else how.toa_std**2
-    pings: dict[tuple[object, str], list[_Arrival]] = {}
+    pings: dict[tuple[object, str], list[Arrival]] = {}
     table = CsvTable(path, how.options)
     passive = _is_passive(table)
     rows = report.read_rows(table, lambda row: _parse(row, passive, places, senders, default))
     for _, arrival in rows:
         key = (arrival.ping if table.has('ping') else arrival.time_ns, arrival.tag)
         pings.setdefault(key, []).append(arrival)
+    stations = Stations(places, senders, origin)
+    return write_pings(table, pings, stations, passive, report, how)
+
+
+class Stations(NamedTuple):
+    """Positions of receivers and transmitters by name, and the origin of their local metres."""
+
+    receivers: Places
+    transmitters: Places
+    origin: tuple[float, ...] | None
+
+
+def write_pings(
+    table: Table,
+    pings: Mapping[tuple[object, str], list[Arrival]],
+    stations: Stations,
+    passive: bool,
+    report: ConversionReport,
+    how: ArrivalsOptions | DetectionsOptions,
+) -> ConversionReport:
+    """Write one message for each ping, by its name and its tag. passive: nobody knows when a ping
+    was emitted. Raises `BagError`."""
+    places, senders, origin = stations
     tags = _tag_numbers([arrival.tag for ping in pings.values() for arrival in ping], report)
     numbers = number_names(list(places))
     sender_numbers = tags
@@ -105,7 +128,7 @@ def convert_arrivals(
     records: list[Record] = []
     for label, ping in pings.items():
         try:
-            measurement = _one_ping(
+            measurement = _of_ping(
                 ping, passive, places, senders, numbers, sender_numbers, how.frame_id
             )
             records.append(
@@ -120,10 +143,10 @@ def convert_arrivals(
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
     return write_bag(
-        out,
+        report.path,
         records,
         report,
-        source=Path(path).name,
+        source=table.path.name,
         storage=how.storage,
         parameters={'diver': origin_parameters(origin)},
     )
@@ -147,7 +170,7 @@ def _is_passive(table: CsvTable) -> bool:
     return True
 
 
-def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> _Arrival:
+def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> Arrival:
     """Read one line of the arrivals."""
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
     if receiver not in places:
@@ -160,7 +183,7 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     time_ns = row.stamp_ns('arrival' if passive else 'stamp')
     toa = math.nan if passive else row.seconds_ns('toa') * 1e-9
     var_toa = _variance(row, 'toa')
-    return _Arrival(
+    return Arrival(
         ping,
         time_ns,
         toa,
@@ -177,7 +200,7 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     )
 
 
-def _names_tags(table: CsvTable) -> bool:
+def _names_tags(table: Table) -> bool:
     """Whether a column says which tag was heard, and not which receiver has heard it."""
     return table.has('tag') and table.index['tag'] != table.index.get('receiver')
 
@@ -190,8 +213,8 @@ def _variance(row: Row, what: str) -> float:
     return std * std
 
 
-def _one_ping(
-    ping: list[_Arrival],
+def _of_ping(
+    ping: list[Arrival],
     passive: bool,
     places: Places,
     senders: Places,
@@ -226,7 +249,7 @@ def _one_ping(
     )
 
 
-def _read_places(
+def read_places(
     path: str | Path,
     report: ConversionReport,
     options: CsvOptions | None,

@@ -30,11 +30,12 @@ from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import FixesOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import BadRow, Row, Table
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
 from ..polar_rows import PolarRows
 from ..sources import BagError
+from ..track_files import open_table
 from .truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
@@ -58,7 +59,14 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
     leaves them out.
     """
     how = FixesOptions(**values)
-    table = CsvTable(path, how.options)
+    table = open_table(path, how.options)
+    return write_fixes(table, ConversionReport(Path(out)), how)
+
+
+def write_fixes(
+    table: Table, report: ConversionReport, how: FixesOptions, beside: Sequence[Record] = ()
+) -> ConversionReport:
+    """`convert_fixes` of a table that is open, with records `beside` its own."""
     table.require('stamp')
     polar = None
     if table.has('range', 'bearing') and not _has_places(table):
@@ -70,7 +78,6 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
         polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
     frame = None if polar else LocalFrame(table, how.origin)
     origin = frame.origin if frame else None
-    report = ConversionReport(Path(out))
     place = ('range', 'bearing') if polar else ('x', 'y')
     if frame and frame.geodetic:
         place = ('latitude', 'longitude')
@@ -131,21 +138,21 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
     return write_bag(
-        out,
-        records,
+        report.path,
+        [*records, *beside] if records else [],
         report,
-        source=Path(path).name,
+        source=table.path.name,
         storage=how.storage,
         parameters={'diver': origin_parameters(origin)},
     )
 
 
-def _has_places(table: CsvTable) -> bool:
+def _has_places(table: Table) -> bool:
     return table.has('x', 'y') or table.has('latitude', 'longitude')
 
 
 def _names_divers(
-    table: CsvTable, rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport
+    table: Table, rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport
 ) -> bool:
     """Whether the column ``id`` says whose the rows are. One that is another in most rows numbers
     the rows."""

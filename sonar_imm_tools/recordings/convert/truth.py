@@ -31,8 +31,9 @@ from sonar_imm.truth import TrueTrack
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import TruthOptions
-from ..csv_table import CsvOptions, CsvTable, Row
+from ..csv_table import CsvOptions, Row
 from ..local_frame import LocalFrame
+from ..track_files import open_table
 from ..truth import records_of
 
 
@@ -57,7 +58,7 @@ def truth_records(
     origin: tuple[float, ...] | None,
 ) -> list[Record]:
     """Read a truth CSV into records; bad rows and notes go to `report`."""
-    table = CsvTable(path, options)
+    table = open_table(path, options)
     table.require('stamp')
     frame = LocalFrame(table, origin)
     with_velocity = table.has('vx', 'vy')

@@ -125,7 +125,7 @@ def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> Non
                     f'{picks.depth[k]:.3f}',
                     f'{picks.depth_std[k]:.3f}',
                     *(_number(picks.columns[name][k], 3) for name in _COPIED),
-                    _utc(int(picks.stamp_ns[k])),
+                    utc_text(int(picks.stamp_ns[k])),
                 )
             )
 
@@ -147,7 +147,7 @@ def write_geojson(path: Path, picks: Picks) -> int:
         properties = {
             'horizon': int(picks.horizon[k]),
             'trace': int(picks.record[k]),
-            'time_utc': _utc(int(picks.stamp_ns[k])),
+            'time_utc': utc_text(int(picks.stamp_ns[k])),
             'twt_ms': round(1e3 * float(picks.two_way_time[k]), 4),
             'depth_m': round(float(picks.depth[k]), 3),
             'depth_std_m': round(float(picks.depth_std[k]), 3),
@@ -182,7 +182,8 @@ def _number(value: float, digits: int) -> str:
     return f'{value:.{digits}f}' if np.isfinite(value) else ''
 
 
-def _utc(stamp_ns: int) -> str:
+def utc_text(stamp_ns: int) -> str:
+    """A stamp as ISO 8601 with milliseconds."""
     seconds, rest = divmod(stamp_ns, 10**9)
     moment = datetime.fromtimestamp(seconds, timezone.utc)
     return f'{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z'

@@ -127,4 +127,5 @@ def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
     )
     *before, sentence = said.splitlines()
     assert code == 2 and '/sys/sonar_imm' in sentence
-    assert all(line.startswith('using the parameters of the recording') for line in before)
+    said = ('using the parameters of the recording', 'diver <- ')
+    assert all(line.startswith(said) for line in before)

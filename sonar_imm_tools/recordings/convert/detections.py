@@ -1,0 +1,320 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Detections of acoustic tags by receivers with clocks of their own, as arrivals of pings.
+
+Telemetry receivers store which tag they heard at which time of their own clock. Fixed tags
+("sync tags") compare the clocks. Detection i of one transmission, by receiver r at the distance
+d_r from the tag, satisfies
+
+    t_i = T + d_r / c + o_r(t_i) + error,
+
+with the unknown time T of the transmission, common to all its detections, and the offset o_r of
+the clock. T is removed by taking the mean over a transmission. o_r is linear between knots, its
+values there follow by least squares, and the first receiver that others share detections with has
+the right time. Detections that do not go with the others (echoes) are left out step by step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
+
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+
+from ... import SECOND
+from ..conversion import ConversionReport
+from ..convert_options import DetectionsOptions
+from ..csv_table import BadRow, CsvTable, Row
+from .arrivals import Arrival, Places, read_places, Stations, write_pings
+
+HOUR = 3600.0
+LONGEST_SYNC = 60.0
+"""Seconds between the clocks of two receivers, at most."""
+ROUNDS = 5
+FAR = 5.0
+"""Standard deviations, by the median, at which a detection does not go with the others."""
+LEAST = 1e-6
+"""Seconds; no clock is compared better."""
+
+
+class Heard(NamedTuple):
+    """Detections: receiver (n,), an index; tag (n,), an index; stamp_ns (n,)."""
+
+    receiver: IntArray
+    tag: IntArray
+    stamp_ns: IntArray
+
+
+class Clocks(NamedTuple):
+    """Offsets of clocks. knots (k,) s after the first detection; offset (receivers, k) s, NaN for
+    a receiver that no fixed tag connects with the first; std: s, of a detection about them, NaN
+    when nothing was compared; used: how many detections of fixed tags."""
+
+    begin_ns: int
+    knots: FloatArray
+    offset: FloatArray
+    std: float
+    used: int
+
+    def right(self, heard: Heard) -> tuple[IntArray, BoolArray]:
+        """Stamps (n,) by one clock, and whether (n,) they could be told."""
+        seconds = (heard.stamp_ns - self.begin_ns) / SECOND
+        late = np.zeros(len(seconds))
+        for receiver in np.unique(heard.receiver):
+            own = heard.receiver == receiver
+            late[own] = np.interp(seconds[own], self.knots, self.offset[receiver])
+        known = np.isfinite(late)
+        shift = np.round(np.where(known, late, 0.0) * SECOND).astype(np.int64)
+        return heard.stamp_ns - shift, known
+
+
+def convert_detections(
+    path: str | Path, out: str | Path, receivers: str | Path, **values: Any
+) -> ConversionReport:
+    """Convert rows of receiver, tag and time to the topic ``/arrivals``, one message per ping.
+
+    values: as in `DetectionsOptions`. Fixed tags are not written. Raises `BagError`.
+    """
+    how = DetectionsOptions(receivers=receivers, **values)
+    report = ConversionReport(Path(out))
+    places, origin = read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
+    fixed: Places = {}
+    if how.sync is not None:
+        fixed = read_places(how.sync, report, how.receiver_options, origin, 'tag')[0]
+    table = CsvTable(path, how.options)
+    table.require('stamp', 'receiver', 'tag')
+    names = list(places)
+
+    def parse(row: Row) -> tuple[int, str, int]:
+        receiver, tag = row.text('receiver'), row.text('tag')
+        if receiver not in places:
+            raise BadRow(f"the position of receiver '{receiver}' is not known", 'unknown receiver')
+        if not tag:
+            raise BadRow('the tag is empty')
+        return names.index(receiver), tag, row.stamp_ns()
+
+    rows = [parsed for _, parsed in report.read_rows(table, parse)]
+    tags = list(dict.fromkeys(tag for _, tag, _ in rows))
+    number = {tag: k for k, tag in enumerate(tags)}
+    heard = Heard(
+        np.array([receiver for receiver, _, _ in rows], np.int64),
+        np.array([number[tag] for _, tag, _ in rows], np.int64),
+        np.array([stamp for _, _, stamp in rows], np.int64),
+    )
+    stamps, known, std = heard.stamp_ns, np.ones(len(rows), bool), how.toa_std
+    if fixed:
+        at = np.array([fixed.get(tag, (np.nan,) * 3) for tag in tags]).reshape(-1, 3)
+        clocks = compare_clocks(
+            heard, np.array(list(places.values())), at, how.sound_speed, how.clock_interval * HOUR
+        )
+        stamps, known = clocks.right(heard)
+        std = std or (None if np.isnan(clocks.std) else max(clocks.std, LEAST))
+        _note(report, clocks, names)
+        for k in np.flatnonzero(~known)[:1]:
+            report.problems.append(
+                f'{int((~known).sum())} detections have no common time, the first of receiver '
+                f'{names[heard.receiver[k]]}: it shares no ping of a fixed tag with the others'
+            )
+    pings: dict[tuple[object, str], list[Arrival]] = {}
+    for tag in tags:
+        if tag in fixed:
+            continue
+        own = np.flatnonzero((heard.tag == number[tag]) & known)
+        for ping, members in enumerate(gather(heard.receiver[own], stamps[own], how.window)):
+            pings[ping, tag] = [
+                _arrival(int(stamps[k]), names[heard.receiver[k]], tag, std) for k in own[members]
+            ]
+    if not pings and fixed:
+        report.problems.append('there is no tag beside the fixed ones')
+    return write_pings(table, pings, Stations(places, places, origin), True, report, how)
+
+
+def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> None:
+    if not clocks.used:
+        report.notes['clocks'] = 'no two receivers share a detection of a fixed tag'
+        return
+    spread = [
+        f'{name} {1e3 * offset[0]:+.1f} to {1e3 * offset[-1]:+.1f} ms'
+        for name, offset in zip(names, clocks.offset)
+        if np.isfinite(offset).all()
+    ]
+    report.notes['clocks'] = (
+        f'{", ".join(spread)} at the begin and the end; {clocks.used} detections of fixed tags '
+        f'agree to {1e3 * clocks.std:.2f} ms'
+    )
+
+
+def _arrival(stamp_ns: int, receiver: str, tag: str, std: float | None) -> Arrival:
+    nothing = float('nan')
+    var = nothing if std is None else std * std
+    return Arrival(
+        '', stamp_ns, nothing, '', receiver, var, *(nothing,) * 6, tag
+    )  # fmt: skip
+
+
+def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArray]:
+    """Rows of each transmission of one tag: those within `window` seconds of the first, each
+    receiver once, with its first detection."""
+    found: list[IntArray] = []
+    order = np.argsort(stamp_ns, kind='stable')
+    begin = 0
+    while begin < len(order):
+        inside = np.searchsorted(
+            stamp_ns[order], stamp_ns[order[begin]] + round(window * SECOND), side='right'
+        )
+        members = order[begin:inside]
+        first = np.unique(receiver[members], return_index=True)[1]
+        found.append(members[np.sort(first)])
+        begin = int(inside)
+    return found
+
+
+def compare_clocks(
+    heard: Heard, receivers: FloatArray, tags: FloatArray, sound_speed: float, interval: float
+) -> Clocks:
+    """Compare the clocks of receivers (R, 3) by tags (T, 3), NaN for those that move; m, s.
+
+    interval: seconds from knot to knot. The offsets are against the first of the receivers that
+    are connected with the most others.
+    """
+    begin_ns = int(heard.stamp_ns.min()) if len(heard.stamp_ns) else 0
+    seconds = (heard.stamp_ns - begin_ns) / SECOND
+    spans = max(1, int(np.ceil(seconds.max(initial=0.0) / interval)))
+    knots = np.linspace(0.0, max(seconds.max(initial=0.0), 1.0), spans + 1)
+    groups, reduced = _sync_groups(heard, seconds, receivers, tags, sound_speed)
+    nothing = np.full((len(receivers), len(knots)), np.nan)
+    if not groups:
+        return Clocks(begin_ns, knots, nothing, np.nan, 0)
+    row = np.concatenate(groups)
+    ping = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    keep = np.ones(len(row), bool)
+    for _ in range(ROUNDS):
+        offset = _solve(heard.receiver[row[keep]], seconds[row[keep]], reduced[row[keep]],
+                        ping[keep], knots, len(receivers))  # fmt: skip
+        rest = reduced[row] - _at(offset, knots, heard.receiver[row], seconds[row])
+        rest = rest - _medians(rest, ping)
+        sigma = max(1.4826 * float(np.median(np.abs(rest[keep]))), LEAST)
+        better = np.abs(rest) <= FAR * sigma
+        better &= _counts(better, ping)[ping] > 1
+        if (better == keep).all() or better.sum() < 2:
+            break
+        keep = better
+    linked = _connected(heard.receiver[row[keep]], ping[keep], len(receivers))
+    offset[~linked] = np.nan
+    offset -= offset[np.flatnonzero(linked)[0]]
+    free = keep.sum() - len(np.unique(ping[keep])) - linked.sum() * len(knots) + len(knots)
+    centred = rest[keep] - _means(rest[keep], ping[keep])
+    std = float(np.sqrt((centred**2).sum() / max(free, 1)))
+    return Clocks(begin_ns, knots, offset, std, int(keep.sum()))
+
+
+def _sync_groups(
+    heard: Heard, seconds: FloatArray, receivers: FloatArray, tags: FloatArray, sound_speed: float
+) -> tuple[list[IntArray], FloatArray]:
+    """Rows of the transmissions of fixed tags that two or more receivers detected, and the times
+    (n,) without the travel from the tag."""
+    distance = np.linalg.norm(tags[heard.tag] - receivers[heard.receiver], axis=1)
+    reduced = seconds - distance / sound_speed
+    groups: list[IntArray] = []
+    for tag in np.flatnonzero(np.isfinite(tags).all(axis=1)):
+        own = np.flatnonzero(heard.tag == tag)
+        steps = [
+            np.diff(np.sort(seconds[own[heard.receiver[own] == receiver]]))
+            for receiver in np.unique(heard.receiver[own])
+        ]
+        every = np.concatenate(steps) if steps else np.empty(0)
+        window = min(LONGEST_SYNC, 0.5 * float(np.median(every))) if len(every) else LONGEST_SYNC
+        stamps = np.round(reduced[own] * SECOND).astype(np.int64)
+        groups += [own[found] for found in gather(heard.receiver[own], stamps, window)]
+    return [group for group in groups if len(group) > 1], reduced
+
+
+def _hats(knots: FloatArray, seconds: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The knot before each time, and the weight of the one after it."""
+    before = np.clip(np.searchsorted(knots, seconds, side='right') - 1, 0, len(knots) - 2)
+    return before, (seconds - knots[before]) / (knots[before + 1] - knots[before])
+
+
+def _at(
+    offset: FloatArray, knots: FloatArray, receiver: IntArray, seconds: FloatArray
+) -> FloatArray:
+    before, weight = _hats(knots, seconds)
+    after = offset[receiver, before + 1]
+    return np.asarray(offset[receiver, before] * (1.0 - weight) + after * weight)
+
+
+def _solve(
+    receiver: IntArray,
+    seconds: FloatArray,
+    reduced: FloatArray,
+    ping: IntArray,
+    knots: FloatArray,
+    receivers: int,
+) -> FloatArray:
+    """Offsets (receivers, knots) of least squares, the smallest of those that are as good."""
+    rows, size = len(receiver), receivers * len(knots)
+    before, weight = _hats(knots, seconds)
+    column = receiver * len(knots) + before
+    index = np.arange(rows)
+    hat = coo_array(
+        (
+            np.concatenate([1.0 - weight, weight]),
+            (np.concatenate([index, index]), np.concatenate([column, column + 1])),
+        ),
+        shape=(rows, size),
+    ).tocsr()
+    counts = np.bincount(ping)
+    mean = csr_array((1.0 / counts[ping], (ping, index)), shape=(len(counts), rows))
+    design = hat - (mean @ hat)[ping]
+    wanted = reduced - _means(reduced, ping)
+    # Where nobody was heard a clock goes on as it was.
+    link = diags_array([-1e-3, 1e-3], offsets=[0, 1], shape=(size, size)).tocsr()
+    link = link[np.arange(size) % len(knots) != len(knots) - 1]
+    # A common shift of all clocks is free: the least of all is taken.
+    normal = design.T @ design + link.T @ link + diags_array(np.full(size, 1e-9))
+    solved = spsolve(normal.tocsc(), design.T @ wanted)
+    return np.asarray(solved.reshape(receivers, len(knots)))
+
+
+def _means(values: FloatArray, ping: IntArray) -> FloatArray:
+    counts = np.bincount(ping)
+    return np.asarray((np.bincount(ping, values) / np.maximum(counts, 1))[ping])
+
+
+def _medians(values: FloatArray, ping: IntArray) -> FloatArray:
+    """The median of each ping at its rows; rows of a ping are neighbours."""
+    ends = np.flatnonzero(np.diff(ping)) + 1
+    parts = np.split(values, ends)
+    return np.concatenate([np.full(len(part), np.median(part)) for part in parts])
+
+
+def _counts(keep: BoolArray, ping: IntArray) -> IntArray:
+    return np.bincount(ping, keep.astype(np.int64)).astype(np.int64)
+
+
+def _connected(receiver: IntArray, ping: IntArray, receivers: int) -> BoolArray:
+    """Which receivers (receivers,) are connected by common pings: the largest such group."""
+    pings = int(ping.max(initial=0)) + 1
+    size = receivers + pings
+    graph = coo_array((np.ones(len(receiver)), (receiver, receivers + ping)), (size, size))
+    label = connected_components(graph, directed=False)[1][:receivers]
+    heard = np.isin(np.arange(receivers), receiver)
+    largest = np.bincount(label[heard]).argmax()
+    return np.asarray((label == largest) & heard)

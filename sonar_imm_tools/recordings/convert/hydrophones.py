@@ -1,0 +1,162 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Sound of an array of hydrophones, WAV or FLAC, one channel for each, as blocks of pressure.
+
+The file is read in blocks, so that its length does not matter. What a full scale is worth in
+pascals is an option: the tracker needs ratios only. Whole numbers of 16 bits stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+import re
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from msg_adapters.array_records import write_pressure
+from sonar_imm.measurements import Pressure, Rejection
+
+from ... import SECOND
+from ..conversion import ConversionReport, provenance
+from ..convert_options import HydrophonesOptions
+from ..csv_table import BadRow, iso_ns, TIME_TEXT, zone_of
+from ..messages import ros_message
+from ..sources import BagError
+from ..writer import BagWriter
+
+if TYPE_CHECKING:
+    import soundfile
+
+LONGEST_BLOCK = 2**24
+"""Samples of all channels in a block."""
+FULL_SCALE = 2**15
+_NAMED = re.compile(r'(?<!\d)(20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
+
+
+def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+    """Convert the channels of a sound file to the topic ``/pressure``, block by block.
+
+    values: as in `HydrophonesOptions`. Needs soundfile. A file that ends early keeps what could be
+    read. Raises `BagError`.
+    """
+    how = HydrophonesOptions(**values)
+    path, report = Path(path), ConversionReport(Path(out))
+    with _opened(path) as sound:
+        channels = _channels(sound, how.channels)
+        start_ns = _start_ns(path, how)
+        rows = max(2, round(how.block * sound.samplerate))
+        if rows * sound.channels > LONGEST_BLOCK:
+            raise BagError(
+                f'blocks of {how.block:g} s have {rows * sound.channels} samples; say a shorter '
+                '--block'
+            )
+        whole = sound.subtype == 'PCM_16'
+        report.notes['sound'] = (
+            f'{sound.channels} channels, {sound.samplerate} Hz, '
+            f'{sound.frames / sound.samplerate:.1f} s, {sound.subtype}'
+        )
+        report.notes['full scale'] = f'{how.full_scale:g} Pa'
+        notes = provenance(path.name, report.notes)
+        with BagWriter(report.path, storage=how.storage, custom_data=notes) as bag:
+            _write_blocks(sound, bag, report, how, channels, start_ns, rows, whole)
+            if not bag.count:
+                raise BagError(f'{path} holds no block of sound that could be converted')
+    return report
+
+
+def _write_blocks(
+    sound: soundfile.SoundFile,
+    bag: BagWriter,
+    report: ConversionReport,
+    how: HydrophonesOptions,
+    channels: list[int],
+    start_ns: int,
+    rows: int,
+    whole: bool,
+) -> None:
+    done = 0
+    while True:
+        try:
+            samples = sound.read(rows, dtype='int16' if whole else 'float32', always_2d=True)
+        except RuntimeError as error:
+            report.problems.append(f'{report.path.name}: the rest cannot be read: {error}')
+            return
+        if len(samples) < 2:
+            return
+        report.rows += len(samples)
+        scale = how.full_scale / FULL_SCALE if whole else 0.0
+        pressure = samples[:, channels] * np.float32(scale or how.full_scale)
+        stamp_ns = start_ns + round(done * SECOND / sound.samplerate)
+        done += len(samples)
+        try:
+            block = Pressure(
+                stamp_ns=stamp_ns,
+                frame_id=how.frame_id,
+                pressure=pressure,
+                sample_rate=float(sound.samplerate),
+                reference_depth=how.depth,
+                scale=scale,
+            )
+        except Rejection as error:
+            report.bad_row(Path(sound.name), f'{done / sound.samplerate:.1f} s', error)
+            continue
+        bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
+        report.messages['/pressure'] = report.messages.get('/pressure', 0) + 1
+
+
+def _opened(path: Path) -> soundfile.SoundFile:
+    try:
+        import soundfile
+    except ImportError:
+        raise BagError("sound needs soundfile: pip install 'sonar_imm[sound]'") from None
+    try:
+        return soundfile.SoundFile(str(path))
+    except (soundfile.LibsndfileError, OSError) as error:
+        raise BagError(f'{path} cannot be read as sound: {error}') from None
+
+
+def _channels(sound: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[int]:
+    """The channels of the hydrophones, the deepest first."""
+    channels = list(range(sound.channels)) if wanted is None else list(wanted)
+    if wrong := [k for k in channels if not 0 <= k < sound.channels]:
+        raise BagError(f'{sound.name} has the channels 0 to {sound.channels - 1}, not {wrong[0]}')
+    if len(channels) < 2:
+        raise BagError(f'{sound.name} has one channel; an array has at least two hydrophones')
+    return channels
+
+
+def _start_ns(path: Path, how: HydrophonesOptions) -> int:
+    """When the first sample was taken, from the option or the name of the file."""
+    if how.start:
+        parts = TIME_TEXT.match(how.start)
+        if parts is None:
+            raise BagError(f"'{how.start}' is no time; write 2024-05-31T10:00:00Z")
+        day, clock, fraction, zone = parts.groups()
+        return _stamp(day, clock, fraction, zone or how.time_zone)
+    found = _NAMED.search(path.stem)
+    if found is None:
+        raise BagError(
+            f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z'
+        )
+    year, month, day, hour, minute, second = found.groups()[1:]
+    return _stamp(f'20{year}-{month}-{day}', f'{hour}:{minute}:{second}', None, how.time_zone)
+
+
+def _stamp(day: str, clock: str, fraction: str | None, zone: str) -> int:
+    try:
+        return iso_ns(day, clock, fraction, zone_of(zone))
+    except BadRow as error:
+        raise BagError(str(error)) from None

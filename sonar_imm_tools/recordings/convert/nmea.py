@@ -1,0 +1,335 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Logs of NMEA 0183 sentences and AIS messages: positions of targets, and of the vessel itself.
+
+Positions of targets are those that AIS reports (``!AIVDM``: messages 1, 2, 3, 18, 19 and 27, by
+MMSI), targets with latitude and longitude (``TLL``) and tracked targets with distance and bearing
+(``TTM``), which are placed from the vessel's last position. The vessel's own position is in
+``GGA``, ``RMC``, ``GLL`` or ``GNS``, its heading in ``HDT`` or ``THS``.
+
+Few sentences have a whole time. In this order a time is that before the sentence (seconds since
+1970 or ISO 8601), that of its tag block (``\\c:...*hh\\``), or the vessel's clock as of the last
+sentence that had one, with the date of ``ZDA`` or ``RMC``. An AIS report says the second at which
+it was true; its time is moved there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import date as Date
+from datetime import datetime, timedelta, timezone
+from datetime import time as Time
+import math
+from pathlib import Path
+import re
+from typing import Any
+
+from attrs import define, Factory
+import numpy as np
+
+from msg_adapters.geodetic import write_geodetic
+from msg_adapters.vessel import write_heading
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
+
+from ... import SECOND
+from ..conversion import ConversionReport, Record
+from ..convert_options import FixesOptions, NmeaOptions
+from ..csv_table import BadRow, iso_ns, TIME_TEXT, zone_of
+from ..messages import ros_message
+from ..sources import BagError
+from ..track_files import TrackFile
+from .fixes import write_fixes
+
+LONGEST_LINE = 1000
+LATER = timedelta(hours=12)
+"""A time of day that is further back than this belongs to the next day."""
+HALF_MINUTE = 30 * SECOND
+LENGTHS = {'K': 1000.0, 'N': 1852.0, 'S': 1609.344}
+"""Metres of the units of ``TTM``: kilometres, nautical and statute miles."""
+ACCURATE, INACCURATE = 5.0, 15.0
+"""Standard deviation on each axis of an AIS position, m: the report says better or worse than
+10 m."""
+_SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,6},.*?\*[0-9A-Fa-f]{2})\s*$')
+_TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
+
+
+@define
+class _Log:
+    """What was read so far. clock: ns since 1970 of the last sentence with a time; place: of the
+    vessel (latitude, longitude), degrees; std: of its position, m, NaN when nobody says."""
+
+    day: Date | None
+    clock: int | None = None
+    of_day: Time | None = None
+    place: tuple[float, float] | None = None
+    heading: float = math.nan
+    std: float = math.nan
+    own: list[VesselFix] = Factory(list)
+    headings: list[VesselHeading] = Factory(list)
+    targets: list[dict[str, str]] = Factory(list)
+    unread: dict[str, int] = Factory(dict)
+
+
+def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+    """Convert a log of sentences to ``/fixes`` of its targets, and ``/nav_fix`` and ``/heading``
+    of the vessel; where it holds no targets, the vessel's positions are the fixes.
+
+    values: as in `NmeaOptions`. Needs pyais and pynmea2. Sentences that are damaged or have no
+    time are counted and named. Raises `BagError`.
+    """
+    how = NmeaOptions(**values)
+    report = ConversionReport(Path(out))
+    log = _read(Path(path), report, how.date)
+    as_fixes = how.own == 'fixes' or (how.own == 'auto' and not log.targets)
+    rows, beside = log.targets, list[Record]()
+    if as_fixes:
+        rows = rows + [
+            _row(fix.stamp_ns, fix.latitude, fix.longitude, fix.height) for fix in log.own
+        ]
+        report.notes['own'] = 'the positions of the receiver itself are the fixes'
+    else:
+        beside += [(fix.stamp_ns, '/nav_fix', write_geodetic(fix, ros_message)) for fix in log.own]
+        beside += [
+            (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
+            for heading in log.headings
+        ]
+    if log.unread:
+        counts = sorted(log.unread.items(), key=lambda item: -item[1])
+        report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts[:12])
+    if not rows:
+        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
+        raise BagError(f'{path} holds no position of a target{first}')
+    table = TrackFile(path, None, rows, 'a log of NMEA sentences')
+    fixes = FixesOptions(
+        truth=how.truth,
+        truth_options=how.truth_options,
+        frame_id=how.frame_id,
+        origin=how.origin,
+        storage=how.storage,
+    )
+    return write_fixes(table, report, fixes, beside)
+
+
+def _read(path: Path, report: ConversionReport, day: str) -> _Log:
+    try:
+        import pyais
+        import pynmea2
+    except ImportError:
+        raise BagError(
+            "logs of NMEA sentences need pyais and pynmea2: pip install 'sonar_imm[nmea]'"
+        ) from None
+    log = _Log(_day(day))
+    wrong = (pynmea2.ParseError, pyais.exceptions.AISBaseException, BadRow, Rejection)
+    for number, line in _lines(path):
+        found = _SENTENCE.match(line)
+        if found is None:
+            report.rows += 1
+            report.bad_row(path, f'line {number}', 'is no sentence with a checksum')
+            continue
+        report.rows += 1
+        try:
+            stamp = _stamp(found['before'])
+            sentence = found['sentence']
+            if sentence[3:6] in ('VDM', 'VDO'):
+                _take_ais(log, pyais.decode(sentence.encode()), stamp, sentence[3:6] == 'VDO')
+            else:
+                _take(log, pynmea2.parse(sentence, check=True), stamp)
+        except wrong as error:
+            report.bad_row(path, f'line {number}', error)
+        except (ValueError, TypeError, IndexError, AttributeError, KeyError) as error:
+            # Neither library promises more for sentences of the right sum and the wrong content.
+            report.bad_row(path, f'line {number}', f'cannot be understood: {error}')
+    return log
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    try:
+        with path.open(encoding='ascii', errors='replace') as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), ''), start=1):
+                if line.strip():
+                    yield number, line.strip()
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+
+
+def _day(text: str) -> Date | None:
+    try:
+        return Date.fromisoformat(text) if text else None
+    except ValueError:
+        raise BagError(f"'{text}' is no date; write 2024-05-31") from None
+
+
+def _stamp(before: str) -> int | None:
+    """The time that stands before a sentence, ns since 1970. Raises `BadRow`."""
+    if block := _TAG_BLOCK.search(before):
+        number = int(block.group(1))
+        return number * (10**6 if number > 10**11 else SECOND)
+    text = before.split('\\')[0].strip(' \t,;[]')
+    if not text:
+        return None
+    if parts := TIME_TEXT.match(text):
+        day, clock, fraction, zone = parts.groups()
+        return iso_ns(day, clock, fraction, zone_of(zone or 'UTC'))
+    if re.fullmatch(r'\d{9,10}(\.\d+)?', text):
+        return round(float(text) * 1e6) * 1000
+    return int(text) * 10**6 if re.fullmatch(r'\d{12,13}', text) else None
+
+
+def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
+    """What a sentence of NMEA 0183 says. Raises `BadRow` or `Rejection`."""
+    kind = sentence.sentence_type
+    day = _dated(sentence)
+    if day is not None and day != log.day:
+        log.day, log.of_day = day, None
+    clock = getattr(sentence, 'timestamp', None)
+    if stamp is not None:
+        log.clock = stamp
+    elif isinstance(clock, Time) and kind != 'GST':
+        _tell_time(log, clock)
+    if kind in ('GGA', 'RMC', 'GLL', 'GNS'):
+        _take_own(log, sentence)
+    elif kind in ('HDT', 'THS'):
+        _take_heading(log, float(sentence.data[0]))
+    elif kind == 'GST':
+        stds = [float(std) for std in (sentence.std_dev_latitude, sentence.std_dev_longitude)]
+        log.std = max(stds)
+    elif kind == 'TLL':
+        row = _row(_now(log), sentence.latitude, sentence.longitude)
+        log.targets.append(row | {'id': str(sentence.target_name or sentence.target_number)})
+    elif kind == 'TTM':
+        _take_tracked(log, sentence)
+    elif day is None:
+        log.unread[kind] = log.unread.get(kind, 0) + 1
+
+
+def _dated(sentence: Any) -> Date | None:
+    if sentence.sentence_type == 'ZDA':
+        return Date(int(sentence.year), int(sentence.month), int(sentence.day))
+    day = getattr(sentence, 'datestamp', None)
+    return day if isinstance(day, Date) else None
+
+
+def _tell_time(log: _Log, clock: Time) -> None:
+    """Set the clock of the log by a time of day."""
+    clock = clock.replace(tzinfo=None)
+    if log.day is None:
+        return
+    if log.of_day is not None:
+        back = datetime.combine(log.day, log.of_day) - datetime.combine(log.day, clock)
+        log.day += timedelta(days=int(back > LATER))
+    log.of_day = clock
+    log.clock = iso_ns(
+        log.day.isoformat(), clock.strftime('%H:%M:%S'), f'.{clock.microsecond:06d}', timezone.utc
+    )
+
+
+def _now(log: _Log) -> int:
+    if log.clock is None:
+        raise BadRow(
+            'has no time, and none came before it: say the date of the first line with --date '
+            '2024-05-31',
+            'no time',
+        )
+    return log.clock
+
+
+def _take_own(log: _Log, sentence: Any) -> None:
+    kind = sentence.sentence_type
+    good = {'GGA': 'gps_qual', 'RMC': 'status', 'GLL': 'status', 'GNS': 'mode_indicator'}[kind]
+    if not sentence.lat or str(getattr(sentence, good, '')) in ('0', 'V', 'N', 'NN'):
+        raise BadRow('has no valid position', 'no position')
+    stamp_ns = _now(log)
+    height = 0.0
+    if kind == 'GGA':
+        height = float(sentence.altitude or 0.0) + float(sentence.geo_sep or 0.0)
+    covariance = None
+    if log.std > 0.0:
+        covariance = np.diag([log.std**2, log.std**2, 4.0 * log.std**2])
+    fix = VesselFix(
+        stamp_ns=stamp_ns,
+        latitude=float(sentence.latitude),
+        longitude=float(sentence.longitude),
+        height=height,
+        covariance=covariance,
+        frame_id='gps',
+    )
+    log.place = fix.latitude, fix.longitude
+    if not log.own or log.own[-1].stamp_ns != stamp_ns:
+        log.own.append(fix)
+    elif kind == 'GGA':  # of several of one moment the one with a height
+        log.own[-1] = fix
+
+
+def _take_heading(log: _Log, degrees: float) -> None:
+    """degrees: clockwise from true north."""
+    log.heading, stamp_ns = degrees, _now(log)
+    if log.headings and log.headings[-1].stamp_ns == stamp_ns:
+        return
+    half = 0.5 * (0.5 * math.pi - math.radians(degrees))
+    log.headings.append(
+        VesselHeading(
+            stamp_ns=stamp_ns,
+            orientation=np.array([0.0, 0.0, math.sin(half), math.cos(half)]),
+            frame_id='vessel',
+        )
+    )
+
+
+def _take_tracked(log: _Log, sentence: Any) -> None:
+    """A target by distance and bearing from the vessel, placed from its last position."""
+    if log.place is None:
+        raise BadRow('needs a position of the vessel before it', 'no position')
+    bearing = float(sentence.bearing)
+    if sentence.brg_ref == 'R':
+        if math.isnan(log.heading):
+            raise BadRow('counts from the bow and no heading came before it', 'no heading')
+        bearing += log.heading
+    distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
+    angle = math.radians(bearing)
+    place = Origin(*log.place, 0.0).geodetic(
+        np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
+    )
+    row = _row(_now(log), float(place[0]), float(place[1]))
+    log.targets.append(row | {'id': str(sentence.name or sentence.target_number)})
+
+
+def _take_ais(log: _Log, message: Any, stamp: int | None, own: bool) -> None:
+    if not hasattr(message, 'lat') or message.msg_type not in (1, 2, 3, 18, 19, 27):
+        name = f'AIS {message.msg_type}'
+        log.unread[name] = log.unread.get(name, 0) + 1
+        return
+    if stamp is not None:
+        log.clock = stamp
+    stamp_ns, second = _now(log), getattr(message, 'second', 60)
+    if second < 60:
+        late = (stamp_ns - int(second) * SECOND + HALF_MINUTE) % (60 * SECOND) - HALF_MINUTE
+        stamp_ns -= late
+    latitude, longitude = float(message.lat), float(message.lon)
+    if latitude > 90.0 or longitude > 180.0:
+        raise BadRow('says that it has no position', 'no position')
+    if own:
+        return
+    std = ACCURATE if message.accuracy else INACCURATE
+    row = _row(stamp_ns, latitude, longitude)
+    log.targets.append(row | {'std': str(std), 'id': str(message.mmsi)})
+
+
+def _row(stamp_ns: int, latitude: float, longitude: float, height: float = 0.0) -> dict[str, str]:
+    return {
+        'stamp': f'{stamp_ns // SECOND}.{stamp_ns % SECOND:09d}',
+        'latitude': repr(latitude),
+        'longitude': repr(longitude),
+        'height': repr(height),
+    }

@@ -1,0 +1,163 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a file is, by its content: the kind of conversion that fits it, and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import zipfile
+
+from attrs import frozen
+import numpy as np
+
+from sonar_imm.trackers import SYSTEMS
+
+from .convert.snapshots import NAMES as SNAPSHOT_NAMES
+from .csv_table import CsvTable
+from .reader import BagReader
+from .sources import BagError, SUFFIXES
+from .topics import made_topics
+from .track_files import kind_of_text, START
+
+NO_READER = {
+    'ek80': 'a raw file of a Simrad EK60 or EK80',
+    'kmall': 'a KMALL file of a Kongsberg multibeam',
+    'all': 'an .all file of a Kongsberg multibeam',
+    'xtf': 'an XTF file',
+}
+"""What is recognised and not read."""
+
+
+@frozen
+class Guess:
+    """kind: of conversion; why: what the file looks like."""
+
+    kind: str
+    why: str
+
+
+def sniff(path: Path) -> Guess:
+    """What a file is. Raises `BagError` with what it could be and what would settle it."""
+    if path.is_dir() or path.suffix.lower() in SUFFIXES:
+        return _of_bag(path)
+    try:
+        with path.open('rb') as file:
+            start = file.read(START)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+    if not start:
+        raise BagError(f'{path} is empty')
+    if start[:4] == b'RIFF' and start[8:12] == b'WAVE' or start[:4] in (b'fLaC', b'RF64'):
+        return Guess('hydrophones', 'sound of hydrophones')
+    if start[:2] == b'PK':
+        return _of_archive(path)
+    if _is_segy(start):
+        return Guess('segy', 'traces in SEG-Y')
+    if unread := _unread(start):
+        raise BagError(
+            f'{path} is {NO_READER[unread]}, which has no reader here; programs that read it '
+            'write its samples into a numpy archive, for sonar-imm convert snapshots'
+        )
+    if kind := kind_of_text(path):
+        if kind == 'json':
+            return Guess('autoferry', 'scans in JSON')
+        return Guess('fixes', f'a {kind.upper()} file of positions')
+    if _is_nmea(start):
+        return Guess('nmea', 'NMEA 0183 or AIS sentences')
+    return _of_table(CsvTable(path))
+
+
+def _of_bag(path: Path) -> Guess:
+    with BagReader(path) as bag:
+        found = [topic for system in SYSTEMS for topic in made_topics(bag, system)]
+    if found:
+        return Guess('images', f'a recording with images of a sonar on {found[0]}')
+    raise BagError(
+        f'{path} is a recording already: sonar-imm info {path} shows which tracker takes it; '
+        'amplitude and phase of an interferometer need sonar-imm convert interferometer'
+    )
+
+
+def _of_archive(path: Path) -> Guess:
+    try:
+        names = {Path(name).stem for name in zipfile.ZipFile(path).namelist()}
+    except (OSError, zipfile.BadZipFile):
+        raise BagError(f'{path} is a damaged archive') from None
+    if names & set(SNAPSHOT_NAMES['iq']):
+        return Guess('snapshots', 'a numpy archive with samples of an array')
+    if {'depth', 'amplitude'} <= names:
+        return Guess('traces', 'a numpy archive with traces')
+    raise BagError(
+        f'{path} is an archive of {", ".join(sorted(names)[:10]) or "nothing"}; of numpy archives '
+        'those are taken with the array iq (sonar-imm convert snapshots, --name iq=ARRAY for '
+        'another name) or the arrays depth and amplitude (sonar-imm convert traces)'
+    )
+
+
+def _is_segy(start: bytes) -> bool:
+    """A header of 3,200 characters, EBCDIC or ASCII, whose first line begins with C, and a format
+    code that exists."""
+    if len(start) < 3600 or start[:1] not in (b'\xc3', b'C'):
+        return False
+    code, samples = np.frombuffer(start[3220:3226], '>i2')[[2, 0]]
+    return 1 <= code <= 16 and samples != 0
+
+
+def _unread(start: bytes) -> str:
+    if start[4:8] in (b'XML0', b'CON0', b'FIL1'):
+        return 'ek80'
+    if start[4:5] == b'#' and start[5:8].isalpha() and start[5:8].isupper():
+        return 'kmall'
+    if start[4:6] in (b'\x02I', b'\x02i'):
+        return 'all'
+    return 'xtf' if start[0] == 123 and b'\0' in start[1:200] else ''
+
+
+def _is_nmea(start: bytes) -> bool:
+    lines = [line for line in start.splitlines()[:20] if line.strip()]
+    found = sum(
+        bool(re.search(rb'(^|[\s\\,;])[$!][A-Z]{4,6},.*\*[0-9A-Fa-f]{2}', line)) for line in lines
+    )
+    return 2 * found >= max(len(lines) - 1, 1)
+
+
+def _of_table(table: CsvTable) -> Guess:
+    columns = ', '.join(table.headers[:12])
+    why = f'a table with the columns {columns}'
+    if table.has('receiver', 'toa') or table.has('receiver', 'ping', 'arrival'):
+        return Guess('arrivals', why)
+    if table.has('receiver', 'tag', 'stamp') and _names_tags(table):
+        return Guess('detections', f'{why}: which receiver heard which tag')
+    if table.has('stamp', 'depth', 'amplitude'):
+        return Guess('traces', why)
+    if table.has('stamp') and (
+        table.has('vessel_x', 'vessel_y') or table.has('vessel_latitude', 'vessel_longitude')
+    ):
+        return Guess('relative', f'{why}: positions from a vessel')
+    places = (('x', 'y'), ('latitude', 'longitude'), ('range', 'bearing'))
+    if table.has('stamp') and any(table.has(*pair) for pair in places):
+        return Guess('fixes', why)
+    missing = 'a time' if not table.has('stamp') else 'a position'
+    flag = 'stamp' if missing == 'a time' else 'x'
+    raise BagError(
+        f'{table.path} is {why}: no name among them stands for {missing}. It could be fixes of '
+        f'divers (sonar-imm convert fixes IN OUT --column {flag}=HEADER), or relative, arrivals, '
+        'detections or traces; sonar-imm convert lists them'
+    )
+
+
+def _names_tags(table: CsvTable) -> bool:
+    """Whether tags have a column of their own beside the receivers."""
+    return table.index['tag'] != table.index['receiver']

@@ -1,0 +1,195 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Files of positions that are no CSV, as the tables that converters read: GPX, KML and GeoJSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import json
+import math
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from .csv_table import CsvOptions, CsvTable, Table
+from .sources import BagError
+
+START = 4096
+"""Bytes by which a file is told from others."""
+LARGEST_JSON = 200_000_000
+"""Bytes of a GeoJSON file, which is read as a whole."""
+PLACE = ('stamp', 'latitude', 'longitude', 'height', 'id')
+TIMES = ('coordTimes', 'times', 'coordinateProperties.times')
+"""Where writers of GeoJSON keep the times of a line."""
+
+
+class TrackFile(Table):
+    """Rows that were read from a file of another kind than CSV: cells by name of column."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        options: CsvOptions | None,
+        records: Iterable[Mapping[str, str]],
+        what: str,
+    ):
+        self._records = list(records)
+        names = dict.fromkeys(name for record in self._records for name in record)
+        if not names:
+            raise BagError(f'{path} is {what} without a position')
+        super().__init__(path, options, list(names))
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        for number, record in enumerate(self._records, start=1):
+            yield number, [record.get(name, '') for name in self.headers]
+
+
+def open_table(path: str | Path, options: CsvOptions | None = None) -> Table:
+    """The table of a file, whatever kind it is of. Raises `BagError`."""
+    kind = kind_of_text(Path(path))
+    if kind in ('gpx', 'kml'):
+        return TrackFile(path, options, _read_xml(Path(path), kind), f'a {kind.upper()} file')
+    if kind == 'geojson':
+        return TrackFile(path, options, _read_geojson(Path(path)), 'a GeoJSON file')
+    return CsvTable(path, options)
+
+
+def kind_of_text(path: Path) -> str:
+    """gpx, kml, json, geojson or '' by the first bytes of a file. Raises `BagError` where it
+    cannot be read."""
+    try:
+        with path.open('rb') as file:
+            start = file.read(START)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+    text = start.removeprefix(b'\xef\xbb\xbf').lstrip()
+    if text.startswith(b'<'):
+        return next((kind for kind in ('gpx', 'kml') if f'<{kind}'.encode() in text), '')
+    if text[:1] in (b'{', b'['):
+        head = text.replace(b' ', b'')
+        names = (b'"FeatureCollection"', b'"Feature"')
+        return 'geojson' if any(b'"type":' + name in head for name in names) else 'json'
+    return ''
+
+
+def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
+    """Positions of a GPX or KML file; what has no time has an empty one."""
+    names: list[str] = []
+    with path.open('rb') as file:
+        if b'<!' in file.read(START).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
+            raise BagError(
+                f'{path} declares entities, which {kind.upper()} has not and which may multiply'
+            )
+    try:
+        for event, element in ElementTree.iterparse(path, events=('start', 'end')):
+            tag = element.tag.rpartition('}')[2]
+            if event == 'start':
+                names += [''] if tag in ('trk', 'rte', 'Placemark') else []
+                continue
+            if tag == 'name' and names:
+                names[-1] = names[-1] or (element.text or '').strip()
+            elif tag in ('trkpt', 'rtept', 'wpt'):
+                yield _gpx_point(element, names[-1] if names else '')
+                element.clear()
+            elif tag == 'Placemark':
+                yield from _placemark(element, names.pop())
+                element.clear()
+            elif tag in ('trk', 'rte'):
+                names.pop()
+                element.clear()
+    except (ElementTree.ParseError, UnicodeError) as error:
+        raise BagError(f'{path} is damaged {kind.upper()}: {error}') from None
+
+
+def _text(element: ElementTree.Element, tag: str) -> str:
+    found = (part.text or '' for part in element if part.tag.rpartition('}')[2] == tag)
+    return next(found, '').strip()
+
+
+def _gpx_point(point: ElementTree.Element, name: str) -> dict[str, str]:
+    place = (point.get('lat', ''), point.get('lon', ''), _text(point, 'ele'))
+    own = _text(point, 'name') if point.tag.endswith('wpt') else name
+    return dict(zip(PLACE, (_text(point, 'time'), *place, own)))
+
+
+def _placemark(placemark: ElementTree.Element, name: str) -> Iterator[dict[str, str]]:
+    """The points of a Placemark: one with a time, or the track of Google's extension."""
+    times, places = [], []
+    for part in placemark.iter():
+        tag, text = part.tag.rpartition('}')[2], (part.text or '').strip()
+        if tag == 'when':
+            times.append(text)
+        elif tag == 'coord':
+            places.append(text.split())
+        elif tag == 'coordinates':
+            places += [place.split(',') for place in text.split()]
+    if len(times) != len(places):
+        times = times * len(places) if len(times) == 1 else [''] * len(places)
+    for time, (longitude, latitude, *height) in zip(times, places):
+        yield dict(zip(PLACE, (time, latitude, longitude, height[0] if height else '', name)))
+
+
+def _read_geojson(path: Path) -> Iterator[dict[str, str]]:
+    """The points of all features, with their properties; those of lines with their times."""
+    if path.stat().st_size > LARGEST_JSON:
+        raise BagError(f'{path} has more than {LARGEST_JSON // 10**6} MB')
+    try:
+        whole = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise BagError(f'{path} is damaged JSON: {error}') from None
+    features = whole.get('features') if isinstance(whole, dict) else None
+    for feature in features if isinstance(features, list) else [whole]:
+        if not isinstance(feature, dict):
+            continue
+        geometry, found = feature.get('geometry') or {}, feature.get('properties') or {}
+        if not isinstance(geometry, dict) or not isinstance(found, dict):
+            continue
+        cells = {str(name): _cell(value) for name, value in found.items()}
+        places, times = _places_of(geometry), _times_of(found)
+        for number, place in enumerate(places):
+            row = dict(zip(('longitude', 'latitude', 'height'), map(_cell, place)))
+            if len(times) == len(places):
+                row['stamp'] = _cell(times[number])
+            yield cells | row
+
+
+def _places_of(geometry: Mapping[str, Any]) -> list[Any]:
+    """The positions of a point or a line, of several one after the other."""
+    found, kind = geometry.get('coordinates'), geometry.get('type')
+    depth = {'Point': 0, 'MultiPoint': 1, 'LineString': 1, 'MultiLineString': 2}.get(str(kind))
+    if depth is None or not isinstance(found, list):
+        return []
+    places: list[Any] = [found]
+    for _ in range(depth):
+        places = [part for place in places if isinstance(place, list) for part in place]
+    return [place for place in places if isinstance(place, list) and len(place) >= 2]
+
+
+def _times_of(properties: Mapping[str, Any]) -> list[Any]:
+    for path in TIMES:
+        found: Any = properties
+        for name in path.split('.'):
+            found = found.get(name) if isinstance(found, dict) else None
+        if isinstance(found, list):
+            nested = any(isinstance(part, list) for part in found)
+            return [time for part in found for time in part] if nested else found
+    return []
+
+
+def _cell(value: Any) -> str:
+    if value is None or isinstance(value, (list, dict)):
+        return ''
+    if isinstance(value, float) and not math.isfinite(value):
+        return 'nan'
+    return str(value)

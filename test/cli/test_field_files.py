@@ -1,0 +1,167 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The road of a stranger's file: convert, info, track, export, with nothing but its name."""
+
+import csv
+import itertools
+from pathlib import Path
+
+from helpers.dive_scenes import legs
+import numpy as np
+import pytest
+
+from msg_adapters.fixes import write_fix
+from msg_adapters.geodetic import write_geodetic
+from sonar_imm.measurements import Fix, VesselFix
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
+
+pyais = pytest.importorskip('pyais')
+soundfile = pytest.importorskip('soundfile')
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+BEGIN = 1_717_149_600
+PLACE = 54.0, 10.0
+DEGREE = 111_320.0
+
+
+def degrees_of(place):
+    east = place[:, 0] / (DEGREE * np.cos(np.radians(PLACE[0])))
+    return PLACE[0] + place[:, 1] / DEGREE, PLACE[1] + east
+
+
+def dive(count=80, seed=1):
+    times = np.arange(count)
+    noise = np.random.default_rng(seed).normal(0.0, 1.2, (count, 2))
+    return BEGIN + times, legs(times * 1.0)[:, :2] + noise
+
+
+def usbl_csv(path):
+    times, place = dive()
+    rows = [f'{t},{x:.3f},{y:.3f},1.2' for t, (x, y) in zip(times, place)]
+    path.write_text('Time (s);East;North;Std\n'.replace(';', ',') + '\n'.join(rows) + '\n')
+
+
+def gpx(path):
+    times, place = dive()
+    points = [
+        f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}"><time>{np.datetime64(int(t), "s")}Z</time>'
+        '</trkpt>'
+        for t, lat, lon in zip(times, *degrees_of(place))
+    ]
+    path.write_text(
+        '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><name>1</name><trkseg>'
+        f'{"".join(points)}</trkseg></trk></gpx>'
+    )
+
+
+def ais_log(path):
+    times, place = dive()
+    lines = []
+    for t, lat, lon in zip(times, *degrees_of(5.0 * place)):
+        content = {'type': 1, 'mmsi': 211_000_001, 'lat': lat, 'lon': lon, 'second': int(t) % 60}
+        sentence = pyais.encode_dict(
+            content | {'accuracy': 1}, talker_id='AI', sentence_type='VDM'
+        )[0]
+        lines.append(f'{t} {sentence}')
+    path.write_text('\r\n'.join(lines))
+
+
+ROADS = {'usbl.csv': usbl_csv, 'dive.gpx': gpx, 'harbour.nmea': ais_log}
+
+
+@pytest.mark.parametrize('name', ROADS)
+def test_from_a_file_to_a_file_in_three_commands(tmp_path, name, capsys):
+    ROADS[name](tmp_path / name)
+    bag, run, out = tmp_path / 'dive.bag', tmp_path / 'run', tmp_path / 'tracks.csv'
+    assert main(['convert', str(tmp_path / name), str(bag)]) == 0
+    assert 'is taken for' in capsys.readouterr().err
+    assert main(['info', str(bag)]) == 0
+    suggested = capsys.readouterr().out.split('to track it: sonar-imm ')[1].splitlines()[0]
+    words = suggested.replace('OUT_DIR', str(run)).split()
+    assert main(words) == 0  # what is suggested works
+    assert 'diver <- /fix' in capsys.readouterr().out
+    assert main(['export', str(run), str(out)]) == 0
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) > 60 and {row['track_id'] for row in rows} == {rows[0]['track_id']}
+    assert np.isfinite([float(row['std_major']) for row in rows]).all()
+
+
+def test_from_sound_to_reflectors(tmp_path, capsys):
+    """The sound of a shipped array comes back from a WAV sample by sample, and is tracked."""
+    with BagReader(BAGS / 'fathometer_pressure') as bag:
+        first = itertools.islice(measurements_of(bag, 'fathometer'), 12)
+        blocks = [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+    pressure = np.concatenate([block.pressure for block in blocks])
+    rate, scale = blocks[0].sample_rate, blocks[0].scale
+    steps = np.round(pressure / scale).astype(np.int16)
+    name = tmp_path / 'a_20240531_100000.wav'
+    soundfile.write(name, steps, int(rate), subtype='PCM_16')
+    options = ['--full-scale', repr(scale * 2**15), '--block', repr(len(blocks[0]) / rate)]
+    assert main(['convert', str(name), str(tmp_path / 'bag'), *options]) == 0
+    with BagReader(tmp_path / 'bag') as bag:
+        found = [item.measurement.pressure for item in measurements_of(bag, 'fathometer')]
+        # Each record of the recording has a scale of its own, within 2e-4.
+        assert np.concatenate(found) == pytest.approx(pressure, rel=3e-4, abs=1e-3 * scale)
+    parameters = ['--params', str(BAGS / 'fathometer_pressure' / 'parameters.yaml')]
+    parameters += ['--set', 'particles=200']
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *parameters]) == 0
+    assert 'fathometer <- /pressure as pressure' in capsys.readouterr().out
+
+
+def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):
+    usbl_csv(tmp_path / 'usbl.csv')
+    monkeypatch.chdir(tmp_path)
+    assert main(['convert', 'usbl.csv']) == 0
+    assert (tmp_path / 'usbl.bag').is_dir()
+
+
+@pytest.mark.parametrize(
+    'arguments, wanted',
+    [
+        (['nothing.csv', 'out'], 'nothing.csv does not exist'),
+        (['fixess', 'out'], "did you mean 'fixes'"),
+        (['dive.bag', 'out'], 'is a recording already'),
+    ],
+)
+def test_what_cannot_be_converted_is_one_sentence(
+    tmp_path, capsys, monkeypatch, arguments, wanted
+):
+    monkeypatch.chdir(tmp_path)
+    usbl_csv(tmp_path / 'usbl.csv')
+    assert main(['convert', 'usbl.csv', 'dive.bag']) == 0
+    capsys.readouterr()
+    assert main(['convert', *arguments]) != 0
+    printed = capsys.readouterr().err
+    assert wanted.lower() in printed.lower() and 'Traceback' not in printed
+
+
+def test_track_says_what_it_takes_and_what_not(tmp_path, capsys):
+
+    times, place = dive()
+    with BagWriter(tmp_path / 'bag') as bag:
+        for t, (x, y) in zip(times.tolist(), place):
+            stamp = t * 10**9
+            fix = Fix(stamp_ns=stamp, position=[x, y, 0.0], frame_id='map', covariance=np.eye(2))
+            own = VesselFix(stamp_ns=stamp, latitude=54.0, longitude=10.0, frame_id='gps')
+            bag.write('/usbl/fix', write_fix(fix, ros_message), stamp)
+            bag.write('/gps', write_geodetic(own, ros_message), stamp)
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
+    printed = capsys.readouterr().out
+    assert 'diver <- /usbl/fix as fix (80 messages)' in printed
+    assert 'ignored: /gps (80 messages); --topic fix=/gps would take it' in printed

@@ -1,0 +1,200 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Logs of sentences: whose positions they hold, and when they were true."""
+
+from datetime import datetime, timedelta, timezone
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pymap3d
+import pytest
+
+from sonar_imm_tools.recordings.convert import convert_nmea
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
+
+pyais = pytest.importorskip('pyais')
+pynmea2 = pytest.importorskip('pynmea2')
+
+BEGIN = datetime(2024, 5, 31, 23, 59, 50, tzinfo=timezone.utc)
+PLACE = 54.0, 10.0
+
+
+def degrees(value, width):
+    whole = int(abs(value))
+    return f'{whole:0{width}d}{60 * (abs(value) - whole):07.4f}'
+
+
+def position(kind, moment, place=PLACE):
+    lat = (degrees(place[0], 2), 'N' if place[0] >= 0 else 'S')
+    lon = (degrees(place[1], 3), 'E' if place[1] >= 0 else 'W')
+    clock = f'{moment:%H%M%S}.00'
+    if kind == 'GGA':
+        rest = ('4', '08', '0.9', '2.0', 'M', '40.0', 'M', '', '')
+        return str(pynmea2.GGA('GP', 'GGA', (clock, *lat, *lon, *rest)))
+    rest = ('1.0', '45.0', f'{moment:%d%m%y}', '', '')
+    return str(pynmea2.RMC('GP', 'RMC', (clock, 'A', *lat, *lon, *rest)))
+
+
+def heading(value):
+    return str(pynmea2.HDT('GP', 'HDT', (f'{value}', 'T')))
+
+
+def ais(mmsi, place, second, kind=1, **more):
+    content = {'type': kind, 'mmsi': mmsi, 'lat': place[0], 'lon': place[1], 'second': second}
+    return pyais.encode_dict(content | more, talker_id='AI', sentence_type='VDM')[0]
+
+
+def converted(tmp_path, lines, **options):
+    (tmp_path / 'log.nmea').write_text('\r\n'.join(lines) + '\r\n')
+    return convert_nmea(tmp_path / 'log.nmea', tmp_path / 'out', **options)
+
+
+def messages_of(path):
+    with BagReader(path) as bag:
+        return {
+            topic: [item.message for item in bag.messages([topic])]
+            for topic in [found.name for found in bag.topics]
+        }
+
+
+def scans_of(path):
+    with BagReader(path) as bag:
+        return [item.measurement for item in measurements_of(bag, 'diver', {'/fixes': 'fixes'})]
+
+
+def ns(moment):
+    return round(moment.timestamp()) * 10**9
+
+
+def test_vessel_and_targets_over_midnight(tmp_path):
+    lines = []
+    for k in range(20):
+        moment = BEGIN + timedelta(seconds=k)
+        lines += [position('RMC', moment), position('GGA', moment), heading(30.0)]
+        if k % 5 == 0:
+            lines.append(ais(211_000_000 + k % 2, (54.01, 10.01), (moment.second - 3) % 60))
+    report = converted(tmp_path, lines, origin=(*PLACE,))
+    found = messages_of(report.path)
+    assert {topic: len(items) for topic, items in found.items()} == {
+        '/nav_fix': 20,
+        '/heading': 20,
+        '/fixes': 4,
+    }
+    stamps = [item.header.stamp.sec for item in found['/nav_fix']]
+    assert stamps == [ns(BEGIN) // 10**9 + k for k in range(20)]
+    assert found['/nav_fix'][0].altitude == pytest.approx(42.0)  # above the ellipsoid
+    yaw = 2.0 * math.atan2(found['/heading'][0].orientation.z, found['/heading'][0].orientation.w)
+    assert math.degrees(yaw) == pytest.approx(60.0)
+    scans = scans_of(report.path)
+    # The report says the second; the clock of the log is 3 s later.
+    assert [scan.stamp_ns for scan in scans] == [ns(BEGIN) + (5 * k - 3) * 10**9 for k in range(4)]
+    east, north, _ = pymap3d.geodetic2enu(54.01, 10.01, 0.0, *PLACE, 0.0)
+    # AIS counts in 1e-4 minutes.
+    assert scans[0].position[0, :2] == pytest.approx([east, north], abs=0.2)
+    assert scans[0].covariance[0, 0, 0] == 15.0**2
+
+
+def test_without_targets_the_receiver_is_the_target(tmp_path):
+    lines = [position('RMC', BEGIN + timedelta(seconds=k)) for k in range(5)]
+    report = converted(tmp_path, lines)
+    assert report.messages == {'/fix': 5} and 'are the fixes' in report.notes['own']
+    with pytest.raises(BagError, match='no position of a target'):
+        convert_nmea(tmp_path / 'log.nmea', tmp_path / 'none', own='vessel')
+
+
+@pytest.mark.parametrize('reference, bearing', [('T', 120.0), ('R', 90.0)])
+def test_tracked_targets_are_placed_from_the_vessel(tmp_path, reference, bearing):
+    data = ('07', '0.5', f'{bearing}', reference, '3.0', '0.0', 'T', '', '', 'N', 'buoy', 'T', '')
+    tracked = str(pynmea2.TTM('RA', 'TTM', (*data, '235950.00', 'A')))
+    lines = [position('RMC', BEGIN), heading(30.0), tracked]
+    scan = scans_of(converted(tmp_path, lines, origin=PLACE).path)[0]
+    reach, angle = 926.0, math.radians(120.0)
+    wanted = [reach * math.sin(angle), reach * math.cos(angle)]
+    assert scan.position[0, :2] == pytest.approx(wanted, abs=0.1)
+
+
+def test_targets_with_their_own_place(tmp_path):
+    data = ('01', degrees(54.02, 2), 'N', degrees(10.03, 3), 'E', 'anna', '235952.00', 'T', '')
+    line = str(pynmea2.TLL('RA', 'TLL', data))
+    scan = scans_of(converted(tmp_path, [position('RMC', BEGIN), line], origin=PLACE).path)[0]
+    east, north, _ = pymap3d.geodetic2enu(54.02, 10.03, 0.0, *PLACE, 0.0)
+    assert scan.position[0, :2] == pytest.approx([east, north], abs=0.1)
+    assert scan.stamp_ns == ns(BEGIN + timedelta(seconds=2))
+
+
+@pytest.mark.parametrize(
+    'before',
+    ['1717199990.0 ', '2024-05-31T23:59:50Z,', '\\s:a,c:1717199990*5A\\', '1717199990000;'],
+)
+def test_times_before_a_sentence(tmp_path, before):
+    line = before + ais(211_000_001, (54.01, 10.01), 60)
+    assert scans_of(converted(tmp_path, [line]).path)[0].stamp_ns == ns(BEGIN)
+
+
+def test_what_cannot_be_used_is_counted_and_named(tmp_path):
+    good = position('RMC', BEGIN)
+    lines = [
+        ais(211_000_001, (54.01, 10.01), 10),  # no time yet
+        good,
+        good.replace('54', '55', 1),  # wrong checksum
+        'no sentence',
+        position('GGA', BEGIN, (91.0, 10.0)),
+        ais(211_000_001, (91.0, 181.0), 10),  # says that it has no position
+        ais(211_000_001, (54.01, 10.01), 50),
+    ]
+    report = converted(tmp_path, lines)
+    assert report.bad_rows == 5 and report.messages == {'/fixes': 1, '/nav_fix': 1}
+    assert report.reasons['no time'] == 1
+    assert [problem.split(',')[1].split(':')[0] for problem in report.problems] == [
+        f' line {k}' for k in (1, 3, 4, 5, 6)
+    ]
+
+
+def test_a_date_can_be_told(tmp_path):
+    line = position('GGA', BEGIN)
+    with pytest.raises(BagError, match='--date'):
+        converted(tmp_path, [line])
+    report = converted(tmp_path, [line], date='2024-05-31')
+    assert messages_of(report.path)['/fix'][0].header.stamp.sec == ns(BEGIN) // 10**9
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 70), st.characters(max_codepoint=255)),
+        max_size=8,
+    )
+)
+def test_damaged_sentences_are_no_tracebacks(tmp_path_factory, changes):
+    lines = [position('RMC', BEGIN), ais(211_000_001, (54.0, 10.0), 5), heading(3.0), 'x']
+    for line, place, letter in changes:
+        lines[line] = lines[line][:place] + letter + lines[line][place + 1 :]
+        body = lines[line].partition('*')[0]
+        checksum = 0
+        for character in body[1:].encode('ascii', 'replace'):
+            checksum ^= character
+        lines[line] = f'{body}*{checksum:02X}'  # the content is wrong, not the sum
+    folder = tmp_path_factory.mktemp('log')
+    (folder / 'log.nmea').write_text('\n'.join(lines), encoding='utf-8')
+    try:
+        report = convert_nmea(folder / 'log.nmea', folder / 'out')
+    except BagError as error:
+        assert '\n' not in str(error)
+    else:
+        assert np.isfinite(report.rows)

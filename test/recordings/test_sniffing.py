@@ -1,0 +1,85 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a file is taken for, by its content alone."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sonar_imm_tools.recordings.sniffing import sniff
+from sonar_imm_tools.recordings.sources import BagError
+
+
+def segy(letter=b'\xc3'):
+    header = bytearray(3600)
+    header[:1] = letter
+    header[3220:3222], header[3224:3226] = (500).to_bytes(2, 'big'), (5).to_bytes(2, 'big')
+    return bytes(header)
+
+
+FILES = {
+    'fixes': b'stamp,x,y\n1,2,3\n',
+    'fixes ': b'\xef\xbb\xbf<?xml version="1.0"?><gpx></gpx>',
+    'fixes  ': b'{ "type" : "FeatureCollection", "features": []}',
+    'relative': b'stamp,range,bearing,vessel_x,vessel_y,heading\n',
+    'arrivals': b'ping;receiver;arrival\n',
+    'arrivals ': b'stamp,transmitter,receiver,toa\n',
+    'detections': b'Date and Time (UTC),Receiver,Transmitter,Latitude,Longitude\n',
+    'traces': b'stamp,depth,amplitude\n',
+    'nmea': b'$GPHDT,45.0,T*04\r\n!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24\r\n',
+    'nmea ': b'half a line\r\n1717199990.1 $GPHDT,45.0,T*04\r\n',
+    'autoferry': json.dumps([{'measurement': []}]).encode(),
+    'segy': segy(),
+    'segy ': segy(b'C'),
+    'hydrophones': b'RIFF\0\0\0\0WAVEfmt ',
+    'hydrophones ': b'fLaC\0',
+}
+
+
+@pytest.mark.parametrize('kind', FILES)
+def test_the_content_says_the_kind(tmp_path, kind):
+    (tmp_path / 'file.dat').write_bytes(FILES[kind])
+    assert sniff(tmp_path / 'file.dat').kind == kind.strip()
+
+
+def test_archives(tmp_path):
+    np.savez(tmp_path / 'a.npz', iq=np.zeros((3, 2), complex), range=np.zeros(3))
+    np.savez(tmp_path / 'b.npz', depth=np.zeros(3), amplitude=np.zeros(3))
+    np.savez(tmp_path / 'c.npz', other=np.zeros(3))
+    assert sniff(tmp_path / 'a.npz').kind == 'snapshots'
+    assert sniff(tmp_path / 'b.npz').kind == 'traces'
+    with pytest.raises(BagError, match='--name iq=ARRAY'):
+        sniff(tmp_path / 'c.npz')
+
+
+@pytest.mark.parametrize(
+    'content, wanted',
+    [
+        (b'', 'is empty'),
+        (b'\0\0\0\x10XML0' + bytes(100), 'EK60 or EK80'),
+        (b'\0\0\0\x10#IIP' + bytes(100), 'KMALL'),
+        (b'\0\0\0\x10\x02I' + bytes(100), '.all'),
+        (b'\x7b\x01' + bytes(1100), 'XTF'),
+        (b'Zeit,Ost,Nord\n1,2,3\n', '--column stamp=HEADER'),
+        (b'stamp,Rechtswert,Hochwert\n', '--column x=HEADER'),
+        (bytes(range(256)) * 4, 'no text'),
+        (b'PK\x03\x04 and nothing', 'damaged archive'),
+    ],
+)
+def test_what_is_not_known_is_said_with_what_would_help(tmp_path, content, wanted):
+    (tmp_path / 'file.dat').write_bytes(content)
+    with pytest.raises(BagError, match=wanted):
+        sniff(tmp_path / 'file.dat')
