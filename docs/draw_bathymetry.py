@@ -38,6 +38,7 @@ from sonar_imm.acoustics import array, spatial  # noqa: E402
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.hearing import snr  # noqa: E402
+from sonar_imm_tools.simulation.bathymetry.objects import facets_of, surfaces_of  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
@@ -80,6 +81,7 @@ def main() -> None:
     draw_clouds()
     draw_sensitivity()
     draw_labels()
+    draw_ledge()
 
 
 def save(figure, name: str, *, tight: bool = True) -> None:
@@ -298,6 +300,38 @@ def draw_profile(ping, truth, runs) -> None:
     axes[-1].set(xlabel='slant range [m]', ylabel='P(rough)')
     axes[-1].legend(loc='upper left', fontsize=8)
     save(figure, 'bathymetry_profile.png')
+
+
+def draw_ledge() -> None:
+    """A ping over a ledge: its surfaces, and what is made of them, gated and resolved."""
+    config = scenario('ledge', {'pings': 1})
+    ping = simulate(config, 3).measurements[0].measurement
+    facets = facets_of(config, ping.range, snr(config, ping.range))
+    power, height = surfaces_of(facets, len(ping))
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharex=True, sharey=True)
+    for axis, layover in zip(axes, ('gated', 'resolved')):
+        table = columns(BathymetryTracker(BathymetryConfig(layover=layover)).process(ping)[0])
+        surfaces = np.where(power >= 1.0, height, np.nan)
+        axis.plot(ping.range, surfaces, color=INK, linewidth=0.8, label='truth')
+        valid, two = table['valid'] > 0, table['surfaces'] == 2
+        one = valid & ~two
+        axis.plot(ping.range[one], table['height'][one], '.', color=BLUE, label='one surface')
+        if layover == 'gated':
+            axis.plot(ping.range[two], table['height'][two], 'x', color=RED, label='no sounding')
+        else:
+            bars = {'fmt': '.', 'elinewidth': 0.6}
+            pair = (
+                ('height', np.sqrt(table['cov_height_height']), AMBER, 'lower of two'),
+                ('height_2', table['height_2_std'], RED, 'upper of two'),
+            )
+            for name, std, colour, label in pair:
+                bars |= {'color': colour, 'label': label, 'yerr': 2.0 * std[two]}
+                axis.errorbar(ping.range[two], table[name][two], **bars)
+        handles = dict(zip(*reversed(axis.get_legend_handles_labels())))
+        axis.legend(handles.values(), handles.keys(), loc='lower right', fontsize=8)
+        axis.set(xlim=(31.0, 35.0), ylim=(-1.2, 3.2), xlabel='slant range [m]', title=layover)
+    axes[0].set(ylabel='height [m]')
+    save(figure, 'bathymetry_ledge.png')
 
 
 def columns(estimate) -> dict[str, np.ndarray]:

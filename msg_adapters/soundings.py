@@ -23,7 +23,7 @@ import numpy as np
 
 from sonar_imm.estimates import PLACES, places
 from sonar_imm.measurements import Ground, Rejection
-from sonar_imm.soundings import COLUMNS, Soundings
+from sonar_imm.soundings import COLUMNS, LATER, Soundings
 
 from .headers import Make, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
@@ -41,9 +41,12 @@ def write_soundings(soundings: Soundings, make: Make) -> Any:
 def read_soundings(message: Any) -> Soundings:
     """Read what `write_soundings` wrote. Raises `Rejection`."""
     columns = decode_table(message)
-    require_columns(columns, tuple(n for n in COLUMNS if n not in PLACES), 'soundings')
-    for name, coarse in zip(PLACES, 'xyz'):  # older tables lack the exact ones
+    later = (*PLACES, *LATER)  # which older tables lack
+    require_columns(columns, tuple(n for n in COLUMNS if n not in later), 'soundings')
+    for name, coarse in zip(PLACES, 'xyz'):
         columns.setdefault(name, columns[coarse].astype(np.float64))
+    for name, value in LATER.items():
+        columns.setdefault(name, np.full(len(columns['x']), value, COLUMNS[name]))
     for name, kind in COLUMNS.items():
         if columns[name].dtype != np.dtype(kind) or columns[name].ndim != 1:
             raise Rejection(

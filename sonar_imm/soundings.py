@@ -14,7 +14,8 @@
 
 """Soundings: the part of a bathymetry estimate that goes into a chart.
 
-One row for each bin with an echo, in the frame of the navigation. The columns are the contract of
+One row for each bin with an echo, in the frame of the navigation; two where both of its surfaces
+are known (``layover: resolved``). The columns are the contract of
 ``~/soundings`` and of soundings.csv. Everything a gridder reads is float32: the CUBE node for
 ROS 2 reads four-byte floats whatever a field declares, and knows no NaN. The place stands at the
 end once more in float64.
@@ -28,7 +29,7 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimates import Estimate, places
+from .estimates import Estimate, PLACES, places
 
 SIDES = ('port', 'starboard')
 """Names of the numbers in the column `side`."""
@@ -44,6 +45,8 @@ COLUMNS: dict[str, type] = {
     'label_probability': np.float32,
     'range': np.float32,
     'side': np.uint8,
+    'surface': np.uint8,
+    'existence': np.float32,
     'px': np.float64,
     'py': np.float64,
     'pz': np.float64,
@@ -51,7 +54,12 @@ COLUMNS: dict[str, type] = {
 """x y z m in the frame of the navigation; uncertainties: variances, m^2 (horizontal: of x and y
 together); intensity: 10 log10 of the mean power of a stave, dB; beam_angle: rad from straight
 down, port positive; label: number of the most probable terrain model; range m; side: 0 port, 1
-starboard; px py pz: the same place as x y z, which at map coordinates are half a metre coarse."""
+starboard; surface: 1, of two the lower, or 2, the upper; existence: probability of a second
+surface in the bin; px py pz: the same place as x y z, which at map coordinates are half a metre
+coarse."""
+
+LATER = {'surface': 1, 'existence': 0.0}
+"""Columns that tables of before `layover` lack, with what they mean."""
 
 
 @frozen(eq=False)
@@ -70,17 +78,32 @@ def soundings_of(estimate: Estimate) -> Soundings | None:
     """The soundings in a bathymetry estimate, None for one made without navigation.
 
     Rows without an echo are left out, and those of which something is not known: no ray reaches
-    there, or the sound speed says nothing at the height of the array.
+    there, or the sound speed says nothing at the height of the array. A second surface follows
+    the first one of its bin.
     """
-    if 'vertical_uncertainty' not in estimate.extras:
+    extras = estimate.extras
+    if 'vertical_uncertainty' not in extras:
         return None
-    exact = places(estimate.xyz)
-    columns = {**dict(zip('xyz', estimate.xyz.T)), **exact, **estimate.extras}
-    kept = np.asarray(estimate.extras['valid'], bool)
-    with np.errstate(over='ignore'):
+    n = len(estimate)
+    lower = {
+        **dict(zip('xyz', estimate.xyz.T)),
+        **places(estimate.xyz),
+        **extras,
+        'surface': np.ones(n),
+        'existence': extras.get('existence_2', np.zeros(n)),
+    }
+    surfaces = [lower]
+    if 'height_2' in extras:
+        own = {name: extras[f'{name}_2'] for name in COLUMNS if f'{name}_2' in extras}
+        exact = {name: own[place] for name, place in zip('xyz', PLACES)}
+        surfaces.append({**lower, **own, **exact, 'surface': np.full(n, 2)})
+    # Bin by bin, the lower surface first.
+    with np.errstate(over='ignore', invalid='ignore'):
         table: dict[str, np.ndarray] = {
-            name: np.asarray(columns[name]).astype(kind) for name, kind in COLUMNS.items()
+            name: np.column_stack([columns[name] for columns in surfaces]).astype(kind).ravel()
+            for name, kind in COLUMNS.items()
         }
+    kept = np.repeat(np.asarray(extras['valid'], bool), len(surfaces))
     for column in table.values():
         kept = kept & np.isfinite(column)
     return Soundings(

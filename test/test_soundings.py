@@ -58,6 +58,30 @@ def test_rows_that_are_not_known_throughout_are_left_out():
     assert all(np.isfinite(column).all() for column in soundings.columns.values())
 
 
+def test_a_second_surface_follows_the_first_one_of_its_bin():
+    nothing = np.full(6, np.nan)
+    upper = {f'{name}_2': nothing.copy() for name in ('px', 'py', 'pz', 'beam_angle')}
+    for name in ('height', 'vertical_uncertainty', 'horizontal_uncertainty'):
+        upper[f'{name}_2'] = nothing.copy()
+    for k in (1, 2):  # bin 2 is no sounding at all
+        for value, column in enumerate(upper.values()):
+            column[k] = 10.0 * k + value
+    existence = np.array([0.0, 0.9, 0.9, 0.1, 0.0, 0.0], np.float32)
+    made = estimate(existence_2=existence, **upper)
+    columns = soundings_of(made).columns
+    assert columns['surface'].tolist() == [1, 1, 2, 1, 1, 1]
+    np.testing.assert_array_equal(columns['existence'], existence[[0, 1, 1, 3, 4, 5]])
+    np.testing.assert_array_equal(columns['range'], made.extras['range'][[0, 1, 1, 3, 4, 5]])
+    assert columns['x'].tolist() == [0.0, 3.0, 10.0, 9.0, 12.0, 15.0]
+    assert (columns['px'][2], columns['py'][2], columns['pz'][2]) == (10.0, 11.0, 12.0)
+    assert columns['beam_angle'][2] == 13.0 and columns['vertical_uncertainty'][2] == 15.0
+
+
+def test_without_layover_there_is_one_surface():
+    columns = soundings_of(estimate()).columns
+    assert (columns['surface'] == 1).all() and (columns['existence'] == 0.0).all()
+
+
 def test_estimates_without_navigation_have_no_soundings():
     plain = estimate()
     extras = {k: v for k, v in plain.extras.items() if 'uncertainty' not in k}

@@ -42,12 +42,15 @@ from benchmarks.speed import Bench
 from sonar_imm.acoustics.laplace import autocorrelation
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.ping import Look, look
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm.trackers.bathymetry.two_surfaces import stretches
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
 SEA_GOALS = {'particles': 120_000, 'grid': 25_000}
+RESOLVED_GOAL = 40_000
 
 Timed = tuple[Callable[[], Any], int]
 
@@ -239,22 +242,58 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
 def bench_sea(rounds: int = 7) -> dict[str, Any]:
     """Bins per second on a ship that moves, in CPU time: poses, rays through a profile, soundings'
     uncertainties; particles and grid."""
-    config = scenario('moving_profile', {'pings': 1, 'last_range': 117.0})
-    measurements = [item.measurement for item in simulate(config, 1).measurements]
-    ping = next(item for item in measurements if isinstance(item, Snapshot))
     methods: dict[str, Timed] = {}
     for engine in ('particles', 'grid'):
-        values = BathymetryConfig.from_mapping({**config.instruments(), 'engine': engine})
-        tracker = BathymetryTracker(values.for_inputs(frozenset({'snapshot', 'nav'})))
-        for measurement in measurements:
-            if measurement is not ping:
-                tracker.process(measurement)
-        methods[engine] = partial(tracker.process, ping), len(ping)
+        changes = {'last_range': 117.0}, {'engine': engine}
+        methods[engine], _ = under_way('moving_profile', *changes)
     speed = rates(methods, rounds, clock=time.process_time)
     return {
         'bins_per_second': speed,
         'wanted': SEA_GOALS,
         'good': all(speed[name] >= goal for name, goal in SEA_GOALS.items()),
+    }
+
+
+def under_way(
+    name: str, changes: Mapping[str, Any], values: Mapping[str, Any]
+) -> tuple[Timed, Look]:
+    """A tracker that knows the navigation of a scene, with its one ping; and what that holds."""
+    config = scenario(name, {'pings': 1, **changes})
+    measurements = [item.measurement for item in simulate(config, 1).measurements]
+    ping = next(item for item in measurements if isinstance(item, Snapshot))
+    stated = BathymetryConfig.from_mapping({**config.instruments(), **values})
+    inputs = {'snapshot', 'nav'} if config.moving else {'snapshot'}
+    tracker = BathymetryTracker(stated.for_inputs(frozenset(inputs)))
+    for measurement in measurements:
+        if measurement is not ping:
+            tracker.process(measurement)
+    (task,) = tracker.tasks(ping)
+    return (partial(tracker.process, ping), len(ping)), look(task)
+
+
+def bench_layover(rounds: int = 7) -> dict[str, Any]:
+    """Bins per second of CPU time with and without an object, at rest and on a ship that moves,
+    by what is made of bins with two surfaces; what a bin of a stretch costs in `resolved`."""
+    methods: dict[str, Timed] = {}
+    share = 0.0
+    for scene in ('thermal', 'ledge', 'moving_ledge'):
+        for engine in ('particles', 'grid'):
+            for layover in ('ignored', 'gated', 'resolved'):
+                values = {'engine': engine, 'layover': layover}
+                changes = {'patch_std': 0.0} if scene == 'thermal' else {}
+                timed, seen = under_way(scene, changes, values)
+                methods[f'{scene}, {engine}, {layover}'] = timed
+                if scene == 'ledge' and seen.layover is not None:
+                    parts = stretches(seen.layover.existence)
+                    share = sum(end - first for first, end in parts) / timed[1]
+    speed = rates(methods, rounds, clock=time.process_time)
+    slow, fast = (speed[f'ledge, particles, {name}'] for name in ('resolved', 'gated'))
+    return {
+        'bins_per_second': speed,
+        'stretch_share': share,
+        'us_per_stretch_bin': 1e6 * (1.0 / slow - 1.0 / fast) / share,
+        'wanted': RESOLVED_GOAL,
+        'good': slow >= RESOLVED_GOAL,
     }
 
 
@@ -327,6 +366,19 @@ def _sea_sentence(result: Mapping[str, Any]) -> str:
     return f'a moving ship and bent rays, bins a second of CPU time: {each}'
 
 
+def _layover_sentence(result: Mapping[str, Any]) -> str:
+    speed = result['bins_per_second']
+    each = ', '.join(
+        f'{name} {speed[f"ledge, particles, {name}"]:,.0f}'
+        for name in ('ignored', 'gated', 'resolved')
+    )
+    return (
+        f'a ping with a ledge, layover {each} bins a second of CPU time (wanted '
+        f'{result["wanted"]:,}); {result["us_per_stretch_bin"]:.0f} us per bin that may have two '
+        f'surfaces, {result["stretch_share"]:.0%} of them'
+    )
+
+
 def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
     speed = result['bins_per_second']
     return (
@@ -343,6 +395,7 @@ def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
 BENCHES = (
     Bench('numpy', bench_numpy, _numpy_sentence),
     Bench('sea', bench_sea, _sea_sentence),
+    Bench('layover', bench_layover, _layover_sentence),
     Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
     Bench(
         'scaling',

@@ -63,6 +63,8 @@ GATE = 0.3
 """Bins with a more probable second surface are no soundings."""
 EVIDENCE = -4.0, 8.0
 """Bounds of what one bin may say, as a log ratio."""
+LEFT = 0.999
+"""What two waves leave of a bin is no more than noise leaves in so many bins."""
 LEAST_ERROR, ERROR_MARGIN, FEWEST_BINS = 2e-4, 3.0, 50
 TABLES = Path(__file__).with_name('layover_tables.npz')
 _POINTS = 32
@@ -74,25 +76,39 @@ _CLOSEST = 1e-4
 
 
 class Layover(NamedTuple):
-    """The probability (n,) of a second surface in each bin, and the `array_error`."""
+    """The probability (n,) of a second surface in each bin, the `array_error`, and which bins (n,)
+    were usable."""
 
     existence: FloatArray
     array_error: float
+    usable: BoolArray
 
 
 def layover(
-    iq: ComplexArray, signal: FloatArray, noise: FloatArray, usable: BoolArray, spacing: float
+    iq: ComplexArray,
+    signal: FloatArray,
+    noise: FloatArray,
+    usable: BoolArray,
+    spacing: float,
+    loud: BoolArray | None = None,
 ) -> Layover:
     """The second surface along a ping: iq (n, P), local variance of signal and noise (n,) at a
-    stave, spacing of the staves in wavelengths; bins that are not usable (n,) say nothing."""
+    stave, spacing of the staves in wavelengths; bins that are not usable (n,) say nothing.
+
+    loud (n,): bins that are usable, too, if two waves leave no more of them than noise. The staves
+    of such bins do not agree, which one wave would demand.
+    """
     staves = iq.shape[1]
     _, one, two = residuals(iq, spacing)
     snr = signal / noise
     error = array_error(one / noise, snr, staves, usable)
     larger = 1.0 + error * snr
+    if loud is not None and staves > 2:
+        most = float(gammaincinv(staves - 2.0, LEFT))
+        usable = usable | loud & (two < most * noise * larger)
     level = 2.0 * (np.sqrt(one) - np.sqrt(two)) / np.sqrt(noise * larger)
     evidence = np.where(usable, log_ratio(level, snr / larger, staves), 0.0)
-    return Layover(existence(evidence), error)
+    return Layover(existence(evidence), error, usable)
 
 
 def residuals(iq: ArrayLike, spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ from msg_adapters.soundings import read_soundings, write_soundings
 from msg_adapters.table import encode_table
 from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Rejection
-from sonar_imm.soundings import COLUMNS, Soundings
+from sonar_imm.soundings import COLUMNS, LATER, Soundings
 from sonar_imm_tools.recordings.messages import ros_message
 
 
@@ -64,12 +64,14 @@ def test_the_topic_reads_back_with_the_reader_of_ros():
         assert (table[name] == column).all()
 
 
-def test_older_soundings_without_exact_places_are_read():
+def test_older_soundings_without_exact_places_and_surfaces_are_read():
     one = soundings()
-    older = {name: column for name, column in one.columns.items() if name not in PLACES}
+    later = (*PLACES, *LATER)
+    older = {name: column for name, column in one.columns.items() if name not in later}
     again = read_soundings(encode_table(older, stamp_ns=1, frame_id='map', make=ros_message))
     assert list(again.columns) == list(COLUMNS) and again.columns['py'].dtype == np.float64
     assert (again.columns['py'] == one.columns['y']).all()
+    assert (again.columns['surface'] == 1).all() and (again.columns['existence'] == 0.0).all()
 
 
 def test_no_soundings_are_a_message_too():

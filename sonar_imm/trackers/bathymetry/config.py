@@ -49,7 +49,7 @@ SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
 MODEL_SETS = ('height_rw_ncs', *SCALAR_SETS)
 """The sets of one state, which the grid engine can run."""
 NAVIGATION = ('auto', 'required', 'ignored')
-LAYOVER = ('ignored', 'gated')
+LAYOVER = ('ignored', 'gated', 'resolved')
 
 
 @frozen(kw_only=True)
@@ -145,7 +145,8 @@ class BathymetryConfig(MountingParameters):
         'under a wide aperture; it acts as noise', range=(0.0, 0.95))
     layover: str = live('gated', '',
         'bins with echoes of two surfaces, as of a ledge, a box or a wall: gated (no soundings), '
-        'or ignored (as if of one), as always with multipath and in variant paper',
+        'resolved (the height of both, from four staves on; fewer are gated), or ignored (as if '
+        'of one), as always with multipath and in variant paper',
         choices=LAYOVER)
     multipath: bool = live(False, '',
         'expect echoes by way of the surface, modelled as noise from their directions')
@@ -358,8 +359,8 @@ class BathymetryConfig(MountingParameters):
 
     @property
     def layover_used(self) -> str:
-        """``ignored`` or ``gated``. An echo by way of the surface is a second surface in every
-        bin, which says nothing of the floor."""
+        """``ignored``, ``gated`` or ``resolved``. An echo by way of the surface is a second
+        surface in every bin, which says nothing of the floor."""
         return 'ignored' if self.as_printed or self.multipath else self.layover
 
     @property

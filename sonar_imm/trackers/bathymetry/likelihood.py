@@ -30,7 +30,7 @@ from functools import lru_cache
 import math
 from typing import NamedTuple
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics import (
@@ -92,6 +92,11 @@ class Swath:
     looks: Looks | None = None
     profile: rays.Profile | None = None
     water_level: float = 0.0
+
+    @property
+    def of_heights(self) -> Swath:
+        """The same for states that are heights."""
+        return evolve(self, geometry=self.geometry._replace(of_heights=True))
 
     def floor(self, state: FloatArray, variance: FloatArray) -> Floor:
         """The floor at states (T,): heights or angles, as the geometry says."""

@@ -65,6 +65,7 @@ from .likelihood import (
 )
 from .models import build_models, grid_cells, TerrainModels
 from .scatter import filter_scatter, ScatterMotion, smooth_scatter
+from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
 """Values of the column `told`."""
@@ -72,6 +73,9 @@ SURE = 0.9
 """Probability from which on floor is called rough, or smooth."""
 DETECTABLE = 1.5
 """Roughness is seen where its standard deviation is that of so many single snapshots."""
+
+LOUD = 10.0
+"""So many times the noise is much power."""
 FEWEST_BINS = 100
 """Of fewer bins `residual_ratio` says nothing."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.
@@ -120,7 +124,8 @@ class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
     of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
     where layover is ignored; how many bins from the depth of the floor on are usable, and how many
-    of these are passed over; `coherence.common_mode`."""
+    of these are passed over; `coherence.common_mode`; whether there were too few staves for the
+    two surfaces of a bin."""
 
     bins: int
     silent: int
@@ -129,6 +134,7 @@ class LoudBins(NamedTuple):
     beyond: int = 0
     beyond_silent: int = 0
     common_mode: float = 0.0
+    unresolved: bool = False
 
 
 class Answer(NamedTuple):
@@ -160,12 +166,23 @@ def look(ping: Ping) -> Look:
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
-    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two."""
+    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two. To
+    resolve them, also of bins with much power, which the gate for one wave passes over."""
     if ping.config.layover_used == 'ignored':
         return None
-    iq = np.where(likelihood.echo[:, None], ping.snapshot.iq, 0.0)
+    snapshot, echo, loud = ping.snapshot, likelihood.echo, None
+    if _resolves(ping):
+        loud = snapshot.usable & ~echo & np.logical_or.accumulate(echo)
+        loud &= variances.mean_power(snapshot.iq) > LOUD * likelihood.noise
+    heard = echo if loud is None else echo | loud
+    iq = np.where(heard[:, None], snapshot.iq, 0.0)
     spacing = swath.geometry.spacing
-    return layover(iq, likelihood.signal, likelihood.noise, likelihood.echo, spacing)
+    return layover(iq, likelihood.signal, likelihood.noise, echo, spacing, loud)
+
+
+def _resolves(ping: Ping) -> bool:
+    """Whether both surfaces of bins are wanted, and the staves are enough."""
+    return ping.config.layover_used == 'resolved' and ping.snapshot.staves >= FEWEST_STAVES
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:
@@ -278,7 +295,7 @@ def _with_constants(track: Track, ping: PingLikelihood) -> Track:
 
 def summarise(seen: Look, track: Track) -> Answer:
     """The answer of a ping whose models were run."""
-    snapshot, likelihood = seen.ping.snapshot, seen.likelihood
+    config, snapshot, likelihood = seen.config, seen.ping.snapshot, seen.likelihood
     echo, usable = likelihood.echo, snapshot.usable
     counts = Counter(
         used=1,
@@ -305,14 +322,16 @@ def summarise(seen: Look, track: Track) -> Answer:
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
         common_mode(snapshot.iq, echo),
+        config.layover_used == 'resolved' and not _resolves(seen.ping),
     )
+    made = estimate_of(seen, track)
     if seen.layover is not None:
-        counts['bins_two'] = int((echo & (seen.layover.existence > GATE)).sum())
+        counts['bins_two'] = int((made.extras['surfaces'] == 2).sum())
         health['array_error'] = loud.array_error
     health['decorrelation'] = loud.decorrelation
     health['common_mode'] = loud.common_mode
     health['residual_ratio'] = _residual(seen, track)
-    return Answer(estimate_of(seen, track), counts, health, loud, health['residual_ratio'])
+    return Answer(made, counts, health, loud, health['residual_ratio'])
 
 
 def _residual(seen: Look, track: Track) -> float:
@@ -332,19 +351,60 @@ def floor_of(seen: Look, track: Track) -> Floor:
     return seen.swath.floor(track.mean[:, 0], track.covariance[:, 0, 0])
 
 
+def _resolved(seen: Look, track: Track) -> Surfaces | None:
+    """Both surfaces where a bin may hold two; None where `layover` does not ask for them, or where
+    there are too few staves."""
+    if seen.layover is None or not _resolves(seen.ping):
+        return None
+    iq, geometry = seen.ping.snapshot.iq, seen.swath.of_heights.geometry
+    return resolve(iq, seen.likelihood, geometry, seen.layover, floor_of(seen, track).height)
+
+
+def _with_lower(seen: Look, track: Track, surfaces: Surfaces, two: BoolArray) -> Track:
+    """The track with the lower surface in bins `two` (T,)."""
+    mean, covariance = track.mean.copy(), track.covariance.copy()
+    height, variance = surfaces.height[two, 0], surfaces.variance[two, 0]
+    if not seen.swath.geometry.of_heights:
+        reach, tilt = seen.swath.geometry.reach[two], seen.swath.geometry.tilt[two]
+        filled = np.where(two, surfaces.height[:, 0], 0.0)
+        height = seen.swath.of_heights.floor(filled, filled).angle[two]
+        variance = variance / np.square(np.maximum(np.cos(height + tilt), 1e-3) * reach)
+    mean[two, 0] = height
+    covariance[two, 0, :] = covariance[two, :, 0] = 0.0
+    covariance[two, 0, 0] = variance
+    return track._replace(mean=mean, covariance=covariance)
+
+
 def estimate_of(seen: Look, track: Track) -> Estimate:
     """A row for each bin."""
-    config, covariance = seen.config, track.covariance
-    snapshot, posed = seen.ping.snapshot, seen.ping.posed
+    config, snapshot, posed = seen.config, seen.ping.snapshot, seen.ping.posed
     swath, models, ping = seen.swath, seen.models, seen.likelihood
-    floor = floor_of(seen, track)
+    label = track.probability.argmax(axis=1)
+    doubt = ~ping.echo
+    second: dict[str, np.ndarray] = {}
+    if seen.layover is not None:
+        surfaces = _resolved(seen, track)
+        found = seen.layover.existence if surfaces is None else surfaces.existence
+        heard = ping.echo
+        if surfaces is not None:
+            heard = heard | seen.layover.usable & (found >= EXISTS)
+        existence = np.where(heard, found, 0.0)
+        two = existence > GATE if surfaces is None else existence >= EXISTS
+        doubt = ~heard | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
+        second = {
+            'existence_2': existence.astype(np.float32),
+            'surfaces': np.where(heard, 1 + two, 0).astype(np.uint8),
+        }
+        if surfaces is not None:
+            second |= _upper(seen, surfaces, two)
+            track = _with_lower(seen, track, surfaces, two)
+    floor, covariance = floor_of(seen, track), track.covariance
     of_heights = models.state_names[0] == 'height'
     other = ('angle', floor.angle) if of_heights else ('height', floor.height)
-    label = track.probability.argmax(axis=1)
     extras = {
         'range': ping.ranges,
         other[0]: other[1],
-        'valid': ping.echo.astype(np.uint8),
+        'valid': (~doubt).astype(np.uint8),
         'log_likelihood': track.log_likelihood,
         'label': label.astype(np.uint8),
         'label_probability': track.probability[np.arange(len(label)), label],
@@ -352,12 +412,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     }
     if config.in_bank:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
-    if seen.layover is not None:
-        second = np.where(ping.echo, seen.layover.existence, 0.0)
-        two = second > GATE
-        extras['valid'] = (ping.echo & ~two).astype(np.uint8)
-        extras['existence_2'] = second.astype(np.float32)
-        extras['surfaces'] = np.where(ping.echo, 1 + two, 0).astype(np.uint8)
+    extras |= second
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         extras |= {
@@ -411,6 +466,28 @@ def verdict(rough: FloatArray, detectable: FloatArray, rough_std: float) -> np.n
     smooth = (rough < 1.0 - SURE) & (detectable <= rough_std)
     kind = np.where(rough > SURE, ROUGH, np.where(smooth, SMOOTH, CANNOT_TELL))
     return kind.astype(np.uint8)
+
+
+def _upper(seen: Look, surfaces: Surfaces, two: BoolArray) -> dict[str, np.ndarray]:
+    """Columns (T,) of the upper surface, NaN in bins that are not `two` (T,)."""
+    config, swath = seen.config, seen.swath
+    height, variance = (np.where(two, part[:, 1], 0.0) for part in surfaces[1:])
+    unposed = seen.ping.posed is None
+    std = np.sqrt(variance + (config.sonar_height_std**2 if unposed else 0.0))
+    columns: dict[str, np.ndarray] = {
+        'height_2': height.astype(np.float32),
+        'height_2_std': std.astype(np.float32),
+    }
+    if not unposed:
+        floor = swath.of_heights.floor(height, variance)
+        vertical, horizontal = swath.uncertainties(floor, config.budget())
+        columns |= {
+            'vertical_uncertainty_2': vertical,
+            'horizontal_uncertainty_2': horizontal,
+            'beam_angle_2': swath.beam_angle(floor.angle),
+            **{f'{name}_2': part for name, part in places(floor.xyz).items()},
+        }
+    return {name: np.where(two, part, part.dtype.type(np.nan)) for name, part in columns.items()}
 
 
 def _swath(ping: Ping) -> tuple[Swath, float]:

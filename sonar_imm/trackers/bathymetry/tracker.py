@@ -57,6 +57,7 @@ from typing import Any, NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
+from ...acoustics.layover import Layover
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
@@ -79,6 +80,7 @@ from .ping import (
     summarise,
     track_ping,
 )
+from .two_surfaces import resolve
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
 
@@ -160,6 +162,11 @@ class BathymetryTracker:
             for posed in tracker._queue.ready(gap):
                 track_ping(Ping(tracker.config, posed.snapshot, posed))
         track_ping(Ping(tracker.config, snapshot, None))
+        if self.config.layover_used == 'resolved':
+            seen = look(Ping(tracker.config, snapshot, None))
+            everywhere = Layover(np.ones(T), 0.0, np.ones(T, bool))
+            geometry = seen.swath.of_heights.geometry
+            resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(T))
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
@@ -175,6 +182,10 @@ class BathymetryTracker:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
         stated = [*self._silence(), *self._common_mode(), *noise_warnings(self._residuals)]
+        if any(ping.unresolved for ping in self._loud):
+            stated.append(
+                'layover: resolved needs four staves: bins with two surfaces are only gated'
+            )
         if loud < FEWEST_LOUD:
             return stated
         silent = sum(ping.silent for ping in self._loud) / loud

@@ -82,7 +82,7 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
     yield Section(
         'Profile of the floor',
         'Height along one ping. Dotted: truth. Shaded: two standard deviations, which should hold '
-        f'95 % of the truth. Blue: the true rough patch.{which}',
+        f'95 % of the truth. Blue: the true rough patch.{_of_two(profile)}{which}',
         profile_figure(profile),
     )
     if (snapshot := _snapshot(run, profile)) is not None:
@@ -114,6 +114,15 @@ def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
         )
 
 
+def _of_two(profile: Profile) -> str:
+    """What the profile shows where bins have two surfaces."""
+    if profile.two is None or not profile.two.any():
+        return ''
+    if profile.upper is None:
+        return ' Bins with two surfaces are marked: the estimate there is neither.'
+    return ' Where bins have two surfaces, the estimate is the lower; the upper has its own line.'
+
+
 def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
     """The samples of one ping, None when the recording is gone."""
     for ping in read_measurements(run):
@@ -140,10 +149,18 @@ def profile_figure(profile: Profile) -> go.Figure:
         true = np.where(profile.truth.echo, profile.truth.height, np.nan)[shown]
         dotted = {'color': INK, 'width': 1.0, 'dash': 'dot'}
         add_line(figure, ranges, true, 'truth', INK, line=dotted)
+        if profile.truth.height_2 is not None:
+            second = np.isfinite(profile.truth.height_2)
+            place, height_2 = profile.range[second], profile.truth.height_2[second]
+            add_points(figure, place, height_2, 'truth, second surface', INK, size=2)
     add_line(figure, ranges, height, 'estimate', COLOURS[0], 1.4)
     marks = [('no echo', ~profile.heard, 3)]
-    if profile.two is not None:
+    if profile.upper is not None:
+        _add_upper(figure, profile)
+    elif profile.two is not None:
         marks.append(('two surfaces: no sounding', profile.two, 4))
+    if profile.unsure is not None:
+        marks.append(('one surface or two: no sounding', profile.unsure, 4))
     for name, marked, colour in marks:
         place = profile.range[marked]
         place = place[thin(len(place), MOST_BINS)]
@@ -152,6 +169,22 @@ def profile_figure(profile: Profile) -> go.Figure:
             add_points(figure, place, bottom, name, COLOURS[colour], symbol='line-ns-open')
     y = {'title': 'height above the reference [m]'}
     return styled(figure, 400, SLANT | {'zeroline': False}, y)
+
+
+def _add_upper(figure: go.Figure, profile: Profile) -> None:
+    """The upper one of two surfaces with its band."""
+    assert profile.upper is not None and profile.two is not None
+    height, std = profile.upper
+    for number, (begin, end) in enumerate(runs(profile.two)):
+        part, first = slice(begin, end), number == 0
+        where, high = profile.range[part], height[part] + BAND * std[part]
+        low = height[part] - BAND * std[part]
+        add_band(figure, where, high, low, COLOURS[2], (0.15, 0.3), showlegend=False)
+        line = {'color': COLOURS[2], 'width': 1.4}
+        shown = {'legendgroup': 'upper', 'showlegend': first}
+        figure.add_scatter(
+            x=where, y=height[part], mode='lines', name='upper surface', line=line, **shown
+        )
 
 
 def spectrum_figure(

@@ -29,9 +29,9 @@ from ..columns import read_columns
 
 _BINS = (
     'range?', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
-    'surfaces?', 'told?',
+    'surfaces?', 'told?', 'height_2?', 'height_2_std?', 'vertical_uncertainty_2?',
 )  # fmt: skip
-_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?', 'surfaces?')
+_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?', 'surfaces?', 'height_2?')
 FAR = 0.55
 """Share of a bin by which the range of the true floor may differ from that of the estimate: half a
 bin, and a margin for single precision."""
@@ -41,13 +41,19 @@ bin, and a margin for single precision."""
 class TrueFloor:
     """The true floor at the bins of one ping, each (n,): height m and angle rad, NaN where
     unknown; patch: rough floor; echo: neither shadow nor water column; surfaces: how many answer,
-    None where the truth does not say it."""
+    None where the truth does not say it, and height_2 m of the second strongest, NaN for none."""
 
     height: FloatArray
     angle: FloatArray
     patch: BoolArray
     echo: BoolArray
     surfaces: IntArray | None = None
+    height_2: FloatArray | None = None
+
+    def to_nearest(self, height: FloatArray) -> FloatArray:
+        """Distance (n,) of heights (n,) to the nearest of the true surfaces, m."""
+        off = np.abs(height - self.height)
+        return off if self.height_2 is None else np.fmin(off, np.abs(height - self.height_2))
 
 
 @frozen(eq=False)
@@ -57,7 +63,10 @@ class Profile:
     echoes of two, None where the tracker does not look for them; truth: None where unknown;
     side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
     the estimate itself says it, as those of a bank do; verdict (n,): smooth 0, rough 1 or cannot
-    tell 2, None where the estimate does not say it."""
+    tell 2, None where the estimate does not say it; upper: height m and standard deviation
+    (n,) each of the upper of two surfaces, NaN for none, None where the tracker does not say them:
+    the height is then that of the lower, and unsure (n,): bins with an echo of one surface or two.
+    """
 
     stamp_ns: int
     range: FloatArray
@@ -72,11 +81,14 @@ class Profile:
     rough: FloatArray | None = None
     two: BoolArray | None = None
     verdict: FloatArray | None = None
+    upper: tuple[FloatArray, FloatArray] | None = None
+    unsure: BoolArray | None = None
 
     @property
     def heard(self) -> BoolArray:
         """Bins (n,) with an echo."""
-        return self.valid if self.two is None else self.valid | self.two
+        heard = self.valid if self.two is None else self.valid | self.two
+        return heard if self.unsure is None else heard | self.unsure
 
 
 @frozen(eq=False)
@@ -135,6 +147,12 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
     if 'vertical_uncertainty' in estimate.extras:
         arm = np.abs(bins['range'] * np.sin(bins['beam_angle']))
         height_std = np.sqrt(bins['vertical_uncertainty'])
+    upper = None
+    if 'height_2' in estimate.extras:
+        upper_std = bins['height_2_std']
+        if 'vertical_uncertainty_2' in estimate.extras:
+            upper_std = np.sqrt(bins['vertical_uncertainty_2'])
+        upper = bins['height_2'], upper_std
     return Profile(
         stamp_ns=estimate.stamp_ns,
         range=bins['range'],
@@ -149,12 +167,14 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
         side=SIDES[estimate.source] if 'side' in estimate.extras else '',
         two=bins['surfaces'] == 2 if 'surfaces' in estimate.extras else None,
         verdict=bins['told'] if 'told' in estimate.extras else None,
+        upper=upper,
+        unsure=None if upper is None else (bins['surfaces'] == 1) & (bins['valid'] == 0),
     )
 
 
 def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
     """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
-    where, height, angle, patch, valid, surfaces = read_columns(
+    where, height, angle, patch, valid, surfaces, second = read_columns(
         truth, _TRUE, "the truth is not that of a floor: it has no column '{}'"
     ).values()
     if not len(where):
@@ -172,4 +192,5 @@ def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
         patch=found & (patch[nearest] > 0),
         echo=found & (valid[nearest] > 0),
         surfaces=np.where(found, surfaces[nearest], 0) if 'surfaces' in truth.extras else None,
+        height_2=np.where(found, second[nearest], np.nan) if 'height_2' in truth.extras else None,
     )

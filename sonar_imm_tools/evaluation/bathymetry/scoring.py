@@ -16,7 +16,8 @@
 
 Heights and angles are scored in bins with an echo. Shadows are scored apart, because there the
 estimate is a prediction of the models. The segmentation is scored by labels: rough where the rough
-models have more than half of the probability.
+models have more than half of the probability. Where the estimate has both surfaces of a bin, each
+is compared with the nearest of the true ones.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def _errors(known: Known) -> dict[str, Any]:
         high, turn, held = [], [], []
         for profile, truth in known:
             bins = choose(truth)
-            error = np.abs(profile.height - truth.height)[bins]
+            error = height_error(profile, truth)[bins]
             high.append(error)
             turn.append(np.degrees(np.abs(profile.angle - truth.angle)[bins]))
             held.append(error <= BAND * profile.height_std[bins])
@@ -88,6 +89,14 @@ def _errors(known: Known) -> dict[str, Any]:
         angle[place] = error_summary(_finite(turn), unit='deg')
         inside[place] = _mean(held)
     return {'height': height, 'angle': angle, 'inside_band': inside}
+
+
+def height_error(profile: Profile, truth: TrueFloor) -> FloatArray:
+    """Error (n,) of the height, of the lower one where the estimate has two."""
+    error = np.abs(profile.height - truth.height)
+    if profile.upper is None or profile.two is None:
+        return error
+    return np.where(profile.two, truth.to_nearest(profile.height), error)
 
 
 def _gate(known: Known) -> dict[str, Any]:
@@ -102,18 +111,27 @@ def _gate(known: Known) -> dict[str, Any]:
 
 
 def _layover(known: Known) -> dict[str, Any]:
-    """How many bins with two surfaces were found, become soundings all the same, and how many with
-    one were lost; empty where the truth or the estimate does not say it."""
-    two, one, kept = [], [], []
+    """How many bins with two surfaces were found, become soundings all the same, how many with one
+    were lost, and how far the heights of two lie from the nearest true one; empty where the truth
+    or the estimate does not say it."""
+    two, one, kept, off, held = [], [], [], [], []
     for profile, truth in known:
         if truth.surfaces is not None and profile.two is not None:
             two.append(profile.two[truth.surfaces > 1])
             kept.append(profile.valid[truth.surfaces > 1])
             one.append(profile.two[truth.surfaces == 1])
+        if profile.two is not None and profile.upper is not None:
+            for height, std in ((profile.height, profile.height_std), profile.upper):
+                error = truth.to_nearest(height)[profile.two & truth.echo]
+                off.append(error)
+                held.append(error <= BAND * std[profile.two & truth.echo])
     if not two:
         return {}
     counts = {'bins': sum(map(len, two)), 'found': _mean(two), 'soundings': _mean(kept)}
-    return {'layover': {**counts, 'lost': _mean(one)}}
+    scores: dict[str, Any] = {**counts, 'lost': _mean(one)}
+    if off:
+        scores['heights'] = {**error_summary(_finite(off)), 'inside_band': _mean(held)}
+    return {'layover': scores}
 
 
 def _verdicts(profiles: Sequence[Profile]) -> dict[str, Any]:

@@ -42,7 +42,19 @@ METRICS = (
     Metric(
         label='two surfaces: found / soundings all the same / single bins lost',
         line='{layover.found:.0%} / {layover.soundings:.0%} / {layover.lost:.1%}',
-        when=lambda metrics: look_up(metrics, 'layover.bins'),
+        when=lambda metrics: (
+            look_up(metrics, 'layover.bins') and not look_up(metrics, 'layover.heights')
+        ),
+    ),
+    Metric(
+        label='two surfaces: found / single bins taken for two',
+        line='{layover.found:.0%} / {layover.lost:.1%}',
+        when=lambda metrics: look_up(metrics, 'layover.heights'),
+    ),
+    Metric(
+        label='both heights of two surfaces, RMS to the nearest / inside two sd',
+        line='{layover.heights.rmse_m:.2f} m / {layover.heights.inside_band:.0%}',
+        when=lambda metrics: look_up(metrics, 'layover.heights.n'),
     ),
     Metric(card='Pings', value='{pings}', remark='{bins} range bins', when=_unscored),
     Metric(card='Bins with an echo', value='{heard_share:.0%}', when=_unscored),

@@ -30,7 +30,7 @@ from msg_adapters.soundings import read_soundings
 from sonar_imm.estimates import PLACES
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection
-from sonar_imm.soundings import COLUMNS
+from sonar_imm.soundings import COLUMNS, LATER
 
 from ..reader import BagReader
 from ..sources import BagError, is_recording
@@ -45,6 +45,8 @@ _LAS_EXTRAS = (
     'beam_angle',
     'label_probability',
     'range',
+    'surface',
+    'existence',
 )
 
 
@@ -73,7 +75,7 @@ def read_points(path: Path) -> Points:
     recording of `~/soundings`. Raises `BagError` for what is none."""
     if is_recording(path):
         return _read_recording(path)
-    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
+    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in (*PLACES, *LATER))]
     if path.suffix == '.parquet':
         return _read_parquet(path, wanted)
     try:
@@ -151,6 +153,8 @@ def _read_recording(path: Path) -> Points:
 def _exact(stamps: IntArray, columns: dict[str, FloatArray]) -> Points:
     for name, exact in zip('xyz', PLACES):
         columns[name] = columns.pop(exact, columns[name])  # older tables have the coarse ones only
+    for name, value in LATER.items():
+        columns.setdefault(name, np.full(len(stamps), float(value)))
     return Points(stamps, columns)
 
 

@@ -52,7 +52,7 @@ def hear(
     if facets is None:
         y = np.sqrt(signal)[:, None] * _echo(config, sine, rng)
     else:
-        y = _of_facets(config, floor.range, facets, rng)
+        y = _of_facets(config, bins, facets, rng)
     noise = math.sqrt(config.noise_variance) * _circular(rng, bins, config.staves)
     fading = np.sqrt(_fading(config, bins, rng))[:, None]
     if facets is not None:
@@ -85,17 +85,11 @@ def hear(
     )
 
 
-def _of_facets(
-    config: Any, ranges: FloatArray, facets: Facets, rng: np.random.Generator
-) -> ComplexArray:
+def _of_facets(config: Any, bins: int, facets: Facets, rng: np.random.Generator) -> ComplexArray:
     """The echoes (T, P) of facets, each surface of a bin with a texture of its own."""
-    bins = len(ranges)
     texture = np.stack([_fading(config, bins, rng) for _ in range(4)])
     power = config.noise_variance * facets.power * texture[facets.surface, facets.bin]
-    depth = config.sonar_height - facets.height
-    tilt = math.radians(config.tilt_deg)
-    sine = array.direction_sine(depth, ranges[facets.bin], tilt)
-    echo = np.sqrt(power)[:, None] * _echo(config, np.nan_to_num(sine), rng)
+    echo = np.sqrt(power)[:, None] * _echo(config, np.nan_to_num(facets.sine), rng)
     parts = [np.bincount(facets.bin, stave, bins) for stave in echo.view(np.float64).T]
     return np.column_stack(parts).view(np.complex128)
 

@@ -18,6 +18,10 @@ The vertical plane of a ping is cut into facets of a centimetre. A facet is seen
 everything nearer, seen from the sonar, and faces it. Its power goes with the sine of its grazing
 angle, so that the flat floor has the signal-to-noise ratio of the scene. All facets of a bin have
 speckle of their own; those of one surface in a bin share one texture.
+
+Objects go on for ever along the track of a ship, so that it matters only how far from the track a
+ping meets them. Of each facet that piece answers which lies in the fan of the array when the echo
+is received (`acoustics.sounding`).
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sonar_imm.acoustics import array
+from sonar_imm.acoustics.sounding import Looks
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 OBJECTS = ('none', 'ledge', 'box', 'wall', 'boulder')
@@ -34,40 +40,93 @@ FLOOR, FACE, TOP, BEHIND = range(4)
 """The surfaces; a boulder is all face."""
 FACET = 0.01
 THICKNESS = {'box': 2.0, 'wall': 0.2}
+PASSES = 3
+"""Which bin a facet is in says how the ship lay, which says which bin it is in."""
 SECOND_DB, APART = 15.0, 0.5
 """A second surface counts from so many decibels below the first on, at a stave at least as strong
 as the noise, and so many metres above or below it."""
 
 
 class Facets(NamedTuple):
-    """What a ping sees, each (n,): number of the bin, height m, power at a stave in noises, and
-    which surface."""
+    """What a ping sees, each (n,): number of the bin, height above the floor m, direction sine,
+    power at a stave in noises, and which surface."""
 
     bin: IntArray
     height: FloatArray
+    sine: FloatArray
     power: FloatArray
     surface: IntArray
 
 
-def facets_of(config: Any, ranges: FloatArray, snr: FloatArray) -> Facets:
-    """The facets that a level sonar sees. ranges and snr (T,) of the bins, the latter those of a
-    flat floor."""
+class Above(NamedTuple):
+    """How an array on a ship looks at the floor in each of T bins, in the axes along the track, to
+    its side and up: outward (T,) from the track and height (T,) above the floor, m; stave and fore
+    (T, 3), axes of the array."""
+
+    outward: FloatArray
+    height: FloatArray
+    stave: FloatArray
+    fore: FloatArray
+
+
+def above(looks: Looks, course: float, side: str, level: float) -> Above:
+    """The looks of a ship on a course (rad, from east to north) along a track through the origin,
+    over a floor at z = level."""
+    sign = 1.0 if side == 'port' else -1.0
+    axes = np.array(
+        [
+            [math.cos(course), math.sin(course), 0.0],
+            [-sign * math.sin(course), sign * math.cos(course), 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    place, stave, broadside = (
+        part @ axes.T for part in (looks.position, looks.stave, looks.broadside)
+    )
+    return Above(place[:, 1], place[:, 2] - level, stave, np.cross(stave, broadside))
+
+
+def facets_of(
+    config: Any, ranges: FloatArray, snr: FloatArray, ship: Above | None = None
+) -> Facets:
+    """The facets that a level sonar sees, or that of a ship. ranges and snr (T,) of the bins, the
+    latter those of a flat floor."""
     H, width = config.sonar_height, config.bin_width
+    if ship is not None:
+        H = float(ship.height.mean())
     nodes, kinds = _outline(config, float(ranges[-1]) + width)
     parts = [_cut(a, b, kind) for a, b, kind in zip(nodes[:-1], nodes[1:], kinds)]
     x, z, dx, dz, surface = (np.concatenate(column) for column in zip(*parts))
+    if ship is not None:
+        x, off = x - float(ship.outward.mean()), x
     r = np.hypot(x, H - z)
     elevation = np.arctan2(z - H, x)
     highest = np.maximum.accumulate(elevation)
     seen = elevation > np.concatenate([[-math.inf], highest[:-1]])
     projected = (dz * x + dx * (H - z)) / r
     number = np.rint((r - ranges[0]) / width).astype(np.int64)
+    if ship is not None:
+        for _ in range(PASSES):
+            there = np.clip(number, 0, len(ranges) - 1)
+            r, sine = _in_fan(off, z, Above(*(part[there] for part in ship)))
+            number = np.rint((r - ranges[0]) / width).astype(np.int64)
     seen &= (projected > 0.0) & (number >= 0) & (number < len(ranges))
     number = np.where(seen, number, 0)
     # What the flat floor has in a bin, so that it gets the ratio of the scene.
     flat = H * width / np.sqrt(np.maximum(r * r - H * H, width * H))
     power = np.where(seen, snr[number] * projected / flat, 0.0)
-    return Facets(*(part[seen] for part in (number, z, power, surface)))
+    if ship is None:
+        sine = array.direction_sine(H - z, ranges[number], math.radians(config.tilt_deg))
+    return Facets(*(part[seen] for part in (number, z, sine, power, surface)))
+
+
+def _in_fan(off: FloatArray, z: FloatArray, ship: Above) -> tuple[FloatArray, FloatArray]:
+    """Slant range (n,) and direction sine (n,) of what of facets, `off` (n,) from the track and z
+    (n,) above the floor, lies in the fan."""
+    x, up = off - ship.outward, z - ship.height
+    along = -(x * ship.fore[:, 1] + up * ship.fore[:, 2]) / ship.fore[:, 0]
+    r = np.sqrt(along * along + x * x + up * up)
+    return r, (along * ship.stave[:, 0] + x * ship.stave[:, 1] + up * ship.stave[:, 2]) / r
 
 
 def surfaces_of(facets: Facets, bins: int) -> tuple[FloatArray, FloatArray]:

@@ -39,7 +39,7 @@ from sonar_imm.parameters import parameter
 from sonar_imm.truth import Received, Scene, TrueProfile
 
 from .hearing import hear, snr
-from .objects import Facets, facets_of, OBJECTS, second_of, surfaces_of
+from .objects import above, Facets, facets_of, OBJECTS, second_of, surfaces_of
 from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
 
 SIDES = ('starboard', 'port', 'both')
@@ -116,10 +116,12 @@ class BathymetryScenario(ShipScenario):
 
     object: str = parameter('none', '',
         'object on the floor, which is level then: a step up (ledge), a box 2 m wide, a wall or a '
-        'boulder; where it answers at the range of the floor a bin has two surfaces',
+        'boulder, all along the track of a ship; where it answers at the range of the floor a bin '
+        'has two surfaces',
         choices=OBJECTS)
     object_distance: float = parameter(30.0, 'm',
-        'horizontal distance of the object from the sonar', range=(0.1, 10_000.0))
+        'horizontal distance of the object from the sonar, or from the track',
+        range=(0.1, 10_000.0))
     object_size: float = parameter(2.0, 'm',
         'height of the object, or radius of the boulder', range=(0.01, 1000.0))
     shadows: tuple[float, ...] = parameter((), 'm',
@@ -137,8 +139,8 @@ class BathymetryScenario(ShipScenario):
         if self.multipath and self.moving:
             problems.append('multipath is for a sonar that rests, not for moving: true')
         if self.object != 'none':
-            if self.moving or self.multipath:
-                problems.append('objects are for a sonar that rests, without multipath')
+            if self.multipath or self.sound_speed_profile:
+                problems.append('objects are for straight rays and without multipath')
             if self.object_size >= self.sonar_height:
                 problems.append('object_size must be less than sonar_height')
         if self.last_range < self.first_range + 2.0 * self.bin_width:
@@ -154,7 +156,8 @@ class BathymetryScenario(ShipScenario):
     def instruments(self) -> dict[str, Any]:
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
-        return {**super().instruments(), **mounted}
+        second = {} if self.object == 'none' else {'layover': 'resolved'}
+        return {**super().instruments(), **mounted, **second}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
@@ -200,6 +203,10 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'ledge': (
         'a step of 2 m, which answers at the same ranges as the floor; noise that does not fade',
         {'object': 'ledge', 'noise_fades': False},
+    ),
+    'moving_ledge': (
+        'ledge below a ship under way in a swell',
+        {**_UNDER_WAY, 'object': 'ledge', 'noise_fades': False},
     ),
     'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
     'moving': (
@@ -253,9 +260,14 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
             else:
                 profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
             facets = None
-            if config.object != 'none':
+            if config.object != 'none' and ship is None:
                 facets = facets_of(config, ranges, snr(config, ranges))
                 profile = _with_object(config, profile, facets)
+            elif config.object != 'none' and ship is not None:
+                look = _look(config, ship, since_start, ranges, side)
+                floor = above(look, ship.course, side, _level(config))
+                facets = facets_of(config, ranges, snr(config, ranges), floor)
+                profile = _with_object_below(config, profile, facets, look)
             truth.append(profile)
             snapshot = hear(config, profile, rng, facets)
             received.append(Received(stamp + listening_ns, snapshot, namespace))
@@ -320,6 +332,47 @@ def _with_object(config: BathymetryScenario, floor: TrueProfile, facets: Facets)
     )
 
 
+def _with_object_below(
+    config: BathymetryScenario, floor: TrueProfile, facets: Facets, look: sounding.Looks
+) -> TrueProfile:
+    """The truth of a level floor with an object on it below a ship."""
+    number, height, second = second_of(*surfaces_of(facets, len(floor.range)))
+    valid = number > 0
+    z = _level(config) + np.where(valid, height, 0.0)
+    sine = np.clip((look.position[:, 2] - z) / (floor.range * look.C), -1.0, 1.0)
+    sine = sine * np.cos(look.psi) - np.sqrt(1.0 - sine * sine) * np.sin(look.psi)
+    place = look.position + floor.range[:, None] * sounding.direction(look, sine)
+    return evolve(
+        floor,
+        height=z,
+        angle=np.arcsin(np.clip(sine, -1.0, 1.0)),
+        patch=np.zeros(len(z), bool),
+        valid=valid,
+        xyz=np.column_stack([place[:, :2], z]),
+        surfaces=number.astype(np.uint8),
+        height_2=_level(config) + second,
+    )
+
+
+def _level(config: BathymetryScenario) -> float:
+    """z of the floor below a ship."""
+    return config.water_level - config.sonar_depth - config.sonar_height
+
+
+def _axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
+    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
+    return sounding.array_axes(side, math.radians(config.tilt_deg), mount)
+
+
+def _look(
+    config: BathymetryScenario, ship: Ship, sent: float, ranges: FloatArray, side: str
+) -> sounding.Looks:
+    """How the array of a ship looks at a ping sent at a time in s."""
+    received = ship.pose(sent + 2.0 * ranges / config.sound_speed)
+    lever = np.array(config.sonar_lever)
+    return sounding.looks(_axes(config, side), lever, ship.pose(np.array(sent)), received)
+
+
 def _floor_below(
     config: BathymetryScenario,
     ship: Ship,
@@ -338,17 +391,15 @@ def _floor_below(
     def rough(along: FloatArray, off: FloatArray) -> BoolArray:
         return in_outline(config, along, off, config.patch_start, config.patch_end)
 
-    level = config.water_level - config.sonar_depth - config.sonar_height
-    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
     seen = see(
         config,
         ship,
-        Terrain(level, ship.course, rise, rough),
+        Terrain(_level(config), ship.course, rise, rough),
         _roughness(config, len(ranges), rng),
         since_start,
         ranges,
         config.sound_speed,
-        sounding.array_axes(side, math.radians(config.tilt_deg), mount),
+        _axes(config, side),
     )
     valid = seen.reached & _lit(config, ranges)
     return TrueProfile(

@@ -81,3 +81,20 @@ def test_every_variant_is_measured(short):
     assert all(speed > 0.0 for speed in bench.bench_threads(1, 1)['bins_per_second'].values())
     speed = bench.bench_scaling(rounds=1)['bins_per_second']
     assert len(speed) == 13 and min(speed.values()) > 0.0
+
+
+@pytest.mark.parametrize('resolved, good', [(41e3, True), (39e3, False)])
+def test_the_goal_with_both_surfaces_is_met_beside_a_ledge(monkeypatch, resolved, good):
+    ran = {}
+
+    def rates(methods, rounds, clock):
+        ran.update({name: (len(run()[0]), bins) for name, (run, bins) in methods.items()})
+        return {name: resolved if name.endswith('resolved') else 50e3 for name in methods}
+
+    monkeypatch.setattr(bench, 'rates', rates)
+    result = bench.bench_layover(rounds=1)
+    assert result['good'] is good and 0.01 < result['stretch_share'] < 0.1
+    extra = 1e6 * (1.0 / resolved - 1.0 / 50e3)
+    assert result['us_per_stretch_bin'] * result['stretch_share'] == pytest.approx(extra)
+    assert len(ran) == 18 and set(ran.values()) == {(1200, 1200)}
+    assert 'ledge' in next(b for b in bench.BENCHES if b.name == 'layover').sentence(result)

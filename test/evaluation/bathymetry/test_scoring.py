@@ -142,3 +142,37 @@ def test_a_run_without_a_ping_has_words_too():
 def test_runs():
     assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
     assert runs(np.zeros(4, bool)) == runs(np.zeros(0, bool)) == []
+
+
+def test_both_heights_are_compared_with_the_nearest_surface():
+    two = np.zeros(N, bool)
+    two[4:8] = True
+    height = np.full(N, 0.1)
+    height[4:8] = 2.2  # the lower estimate lies near what is strongest
+    truth = evolve(
+        profile().truth,
+        height=np.where(two, 2.0, 0.0),
+        surfaces=np.where(two, 2, 1),
+        height_2=np.where(two, 3.0, np.nan),
+    )
+    unsure = np.zeros(N, bool)
+    unsure[15] = True
+    upper = np.where(two, 2.6, np.nan), np.where(two, 0.15, np.nan)
+    one = evolve(
+        profile(valid=~unsure), truth=truth, height=height, two=two, upper=upper, unsure=unsure
+    )
+    metrics = score(swath(one))
+    scores = metrics['layover']
+    assert (scores['bins'], scores['found'], scores['lost']) == (4, 1.0, 0.0)
+    assert scores['heights']['n'] == 8
+    assert scores['heights']['rmse_m'] == pytest.approx(np.sqrt((0.2**2 + 0.4**2) / 2.0))
+    assert scores['heights']['inside_band'] == 0.0
+    assert metrics['height']['all']['rmse_m'] == pytest.approx(
+        np.sqrt((4 * 0.2**2 + 16 * 0.1**2) / N)
+    )
+    assert metrics['heard_share'] == 1.0
+    words = dict(lines(METRICS, metrics))
+    assert words['two surfaces: found / single bins taken for two'] == '100 % / 0.0 %'
+    names = [trace.name for trace in profile_figure(one).data]
+    assert 'upper surface' in names and 'truth, second surface' in names
+    assert 'one surface or two: no sounding' in names

@@ -20,12 +20,21 @@ import numpy as np
 import pytest
 
 from benchmarks.bathymetry_scenes import truth_of
+from sonar_imm.acoustics import sounding
 from sonar_imm.parameters import ConfigError
+from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
 from sonar_imm_tools.simulation.bathymetry.hearing import snr
-from sonar_imm_tools.simulation.bathymetry.objects import facets_of, second_of, surfaces_of
+from sonar_imm_tools.simulation.bathymetry.objects import (
+    above,
+    FACE,
+    facets_of,
+    second_of,
+    surfaces_of,
+)
+from sonar_imm_tools.simulation.bathymetry.ship import ship_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 
@@ -79,13 +88,55 @@ def test_a_wall_is_gated_and_scored():
         'ledge', {'object': 'wall', 'object_size': 4.0, 'object_distance': 26.0, 'pings': 4}
     )
     scene = simulate(config, 5)
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping(config.instruments()))
+    values = {**config.instruments(), 'layover': 'gated'}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     estimates = [made for item in scene.measurements for made in tracker.process(item.measurement)]
     metrics = score(profiles_of(estimates, truth_of(scene)))
     assert metrics['layover']['bins'] > 80
     assert metrics['layover']['found'] > 0.75
     assert metrics['layover']['soundings'] < 0.2 and metrics['layover']['lost'] < 0.01
     assert 0.0 < metrics['two_share'] < 0.05
+
+
+@pytest.mark.parametrize('side', ['port', 'starboard'])
+def test_facets_below_a_ship_lie_where_the_geometry_of_soundings_puts_them(side):
+    config = scenario('moving_ledge', {'object': 'wall', 'object_size': 3.0})
+    ship = ship_of(config, config.sonar_depth, np.random.default_rng(1))
+    ranges = config.first_range + config.bin_width * np.arange(1200)
+    axes = sounding.array_axes(side, math.radians(config.tilt_deg), np.eye(3))
+    received = ship.pose(3.0 + 2.0 * ranges / config.sound_speed)
+    look = sounding.looks(axes, np.array([1.5, -0.4, -0.8]), ship.pose(np.array(3.0)), received)
+    level = -config.sonar_depth - config.sonar_height
+    over = above(look, ship.course, side, level)
+    facets = facets_of(config, ranges, np.full(1200, 100.0), over)
+    there = sounding.Looks(*(part[facets.bin] for part in look))
+    place = there.position + ranges[facets.bin, None] * sounding.direction(there, facets.sine)
+    assert np.abs(place[:, 2] - level - facets.height).max() < 0.06  # half a bin of range
+    c, s = math.cos(ship.course), math.sin(ship.course)
+    off = (c * place[:, 1] - s * place[:, 0]) * (1.0 if side == 'port' else -1.0)
+    assert (np.abs(off - config.object_distance) < 0.2)[facets.surface == FACE].all()
+
+
+def test_a_ledge_below_a_ship_becomes_soundings_of_both_surfaces():
+    config = scenario('moving_ledge', {'pings': 3, 'object_size': 2.5})
+    scene = simulate(config, 4)
+    values = {**config.instruments(), 'navigation': 'required'}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
+    estimates = [made for item in scene.measurements for made in tracker.process(item.measurement)]
+    off, upper = [], 0
+    for estimate in estimates:
+        columns = soundings_of(estimate).columns
+        again = columns['surface'] == 2
+        upper += int(again.sum())
+        across = np.abs(columns['py'] * math.cos(math.pi / 6) - columns['px'] * 0.5)
+        top = np.where(across < config.object_distance, 0.0, config.object_size)
+        face = np.abs(across - config.object_distance) < 2.0
+        error = np.where(face, np.nan, columns['pz'] + 20.0 - top)
+        off.append(error / np.sqrt(columns['vertical_uncertainty']))
+        assert (columns['existence'][again] >= 0.5).all()
+    error = np.concatenate(off)
+    assert len(estimates) == 3 and upper > 40
+    assert np.nanmean(np.abs(error) < 2.0) > 0.9
 
 
 @pytest.mark.parametrize('values', [{'multipath': True}, {'object_size': 20.0}])

@@ -1,0 +1,274 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Both heights of bins with two surfaces: the likelihood, the smoother, and what becomes of it."""
+
+import math
+from pathlib import Path
+
+from attrs import evolve
+from helpers.bathymetry_cases import floor
+import numpy as np
+from oracles import two_surfaces as oracle
+import pytest
+
+from sonar_imm.acoustics import layover
+from sonar_imm.acoustics.variances import mean_power, signal_variance
+from sonar_imm.trackers.bathymetry import two_surfaces as two
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
+from sonar_imm.trackers.bathymetry.ping import look, Ping
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'layover'
+NEW = ['height_2', 'height_2_std']
+
+
+def step(at=slice(150, 200), up=2.0, **more):
+    """A flat floor on which bins `at` have a second surface `up` metres above it."""
+    snapshot, above = floor(0.0, seed=1, **more), floor(up, seed=2, **more)
+    iq = snapshot.iq.copy()
+    iq[at] += above.iq[at]
+    return evolve(snapshot, iq=iq)
+
+
+def run(snapshot, layover='resolved', **values):
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping({'layover': layover, **values}))
+    return tracker, tracker.process(snapshot)[0]
+
+
+def bins(n, P, rng):
+    """Bins (n, P) with an echo or two, and noise."""
+    waves = rng.normal(size=(n, 2, 2)).view(complex) * 4.0
+    sines = rng.uniform(-0.3, 0.3, (n, 2, 1))
+    y = (waves * np.exp(1j * math.pi * sines * np.arange(P))).sum(axis=1)
+    return y + rng.normal(size=(n, P, 2)).view(complex)[..., 0]
+
+
+@pytest.mark.parametrize('P, spacing', [(4, 0.5), (8, 0.5), (8, -0.5), (5, 3.66)])
+def test_likelihoods_are_those_of_normal_echoes_in_noise(P, spacing):
+    rng = np.random.default_rng(P)
+    G, gap, v = 14, 3, 17.0
+    sines = np.sort(rng.uniform(-0.4, 0.2, G))
+    sines[5] = np.nan
+    y = bins(1, P, rng)[0]
+    one, pairs = np.empty(G), np.zeros((G, G))
+    work, price = np.empty((8, G)), np.empty((G, G))
+    assert two.pair_likelihoods(y, v, sines, spacing, gap, work, price, one, pairs)
+    states = oracle.states_of(G, gap)
+    wanted = np.array(
+        [
+            -np.inf if 5 in state else oracle.log_likelihood(y, v, sines[list(state)], spacing)
+            for state in states
+        ]
+    )
+    found = np.array([one[s[0]] if len(s) == 1 else pairs[s] for s in states])
+    wanted = np.exp(wanted - wanted.max())
+    np.testing.assert_allclose(found / found.max(), wanted, rtol=1e-7, atol=1e-30)
+    sines[:] = np.nan
+    assert not two.pair_likelihoods(y, v, sines, spacing, gap, work, price, one, pairs)
+
+
+def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
+    rng = np.random.default_rng(4)
+    n, P, G, first = 5, 6, 15, 2
+    moves = two.Moves(0.02, 0.1, 0.03, *(two._taps(w) for w in (two.WALK, two.WALK_OF_TWO)), 3)
+    moves = moves._replace(walk_of_two=moves.walk_of_two.astype(np.float32))
+    cells = -0.4 + two.STEP * np.arange(G)
+    ranges = 20.0 + 0.5 * np.arange(n + first)
+    geometry = level_geometry(ranges, 15.0, math.radians(30.0), 0.5)
+    y, v, usable = bins(n, P, rng), rng.uniform(2.0, 9.0, n), np.ones(n, bool)
+    y[1:4] *= 0.5
+    usable[3] = False
+    start = rng.dirichlet(np.ones(G))
+    existence, height, variance = np.empty(n), np.empty((n, 2)), np.empty((n, 2))
+    two.smooth_stretch(
+        first, start, cells, y, v, usable, geometry, moves, existence, height, variance
+    )
+
+    states = oracle.states_of(G, 3)
+    reach = len(moves.walk) - 1
+    one, pair = (oracle.walk(G, w, two.STEP, reach) for w in (two.WALK, two.WALK_OF_TWO))
+    step_matrix = oracle.transition(states, one, pair, 0.02, 0.1, 0.03, G)
+    weights = np.zeros((n, len(states)))
+    for t in np.flatnonzero(usable):
+        depth = (15.0 - cells) / ranges[first + t]
+        sines = np.sin(np.arcsin(depth) - math.radians(30.0))
+        weights[t] = [oracle.log_likelihood(y[t], v[t], sines[list(s)], 0.5) for s in states]
+    begin = np.concatenate([start, np.zeros(len(states) - G)])
+    p = oracle.smooth(begin, step_matrix, weights)
+    assert existence == pytest.approx(p[:, G:].sum(axis=1), abs=1e-5)
+    assert 0.01 < existence.max() and existence[0] == 0.0
+    for side in (0, 1):
+        place = np.array([cells[s[side]] for s in states[G:]])
+        for t in range(1, n):
+            share = p[t, G:] / p[t, G:].sum()
+            mean = share @ place
+            assert height[t, side] == pytest.approx(mean, abs=1e-4)
+            assert variance[t, side] == pytest.approx(share @ (place - mean) ** 2, abs=1e-4)
+
+
+def test_existence_and_heights_of_the_prototype(monkeypatch):
+    monkeypatch.setattr(two, 'POSSIBLE', 0.05)  # where its own stretches begin
+    with np.load(VECTORS / 'pings.npz') as archive:
+        known = dict(archive)
+    parts = known['iq'].astype(np.float32)
+    iq = parts[..., 0] + 1j * parts[..., 1]
+    config = BathymetryConfig(layover='resolved', shadow_gate=False)
+    off, inside = [], []
+    for k, chain in enumerate(known['existence_chain']):
+        noise = np.ones(1200)
+        snapshot = evolve(
+            floor(0.0, ranges=known['r']),
+            iq=iq[k].astype(np.complex64),
+            noise_variance=noise,
+            signal_variance=signal_variance(mean_power(iq[k]), noise),
+        )
+        seen = look(Ping(config, snapshot, None))
+        second = seen.layover._replace(existence=chain.astype(float))
+        geometry = seen.swath.geometry
+        found = two.resolve(snapshot.iq, seen.likelihood, geometry, second, np.zeros(1200))
+        assert (np.abs(found.existence - known['existence_2'][k]) < 0.1).mean() >= 0.98
+        there = known['existence_2'][k] >= 0.5
+        off.append((found.height - known['heights'][k])[there])
+        inside.append(np.isfinite(found.height[:, 0]) == np.isfinite(known['heights'][k][:, 0]))
+    assert np.mean(inside) > 0.999
+    assert np.median(np.abs(np.concatenate(off)), axis=0) == pytest.approx(0.0, abs=0.08)
+    assert np.quantile(np.abs(np.concatenate(off)), 0.9) < 0.25
+
+
+@pytest.mark.parametrize(
+    'values',
+    [{}, {'model_set': 'height_rw_ncs'}, {'model_set': 'angle_two_rw'}, {'engine': 'grid'}],
+)
+def test_both_heights_of_a_step(values):
+    snapshot = step()
+    tracker, resolved = run(snapshot, **values)
+    _, gated = run(snapshot, 'gated', **values)
+    a, b = resolved.columns(), gated.columns()
+    assert [name for name in a if name not in b] == NEW
+    assert a['height_2'].dtype == a['height_2_std'].dtype == np.float32
+    double = a['surfaces'] == 2
+    assert double[152:198].mean() > 0.95
+    assert not double[:145].any() and not double[205:].any()
+    assert tracker.counts['bins_two'] == double.sum()
+    for name, true in (('height', 0.0), ('height_2', 2.0)):
+        error = a[name][double] - true
+        assert np.sqrt(np.mean(np.square(error))) < 0.25
+    std = a['height_2_std'][double]
+    assert np.mean(np.abs(a['height_2'][double] - 2.0) < 2.0 * std) > 0.9 and std.max() < 1.0
+    assert np.isnan(a['height_2'][~double]).all() and np.isnan(a['height_2_std'][~double]).all()
+    # The lower height is the state, with its variance, and the place is its own.
+    np.testing.assert_allclose(resolved.xyz[:, 2], a['height'] - 15.0, atol=1e-5)
+    # Bins that one wave does not explain are no longer silent.
+    assert ((b['surfaces'] == 0) & double).sum() > 3
+    single = ~double
+    for name in b:
+        if name not in ('existence_2', 'surfaces', 'valid'):
+            np.testing.assert_array_equal(a[name][single], b[name][single])
+    doubt = (a['existence_2'] > 0.3) & (a['existence_2'] < 0.5)
+    np.testing.assert_array_equal(a['valid'] == 0, doubt | (a['surfaces'] == 0))
+    assert (np.linalg.eigvalsh(resolved.covariance) > 0.0).all()
+
+
+def test_an_angle_has_the_height_of_the_lower_surface():
+    resolved = run(step(), model_set='angle_two_rw')[1]
+    double = resolved.extras['surfaces'] == 2
+    down = resolved.state[:, 0] + math.radians(30.0)
+    height = 15.0 - resolved.extras['range'] * np.sin(down)
+    np.testing.assert_allclose(height, resolved.extras['height'], atol=1e-9)
+    std = np.sqrt(resolved.covariance[:, 0, 0]) * resolved.extras['range'] * np.cos(down)
+    assert ((0.03 < std) & (std < 1.0))[double].all()
+
+
+def test_a_flat_floor_is_as_without():
+    snapshot = floor(0.0)
+    resolved, gated = (run(snapshot, value)[1] for value in ('resolved', 'gated'))
+    for name, column in gated.columns().items():
+        np.testing.assert_array_equal(resolved.columns()[name], column)
+    assert (resolved.extras['surfaces'] < 2).all()
+
+
+def test_a_burst_of_noise_is_no_pair():
+    snapshot = floor(0.0)
+    rng = np.random.default_rng(8)
+    iq = snapshot.iq.copy()
+    bursts = rng.uniform(size=len(iq)) < 0.1
+    iq[bursts] = 300.0 * rng.normal(size=(bursts.sum(), 8, 2)).view(complex)[..., 0]
+    made = run(evolve(snapshot, iq=iq))[1]
+    assert (made.extras['surfaces'][bursts] == 0).mean() > 0.8
+    assert (made.extras['surfaces'] == 2).mean() < 0.02
+
+
+def test_few_staves_are_gated_and_it_is_said():
+    tracker, made = run(step(P=3))
+    gated_by, gated = run(step(P=3), 'gated')
+    assert list(made.columns()) == list(gated.columns())
+    np.testing.assert_array_equal(made.extras['valid'], gated.extras['valid'])
+    assert any('four staves' in sentence for sentence in tracker.warnings())
+    assert not any('four staves' in sentence for sentence in gated_by.warnings())
+    assert not any('four staves' in sentence for sentence in run(step(P=4))[0].warnings())
+
+
+def test_heights_out_of_reach_are_no_trouble():
+    ranges = 14.0 + 0.02 * np.arange(120)  # the first ones end above the floor
+    snapshot = floor(0.0, ranges=ranges + 1.1)
+    snapshot = evolve(snapshot, range=ranges)
+    config = BathymetryConfig(layover='resolved', shadow_gate=False)
+    seen = look(Ping(config, snapshot, None))
+    everywhere = layover.Layover(np.ones(120), 0.0, np.ones(120, bool))
+    geometry = seen.swath.geometry
+    for level in (0.0, -30.0):  # the second one: nothing of the grid can be reached
+        found = two.resolve(
+            snapshot.iq, seen.likelihood, geometry, everywhere, np.full(120, level)
+        )
+        assert np.isfinite(found.existence).all()
+        assert ((found.existence >= 0.0) & (found.existence <= 1.0)).all()
+        assert np.isfinite(found.height[1:]).all()
+
+
+def test_stretches_have_a_margin_and_are_cut_where_they_are_long():
+    existence = np.zeros(10_000)
+    existence[[100, 115, 400]] = 1.0
+    existence[2000:9000] = 0.06
+    assert two.stretches(existence) == [
+        (90, 126),
+        (390, 411),
+        (1990, 5990),
+        (5990, 9010),
+    ]
+    assert two.stretches(np.zeros(50)) == []
+    assert two.stretches(np.ones(5)) == [(0, 5)]
+
+
+def test_the_grid_holds_both_ends_of_a_stretch():
+    ledge = np.concatenate([np.zeros(60), np.full(60, 3.0)])
+    cells = two._cells(ledge, 50, 70)
+    assert cells[0] == pytest.approx(-1.5) and cells[-1] == pytest.approx(4.5)
+    high = two._cells(2.0 * ledge, 50, 70)
+    assert high[0] == pytest.approx(-1.5) and high[-1] == pytest.approx(7.5)
+    assert len(two._cells(20.0 * ledge, 50, 70)) == two.MOST_CELLS
+
+
+def test_warm_compiles_what_resolved_needs():
+    tracker = BathymetryTracker(BathymetryConfig(layover='resolved'))
+    tracker.warm()
+    before = list(two.smooth_stretch.signatures)
+    assert before
+    run(step())
+    assert two.smooth_stretch.signatures == before
+
+
+@pytest.mark.parametrize('values', [{'multipath': True}, {'variant': 'paper'}])
+def test_surface_echoes_and_the_paper_leave_layover_alone(values):
+    assert not set(NEW) & set(run(floor(0.0), **values)[1].extras)
