@@ -149,7 +149,10 @@ def test_noise_that_grows_with_the_depth_is_measured(stack):
     assert (np.diff(found) >= 0.0).all()
     # A mean of four envelopes has less rms than one, by the spread that is averaged.
     scale = np.sqrt(np.pi / 4.0 + (1.0 - np.pi / 4.0) / stack)
-    assert found == pytest.approx(scale * true, rel=0.45)
+    # Just below the floor what scatters there cannot be told from it.
+    ratio = found / (scale * true)
+    assert ratio.min() > 0.8 and ratio.max() < 1.7
+    assert np.delete(ratio, np.arange(50, 110)).max() < 1.25
     assert noise_by_depth(line(), stack, 1e-3) is None
 
 
