@@ -95,19 +95,19 @@ def layover(
     """The second surface along a ping: iq (n, P), local variance of signal and noise (n,) at a
     stave, spacing of the staves in wavelengths; bins that are not usable (n,) say nothing.
 
-    loud (n,): bins that are usable, too, if two waves leave no more of them than noise. The staves
-    of such bins do not agree, which one wave would demand.
+    loud (n,): bins that are called usable, too, if two waves leave no more of them than noise. The
+    staves of such bins do not agree, which one wave would demand; the chain leaves them out.
     """
     staves = iq.shape[1]
     _, one, two = residuals(iq, spacing)
     snr = signal / noise
     error = array_error(one / noise, snr, staves, usable)
     larger = 1.0 + error * snr
+    level = 2.0 * (np.sqrt(one) - np.sqrt(two)) / np.sqrt(noise * larger)
+    evidence = np.where(usable, log_ratio(level, snr / larger, staves), 0.0)
     if loud is not None and staves > 2:
         most = float(gammaincinv(staves - 2.0, LEFT))
         usable = usable | loud & (two < most * noise * larger)
-    level = 2.0 * (np.sqrt(one) - np.sqrt(two)) / np.sqrt(noise * larger)
-    evidence = np.where(usable, log_ratio(level, snr / larger, staves), 0.0)
     return Layover(existence(evidence), error, usable)
 
 

@@ -48,7 +48,7 @@ from ...estimation.elementary import exponentials, phasors
 from ...estimation.jit import kernel
 from .kernels import Geometry, PingLikelihood, sines_of
 
-POSSIBLE, MARGIN = 0.02, 10
+POSSIBLE, MARGIN = 0.05, 10
 """A stretch is where the chain says more than this, and so many bins around it."""
 EXISTS = 0.5
 """From this probability on both surfaces are soundings."""

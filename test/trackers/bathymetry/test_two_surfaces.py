@@ -118,8 +118,7 @@ def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
             assert variance[t, side] == pytest.approx(share @ (place - mean) ** 2, abs=1e-4)
 
 
-def test_existence_and_heights_of_the_prototype(monkeypatch):
-    monkeypatch.setattr(two, 'POSSIBLE', 0.05)  # where its own stretches begin
+def test_existence_and_heights_of_the_prototype():
     with np.load(VECTORS / 'pings.npz') as archive:
         known = dict(archive)
     parts = known['iq'].astype(np.float32)
