@@ -25,7 +25,6 @@ from .common import example, json_option, print_json, say
 
 @click.command(
     epilog=example(
-        'sonar-imm track port.bag port && sonar-imm track starboard.bag starboard',
         'sonar-imm fuse port starboard both',
         'sonar-imm evaluate both',
     )

@@ -42,11 +42,12 @@ import math
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold
 from ...estimation.small_matrices import add_jitter_all
 from .config import DiverConfig
 from .fix_kernels import update_heights
+from .jipda import Association
 from .scan import Height, Ping, Positions
 from .state import DiverState, HeightCounts
 from .state_space import Layout, ModelSet
@@ -103,17 +104,19 @@ def _set(
 def update(
     now: DiverState,
     fixes: Positions,
-    tracks: IndexArray,
-    detection: IntArray,
-    weight: FloatArray,
+    association: Association,
     layout: Layout,
     place: int,
     config: DiverConfig,
 ) -> DiverState:
-    """The `tracks` (t,) after the heights of the `fixes` that they took, `detection` (t,), each
-    with the probability `weight` (t,) that it is the track's; place: of z in the state."""
-    heights = fixes.heights
-    assert heights is not None
+    """The tracks after the heights of the `fixes` that are theirs; place: of z in the state."""
+    heights, tracks, detection = fixes.heights, association.tracks, association.detection
+    if heights is None or not len(tracks):
+        return now
+    weight, weights = np.ones(len(tracks)), association.weights
+    if weights is not None:
+        share = weights.beta[tracks, detection] / weights.existence[tracks]
+        weight = np.minimum(share, 1.0)
     stated = np.isfinite(heights.value[detection])
     tracks, detection, weight = tracks[stated], detection[stated], weight[stated]
     if not len(tracks):

@@ -145,10 +145,8 @@ class DiverTracker:
         tracker = self._for_warming()
         for second in (1, 2):
             for x in (0.0, 0.1):
-                position = np.array([x, 0.0, 0.0])
-                covariance = np.eye(self.config.dimensions)
-                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=covariance)
-                tracker.process(fix)
+                stamp_ns, at, P = second * 10**9, (x, 0.0, 0.0), np.eye(self.config.dimensions)
+                tracker.process(Fix(stamp_ns=stamp_ns, position=at, covariance=P))
 
     def _warm_echoes(self) -> None:
         self._warm_pings(np.zeros(3))
@@ -202,11 +200,8 @@ class DiverTracker:
     def warnings(self) -> list[str]:
         """What of the input cannot be true or used, in sentences for the user."""
         state, advice = self._stream.state, 'check var_toa, var_bearing and toa_std'
-        unstated = [
-            name
-            for name in ('receiver_position_std', 'receiver_clock_std', 'sound_speed_std')
-            if not getattr(self.config, name)
-        ]
+        stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
+        unstated = [name for name in stds if not getattr(self.config, name)]
         if self.config.dimensions == 2:
             unstated.insert(0, 'target_z (or dimensions: 3)')
         if unstated:
@@ -425,19 +420,10 @@ class DiverTracker:
             now = self._with_scale(now, fixes, tracks, detection)
         return now
 
-    def _update_heights(
-        self, now: DiverState, fixes: Positions, association: Association
-    ) -> DiverState:
+    def _update_heights(self, now: DiverState, fixes: Positions, found: Association) -> DiverState:
         """The tracks after what the fixes that are theirs state of z."""
-        if fixes.heights is None or not len(association.tracks):
-            return now
-        tracks, row, weights = association.tracks, association.detection, association.weights
-        probability = np.ones(len(tracks))
-        if weights is not None:
-            share = weights.beta[tracks, row] / weights.existence[tracks]
-            probability = np.minimum(share, 1.0)
         layout, place = self._layout(now.instruments), self.models.height
-        return heights.update(now, fixes, tracks, row, probability, layout, place, self.config)
+        return heights.update(now, fixes, found, layout, place, self.config)
 
     def _with_scale(
         self, now: DiverState, fixes: Positions, tracks: IndexArray, detection: IntArray
