@@ -27,6 +27,7 @@ from sonar_imm.trackers.obstacle.filters import (
     BAND,
     beam_of,
     depth_span,
+    Hints,
     Mixture,
     Sonar,
     two_way_echo,
@@ -55,7 +56,9 @@ class Landmark:
     def ready(self, sonar: Sonar) -> bool:
         return True
 
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
+    ) -> Mixture:
         lowest, highest = depth_span(z, sonar, self.config)
         seen = np.zeros((len(z), 4))
         seen[:, :2], seen[:, 2] = z, sonar.pose.position[2] + 0.5 * (lowest + highest)

@@ -239,8 +239,9 @@ def _type_problem(spec: ParameterSpec, given: Parameter) -> str | None:
 
 
 def _is_empty_list(spec: ParameterSpec, given: Parameter) -> bool:
-    """Recognize ``name: []``, which arrives without a type."""
-    return given.type_ == Parameter.Type.NOT_SET and spec.kind.endswith('[]')
+    """Recognize ``name: []``, which arrives without a type, or with that of bytes."""
+    untyped = Parameter.Type.NOT_SET, Parameter.Type.BYTE_ARRAY
+    return spec.kind.endswith('[]') and given.type_ in untyped and not given.value
 
 
 def _plain_values(parameters: Iterable[Parameter]) -> dict[str, Any]:

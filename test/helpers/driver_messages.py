@@ -19,6 +19,18 @@ from functools import cache
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 DEFINITIONS = {
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
+    'vision_msgs/msg/ObjectHypothesisWithPose': (
+        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+    ),
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
+    'vision_msgs/msg/Detection3D': (
+        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
+        'vision_msgs/BoundingBox3D bbox\nstring id\n'
+    ),
+    'vision_msgs/msg/Detection3DArray': (
+        'std_msgs/Header header\nvision_msgs/Detection3D[] detections\n'
+    ),
     'geographic_msgs/msg/GeoPoint': 'float64 latitude\nfloat64 longitude\nfloat64 altitude\n',
     'geographic_msgs/msg/GeoPose': (
         'geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation\n'
