@@ -42,7 +42,8 @@ PROMISE = {
 """By recording, else by system: largest difference of any number, as a share of the largest
 magnitude in its column. Measured between Prescott and SkylakeX, with numpy's AVX2 and AVX-512
 loops off and on: bathymetry 2e-12 (a ship that moves; at rest 4e-16), diver 3e-13, obstacle 2e-9,
-fathometer 8e-12; two surfaces in a bin 1.5e-9 between Prescott and Haswell. Spectra of pressure are computed in single precision, which the inverse of their
+fathometer 8e-12; two surfaces in a bin 1.5e-9 between Prescott and Haswell. Spectra of pressure
+are computed in single precision, which the inverse of their
 matrix makes 6e-6: that moves some particles to other cells, a depth by 3e-6 and a covariance by
 .015."""
 

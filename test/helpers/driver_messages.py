@@ -101,6 +101,8 @@ def _zero(name):
             import numpy as np
 
             made.append(np.zeros(detail[1]))
+        elif node.name == 'SEQUENCE':
+            made.append([])
         else:
             kind = detail[0]
             made.append(
