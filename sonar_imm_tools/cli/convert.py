@@ -54,22 +54,20 @@ class Convert(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        named = bool(args) and args[0] not in self.commands
-        if named and not Path(args[0]).exists() and Path(args[0]).suffix:
-            ctx.fail(f'{args[0]} does not exist')
-        if named and Path(args[0]).exists():
+        if not args or args[0] in self.commands:
+            return super().resolve_command(ctx, args)
+        source = Path(args[0])
+        if source.exists():
             from ..recordings.sniffing import sniff
 
-            guess = sniff(Path(args[0]))
-            taken = f'{args[0]} is taken for {guess.why}: convert {guess.kind}'
+            guess = sniff(source)
+            taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
             click.echo(visible(taken), err=True)
-            args = [guess.kind, *(args if len(args) > 1 else (*args, _beside(args[0])))]
+            # Where no bag is named it is made in the folder of the command.
+            args = [guess.kind, *args, *([f'{source.stem}.bag'] if len(args) == 1 else [])]
+        elif source.suffix:
+            ctx.fail(f'{source} does not exist')
         return super().resolve_command(ctx, args)
-
-
-def _beside(source: str) -> str:
-    """The bag that is made where none is named: beside the file, or in this folder."""
-    return f'{Path(source).stem}.bag'
 
 
 @click.group(

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,15 @@ def _export_map(
     say(f'{out}: {len(landmarks)} obstacles')
 
 
+def _to_degrees(epsg: int, origin: tuple[float, float, float]) -> Callable[[Any], Any]:
+    """Longitude and latitude (n,) of places (n, 2) in metres from `origin`."""
+    import numpy as np
+
+    from ..recordings.export.points import degrees_of
+
+    return lambda places: degrees_of(places + np.array(origin[:2]), epsg)
+
+
 def _export_tracks(
     run: Path,
     out: Path,
@@ -174,19 +184,10 @@ def _export_tracks(
     as_json: bool,
 ) -> None:
     """Tracks of a run of divers or obstacles."""
-    import numpy as np
-
     from ..offline.run_folder import RunFolder
-    from ..recordings.export.points import degrees_of
     from ..recordings.export.tracks import tracks_of, write_tracks
 
-    degrees = None
-    if epsg is not None:
-        number = epsg
-
-        def degrees(places: Any) -> Any:
-            return degrees_of(places + np.array(origin[:2]), number)
-
+    degrees = None if epsg is None else _to_degrees(epsg, origin)
     tracks = tracks_of(RunFolder(run).read_estimates(), degrees)
     with whole(out) as unfinished:
         left_out = write_tracks(unfinished, tracks, kind, run.name)
@@ -210,21 +211,18 @@ def _export_horizons(
     as_json: bool,
 ) -> None:
     """Picks of a run of the fathometer; record: its run.json."""
-    import numpy as np
 
     from ..offline.run_folder import RunFolder
     from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
     from ..recordings.export.picks import write_picks
-    from ..recordings.export.points import degrees_of
     from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader
     from ..recordings.sources import BagError
 
     if record['system'] != 'fathometer':
-        raise BagError(
-            f'{run} is of {record["system"]}: .{out.suffix[1:]} is for the tracks of divers and '
-            'obstacles and the horizons of the fathometer'
-        )
+        raise BagError(f'{run} is of {record["system"]}: only the fathometer has horizons')
+    if kind not in HORIZON_FORMATS:
+        raise BagError(f'{run} is of the fathometer: .{kind} is for tracks')
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
         raise click.UsageError(
@@ -237,9 +235,7 @@ def _export_horizons(
         with BagReader(record['bag']) as bag:
             positions, notes = read_positions(bag), bag.custom_data
             if positions is None and epsg is not None:
-                positions = read_navigated(
-                    bag, lambda places: degrees_of(places + np.array(origin[:2]), epsg)
-                )
+                positions = read_navigated(bag, _to_degrees(epsg, origin))
             elif positions is None and kind == 'geojson' and navigation_topics(bag):
                 raise BagError(
                     'the recording has navigation in metres: say with --epsg and --origin where '

@@ -20,7 +20,7 @@ Columns with other names are mapped by hand. A row that cannot be read raises `B
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import csv
 from datetime import datetime, timedelta, timezone, tzinfo
@@ -245,11 +245,8 @@ class Row:
 
     def stamp_ns(self, name: str = 'stamp') -> int:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
-        parts = TIME_TEXT.match(self._moment(name))
-        if parts:
-            date, clock, fraction, zone = parts.groups()
-            stamp = iso_ns(date, clock, fraction, zone_of(zone or self._zone(name)))
-        else:
+        stamp = moment_ns(self._moment(name), lambda: self._zone(name))
+        if stamp is None:
             stamp = self.seconds_ns(name)
         stamp += self.table.options.time_offset_ns
         if not stamp and self.table.counts_from_zero(name):
@@ -463,6 +460,16 @@ def zone_of(name: str) -> tzinfo:
         raise BagError(
             f"there is no time zone '{name}'; write UTC, +02:00 or Europe/Berlin"
         ) from None
+
+
+def moment_ns(text: str, zone: Callable[[], str]) -> int | None:
+    """Nanoseconds since 1970 of a date and a time of day, in the zone that `zone` gives where the
+    text names none; None for other texts. Raises `BadRow` and `BagError`."""
+    parts = TIME_TEXT.match(text)
+    if parts is None:
+        return None
+    date, clock, fraction, named = parts.groups()
+    return iso_ns(date, clock, fraction, zone_of(named or zone()))
 
 
 def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:

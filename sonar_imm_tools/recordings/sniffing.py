@@ -16,14 +16,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-import re
 import zipfile
 
 from attrs import frozen
-import numpy as np
 
 from sonar_imm.trackers import SYSTEMS
 
+from .convert.arrivals import names_tags
+from .convert.nmea import SENTENCE
 from .convert.snapshots import NAMES as SNAPSHOT_NAMES
 from .csv_table import CsvTable
 from .reader import BagReader
@@ -92,7 +92,8 @@ def _of_bag(path: Path) -> Guess:
 
 def _of_archive(path: Path) -> Guess:
     try:
-        names = {Path(name).stem for name in zipfile.ZipFile(path).namelist()}
+        with zipfile.ZipFile(path) as packed:
+            names = {Path(name).stem for name in packed.namelist()}
     except (OSError, zipfile.BadZipFile):
         raise BagError(f'{path} is a damaged archive') from None
     if names & set(SNAPSHOT_NAMES['iq']):
@@ -111,8 +112,8 @@ def _is_segy(start: bytes) -> bool:
     code that exists."""
     if len(start) < 3600 or start[:1] not in (b'\xc3', b'C'):
         return False
-    code, samples = np.frombuffer(start[3220:3226], '>i2')[[2, 0]]
-    return 1 <= code <= 16 and samples != 0
+    code = int.from_bytes(start[3224:3226], 'big')
+    return 1 <= code <= 16 and any(start[3220:3222])
 
 
 def _unread(start: bytes) -> str:
@@ -126,10 +127,9 @@ def _unread(start: bytes) -> str:
 
 
 def _is_nmea(start: bytes) -> bool:
-    lines = [line for line in start.splitlines()[:20] if line.strip()]
-    found = sum(
-        bool(re.search(rb'(^|[\s\\,;])[$!][A-Z]{4,6},.*\*[0-9A-Fa-f]{2}', line)) for line in lines
-    )
+    text = start.decode('ascii', errors='replace')
+    lines = [line for line in text.splitlines()[:20] if line.strip()]
+    found = sum(SENTENCE.match(line) is not None for line in lines)
     return 2 * found >= max(len(lines) - 1, 1)
 
 
@@ -138,7 +138,7 @@ def _of_table(table: CsvTable) -> Guess:
     why = f'a table with the columns {columns}'
     if table.has('receiver', 'toa') or table.has('receiver', 'ping', 'arrival'):
         return Guess('arrivals', why)
-    if table.has('receiver', 'tag', 'stamp') and _names_tags(table):
+    if table.has('receiver', 'stamp') and names_tags(table):
         return Guess('detections', f'{why}: which receiver heard which tag')
     if table.has('stamp', 'depth', 'amplitude'):
         return Guess('traces', why)
@@ -156,8 +156,3 @@ def _of_table(table: CsvTable) -> Guess:
         f'divers (sonar-imm convert fixes IN OUT --column {flag}=HEADER), or relative, arrivals, '
         'detections or traces; sonar-imm convert lists them'
     )
-
-
-def _names_tags(table: CsvTable) -> bool:
-    """Whether tags have a column of their own beside the receivers."""
-    return table.index['tag'] != table.index['receiver']

@@ -114,8 +114,6 @@ def said_of_topics(
     for topic in bag.topics:
         if topic.name in used or 'truth' in topic.name.split('/'):
             continue
-        if any(f'topic {topic.name} ' in problem for problem in bag.problems):
-            continue  # it was said why
         entries = [entry for entry in inputs_of(system) if _can_read(topic, entry)]
         could = [e.name for e in entries if e.may_be(topic.name, topic.type_name)]
         # What has the name of an input and is not used would only help what is not there.

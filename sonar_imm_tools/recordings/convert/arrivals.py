@@ -196,11 +196,11 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
         _variance(row, 'elevation'),
         row.optional('depth'),
         _variance(row, 'depth'),
-        row.text('tag') if passive and _names_tags(row.table) else '',
+        row.text('tag') if passive and names_tags(row.table) else '',
     )
 
 
-def _names_tags(table: Table) -> bool:
+def names_tags(table: Table) -> bool:
     """Whether a column says which tag was heard, and not which receiver has heard it."""
     return table.has('tag') and table.index['tag'] != table.index.get('receiver')
 

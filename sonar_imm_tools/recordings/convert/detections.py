@@ -101,6 +101,7 @@ def convert_detections(
     table = CsvTable(path, how.options)
     table.require('stamp', 'receiver', 'tag')
     names = list(places)
+    numbers = {name: k for k, name in enumerate(names)}
 
     def parse(row: Row) -> tuple[int, str, int]:
         receiver, tag = row.text('receiver'), row.text('tag')
@@ -108,7 +109,7 @@ def convert_detections(
             raise BadRow(f"the position of receiver '{receiver}' is not known", 'unknown receiver')
         if not tag:
             raise BadRow('the tag is empty')
-        return names.index(receiver), tag, row.stamp_ns()
+        return numbers[receiver], tag, row.stamp_ns()
 
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))

@@ -32,7 +32,7 @@ from sonar_imm.measurements import Pressure, Rejection
 from ... import SECOND
 from ..conversion import ConversionReport, provenance
 from ..convert_options import HydrophonesOptions
-from ..csv_table import BadRow, iso_ns, TIME_TEXT, zone_of
+from ..csv_table import BadRow, moment_ns
 from ..messages import ros_message
 from ..sources import BagError
 from ..writer import BagWriter
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 LONGEST_BLOCK = 2**24
 """Samples of all channels in a block."""
 FULL_SCALE = 2**15
-_NAMED = re.compile(r'(?<!\d)(20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
+_NAMED = re.compile(r'(?<!\d)(?:20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
 
 
 def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
@@ -63,7 +63,6 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
                 f'blocks of {how.block:g} s have {rows * sound.channels} samples; say a shorter '
                 '--block'
             )
-        whole = sound.subtype == 'PCM_16'
         report.notes['sound'] = (
             f'{sound.channels} channels, {sound.samplerate} Hz, '
             f'{sound.frames / sound.samplerate:.1f} s, {sound.subtype}'
@@ -71,7 +70,7 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
         report.notes['full scale'] = f'{how.full_scale:g} Pa'
         notes = provenance(path.name, report.notes)
         with BagWriter(report.path, storage=how.storage, custom_data=notes) as bag:
-            _write_blocks(sound, bag, report, how, channels, start_ns, rows, whole)
+            _write_blocks(sound, bag, report, how, channels, start_ns, rows)
             if not bag.count:
                 raise BagError(f'{path} holds no block of sound that could be converted')
     return report
@@ -85,14 +84,13 @@ def _write_blocks(
     channels: list[int],
     start_ns: int,
     rows: int,
-    whole: bool,
 ) -> None:
-    done = 0
+    source, whole, done = Path(sound.name), sound.subtype == 'PCM_16', 0
     while True:
         try:
             samples = sound.read(rows, dtype='int16' if whole else 'float32', always_2d=True)
         except RuntimeError as error:
-            report.problems.append(f'{report.path.name}: the rest cannot be read: {error}')
+            report.problems.append(f'{source.name}: the rest cannot be read: {error}')
             return
         if len(samples) < 2:
             return
@@ -111,7 +109,7 @@ def _write_blocks(
                 scale=scale,
             )
         except Rejection as error:
-            report.bad_row(Path(sound.name), f'{done / sound.samplerate:.1f} s', error)
+            report.bad_row(source, f'{done / sound.samplerate:.1f} s', error)
             continue
         bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
         report.messages['/pressure'] = report.messages.get('/pressure', 0) + 1
@@ -140,23 +138,18 @@ def _channels(sound: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[
 
 def _start_ns(path: Path, how: HydrophonesOptions) -> int:
     """When the first sample was taken, from the option or the name of the file."""
-    if how.start:
-        parts = TIME_TEXT.match(how.start)
-        if parts is None:
-            raise BagError(f"'{how.start}' is no time; write 2024-05-31T10:00:00Z")
-        day, clock, fraction, zone = parts.groups()
-        return _stamp(day, clock, fraction, zone or how.time_zone)
-    found = _NAMED.search(path.stem)
-    if found is None:
-        raise BagError(
-            f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z'
-        )
-    year, month, day, hour, minute, second = found.groups()[1:]
-    return _stamp(f'20{year}-{month}-{day}', f'{hour}:{minute}:{second}', None, how.time_zone)
-
-
-def _stamp(day: str, clock: str, fraction: str | None, zone: str) -> int:
+    text = how.start
+    if not text:
+        found = _NAMED.search(path.stem)
+        if found is None:
+            raise BagError(
+                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z'
+            )
+        text = '20{}-{}-{} {}:{}:{}'.format(*found.groups())
     try:
-        return iso_ns(day, clock, fraction, zone_of(zone))
+        start_ns = moment_ns(text, lambda: how.time_zone)
     except BadRow as error:
         raise BagError(str(error)) from None
+    if start_ns is None:
+        raise BagError(f"'{text}' is no time; write 2024-05-31T10:00:00Z")
+    return start_ns

@@ -26,6 +26,7 @@ it was true; its time is moved there.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from datetime import date as Date
 from datetime import datetime, timedelta, timezone
@@ -46,7 +47,7 @@ from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 from ... import SECOND
 from ..conversion import ConversionReport, Record
 from ..convert_options import FixesOptions, NmeaOptions
-from ..csv_table import BadRow, iso_ns, TIME_TEXT, zone_of
+from ..csv_table import BadRow, iso_ns, moment_ns
 from ..messages import ros_message
 from ..sources import BagError
 from ..track_files import TrackFile
@@ -61,7 +62,8 @@ LENGTHS = {'K': 1000.0, 'N': 1852.0, 'S': 1609.344}
 ACCURATE, INACCURATE = 5.0, 15.0
 """Standard deviation on each axis of an AIS position, m: the report says better or worse than
 10 m."""
-_SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,6},.*?\*[0-9A-Fa-f]{2})\s*$')
+SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,6},.*?\*[0-9A-Fa-f]{2})\s*$')
+"""A sentence, behind a time or a tag block where there is one."""
 _TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
 
 
@@ -79,7 +81,7 @@ class _Log:
     own: list[VesselFix] = Factory(list)
     headings: list[VesselHeading] = Factory(list)
     targets: list[dict[str, str]] = Factory(list)
-    unread: dict[str, int] = Factory(dict)
+    unread: Counter[str] = Factory(Counter)
 
 
 def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
@@ -106,8 +108,8 @@ def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> Conversion
             for heading in log.headings
         ]
     if log.unread:
-        counts = sorted(log.unread.items(), key=lambda item: -item[1])
-        report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts[:12])
+        counts = log.unread.most_common(12)
+        report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts)
     if not rows:
         first = f' (the first problem: {report.problems[0]})' if report.problems else ''
         raise BagError(f'{path} holds no position of a target{first}')
@@ -133,7 +135,7 @@ def _read(path: Path, report: ConversionReport, day: str) -> _Log:
     log = _Log(_day(day))
     wrong = (pynmea2.ParseError, pyais.exceptions.AISBaseException, BadRow, Rejection)
     for number, line in _lines(path):
-        found = _SENTENCE.match(line)
+        found = SENTENCE.match(line)
         if found is None:
             report.rows += 1
             report.bad_row(path, f'line {number}', 'is no sentence with a checksum')
@@ -179,9 +181,8 @@ def _stamp(before: str) -> int | None:
     text = before.split('\\')[0].strip(' \t,;[]')
     if not text:
         return None
-    if parts := TIME_TEXT.match(text):
-        day, clock, fraction, zone = parts.groups()
-        return iso_ns(day, clock, fraction, zone_of(zone or 'UTC'))
+    if (stamp_ns := moment_ns(text, lambda: 'UTC')) is not None:
+        return stamp_ns
     if re.fullmatch(r'\d{9,10}(\.\d+)?', text):
         return round(float(text) * 1e6) * 1000
     return int(text) * 10**6 if re.fullmatch(r'\d{12,13}', text) else None
@@ -211,7 +212,7 @@ def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     elif kind == 'TTM':
         _take_tracked(log, sentence)
     elif day is None:
-        log.unread[kind] = log.unread.get(kind, 0) + 1
+        log.unread[kind] += 1
 
 
 def _dated(sentence: Any) -> Date | None:
@@ -307,8 +308,7 @@ def _take_tracked(log: _Log, sentence: Any) -> None:
 
 def _take_ais(log: _Log, message: Any, stamp: int | None, own: bool) -> None:
     if not hasattr(message, 'lat') or message.msg_type not in (1, 2, 3, 18, 19, 27):
-        name = f'AIS {message.msg_type}'
-        log.unread[name] = log.unread.get(name, 0) + 1
+        log.unread[f'AIS {message.msg_type}'] += 1
         return
     if stamp is not None:
         log.clock = stamp

@@ -161,6 +161,7 @@ def test_segy_read_by_segyio_and_by_hand(tracked):
 @pytest.mark.parametrize(
     'name, options, words',
     [
+        ('tracks.gpx', [], 'is for tracks'),
         ('x.sgy', (), 'needs --segy'),
         ('x.txt', (), 'ends in none of'),
         ('line.seg', ('--segy', 'line.seg', '--overwrite'), 'stays as it is'),
