@@ -113,6 +113,8 @@ def _xtf_ping(head: Any, packet: Any, types: Any) -> Record:
     sides = {types.port.value: 'port', types.stbd.value: 'starboard'}
     channels = []
     for header, samples in zip(packet.ping_chan_headers, packet.data):
+        if len(samples) < header.NumSamples:
+            raise ValueError('a ping is cut off')
         info = (
             head.ChanInfo[header.ChannelNumber] if header.ChannelNumber < 6 else head.ChanInfo[0]
         )
@@ -123,26 +125,25 @@ def _xtf_ping(head: Any, packet: Any, types: Any) -> Record:
                 'samples': samples,
                 'slant_range': header.SlantRange,
                 'delay': header.TimeDelay,
-                'frequency': 1e3 * header.Frequency or info.Frequency,
+                'frequency': _hertz(header.Frequency or info.Frequency),
             }
         )
     try:
         stamp_ns = int(packet.get_time().astype('datetime64[ns]').astype(np.int64))
     except (ValueError, OverflowError):
         stamp_ns = -1
-    at_sensor = packet.SensorXcoordinate or packet.SensorYcoordinate
-    place = (
-        (packet.SensorXcoordinate, packet.SensorYcoordinate)
-        if at_sensor
-        else (packet.ShipXcoordinate, packet.ShipYcoordinate)
-    )
+    place = packet.SensorXcoordinate, packet.SensorYcoordinate
+    if not any(place):
+        place = packet.ShipXcoordinate, packet.ShipYcoordinate
+    units = {DEGREES: 'degrees', METRES: 'metres'}.get(head.NavUnits, '')
     return {
         'kind': 'ping',
         'stamp_ns': stamp_ns,
         'channels': channels,
         # Half the speed of sound is what many programs write there.
         'sound_speed': packet.SoundVelocity * (2.0 if packet.SoundVelocity < 1000.0 else 1.0),
-        'units': {DEGREES: 'degrees', METRES: 'metres'}.get(head.NavUnits, ''),
+        # Who has no position leaves it at zero.
+        'units': units if any(place) else '',
         'place': place,
         'heading': packet.SensorHeading or packet.ShipGyro,
         'pitch': packet.SensorPitch,
@@ -150,6 +151,11 @@ def _xtf_ping(head: Any, packet: Any, types: Any) -> Record:
         'depth': packet.SensorDepth,
         'altitude': packet.SensorPrimaryAltitude,
     }
+
+
+def _hertz(stated: float) -> float:
+    """A frequency of XTF, which some programs write in kHz."""
+    return 1e3 * stated if stated < 1e4 else stated
 
 
 def _simrad(path: str) -> Iterator[Record]:

@@ -14,6 +14,7 @@
 """Files of sonars, made by the writers of the libraries that read them."""
 
 from datetime import datetime, timedelta, timezone
+import struct
 
 import numpy as np
 
@@ -86,5 +87,85 @@ def side_scan(path, pings=60, bins=500, target=(3.0, 30.0), seed=1):
             starboard[round(target[1] / 50.0 * bins)] = 20_000.0
         samples = [port[::-1].astype('u2'), starboard.astype('u2')]
         parts.append(xtf_ping(seconds, samples, place_of(x, 0.0)))
+    path.write_bytes(b''.join(parts))
+    return path
+
+
+def ek80_datagram(kind, seconds, content):
+    """A datagram of a raw file: its length, type, time in 100 ns since 1601, content and length
+    again, as Kongsberg's EK80 interface specification has it."""
+    since = BEGIN - datetime(1601, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=seconds)
+    ticks = since // timedelta(microseconds=1) * 10
+    body = kind.encode() + struct.pack('<Q', ticks) + content
+    return struct.pack('<i', len(body)) + body + struct.pack('<i', len(body))
+
+
+def ek80(path, samples, chirp=False, channel='WBT 1-15 ES70', place=PLACE):
+    """A raw file with one channel; samples: (pings, bins, sectors), complex, 5 pings per second.
+    The datagrams with samples are written by the library."""
+    from themachinethatgoesping.echosounders import simradraw
+
+    def xml(seconds, text):
+        return ek80_datagram('XML0', seconds, text.encode())
+
+    pulse = 'FrequencyStart="55000" FrequencyEnd="90000"' if chirp else 'Frequency="70000"'
+    parts = [
+        xml(
+            0.0,
+            '<?xml version="1.0" encoding="utf-8"?><Configuration><Header ApplicationName="EK80" '
+            'Version="2.0.1.0" FileFormatVersion="1.23" TimeBias="0"/><Transceivers>'
+            '<Transceiver TransceiverName="WBT 1" SerialNumber="1" Impedance="5400" '
+            'RxSampleFrequency="1500000" TransceiverNumber="1" TransceiverType="WBT"><Channels>'
+            f'<Channel ChannelID="{channel}" ChannelIdShort="ES70" MaxTxPowerTransceiver="750" '
+            'PulseDuration="0.000256" PulseDurationFM="0.000512"><Transducer '
+            'TransducerName="ES70" SerialNumber="1" Frequency="70000" FrequencyMinimum="45000" '
+            'FrequencyMaximum="90000" Gain="27" SaCorrection="0" EquivalentBeamAngle="-20.7" '
+            'AngleSensitivityAlongship="23" AngleSensitivityAthwartship="23" '
+            'BeamWidthAlongship="7" BeamWidthAthwartship="7" BeamType="1"/></Channel></Channels>'
+            '</Transceiver></Transceivers><Transducers><Transducer TransducerName="ES70" '
+            'TransducerMounting="HullMounted" TransducerOffsetX="0" TransducerOffsetY="0" '
+            'TransducerOffsetZ="0"/></Transducers></Configuration>',
+        ),
+        xml(
+            0.0,
+            '<?xml version="1.0" encoding="utf-8"?><Environment Depth="28" Acidity="8" '
+            'Salinity="35" SoundSpeed="1490" Temperature="10" Latitude="54" '
+            'WaterLevelDraft="1"/>',
+        ),
+    ]
+    for k, iq in enumerate(samples):
+        seconds = 0.2 * k
+        latitude, longitude = place
+        moment = BEGIN + timedelta(seconds=seconds)
+        fix = (
+            f'GPGGA,{moment:%H%M%S}.{moment.microsecond // 10_000:02d},'
+            f'{int(latitude):02d}{latitude % 1 * 60:08.5f},N,'
+            f'{int(longitude):03d}{longitude % 1 * 60:08.5f},E,1,10,1.0,0.0,M,0.0,M,,'
+        )
+        for text in (fix, 'INHDT,90.0,T'):
+            total = 0
+            for letter in text:
+                total ^= ord(letter)
+            parts.append(ek80_datagram('NME0', seconds, f'${text}*{total:02X}'.encode()))
+        mode = 1 if chirp else 0
+        parts.append(
+            xml(
+                seconds,
+                '<?xml version="1.0" encoding="utf-8"?><Parameter><Channel '
+                f'ChannelID="{channel}" ChannelMode="0" PulseForm="{mode}" {pulse} '
+                'PulseDuration="0.000256" SampleInterval="4e-05" TransmitPower="750" '
+                'Slope="0.1" SoundVelocity="1490"/></Parameter>',
+            )
+        )
+        data, kinds = simradraw.datagrams.RAW3(), simradraw.datagrams.raw3datatypes
+        pairs = np.stack([iq.real, iq.imag], axis=-1).astype(np.float32)
+        data.set_channel_id(channel.ljust(128, '\0'))
+        data.set_timestamp(BEGIN.timestamp() + seconds)
+        data.set_data_type(kinds.t_RAW3DataType.ComplexFloat32)
+        data.set_number_of_complex_samples(iq.shape[1])
+        data.set_count(len(iq))
+        data.set_offset(0)
+        data.set_sample_data(kinds.RAW3DataComplexFloat32(np.ascontiguousarray(pairs)))
+        parts.append(ek80_datagram('RAW3', seconds, data.to_binary()[16:-4]))
     path.write_bytes(b''.join(parts))
     return path

@@ -212,9 +212,9 @@ class _Frame:
         """Where the ship was at a ping; None where the file does not say."""
         east, north = (float(value) for value in record['place'])
         geodetic = record['units'] == 'degrees'
-        known = all(map(math.isfinite, (east, north, record['heading']))) and (east or north)
-        on_earth = not geodetic or (abs(east) <= 180.0 and abs(north) <= 90.0)
-        if not (known and on_earth and record['units']):
+        known = all(map(math.isfinite, (east, north, record['heading'])))
+        on_earth = abs(east) <= 180.0 and abs(north) <= 90.0 and (east or north)
+        if not (known and record['units'] and (on_earth or not geodetic)):
             self.missing += 1
             return None
         if geodetic:

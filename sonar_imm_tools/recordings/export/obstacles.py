@@ -18,13 +18,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .horizons import utc_text
+from .horizons import feature, utc_text, write_features
 from .points import degrees_of
 
 
@@ -55,7 +54,5 @@ def write_obstacles(
             round(float(latitude[k]), 8),
             round(float(places[k, 2]), 3),
         ]
-        geometry = {'type': 'Point', 'coordinates': place}
-        features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
-    content = {'type': 'FeatureCollection', 'features': features}
-    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
+        features.append(feature('Point', place, properties))
+    write_features(path, features)

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 import csv
-import json
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -35,7 +34,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..sources import BagError
-from .horizons import utc_text
+from .horizons import feature, utc_text, write_features
 
 Degrees = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Longitude and latitude (n,) of places (n, 2) in metres."""
@@ -205,20 +204,18 @@ def _write_geojson(path: Path, tracks: Tracks, name: str) -> None:
         style = {'stroke': COLOURS[turn % len(COLOURS)], 'stroke-width': 2}
         points = [tracks.row(int(k)) for k in rows]
         if len(points) > 1:
-            line = {'type': 'LineString', 'coordinates': [_place(point) for point in points]}
             about = {
                 'track_id': number,
                 'begin_utc': points[0]['time_utc'],
                 'end_utc': points[-1]['time_utc'],
             }
-            features.append({'type': 'Feature', 'geometry': line, 'properties': about | style})
+            places = [_place(point) for point in points]
+            features.append(feature('LineString', places, about | style))
         for point in points:
-            place = {'type': 'Point', 'coordinates': _place(point)}
             about = {key: value for key, value in point.items() if key not in _PLACE}
             about |= {'marker-color': style['stroke'], 'marker-size': 'small'}
-            features.append({'type': 'Feature', 'geometry': place, 'properties': about})
-    content = {'type': 'FeatureCollection', 'name': name, 'features': features}
-    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
+            features.append(feature('Point', _place(point), about))
+    write_features(path, features, name=name)
 
 
 _PLACE = ('latitude', 'longitude', 'z')
