@@ -23,7 +23,7 @@ A ping whose clock is off for itself is left out; a clock that was set is follow
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -446,9 +446,9 @@ def _turns(samples: np.ndarray, radians_per_count: float | None) -> np.ndarray:
 
 def _split_beam(ping: Record, how: Ek80Options) -> Snapshot:
     """The halves, or the chosen sums, of the sectors of a split beam."""
-    iq, speed = ping['iq'], _speed(ping)
+    iq, speed = ping['iq'][1:], _speed(ping)  # the first sample lies at range 0
     sectors = iq.shape[1]
-    staves = how.staves or HALVES.get(sectors, ())
+    staves: Sequence[Sequence[int]] = how.staves or HALVES.get(sectors, ())
     if len(staves) < 2 or any(not 0 <= k < sectors for stave in staves for k in stave):
         raise Rejection('bad_staves', f'it has {sectors} sectors; --staves says which to take')
     interval = float(ping['sample_interval'])
@@ -457,7 +457,7 @@ def _split_beam(ping: Record, how: Ek80Options) -> Snapshot:
     return Snapshot(
         stamp_ns=ping['stamp_ns'],
         frame_id=how.frame_id,
-        range=np.arange(len(iq)) * 0.5 * speed * interval,
+        range=np.arange(1, 1 + len(iq)) * 0.5 * speed * interval,
         iq=np.stack([iq[:, list(stave)].sum(axis=1) for stave in staves], axis=1),
         sound_speed=speed,
         frequency=float(ping['frequency']),
@@ -479,12 +479,13 @@ def _table_of(folder: Path, named: Path | str | None) -> Path:
 
 def _picture_row(row: Row, how: PicturesOptions) -> Record:
     """What the table says of a picture. Raises `BadRow`."""
-    given = {name: row.optional(name) for name in ('near_range', 'far_range', 'fov')}
+    usual = {'near_range': how.near_range, 'far_range': how.far_range, 'fov': how.fov}
+    given = {name: row.optional(name) for name in usual}
     near, far, fov = (
-        default if math.isnan(given[name]) else given[name]
-        for name, default in zip(given, (how.near_range, how.far_range, how.fov))
+        (default or 0.0) if math.isnan(given[name]) else given[name]
+        for name, default in usual.items()
     )
-    if far is None or fov is None or not 0.0 <= near < far or not 0.0 < fov <= 360.0:
+    if not (0.0 <= near < far and 0.0 < fov <= 360.0):
         raise BadRow('does not say its ranges and directions: --far-range and --fov', 'geometry')
     geodetic = row.table.has('latitude', 'longitude')
     names = ('longitude', 'latitude') if geodetic else ('x', 'y')
