@@ -103,26 +103,31 @@ def diver_models(name: str, config: Config) -> OwnSet:
     """The model set of that name. Raises ConfigError."""
     made = _made('model_set', name, config, ('models', 'transition', 'start'))
     try:
-        joint = Joint(made.models)
-        for model in joint.models:
-            if tuple(model.components[:2]) != ('px', 'py'):
-                raise ValueError(f"the components of model '{model.name}' have to begin px, py")
-            if not _WORD.fullmatch(model.name):
-                raise ValueError(f"'{model.name}' cannot name a column; letters, digits, _ can")
-        if lacking := sorted(set(joint.components[2:]) - set(made.start)):
-            raise ValueError(f'start lacks {", ".join(lacking)}')
-        law = [(0.0, 1.0)] * 2 + [made.start[name] for name in joint.components[2:]]
-        mean, std = np.array(law, np.float64).T
-        if not (np.isfinite(mean).all() and np.isfinite(std).all() and (std > 0.0).all()):
-            raise ValueError('start needs finite means, and standard deviations above 0')
-        transition = check_transition_matrix(made.transition)
-        if len(transition) != len(joint.names):
-            raise ValueError(f'transition needs a row for each of {len(joint.names)} models')
-        found = OwnSet(joint, transition, mean, std**2)
-        if not all(np.isfinite(part).all() for part in found.motion(1.0)):
-            raise ValueError('a motion depends on the state; the diver tracker takes linear ones')
+        return checked(made)
     except Exception as error:
         raise _wrong('model_set', name, error) from error
+
+
+def checked(made: DiverModels) -> OwnSet:
+    """What the diver tracker makes of a set. Raises ValueError."""
+    joint = Joint(made.models)
+    for model in joint.models:
+        if tuple(model.components[:2]) != ('px', 'py'):
+            raise ValueError(f"the components of model '{model.name}' have to begin px, py")
+        if not _WORD.fullmatch(model.name):
+            raise ValueError(f"'{model.name}' cannot name a column; letters, digits, _ can")
+    if lacking := sorted(set(joint.components[2:]) - set(made.start)):
+        raise ValueError(f'start lacks {", ".join(lacking)}')
+    law = [(0.0, 1.0)] * 2 + [made.start[name] for name in joint.components[2:]]
+    mean, std = np.array(law, np.float64).T
+    if not (np.isfinite(mean).all() and np.isfinite(std).all() and (std > 0.0).all()):
+        raise ValueError('start needs finite means, and standard deviations above 0')
+    transition = check_transition_matrix(made.transition)
+    if len(transition) != len(joint.names):
+        raise ValueError(f'transition needs a row for each of {len(joint.names)} models')
+    found = OwnSet(joint, transition, mean, std**2)
+    if not all(np.isfinite(part).all() for part in found.motion(1.0)):
+        raise ValueError('a motion depends on the state; the diver tracker takes linear ones')
     return found
 
 

@@ -13,3 +13,7 @@
 # limitations under the License.
 
 """The bathymetry tracker: the sea floor from side-scan array snapshots."""
+
+__all__ = ['config', 'tracker']
+
+__all__ = ['config', 'tracker']

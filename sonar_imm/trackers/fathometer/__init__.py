@@ -13,3 +13,7 @@
 # limitations under the License.
 
 """The fathometer tracker: sub-bottom reflectors from array noise or traces."""
+
+__all__ = ['config', 'tracker']
+
+__all__ = ['config', 'tracker']

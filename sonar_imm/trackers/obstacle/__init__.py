@@ -13,3 +13,7 @@
 # limitations under the License.
 
 """The obstacle tracker: obstacles ahead of a vehicle, with their vertical offset."""
+
+__all__ = ['config', 'tracker']
+
+__all__ = ['config', 'tracker']
