@@ -31,6 +31,7 @@ LIBRARY = {
     'sonar_imm.estimation.imm_filter.range_bearing': 'of the ready filter',
     'sonar_imm.estimation.kalman.update': 'one Kalman filter, without models',
     'sonar_imm.estimation.motion.ca': 'of the ready filter',
+    'sonar_imm.estimation.motion.ct': 'of the ready filter',
     'sonar_imm.estimation.motion.cv': 'of the ready filter',
     'sonar_imm.estimation.motion.hover': 'of the ready filter',
     'sonar_imm.estimation.particles.covariance': 'of a weighted set',

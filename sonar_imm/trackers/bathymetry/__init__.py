@@ -15,5 +15,3 @@
 """The bathymetry tracker: the sea floor from side-scan array snapshots."""
 
 __all__ = ['config', 'tracker']
-
-__all__ = ['config', 'tracker']

@@ -14,6 +14,4 @@
 
 """The diver tracker: divers from fixes or raw arrival times."""
 
-__all__ = ['config', 'tracker', 'smoothing']
-
 __all__ = ['config', 'smoothing', 'tracker']

@@ -15,5 +15,3 @@
 """The fathometer tracker: sub-bottom reflectors from array noise or traces."""
 
 __all__ = ['config', 'tracker']
-
-__all__ = ['config', 'tracker']

@@ -15,5 +15,3 @@
 """The obstacle tracker: obstacles ahead of a vehicle, with their vertical offset."""
 
 __all__ = ['config', 'tracker']
-
-__all__ = ['config', 'tracker']
