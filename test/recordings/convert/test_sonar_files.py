@@ -21,6 +21,7 @@ from helpers.sonar_files import ek80, side_scan, xtf_head, xtf_ping
 import numpy as np
 import pytest
 
+from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Snapshot
 from sonar_imm_tools.recordings import foreign
 from sonar_imm_tools.recordings.convert import (
@@ -28,6 +29,7 @@ from sonar_imm_tools.recordings.convert import (
     convert_kongsberg,
     convert_pictures,
     convert_xtf,
+    sonar_files,
 )
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
@@ -268,3 +270,30 @@ def test_pictures_that_cannot_be_used_are_counted(tmp_path, folder):
     (folder / 'other.csv').write_text('file\n')
     with pytest.raises(BagError, match='2 CSV files; name the one'):
         convert_pictures(folder, tmp_path / 'none')
+
+
+def test_soundings_of_a_multibeam_lie_beside_the_ship(tmp_path, monkeypatch):
+    """Heading east: forward is east, starboard south. The reader itself is not in this test."""
+    (tmp_path / 'a.kmall').write_bytes(b'\0\0\0\x10#IIP')
+    ping = {
+        'kind': 'ping',
+        'units': 'degrees',
+        'heading': 90.0,
+        'pitch': 0.0,
+        'roll': 0.0,
+        'depth': 1.0,
+        'altitude': float('nan'),
+        'soundings': np.array([[2.0, 10.0, 20.0], [np.nan, 0.0, 0.0]]),
+    }
+    lost = {'soundings': None, 'place': (10.0, 54.0)}
+    records = [
+        {**ping, 'stamp_ns': 1_717_149_600 * 10**9, 'place': (10.0, 54.0)},
+        {**ping, 'stamp_ns': 1_717_149_601 * 10**9, 'place': (0.0, 0.0)},
+        {**ping, 'stamp_ns': 1_717_149_602 * 10**9, **lost},
+    ]
+    monkeypatch.setattr(sonar_files, 'read_apart', lambda reader, path: iter(records))
+    report = convert_kongsberg(tmp_path / 'a.kmall', tmp_path / 'bag')
+    assert report.messages == {'/nav': 1, '/ground': 1} and report.bad_rows == 2
+    with BagReader(tmp_path / 'bag') as bag:
+        (found,) = [read_ground(item.message) for item in bag.messages(['/ground'])]
+    assert found.position == pytest.approx(np.array([[2.0, -10.0, -21.0]]), abs=1e-6)
