@@ -24,6 +24,8 @@ PACKAGE = 'sonar_imm'
 PACKAGES = (PACKAGE, f'{PACKAGE}_tools', 'msg_adapters')
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
+# Bytes. What is larger stays in the repository, and the demo of an installation simulates it.
+LARGEST_RECORDING = 850_000
 
 # By their folders, because sonar_imm.trackers cannot be imported before its dependencies are here.
 SYSTEMS = sorted(path.parent.name for path in (ROOT / PACKAGE / 'trackers').glob('*/tracker.py'))
@@ -94,7 +96,7 @@ def shared_files() -> list[tuple[str, list[str]]]:
     }
     for room in ('bags', 'config', 'launch'):
         for path in sorted((ROOT / room).rglob('*')):
-            if path.is_file():
+            if path.is_file() and (room != 'bags' or path.stat().st_size <= LARGEST_RECORDING):
                 name = path.relative_to(ROOT)
                 folder = f'share/{PACKAGE}/{name.parent.as_posix()}'
                 files.setdefault(folder, []).append(name.as_posix())

@@ -106,7 +106,7 @@ def run_checks(
     todo = [
         (path, system, name, topics)
         for system in systems
-        for path in ([bag] if bag else shipped_bags(system))
+        for path in ([bag] if bag else shipped_bags(system, folder))
         for name, topics in instruments_in(path, system).items()
     ]
     plays = [

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
+import shutil
 from typing import Any
 
 from attrs import asdict, frozen
@@ -34,7 +35,7 @@ from ..evaluation.judging import Check, Judgement
 from ..offline.batch import Job
 from ..offline.run_folder import BAG, CSV, RunFolder
 from ..offline.tracking import final_estimates, InputOptions
-from ..recordings.own_files import own_limit, own_parameters
+from ..recordings.own_files import LIMIT, own_limit, own_parameters, own_recipe
 from ..recordings.reader import BagReader
 from ..recordings.topics import instruments
 from ..replay.harness import LockstepResult, run_lockstep
@@ -96,12 +97,28 @@ class PlayedRecording:
         )
 
 
-def shipped_bags(system: str) -> list[Path]:
-    """The recordings of `system` that come with the package. Raises FileNotFoundError if none."""
-    found = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
-    if not found:
+def shipped_bags(system: str, scratch: Path) -> list[Path]:
+    """The recordings of `system` that come with the package.
+
+    An installation has the small ones only (setup.py): where it has none of a system, the first
+    is simulated into `scratch`. Raises FileNotFoundError if none is known, `BagError` without a
+    recipe.
+    """
+    known = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
+    if not known:
         raise FileNotFoundError(f'no recordings for {system} in {share_folder() / "bags"}')
-    return found
+    installed = [path for path in known if any(path.glob('*.mcap'))]
+    return installed or [_simulated(known[0], system, scratch / 'bags')]
+
+
+def _simulated(folder: Path, system: str, scratch: Path) -> Path:
+    """Make the recording that belongs into `folder`, with its limit, below `scratch`."""
+    from .simulate import command
+
+    made, recipe = scratch / folder.name, own_recipe(folder)
+    command.main([system, str(made), *recipe], standalone_mode=False)
+    shutil.copy(folder / LIMIT, made)
+    return made
 
 
 def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
