@@ -16,6 +16,7 @@
 
 from pathlib import Path
 import re
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -103,14 +104,19 @@ def shared_files() -> list[tuple[str, list[str]]]:
     return list(files.items())
 
 
+# Who maintains the package, and where it lives, is stated in package.xml only.
+MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
+MAINTAINER = MANIFEST.find('maintainer')
+
 setup(
     name=PACKAGE,
     version=version(),
-    description='Online multiple-model tracking for sonar: library, ROS 2 nodes and a command',
+    description=MANIFEST.findtext('description'),
     long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
-    maintainer='The sonar_imm developers',
-    maintainer_email='maintainers@example.org',  # see package.xml
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get('email'),
+    project_urls={url.get('type', 'website'): url.text for url in MANIFEST.iter('url')},
     license='Apache-2.0',
     classifiers=[
         'Development Status :: 4 - Beta',

@@ -43,8 +43,8 @@ PARAMETERS = 'parameters.yaml'
 LIMIT = 'check.yaml'
 _HEADS = {
     PARAMETERS: '# Parameters of the tracker that describe the instruments of this recording.\n',
-    LIMIT: '# The largest error that `sonar-imm check` allows on this recording, and what makes it\n'
-    '# again; see README.md.\n',
+    LIMIT: '# The largest error that `sonar-imm check` allows on this recording, and what makes\n'
+    '# it again; see README.md.\n',
 }
 
 
