@@ -36,7 +36,7 @@ from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .scoring import fix_series, score
 from .series import series_of
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, seen, summary_sentence
 from .truth import Truth
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
