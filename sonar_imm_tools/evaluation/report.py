@@ -36,21 +36,18 @@ from urllib.parse import quote
 
 from attrs import frozen
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-import numpy as np
 import plotly.graph_objects as go
 import plotly.offline
 
 from sonar_imm import __version__
 from sonar_imm.files import whole
 
-from .numbers import Card, Check, flatten, front
+from .numbers import Card, Check, counted, flatten, front
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
 """A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
 only the largest figures of a page are drawn by WebGL."""
-FINEST = 1e-4
-"""Numbers of a plot keep this share of their span, ten times finer than a pixel."""
 PLOTLYJS = 'plotly.min.js'
 
 
@@ -102,7 +99,7 @@ class Part:
         """What the checks and the stated uncertainty say, for the front page."""
         if self.failed:
             return f'FAILED: {", ".join(self.failed)}'
-        checked = [f'{len(self.checks)} checks ok'] if self.checks else []
+        checked = [f'{counted(len(self.checks), "check")} ok'] if self.checks else []
         return ', '.join([*checked, self.verdict or 'uncertainty not scored'])
 
     @property
@@ -206,24 +203,9 @@ def _gl_points(figure: go.Figure) -> int:
 
 def _packed_figure(accelerated: Sequence[go.Figure], figure: go.Figure) -> str:
     """Data and layout of a figure, `packed`."""
-    content = _shortened(figure.to_plotly_json())
+    content = figure.to_dict()
     if not any(figure is fast for fast in accelerated):
         for trace in content['data']:
             if trace['type'] == 'scattergl':
                 trace['type'] = 'scatter'
     return packed(go.Figure(content).to_json())
-
-
-def _shortened(values: Any) -> Any:
-    """With numbers in single precision where that is fine enough."""
-    if isinstance(values, Mapping):
-        return {name: _shortened(value) for name, value in values.items()}
-    if isinstance(values, (list, tuple)):
-        return [_shortened(value) for value in values]
-    if not isinstance(values, np.ndarray) or values.dtype != np.float64:
-        return values
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return values
-    coarse = np.spacing(np.float32(np.abs(finite).max()))
-    return values.astype(np.float32) if coarse <= FINEST * np.ptp(finite) else values

@@ -65,7 +65,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         # plotly, which only a report needs, takes a second to load.
         from .figures import sections
 
-        return sections(run, metrics, series, truth, raw)
+        return sections(run, metrics, series, truth, raw, config.origin())
 
     return Judgement(
         run=run,
