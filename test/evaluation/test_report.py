@@ -89,7 +89,7 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.headings, self.ids, self.loads, self._open = [], [], [], None
-        self.figures, self.cells, self.plotlyjs = [], [], ''
+        self.figures, self.cells, self.plotlyjs, self._inside_cell = [], [], '', False
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -99,7 +99,13 @@ class Page(HTMLParser):
         if 'data-figure' in attributes:
             self.figures.append(json.loads(unpacked(attributes['data-figure'])))
         self._open = attributes.get('id') if tag == 'script' else tag
-        self.cells += [''] if tag == 'td' else []
+        if tag == 'td':
+            self.cells.append('')
+            self._inside_cell = True
+
+    def handle_endtag(self, tag):
+        if tag == 'td':
+            self._inside_cell = False
 
     def handle_data(self, data):
         if self._open in ('h1', 'h2'):
@@ -107,7 +113,7 @@ class Page(HTMLParser):
             self._open = None
         elif self._open == 'plotlyjs':
             self.plotlyjs = data
-        elif self.cells:
+        elif self._inside_cell:
             self.cells[-1] += data.rstrip('\n')
 
 
