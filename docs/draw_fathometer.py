@@ -59,15 +59,13 @@ LINES = (
 )
 BLUE, RED, GREEN, AMBER, INK = '#0072B2', '#D55E00', '#009E73', '#E69F00', '#1b2733'
 COLOURS = (BLUE, RED, GREEN, '#CC79A7', AMBER, '#56B4E9')
-MEAN_OF = 15
 
 
 def main() -> None:
     plt.rcParams.update({'font.size': 9, 'axes.spines.top': False, 'axes.spines.right': False})
     draw_conventions()
     processed = drift(3)
-    with plt.rc_context({'font.size': 12}):
-        draw_paper(processed)
+    draw_paper(processed)
     draw_orders(processed)
     draw_fixed_orders(processed['mvdr'])
     if DATA.exists():
@@ -244,9 +242,8 @@ def drift(seed):
 
 
 def draw_paper(processed) -> None:
-    """As the paper's Figure 1: both processors, the tracks over them, the amplitudes with the mean
-    of `MEAN_OF` records."""
-    figure, axes = plt.subplots(3, 2, figsize=(12, 13), height_ratios=(1.2, 1.2, 1.2), sharex=True)
+    """As the paper's Figure 1: both processors, the tracks over them, the amplitudes."""
+    figure, axes = plt.subplots(3, 2, figsize=(12, 11), height_ratios=(1.4, 1.4, 1), sharex=True)
     for name, column in zip(('conventional', 'mvdr'), axes.T):
         records, value, depth = processed[name]
         extent = (-0.5, len(records) - 0.5, depth[-1], depth[0])
@@ -261,12 +258,9 @@ def draw_paper(processed) -> None:
                 for k, r in enumerate(records)
                 if track_id in r.found.track_id
             ]
-            where, strength = np.transpose(place)
-            colour = COLOURS[track_id % len(COLOURS)]
-            column[2].plot(where, strength, '.', ms=2, alpha=0.25, color=colour)
-            if len(where) >= MEAN_OF:
-                mean = np.convolve(strength, np.full(MEAN_OF, 1.0 / MEAN_OF), mode='valid')
-                column[2].plot(where[MEAN_OF // 2 :][: len(mean)], mean, lw=1.6, color=colour)
+            column[2].plot(
+                *zip(*place), '.-', lw=0.8, ms=2, color=COLOURS[track_id % len(COLOURS)]
+            )
         column[2].set(xlabel='record', ylim=(0.0, None))
     for axis, label in zip(axes[:, 0], ('depth [m]', 'depth [m]', 'relative amplitude')):
         axis.set_ylabel(label)
