@@ -73,7 +73,7 @@ $(STAMP): setup.py pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(ROS)test,lint,sweep]'
 	@touch $@
 
-demo: venv ## track a shipped bag with the live node and offline, score both, write a report
+demo: venv ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
 	$(BIN)/sonar-imm demo --out demo
 
 test: test-core test-system ## run the tests; of the Monte Carlo ones a fourth, in turn

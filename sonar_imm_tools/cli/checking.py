@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One recording through the real node and through the offline tracker, compared and scored.
+"""One recording through the offline tracker and through the real node, compared and scored.
 
 ``check`` prints the result, ``demo`` makes a report of it.
 """
@@ -49,7 +49,7 @@ from .track import track_one
 class CheckedRecording:
     """All checks of one recording, and the judgement of the offline run.
 
-    `folder` holds the runs ``offline`` and ``live``.
+    `folder` holds the runs ``offline`` and ``live``, the latter where the node was there.
     """
 
     system: str
@@ -77,8 +77,8 @@ class CheckedRecording:
 
 @frozen
 class PlayedRecording:
-    """A recording tracked offline and by the node, `checks` of both against each other, and the
-    largest error allowed, None for that of the system."""
+    """A recording tracked offline and, unless left out, by the node; `checks` of both against each
+    other, and the largest error allowed, None for that of the system."""
 
     system: str
     bag: Path
@@ -142,8 +142,9 @@ def play_recording(
     limit: float | None = None,
     topics: Mapping[str, str] | None = None,
     quiet: bool = False,
+    live: bool = True,
 ) -> PlayedRecording:
-    """Track `bag` offline and by the live node into `folder`, and compare.
+    """Track `bag` offline and, if `live`, by the node too into `folder`, and compare.
 
     params: parameter file; None for the one that comes with the recording, if any. limit: largest
     error allowed, in the unit of the system; None for that of the recording, if it states one, or
@@ -172,8 +173,10 @@ def play_recording(
         ),
         quiet,
     )
+    if not live:
+        return PlayedRecording(system, bag, folder, limit, (), {})
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
-        live = run_lockstep(
+        played = run_lockstep(
             bag,
             system,
             params_file=params,
@@ -181,9 +184,9 @@ def play_recording(
             topics=topics,
             progress=advance,
         )
-    _keep(live, config, system, folder / 'live')
-    checks = (_answered(live, run), _equal(folder), _ended(live))
-    return PlayedRecording(system, bag, folder, limit, checks, live.latency_ms())
+    _keep(played, config, system, folder / 'live')
+    checks = (_answered(played, run), _equal(folder), _ended(played))
+    return PlayedRecording(system, bag, folder, limit, checks, played.latency_ms())
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
