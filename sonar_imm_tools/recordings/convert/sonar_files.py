@@ -62,7 +62,7 @@ LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""
 ABEAM: dict[str, Any] = {'horizontal_fov_deg': 3.0, 'vertical_fov_deg': 80.0}
 """Parameters of the obstacle tracker for the narrow, high beam of a side scan."""
-HALVES = {4: ((0, 3), (1, 2)), 3: ((0,), (1,))}
+HALVES: dict[int, Sequence[Sequence[int]]] = {4: ((0, 3), (1, 2)), 3: ((0,), (1,))}
 """The sectors of a split beam that make its starboard and its port half, by their number."""
 EXTRAS = {'xtf': 'xtf', 'ek80': 'echosounders', 'kmall': 'echosounders', 'all': 'echosounders'}
 WANTED = {'xtf': 'pyxtf', 'echosounders': 'themachinethatgoesping'}
@@ -448,7 +448,7 @@ def _split_beam(ping: Record, how: Ek80Options) -> Snapshot:
     """The halves, or the chosen sums, of the sectors of a split beam."""
     iq, speed = ping['iq'][1:], _speed(ping)  # the first sample lies at range 0
     sectors = iq.shape[1]
-    staves: Sequence[Sequence[int]] = how.staves or HALVES.get(sectors, ())
+    staves = HALVES.get(sectors, ()) if how.staves is None else how.staves
     if len(staves) < 2 or any(not 0 <= k < sectors for stave in staves for k in stave):
         raise Rejection('bad_staves', f'it has {sectors} sectors; --staves says which to take')
     interval = float(ping['sample_interval'])
