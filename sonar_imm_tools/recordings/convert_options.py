@@ -93,6 +93,24 @@ def _bearing_std() -> Any:
     return option(None, 'DEGREES', help, flag='bearing-std', kind='float', above=0.0)
 
 
+def _detector() -> Any:
+    help = 'Change one parameter of the detector; may be given several times.'
+    return option({}, 'NAME=VALUE', help, flag='set', kind='pairs')
+
+
+def _element_spacing() -> Any:
+    help = 'Distance between staves, to be stated in the snapshots.'
+    return option(None, 'METRES', help, kind='float', range=(1e-5, 10.0))
+
+
+def _phase_scale() -> Any:
+    help = (
+        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
+        'full circle over their range.'
+    )
+    return option(None, 'RAD', help, flag='phase-scale', kind='float')
+
+
 @frozen(kw_only=True)
 class FixesOptions:
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
@@ -324,12 +342,8 @@ class InterferometerOptions:
         'Where something stands in the messages, e.g. phase=sidescan.phase.', flag='field',
         kind='pairs')
     side: str = option('', '', 'Of the array.', choices=('port', 'starboard'))
-    radians_per_count: float | None = option(None, 'RAD',
-        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
-        'full circle over their range.', flag='phase-scale', kind='float')
-    element_spacing: float | None = option(None, 'METRES',
-        'Distance between staves, to be stated in the snapshots.', kind='float',
-        range=(1e-5, 10.0))
+    radians_per_count: float | None = _phase_scale()
+    element_spacing: float | None = _element_spacing()
     sound_speed: float = option(1500.0, '',
         'Speed of sound in m/s, where a message states none.', kind='float',
         range=(1300.0, 1700.0))
@@ -428,15 +442,9 @@ class XtfOptions:
     port_samples: str = option('far', '',
         'Which sample of a port channel comes first: most programs write the farthest.',
         choices=('far', 'near'))
-    radians_per_count: float | None = option(None, 'RAD',
-        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
-        'full circle over their range.', flag='phase-scale', kind='float')
-    element_spacing: float | None = option(None, 'METRES',
-        'Distance between staves, to be stated in the snapshots.', kind='float',
-        range=(1e-5, 10.0))
-    parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
-        'Change one parameter of the detector; may be given several times.', flag='set',
-        kind='pairs')
+    radians_per_count: float | None = _phase_scale()
+    element_spacing: float | None = _element_spacing()
+    parameters: Mapping[str, Any] = _detector()
     frame_id: str = option('sonar', '', 'Frame of the sonar.')
     storage: str = _storage()
 
@@ -455,9 +463,7 @@ class Ek80Options:
     channel: str = option('', 'TEXT', 'Part of the name of the channel.')
     staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
         'Sectors, from 0, of each stave; those joined by + are summed.', parse=_staves)
-    element_spacing: float | None = option(None, 'METRES',
-        'Distance between staves, to be stated in the snapshots.', kind='float',
-        range=(1e-5, 10.0))
+    element_spacing: float | None = _element_spacing()
     frame_id: str = option('sonar', '', 'Frame of the array.')
     storage: str = _storage()
 
@@ -495,9 +501,7 @@ class PicturesOptions:
     fov: float | None = option(None, 'DEGREES',
         'Width of the sector, for rows that state none.', kind='float', range=(0.1, 360.0))
     options: CsvOptions = group(CsvOptions)
-    parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
-        'Change one parameter of the detector; may be given several times.', flag='set',
-        kind='pairs')
+    parameters: Mapping[str, Any] = _detector()
     frame_id: str = option('sonar', '', 'Frame of the sonar.')
     storage: str = _storage()
 # fmt: on
