@@ -14,7 +14,7 @@
 
 """Whatever a driver fills in, a position is read or refused, and the tracker goes on."""
 
-from helpers.driver_messages import driver_message
+from helpers.marine import driver_message
 import numpy as np
 import pytest
 
