@@ -27,7 +27,7 @@ SMALLER = {
     'bathymetry': {'pings': 2},
     'diver': {'duration': 20.0},
     'fathometer': {'records': 2, 'phones': 6, 'snapshot_seconds': 0.1, 'frequency_max': 1000.0},
-    'obstacle': {},
+    'obstacle': {'first_range': 60.0, 'last_range': 50.0},
 }
 """Overrides that make any scenario small, by system."""
 

@@ -16,6 +16,7 @@
 
 from functools import cache
 
+from helpers.scenes import smaller_scene
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -24,6 +25,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, SCENARIOS, simulate
 
 EXACT = {
@@ -43,8 +45,8 @@ def of(scene, kind):
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_each_obstacle_has_its_truth_and_the_sea_another_motion_by_seed(name):
-    config = scenario(name)
-    first, other = simulate(config, 3), simulate(config, 4)
+    config, first = smaller_scene(SYSTEMS['obstacle'], name, 3)
+    other = simulate(config, 4)
     assert len(first.truth) == config.obstacles
     assert any(
         not np.array_equal(a.position, b.position)
