@@ -95,16 +95,9 @@ class ObstacleScenario(ImageScenario):
     """Parameters of an obstacle scene; the defaults are the first case of docs/obstacle.md."""
 
     INSTRUMENT = (
-        'sonar_lever',
-        'sonar_mount_rpy_deg',
-        'azimuth_model',
-        'ping_timing',
-        'max_range',
-        'horizontal_fov_deg',
-        'vertical_fov_deg',
-        'detection_ranges',
-        'detection_factors',
-    )
+        'sonar_lever', 'sonar_mount_rpy_deg', 'azimuth_model', 'ping_timing', 'max_range',
+        'horizontal_fov_deg', 'vertical_fov_deg', 'detection_ranges', 'detection_factors',
+    )  # fmt: skip
 
     # fmt: off
     # -- the vehicle -----------------------------------------------------------------------------
