@@ -41,7 +41,7 @@ COMMON_INTERFACES = {
     'trajectory_msgs',
     'visualization_msgs',
 }
-COME_WITH_RCLPY = {'builtin_interfaces', 'rcl_interfaces', 'rosgraph_msgs'}
+COME_WITH_RCLPY = {'builtin_interfaces', 'lifecycle_msgs', 'rcl_interfaces', 'rosgraph_msgs'}
 ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
 
 
