@@ -70,9 +70,9 @@ class PlacedNodeConfig(NodeConfig):
     """What is tracked has a place in the world."""
 
     # fmt: off
-    use_tf_static: bool = parameter(False, '',
-        'listen to /tf_static, and transform input from another frame that is fixed to the frame '
-        'of the tracks instead of refusing it')
+    use_tf_static: bool = parameter(True, '',
+        'listen to /tf_static, where its type is installed, and transform what comes in another '
+        'frame that is fixed to the expected one instead of refusing it')
     # fmt: on
 
 

@@ -44,7 +44,7 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import Rejection, StaticTransforms
 from ..node_config import node_config_type, type_spec, type_specs
 from ..parameters import Config
 from ..trackers import SYSTEMS, WarmStep
@@ -263,7 +263,7 @@ class BaseNode(ManagedNode):
                 self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
             )
             for topic in topics:
-                for name in topic.instances(settings) if topic.wanted(settings) else ():
+                for name in topic.instances(settings) if self._wanted(topic, settings) else ():
                     self._inputs[name] = self._input(topic, name, settings)
         required, one_of = needed(topics, settings)
         self._topic_names = {
@@ -273,6 +273,19 @@ class BaseNode(ManagedNode):
         self._reporter = Reporter(
             self._full_name, self._topic_names, self._meter, required=required, one_of=one_of
         )
+
+    def _wanted(self, topic: InputTopic, settings: Mapping[str, Any]) -> bool:
+        """Whether to hear an input. Frames are heard where their type is installed: PyPI has no
+        tf2_msgs. With `sonar_frame` the node cannot do without."""
+        if not topic.wanted(settings):
+            return False
+        if topic.measurement is not StaticTransforms or settings.get('sonar_frame'):
+            return True
+        try:
+            message_class(self._settings.choice(f'{topic.name}_type'))
+        except ImportError:
+            return False
+        return True
 
     def _input(
         self, topic: InputTopic, name: str, settings: Mapping[str, Any]
