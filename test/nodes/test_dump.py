@@ -68,11 +68,16 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     assert 'has no effect' not in capfd.readouterr().err
 
 
-def test_the_detector_has_a_value_for_every_parameter_too(make_bench):
-    pytest.importorskip('marine_acoustic_msgs')
-    bench = make_bench()
+def test_a_dump_of_the_detector_holds_all_and_loads_again(make_bench, tmp_path, capfd):
+    bench = make_bench('-p', 'image_type:=sensor_msgs/msg/Image', '-p', 'stale_after:=7.5')
     bench.add(FlsDetectorNode(context=bench.context))
-    dumped(bench, '/fls_detector')
+    file = tmp_path / 'live.yaml'
+    file.write_text(dumped(bench, '/fls_detector'))
+    assert 'stale_after: 7.5' in file.read_text()
+    again = make_bench('--params-file', str(file))
+    again.add(FlsDetectorNode(context=again.context))
+    assert dumped(again, '/fls_detector') == file.read_text()
+    assert 'has no effect' not in capfd.readouterr().err
 
 
 def test_a_file_for_another_node_is_named(tmp_path):
