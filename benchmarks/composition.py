@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import contextlib
+from functools import partial
 import os
 from pathlib import Path
 import re
@@ -35,7 +36,7 @@ import time
 
 import numpy as np
 
-from benchmarks.node_latency import Case, case_of, LIMIT, Peer, SETTLED
+from benchmarks.node_latency import _passed, Case, case_of, LIMIT, Peer, SETTLED
 from benchmarks.study import Parts, study
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link, LinkError
@@ -55,7 +56,8 @@ def megabytes(pids: Sequence[int], kind: str) -> float:
 def sent(cases: Sequence[Case], peers: Sequence[Peer], link: Link, rate: float) -> np.ndarray:
     """(K, N) milliseconds from sending to each answer."""
     streams = [iter(case.messages) for case in cases]
-    spent, due = [], time.perf_counter()
+    spent: list[list[float]] = []
+    due = time.perf_counter()
     while True:
         timed = []
         for case, peer, stream in zip(cases, peers, streams):
@@ -67,7 +69,7 @@ def sent(cases: Sequence[Case], peers: Sequence[Peer], link: Link, rate: float) 
         if len(timed) < len(peers):
             return np.array(spent[SETTLED:])
         due += 1.0 / rate
-        link.wait_for(lambda due=due: time.perf_counter() >= due, LIMIT)
+        link.wait_for(partial(_passed, due), LIMIT)
         begins = []
         for peer, key, message in timed:
             peer.answered = 0.0

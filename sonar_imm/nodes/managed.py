@@ -36,7 +36,9 @@ import traceback
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
+import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.task import Future
@@ -148,11 +150,19 @@ class ManagedNode(LifecycleNodeMixin, Node):
     raises = False
 
     def __init__(self, name: str, **options: Any):
-        """`options` go to `rclpy.node.Node`."""
-        Node.__init__(self, name, **options)
+        """`options` go to `rclpy.node.Node`. Raises `ConfigError` where the middleware cannot do
+        what it was asked for, such as security."""
+        try:
+            Node.__init__(self, name, **options)
+        except RuntimeError as error:
+            context: Context | None = options.get('context')
+            if not (context.ok() if context else rclpy.ok()):
+                raise
+            raise ConfigError(' '.join(str(error).split())) from None
         # A group of its own: a request that waits for kernels holds up nothing else.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        self._service_change_state.callback = self._on_change_state
+        answer: Any = self._on_change_state  # rclpy's types know no coroutines
+        self._service_change_state.callback = answer
         self._transition: Future | None = None
 
     @property
