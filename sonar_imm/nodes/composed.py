@@ -16,8 +16,7 @@
 
 Each word is the full name of a node, whose last part says what it is::
 
-    ros2 run sonar_imm composed_node /auv1/diver /auv2/diver /auv2/obstacle --ros-args \\
-        --params-file fleet.yaml
+    ros2 run sonar_imm composed_node /auv1/diver /auv2/diver --ros-args --params-file fleet.yaml
 
 Parameters come from files with a section for each full name (``/auv1/diver:``), as for any process
 with several nodes; ``/**/diver:`` is for all divers. What a node sends and hears is the same as in
