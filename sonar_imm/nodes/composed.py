@@ -78,7 +78,8 @@ def _explain(args: Sequence[str] | None) -> str | None:
 
 
 def _names(args: Sequence[str] | None) -> list[str]:
-    return remove_ros_args(list(sys.argv if args is None else args))[1:]
+    words = remove_ros_args(list(sys.argv if args is None else args))[1:]
+    return [name for word in words for name in word.split()]  # launch gives a list as one word
 
 
 def main(args: list[str] | None = None) -> int:
