@@ -24,7 +24,7 @@ from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario
 
-TARGETS = ('point', 'chain', 'float')
+TARGETS = ('point', 'chain', 'float', 'wreck')
 FADINGS = ('steady', 'rayleigh')
 
 
@@ -48,10 +48,10 @@ class ImageScenario(Scenario):
     pulse_length: float = parameter(0.3, 'm',
         '-3 dB width of the echo of a point in range', range=(0.001, 10.0))
     target: str = parameter('point', '',
-        'what obstacles are: a point, a chain of 60 glints along a level line, or a float of 10 '
-        'glints', choices=TARGETS)
+        'what obstacles are: a point, a chain of 60 glints along a level line, a float of 10 '
+        'glints, or the outline of a wreck of 80 glints', choices=TARGETS)
     target_size: float = parameter(6.0, 'm',
-        'length of a chain or diameter of a float', range=(0.0, 100.0))
+        'length of a chain or wreck, or diameter of a float', range=(0.0, 100.0))
     target_snr_db: float = parameter(18.0, 'dB',
         'peak power of an echo on the axis of the sonar over the mean power around it',
         range=(-20.0, 80.0))

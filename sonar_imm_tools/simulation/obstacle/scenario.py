@@ -217,6 +217,18 @@ _FIELD = {
     'random_course': True,
     'passing_distance': 12.0,
 }
+_IMAGES = {
+    'images': True,
+    'image_beams': 128,
+    'image_bins': 330,
+    'max_range': 55.0,
+    'first_range': 52.0,
+    'last_range': 12.0,
+    'altitude': 6.0,
+    'roll_rms_deg': 3.0,
+    'target_snr_db': 26.0,
+}
+_ROUGH = {'seabed_shape': 1.5}
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'approach': ('an obstacle 3 m below the sonar', {}),
@@ -306,18 +318,21 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     'images': (
         'an obstacle 3 m below in images of a small sonar, over a sea floor',
+        {**_IMAGES, 'target': 'float', 'target_size': 0.5},
+    ),
+    'rough_chain': (
+        'a chain of 6 m in images over a rough sea floor',
+        {**_IMAGES, **_ROUGH, 'target': 'chain', 'target_size': 6.0},
+    ),
+    'rough_wreck': (
+        'the outline of a wreck of 12 m in images of a rough sea floor, on which it lies',
         {
-            'images': True,
-            'image_beams': 128,
-            'image_bins': 330,
-            'max_range': 55.0,
-            'first_range': 52.0,
-            'last_range': 12.0,
-            'altitude': 6.0,
-            'roll_rms_deg': 3.0,
-            'target': 'float',
-            'target_size': 0.5,
-            'target_snr_db': 26.0,
+            **_IMAGES,
+            **_ROUGH,
+            'target': 'wreck',
+            'target_size': 12.0,
+            'placement': 'seabed',
+            'altitude': 2.5,
         },
     ),
     'late': (
