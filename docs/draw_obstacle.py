@@ -28,6 +28,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import sys
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -41,13 +42,14 @@ from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
 from benchmarks.obstacle_section5 import echoes, encounter, EXACT, OFFSETS, read  # noqa: E402
+from benchmarks.study import truths  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
 from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
@@ -83,7 +85,7 @@ def draw_band(ax: Axes, name: str, title: str) -> None:
     """What is known of the offset while the range closes."""
     setting = scenario(name)
     scene = simulate(setting, SEED)
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     rows = []
     for stamp, estimate in sorted(track(scene, config_of(setting)).items()):
         ping = int(np.flatnonzero(truth.stamp_ns == stamp)[0])
@@ -149,7 +151,7 @@ def draw_sphere(above: Axes, below: Axes) -> None:
     floor = setting.depth + setting.altitude
     estimated = floor - poses.position[0, 2] - found.best
     above.axhline(estimated, color=BLUE, label='sphere, by the deferred estimate')
-    true = floor + scene.truth[0].position[0, 2]
+    true = floor + truths(scene, TrueObstacle)[0].position[0, 2]
     above.axhline(true, color=BLUE, ls='--', lw=1, label='sphere, true')
     above.set(title='Figure 3: a moored sphere', xlabel='ping', ylabel='above the sea floor, m')
     above.legend(frameon=False, loc='lower left')
@@ -159,7 +161,7 @@ def draw_sphere(above: Axes, below: Axes) -> None:
         (found.best, BLUE, f'predicted, {found.best:.1f} m below'),
         (setting.altitude, RED, 'predicted, on the sea floor'),
     ):
-        m = geometry.to_world(first, geometry.reconstruct(*z[0], offset, first.R))
+        m = geometry.to_world(first, geometry.reconstruct(z[0, 0], z[0, 1], offset, first.R))
         _, azimuth = geometry.project(geometry.to_body(poses, m))
         below.plot(ping, np.degrees(azimuth), color=colour, label=label)
     below.plot(ping, np.degrees(z[:, 1]), '.', color=INK, ms=3, label='measured')
@@ -172,7 +174,7 @@ def draw_image(above: Axes, below: Axes) -> None:
     what the detector finds in it, and what it finds in a whole approach."""
     setting, scene = encounter('large', {}, SEED)
     _, poses = echoes(setting, scene)
-    middle = geometry.flip_world(scene.truth[0].position[0])
+    middle = geometry.flip_world(truths(scene, TrueObstacle)[0].position[0])
     course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
     across = np.array([-np.sin(course), np.cos(course), 0.0])
     floats = [middle + side * across - [0.0, 0.0, 4.0] for side in (-5.0, 0.0, 5.0)]
@@ -212,7 +214,7 @@ def draw_image(above: Axes, below: Axes) -> None:
     below.text(-24.0, 41.5, 'detections of every fourth ping')
 
 
-def show(ax: Axes, found: np.ndarray, marker: str, **style: object) -> None:
+def show(ax: Axes, found: np.ndarray, marker: str, **style: Any) -> None:
     """Draw detections (n, 2), range and azimuth to starboard, as seen from above."""
     d, azimuth = found.T
     ax.plot(d * np.sin(azimuth), d * np.cos(azimuth), marker, color=RED, **style)
@@ -293,7 +295,7 @@ def draw_figure_3() -> None:
     z = read(exact, 'detector', MOORED_SEED)
     offset = deferred(z, poses, config_of(setting), offsets=OFFSETS).best
     first = Pose(poses.position[0], poses.R[0])
-    m = geometry.to_world(first, geometry.reconstruct(*z[0], offset, first.R))
+    m = geometry.to_world(first, geometry.reconstruct(z[0, 0], z[0, 1], offset, first.R))
     predicted = np.column_stack(geometry.project(geometry.to_body(poses, m)))
     for each, marker, colour, label in (
         (z, '.', BLUE, 'measured by the detector'),
@@ -330,7 +332,7 @@ def draw_figure_4() -> None:
     setting, scene = encounter('large', {}, SEED)
     _, poses = echoes(setting, scene)
     glints = large_obstacle(np.random.default_rng(SEED))
-    middle = geometry.flip_world(scene.truth[0].position[0])
+    middle = geometry.flip_world(truths(scene, TrueObstacle)[0].position[0])
     course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
     across = np.array([-np.sin(course), np.cos(course), 0.0])
     ping = 40
