@@ -149,6 +149,7 @@ setup(
         'console_scripts': [
             'sonar-imm = sonar_imm_tools.cli:main',
             'fls_detector_node = sonar_imm.nodes.commands:main',
+            'composed_node = sonar_imm.nodes.commands:main',
             *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],
     },

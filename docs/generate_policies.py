@@ -28,6 +28,7 @@ import time
 from typing import Any
 
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 
 FOLDER = Path(__file__).resolve().parents[1] / 'config' / 'sros2'
 NODES = {
@@ -37,8 +38,12 @@ NODES = {
     'fls_detector': 'FlsDetectorNode',
     'obstacle': 'ObstacleNode',
 }
-# Only needed so that the node starts where the marine messages are not installed.
-EXTRA = {'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image']}
+# So that the nodes start, and hear the same, where messages of others are not installed.
+FRAMES = ['-p', 'tf_static_type:=geometry_msgs/msg/TransformStamped']
+EXTRA = {
+    'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image'],
+    **dict.fromkeys(('bathymetry', 'diver', 'obstacle'), FRAMES),
+}
 RULES = (
     ('topics', 'publish', 'topic'),
     ('topics', 'subscribe', 'topic'),
@@ -115,6 +120,10 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for name in NODES:
         with started(name) as node:
+            executor = SingleThreadedExecutor(context=node.context)
+            executor.add_node(node)
+            while node.state != 'active':
+                executor.spin_once()
             time.sleep(2.0)  # the graph hears of a node's own endpoints a little later
             text = policy(name, used_by(node))
         (FOLDER / f'{name}.xml').write_text(text, encoding='utf-8')

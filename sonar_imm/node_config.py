@@ -46,6 +46,9 @@ class NodeConfig(Config):
     max_revisions: int = live(100, '',
         'largest number of earlier estimates published again after one late message: the newest '
         'ones, the others are counted; 0: all', range=(0, 1_000_000))
+    autostart: bool = parameter(True, '',
+        'configure and activate the node when it starts; false: a lifecycle manager or '
+        '`ros2 lifecycle set` does')
     diagnostics_period: float = parameter(1.0, 's',
         'time between two messages on /diagnostics', range=(0.05, 3600.0))
     stale_after: float = live(10.0, 's',
@@ -67,9 +70,9 @@ class PlacedNodeConfig(NodeConfig):
     """What is tracked has a place in the world."""
 
     # fmt: off
-    use_tf_static: bool = parameter(False, '',
-        'listen to /tf_static, and transform input from another frame that is fixed to the frame '
-        'of the tracks instead of refusing it')
+    use_tf_static: bool = parameter(True, '',
+        'listen to /tf_static, where its type is installed, and transform what comes in another '
+        'frame that is fixed to the expected one instead of refusing it')
     # fmt: on
 
 
@@ -98,6 +101,7 @@ class DetectorNodeConfig(Config):
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 10,
         description='images that an input queue holds while the node is busy', range=(1, 1000))
+    autostart: bool = inherited(NodeConfig, 'autostart', True)
     diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
     stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
     # fmt: on

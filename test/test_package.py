@@ -65,6 +65,9 @@ PYPI_OF_KEY = {
     'python3-websockets': 'websockets',
     'python3-yaml': 'PyYAML',
 }
+"""All keys are in rosdep/python.yaml of ros/rosdistro, as of 2026-08-22, with Ubuntu 24.04."""
+RELEASED = {'ament_copyright', 'ament_flake8', 'ament_pep257', 'rclpy'}
+"""Packages of Jazzy besides messages that are named in package.xml."""
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Libraries that some commands need, each with an extra of its own.
@@ -131,6 +134,29 @@ def test_there_is_one_version(manifest: ElementTree.Element) -> None:
     assert sonar_imm.__version__ == msg_adapters.__version__ == manifest.findtext('version')
     changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
     assert re.search(rf'^{re.escape(sonar_imm.__version__)} \(.+\)$', changelog, re.MULTILINE)
+
+
+def test_every_key_of_package_xml_is_one_of_rosdep_or_a_package_of_jazzy(
+    manifest: ElementTree.Element,
+) -> None:
+    keys = {each.text for each in manifest if each.tag.endswith('depend')}
+    assert keys <= {*PYPI_OF_KEY, *RELEASED, *COMMON_INTERFACES, *COME_WITH_RCLPY}
+
+
+def test_catkin_reads_the_package_and_its_changelog() -> None:
+    """As bloom, colcon and rosdoc2 do."""
+    package = pytest.importorskip('catkin_pkg.package')
+    from catkin_pkg.changelog import get_changelog_from_path
+
+    warned: list[str] = []
+    read = package.parse_package(str(ROOT))
+    read.validate(warnings=warned)
+    assert not warned
+    assert (read.name, read.get_build_type()) == ('sonar_imm', 'ament_python')
+    (version,) = [
+        version for version, _, _ in get_changelog_from_path(str(ROOT)).foreach_version()
+    ]
+    assert version == read.version
 
 
 def test_setup_reads_that_version() -> None:

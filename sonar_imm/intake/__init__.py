@@ -44,10 +44,9 @@ from ..measurements import (
     Snapshot,
     StaticTransforms,
     VesselFix,
-    VesselPose,
 )
 from ..parameters import Config
-from .stream import frame_key, KnownFrames, TRACKS
+from .stream import KnownFrames
 from .transforms import moved, TransformTree
 
 __all__ = ['Intake', 'KnownFrames', 'RepeatFilter', 'TransformTree']
@@ -91,10 +90,14 @@ class Intake:
         if self._sonar_frames and not self.mounting:
             self._require_mounting(measurement)
         frames = self.tracker.frames
-        target = self.frame_id or frames.frame_id
+        target = frames.of(measurement, self.frame_id)
         if target and measurement.frame_id not in ('', target):
             measurement = self._in_frame(measurement, target)
-        frames.check(measurement, self.frame_id)
+        try:
+            frames.check(measurement, self.frame_id)
+        except Rejection as refusal:
+            sentence = f'{refusal.sentence}, and no fixed transform joins the two'
+            raise Rejection(refusal.reason, sentence) from None
         if not isinstance(measurement, frames.kinds):
             frames.settle(measurement)
         return self.repeats.fresh(measurement)
@@ -114,10 +117,7 @@ class Intake:
         self._mount()
 
     def _in_frame(self, measurement: Any, target: str) -> Any:
-        """The measurement in the frame `target`, where it has a place in the world and a transform
-        says how."""
-        if frame_key(measurement) != TRACKS and not isinstance(measurement, VesselPose):
-            return measurement
+        """The measurement in the frame `target`, where a transform says how."""
         pose = self.transforms.pose(target, measurement.frame_id)
         return measurement if pose is None else moved(measurement, target, pose)
 

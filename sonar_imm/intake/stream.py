@@ -41,7 +41,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from attrs import frozen
 
 from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
-from ..measurements import nanoseconds, Rejection
+from ..measurements import nanoseconds, Rejection, VesselPose
 
 State = TypeVar('State')
 TRACKS = 'tracks'
@@ -74,6 +74,12 @@ class KnownFrames:
     def frame_id(self) -> str:
         """The frame of the tracks, empty until one is known."""
         return self._frames[TRACKS]
+
+    def of(self, measurement: Any, required: str = '') -> str:
+        """The frame in which `measurement` has to be, `required` where it is that of the tracks;
+        empty when any will do. The pose of a vessel places what is in the frame of the tracks."""
+        key = TRACKS if isinstance(measurement, VesselPose) else frame_key(measurement)
+        return (required if key == TRACKS else '') or self._frames.get(key, '')
 
     def check(self, measurement: Any, required: str = '') -> None:
         """Raise `Rejection` when `measurement` is in another frame, or, where it is in that of the

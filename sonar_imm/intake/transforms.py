@@ -32,18 +32,23 @@ from ..acoustics.geometry import Pose
 from ..estimation.angles import wrap_angle
 from ..estimation.arrays import FloatArray
 from ..measurements import (
+    Altitude,
     Arrivals,
+    Detections,
     Fix,
     Fixes,
     Ground,
     Navigation,
     Rejection,
+    RelativeFix,
     Start,
     StaticTransforms,
 )
 
 UPRIGHT = 1.0 - 1e-6
 """Least cosine between two verticals that are the same."""
+SAME_PLACE = 0.01
+"""Metres on each axis within which two sensors are at one place."""
 
 
 MOST_FRAMES = 2000
@@ -89,9 +94,13 @@ class TransformTree:
 def moved(measurement: Any, frame_id: str, pose: Pose) -> Any:
     """`measurement`, whose own frame has `pose` in `frame_id`, in that.
 
-    Raises `Rejection` for what cannot be turned: a frame that is tilted, because the variance of z
-    need not be known, and what a sensor measures from itself.
+    What a sensor on board measures from itself is then what the sensor at the place of `frame_id`
+    would have measured. Raises `Rejection` for what cannot be turned: a frame that is tilted,
+    because the variance of z need not be known; echoes of a sonar at another place, whose range
+    and bearing depend on a height that is not known; and the signals of an array.
     """
+    if isinstance(measurement, RelativeFix):
+        return evolve(_relative(measurement, pose), frame_id=frame_id)
     if pose.R[2, 2] < UPRIGHT:
         raise Rejection(
             'frame',
@@ -143,6 +152,37 @@ def _(navigation: Navigation, pose: Pose) -> Navigation:
         orientation=_after(geometry.euler_angles(pose.R)[2], navigation.orientation),
         pose_covariance=None if covariance is None else turn @ covariance @ turn.T,
     )
+
+
+@_moved.register
+def _(height: Altitude, pose: Pose) -> Altitude:
+    return evolve(height, altitude=max(0.0, height.altitude - float(pose.position[2])))
+
+
+@_moved.register
+def _(ping: Detections, pose: Pose) -> Detections:
+    if np.abs(pose.position).max() > SAME_PLACE:
+        raise Rejection(
+            'frame',
+            f"the frame '{ping.frame_id}' is another one, at another place: echoes are turned, "
+            'but not shifted. A second sonar has a node of its own',
+        )
+    return evolve(ping, bearing=wrap_angle(ping.bearing + geometry.euler_angles(pose.R)[2]))
+
+
+def _relative(fix: RelativeFix, pose: Pose) -> RelativeFix:
+    """In the axes of another transceiver, tilted or not. One that is levelled has turned what it
+    says already, and where it is itself depends on how the vessel lies."""
+    if fix.levelled and np.abs(pose.position).max() > SAME_PLACE:
+        raise Rejection(
+            'frame',
+            f"the frame '{fix.frame_id}' is another one, at another place, and levelled positions "
+            'do not say how the vessel lies',
+        )
+    if fix.levelled:
+        return fix
+    covariance = None if fix.covariance is None else pose.R @ fix.covariance @ pose.R.T
+    return evolve(fix, offset=_placed(fix.offset, pose), covariance=covariance)
 
 
 @_moved.register

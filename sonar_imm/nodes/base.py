@@ -16,8 +16,8 @@
 
 A message becomes a measurement (`msg_adapters`), passes the `intake`, the tracker makes estimates
 of it, estimates become messages. The only clock the tracker knows is ``header.stamp``; a /clock
-that jumps back (a looped bag, a restarted simulation) resets it. One node, one process, one
-thread: a queue, not threads, takes up bursts.
+that jumps back (a looped bag, a restarted simulation) resets it. One thread: a queue, not threads,
+takes up bursts.
 
 Every message is answered: after its estimates, however many, comes one row on ``~/processed``
 (latched) with the number of messages taken, refused and of estimates published since the start.
@@ -30,26 +30,26 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 import functools
-import threading
 import time
 import traceback
 from typing import Any
 
 from attrs import evolve
+from lifecycle_msgs.msg import Transition
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import Rejection, StaticTransforms
 from ..node_config import node_config_type, type_spec, type_specs
 from ..parameters import Config
 from ..trackers import SYSTEMS, WarmStep
 from .diagnostics import Announcer, Meter, Reporter
+from .managed import DONE, FAILED, LOOK, ManagedNode, Warming
 from .messages import make, message_class
 from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
 from .parameters import NodeParameters
@@ -58,106 +58,19 @@ from .saved_state import SavedState
 from .stopping import stopper
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
-_LOOK = 0.02
-"""Seconds between two looks at whether the kernels are there."""
+NO_WORK: dict[str, Any] = {'enabled': True, 'counts': {}, 'health': {}}
+"""What a node reports before it is configured."""
 _UNKNOWN = {'received_timestamp': 0}
 """The info of a message that did not come from the middleware."""
 
 
-class Warming:
-    """Compiles or loads kernels in a thread of its own, step by step.
-
-    What the connected publishers call for comes first; when nobody publishes yet, that is
-    everything. The rest is compiled after `ready`, beside the first messages.
-    """
-
-    PATIENCE, PERIOD = 3.0, 10.0
-    """Seconds after which it is said that this takes long, and between two such sentences."""
-    DISCOVERY = 0.5
-    """Seconds that publishers have to be found before anything is compiled."""
-
-    def __init__(
-        self,
-        steps: Callable[[Collection[type] | None], list[WarmStep]],
-        connected: Callable[[], Collection[type] | None],
-        kernels_of: Callable[[Collection[str]], tuple[int, int]],
-    ):
-        """steps: what there is to do for measurements of these classes, None for all. connected:
-        the classes that somebody publishes now, None for nobody. kernels_of: what steps need, see
-        `trackers.System.kernels_of`."""
-        from ..estimation import jit  # and numba, which the tracker has loaded by now
-
-        self._steps, self._connected, self._kernels_of = steps, connected, kernels_of
-        self._jit, self._progress = jit, jit.Progress()
-        self._start = time.monotonic()
-        self._said = -self.PERIOD
-        self._doing, self._ready = 'what is published', False
-        self._stopped = threading.Event()
-        self._trouble: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name='kernels', daemon=True)
-        self._thread.start()
-
-    def ready(self) -> bool:
-        """Whether what the inputs need is there. Raises what went wrong."""
-        if self._trouble:
-            raise self._trouble
-        return self._ready
-
-    def done(self) -> bool:
-        """Whether everything is there."""
-        return not self._thread.is_alive()
-
-    def stop(self, *, wait: bool) -> None:
-        """Begin no further step."""
-        self._stopped.set()
-        if wait:
-            self._thread.join()
-
-    def sentence(self) -> str:
-        """How far it is; empty when everything is there."""
-        if self.done():
-            return ''
-        waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
-        return f'{self._progress.sentence() or "loading kernels"} ({self._doing}); {waiting}'
-
-    def due_sentence(self) -> str:
-        """The same when it is time to say it (again), else empty."""
-        now = time.monotonic()
-        if now - self._start < self.PATIENCE or now - self._said < self.PERIOD:
-            return ''
-        self._said = now
-        return self.sentence()
-
-    def _run(self) -> None:
-        try:
-            self._work()
-        except Exception as error:
-            self._trouble = error
-        self._ready = True
-
-    def _work(self) -> None:
-        if not self._jit.kernels:  # the node has just begun: give discovery a moment
-            end = time.monotonic() + self.DISCOVERY
-            while not self._connected() and time.monotonic() < end:
-                self._stopped.wait(_LOOK)
-        left, done = dict(self._steps(None)), list[str]()
-        while left and not self._stopped.is_set():
-            called_for = dict(self._steps(self._connected()))
-            wanted = [name for name in left if name in called_for]
-            self._ready = self._ready or not wanted
-            self._progress.needed = self._kernels_of([*done, *(wanted or left)])
-            self._doing = (wanted or [*left])[0]
-            left.pop(self._doing)()
-            done.append(self._doing)
-
-
-class BaseNode(Node):
+class BaseNode(ManagedNode):
     """Hears the inputs of `inputs_of`, answers each message, and reports on /diagnostics.
 
-    A node that derives from it says in `take` what it does with a message. Its constructor offers
-    its outputs and calls `begin`. Kernels are then compiled or loaded in a thread, while the node
-    answers services and reports. The inputs are heard after that, so that the first message meets
-    a warm node.
+    A node that derives from it says in `take` what it does with a message. Its constructor calls
+    `begin` at the end, `prepare` offers its outputs. Kernels are then compiled or loaded in a
+    thread, while the node answers services and reports. The inputs are heard after that, so that
+    the first message meets a warm node.
     """
 
     def __init__(self, name: str, config_types: tuple[type[Config], type[Config]], **options: Any):
@@ -172,37 +85,87 @@ class BaseNode(Node):
         self._name = name
         self._full_name = self.get_fully_qualified_name().lstrip('/')
         self._inputs: dict[str, tuple[InputTopic, str, Callable[[Any], Any]]] = {}
+        self._topic_names: dict[str, str] = {}
         self._published = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
-        self._hears = False
+        self._warming: Warming | None = None
+        self._hears = self._warned = False
+        self._made: set[Any] = set()
 
     def begin(self) -> None:
-        """Offer what every node does, report from now on, and hear the inputs as soon as the
-        kernels are there."""
-        settings, topics = self._settings.values(), inputs_of(self._name)
+        """Report from now on. With `autostart` configure, and hear the inputs as soon as the
+        kernels are there; whatever goes wrong until then is raised."""
         with explained_overrides(self):
-            self._processed = ProcessedPublisher(
-                self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
-            )
             self._announcer = Announcer(self._endpoints, self._full_name)
-            for topic in topics:
-                for name in topic.instances(settings) if topic.wanted(settings) else ():
-                    self._inputs[name] = self._input(topic, name, settings)
-        required, one_of = needed(topics, settings)
-        self._topic_names = {
-            name: self.resolve_topic_name(topic.prefix + name)
-            for name, (topic, _, _) in self._inputs.items()
-        }
-        self._reporter = Reporter(
-            self._full_name, self._topic_names, self._meter, required=required, one_of=one_of
-        )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._node_config.diagnostics_period, self._report, clock=steady)
+        self._reporter = Reporter(self._full_name, {}, self._meter)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        period = self._node_config.diagnostics_period
+        self.create_timer(period, self._report, clock=self._steady)
         self._settings.on_change(self._reconfigure)
+        if self._node_config.autostart:
+            self.raises = True
+            self.change(Transition.TRANSITION_CONFIGURE)
+
+    def configured(self) -> None:
+        """Offer what every node does; the transition ends when the kernels are there."""
+        before = self._entities()
+        try:
+            self._offer()
+        finally:
+            self._made = self._entities() - before
         self._warming = Warming(self.warm_steps, self._connected, self.kernels_of)
-        self._until_warm = self.create_timer(_LOOK, self._hear_when_warm, clock=steady)
+        self._until_warm = self.create_timer(LOOK, self.look, clock=self._steady)
+
+    def look(self) -> None:
+        """End configuring once what the inputs need is compiled, and say what takes long."""
+        if self._warming is None:
+            return
+        if sentence := self._warming.due_sentence():
+            self.get_logger().info(sentence)
+        if self.state == 'configuring':
+            if self.attempt(self._warming.trouble, self.released) != DONE:
+                self.conclude(FAILED)
+                return
+            if self._warming.ready():
+                self.conclude(DONE)
+                if self.raises:
+                    self.change(Transition.TRANSITION_ACTIVATE)
+        if self._warming.done():
+            self.destroy_timer(self._until_warm)
+
+    def activated(self) -> None:
+        """Hear the inputs."""
+        with explained_overrides(self):
+            for name in self._inputs:
+                self._listen(name)
+        self.raises, self._hears = False, True
+        if not self._warned:  # those of the inputs' endpoints are known now
+            self._settings.warn_of_unknown()
+            self._warned = True
+        self._acknowledge(None)
+        self.get_logger().info(f'ready, hears {", ".join(self._topic_names.values())}')
+
+    def deactivated(self) -> None:
+        """Hear nothing."""
+        if self._hears:
+            self.get_logger().info('inactive, hears nothing')
+        self._hears = False
+        self._endpoints.unsubscribe()
+
+    def released(self) -> None:
+        """Take back what was made since `configured` began."""
+        if self._warming is not None:
+            self._warming.stop(wait=False)
+            self.destroy_timer(self._until_warm)
+            self._warming = None
+            self.release()
+        self._inputs, self._topic_names = {}, {}
+        self._reporter = Reporter(self._full_name, {}, self._meter)
+        for entity in self._made:
+            getattr(self, f'destroy_{type(entity).__name__.lower()}')(entity)
+        self._made = set()
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -238,8 +201,16 @@ class BaseNode(Node):
 
     def destroy_node(self) -> None:
         """End; a kernel that is being compiled is finished, but not when a signal asked."""
-        self._warming.stop(wait=not stopper.asked)
+        if self._warming is not None:
+            self._warming.stop(wait=not stopper.asked)
+            self.release()
         super().destroy_node()
+
+    def prepare(self) -> None:
+        """Make what works on the messages, and offer its outputs."""
+
+    def release(self) -> None:
+        """Let go of what `prepare` made, but for what it offered."""
 
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Do with a message what the node is there for. Raises `Rejection`."""
@@ -283,6 +254,39 @@ class BaseNode(Node):
 
     # -- the same for all ----------------------------------------------------------------------
 
+    def _offer(self) -> None:
+        """The outputs, and the inputs that will be heard."""
+        settings, topics = self._settings.values(), inputs_of(self._name)
+        with explained_overrides(self):
+            self.prepare()
+            self._processed = ProcessedPublisher(
+                self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
+            )
+            for topic in topics:
+                for name in topic.instances(settings) if self._wanted(topic, settings) else ():
+                    self._inputs[name] = self._input(topic, name, settings)
+        required, one_of = needed(topics, settings)
+        self._topic_names = {
+            name: self.resolve_topic_name(topic.prefix + name)
+            for name, (topic, _, _) in self._inputs.items()
+        }
+        self._reporter = Reporter(
+            self._full_name, self._topic_names, self._meter, required=required, one_of=one_of
+        )
+
+    def _wanted(self, topic: InputTopic, settings: Mapping[str, Any]) -> bool:
+        """Whether to hear an input. Frames are heard where their type is installed: PyPI has no
+        tf2_msgs. With `sonar_frame` the node cannot do without."""
+        if not topic.wanted(settings):
+            return False
+        if topic.measurement is not StaticTransforms or settings.get('sonar_frame'):
+            return True
+        try:
+            message_class(self._settings.choice(f'{topic.name}_type'))
+        except ImportError:
+            return False
+        return True
+
     def _input(
         self, topic: InputTopic, name: str, settings: Mapping[str, Any]
     ) -> tuple[InputTopic, str, Callable[[Any], Any]]:
@@ -304,20 +308,9 @@ class BaseNode(Node):
         }
         return connected or None
 
-    def _hear_when_warm(self) -> None:
-        """Hear the inputs once what they need is compiled, and say what takes long."""
-        if sentence := self._warming.due_sentence():
-            self.get_logger().info(sentence)
-        if self._warming.ready() and not self._hears:
-            with explained_overrides(self):
-                for name in self._inputs:
-                    self._listen(name)
-            self._hears = True
-            self._settings.warn_of_unknown()  # those of the inputs' endpoints are known now
-            self._acknowledge(None)
-            self.get_logger().info(f'ready, hears {", ".join(self._topic_names.values())}')
-        if self._warming.done():
-            self.destroy_timer(self._until_warm)
+    def _entities(self) -> set[Any]:
+        """All that this node has on the graph now, and its timers."""
+        return {*self.publishers, *self.subscriptions, *self.services, *self.timers}
 
     def _listen(self, name: str) -> None:
         """Subscribe to one input."""
@@ -331,7 +324,8 @@ class BaseNode(Node):
 
     def _reconfigure(self) -> None:
         self._node_config = self._settings[self._node_config_type]
-        self.reconfigure()
+        if self._warming is not None:
+            self.reconfigure()
 
     def _waited_too_long(self, name: str, info: Mapping[str, Any]) -> bool:
         """Whether a message lay in the queue for more than `max_wait`; counts it."""
@@ -377,13 +371,19 @@ class BaseNode(Node):
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
                 stale_after=self._node_config.stale_after,
-                starting='' if self._hears else self._warming.sentence(),
+                starting='' if self._hears else self._why_silent(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
                 publishers=self.count_publishers,
-                **self.work_report(),
+                **(NO_WORK if self._warming is None else self.work_report()),
             )
         )
+
+    def _why_silent(self) -> str:
+        """Why no input is heard."""
+        if self._warming and self.state == 'configuring':
+            return self._warming.sentence()
+        return f'no input is heard: the node is {self.state}'
 
 
 class TrackerNode(BaseNode):
@@ -393,31 +393,32 @@ class TrackerNode(BaseNode):
         """Get the tracker ready and begin. As `BaseNode`."""
         config_types = SYSTEMS[system].config_type(), node_config_type(SYSTEMS[system])
         super().__init__(system, config_types, **options)
-        self._saved_state = SavedState(self, system, self._node_config)
-        self._intake = self._saved_state.load(self._config)
-        self.tracker = self._intake.tracker
         self._enabled = True
         self._ignored = self._withheld = 0
-        with explained_overrides(self):
-            self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
-            self._displays = DisplayPublisher(system, self.advertise)
-            self.advertise_more()
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(SetBool, '~/enable', self._on_enable)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
             ),
             post_callback=self._on_clock_back,
         )
-        self._saved_state.save_periodically(lambda: self._config)
         self.begin()
 
-    def destroy_node(self) -> None:
-        """Save the state, then end."""
+    def prepare(self) -> None:
+        """Go on from the state file, or begin anew."""
+        self._saved_state = SavedState(self, self._name, self._node_config)
+        self._intake = self._saved_state.load(self._config)
+        self.tracker = self._intake.tracker
+        self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
+        self._displays = DisplayPublisher(self._name, self.advertise)
+        self.advertise_more()
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(SetBool, '~/enable', self._on_enable)
+        self._saved_state.save_periodically(lambda: self._config)
+
+    def release(self) -> None:
+        """Save the state."""
         self._saved_state.save(self._config, wait=True)
         self._saved_state.close()
-        super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
         """Offer an output; to be used by `advertise_more`."""
@@ -528,6 +529,8 @@ class TrackerNode(BaseNode):
         return response
 
     def _on_clock_back(self, jump: Any) -> None:
+        if self._warming is None:
+            return
         self.get_logger().warning(
             f'/clock is back by {-jump.delta.nanoseconds / 1e9:.3f} s: the tracker starts afresh'
         )

@@ -43,7 +43,7 @@ from ..trackers import WarmStep
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
 from .base import BaseNode, TABLE
 from .messages import make, message_class
-from .qos import explained_overrides, output_qos
+from .qos import output_qos
 from .running import run
 
 NAME = 'fls_detector'
@@ -56,16 +56,18 @@ class FlsDetectorNode(BaseNode):
         """Raises `ConfigError` for parameters that cannot be used, and when the type of the images
         is not installed."""
         super().__init__(NAME, (DetectorConfig, DetectorNodeConfig), **options)
+        self.begin()
+
+    def prepare(self) -> None:
+        """The detector, and its output."""
         self._detector = ImageDetector(self._settings[DetectorConfig])
         self._frames = KnownFrames()
-        with explained_overrides(self):
-            self._detections = self._endpoints.advertise(
-                message_class(TABLE),
-                'detections',
-                output_qos(),
-                matched=lambda: self._acknowledge(None),
-            )
-        self.begin()
+        self._detections = self._endpoints.advertise(
+            message_class(TABLE),
+            'detections',
+            output_qos(),
+            matched=lambda: self._acknowledge(None),
+        )
 
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Detect and publish."""

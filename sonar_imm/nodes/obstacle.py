@@ -49,15 +49,18 @@ class ObstacleNode(TrackerNode):
     """Tracks obstacles ahead and how far above or below the sonar they lie."""
 
     def __init__(self, **options: Any):
-        self._shown: tuple[Any, ...] = ()
         super().__init__('obstacle', **options)
 
     def advertise_more(self) -> None:
+        self._shown: tuple[Any, ...] = ()
         self._map = self._endpoints.advertise(
             message_class('geometry_msgs/msg/PoseArray'), '~/map', latched_qos()
         )
-        newest_ns = max((each.stamp_ns for each in self.tracker.landmarks), default=0)
-        self._show_map(newest_ns)
+
+    def activated(self) -> None:
+        """Hear the inputs, and show what is remembered."""
+        super().activated()
+        self._show_map(max((each.stamp_ns for each in self.tracker.landmarks), default=0))
 
     def show(self, estimates: list[Estimate]) -> None:
         super().show(estimates)

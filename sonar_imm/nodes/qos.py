@@ -156,6 +156,7 @@ class Endpoints:
     def __init__(self, node: Node):
         self._node = node
         self._gaps: dict[str, SequenceGaps] = {}
+        self._subscriptions: list[Subscription] = []
         self._reported_lost: Counter[str] = Counter()
         self._warned: set[str] = set()
         self.incompatible: dict[str, str] = {}
@@ -200,8 +201,17 @@ class Endpoints:
             event_callbacks=events,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+        before = self._gaps.get(topic)
         gaps = self._gaps[topic] = SequenceGaps(subscription.get_publisher_count)
+        gaps.lost = before.lost if before else 0
+        self._subscriptions.append(subscription)
         return subscription
+
+    def unsubscribe(self) -> None:
+        """End all subscriptions; what they lost stays counted."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
 
     def advertise(
         self,

@@ -66,7 +66,7 @@ class InputOptions:
     order: str = 'recorded'
     world_frame: str = 'enu'
     frame_id: str = ''
-    use_tf_static: bool = False
+    use_tf_static: bool = True
     smooth: bool = False
     jobs: int = 1
     detector: Mapping[str, Any] = field(factory=dict)

@@ -15,6 +15,7 @@
 """A small real system, the walker, and a bench to run its node on: one process, one executor."""
 
 import contextlib
+import threading
 import time
 
 import pytest
@@ -29,6 +30,28 @@ from sonar_imm_tools.replay.link import Link
 def _walker(monkeypatch):
     """Make the system 'walker' known for one test."""
     walker.register(monkeypatch.setitem)
+
+
+class Steps:
+    """Steps named after what they wait for; each goes on when it is let go."""
+
+    def __init__(self, **kinds):
+        self.kinds, self.done = kinds, []
+        self.begun = {name: threading.Event() for name in kinds}
+        self.go = {name: threading.Event() for name in kinds}
+
+    def __call__(self, inputs):
+        chosen = [name for name, kind in self.kinds.items() if inputs is None or kind in inputs]
+        return [(name, lambda name=name: self.work(name)) for name in chosen]
+
+    def work(self, name):
+        self.begun[name].set()
+        assert self.go[name].wait(30.0)
+        self.done.append(name)
+
+    def let_go(self):
+        for event in self.go.values():
+            event.set()
 
 
 class Bench:

@@ -131,6 +131,23 @@ def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
         intake.admit(fix('odom', 1.0))
 
 
+def test_an_altimeter_in_another_frame_is_turned_where_the_transform_is_known():
+    intake = Intake(SYSTEMS['bathymetry'].build(SYSTEMS['bathymetry'].config_type()()))
+
+    def take(frame_id):
+        made = intake.admit(Altitude(stamp_ns=10**9, altitude=9.0, frame_id=frame_id))
+        intake.tracker.process(made)
+        return made
+
+    assert take('dvl').altitude == 9.0
+    with pytest.raises(Rejection, match="'altimeter' is not .* and no fixed transform joins"):
+        take('altimeter')
+    above = Pose(np.array([0.0, 0.0, 1.5]), np.eye(3))
+    intake.admit(StaticTransforms(poses={'altimeter': ('dvl', above)}))
+    made = take('altimeter')
+    assert made.altitude == 7.5 and made.frame_id == 'dvl'
+
+
 def test_a_late_altitude_does_not_shut_out_the_later_ones():
     tracker = SYSTEMS['obstacle'].build(SYSTEMS['obstacle'].config_type()())
     intake = Intake(tracker)

@@ -21,12 +21,14 @@ from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.intake.transforms import MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
+    Altitude,
     Arrivals,
     Detections,
     Fix,
     Fixes,
     Navigation,
     Rejection,
+    RelativeFix,
     Start,
     StaticTransforms,
 )
@@ -154,6 +156,32 @@ def test_a_tilted_frame_and_what_a_sonar_sees_are_refused_with_both_names():
     ping = Detections(stamp_ns=STAMP, range=[1.0], bearing=[0.0], frame_id='sonar')
     with pytest.raises(Rejection, match="'sonar'"):
         moved(ping, 'map', TURNED)
+
+
+def test_what_sensors_on_board_measure_is_turned_into_the_axes_of_the_first_one():
+    echo = Detections(stamp_ns=STAMP, range=[5.0], bearing=[3.0], frame_id='skewed')
+    here = Pose(np.zeros(3), TURNED.R)
+    made = moved(echo, 'sonar', here)
+    assert made.frame_id == 'sonar' and made.range.tolist() == [5.0]
+    assert made.bearing == pytest.approx([3.0 + YAW - 2.0 * np.pi])
+    with pytest.raises(Rejection, match="'skewed' is another one, at another place"):
+        moved(echo, 'sonar', TURNED)
+
+    height = Altitude(stamp_ns=STAMP, altitude=9.0, variance=0.04, frame_id='altimeter')
+    made = moved(height, 'dvl', TURNED)
+    assert (made.altitude, made.variance, made.frame_id) == (6.0, 0.04, 'dvl')
+
+    tilted = Pose(np.array([2.0, 0.5, -1.0]), geometry.rotation(0.3, -0.4, 0.9))
+    covariance = np.diag([1.0, 4.0, 9.0])
+    fix = RelativeFix(stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], covariance=covariance, frame_id='b')
+    made = moved(fix, 'usbl', tilted)
+    assert made.offset == pytest.approx((matrix(tilted) @ [9.0, 2.0, -4.0, 1.0])[:3])
+    assert made.covariance == pytest.approx(tilted.R @ covariance @ tilted.R.T)
+    level = RelativeFix(stamp_ns=STAMP, offset=[9.0, 2.0, -4.0], levelled=True, frame_id='b')
+    made = moved(level, 'usbl', Pose(np.zeros(3), tilted.R))
+    assert made.offset.tolist() == [9.0, 2.0, -4.0] and made.frame_id == 'usbl'
+    with pytest.raises(Rejection, match='do not say how the vessel lies'):
+        moved(level, 'usbl', tilted)
 
 
 def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():

@@ -56,6 +56,7 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     settings = ('-p', 'stale_after:=7.5', '-p', 'frame_id:=harbour')
     bench = make_bench(*settings)
     node = bench.add(NODES[system](context=bench.context))
+    bench.spin_until(lambda: node.state == 'active')  # inputs have parameters from then on
     file = tmp_path / 'live.yaml'
     file.write_text(dumped(bench, f'/{system}'))
     config, told = load_config(SYSTEMS[system], file, {})
@@ -63,16 +64,24 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     assert (told.stale_after, told.frame_id) == (7.5, 'harbour')
     again = make_bench('--params-file', str(file))
     second = again.add(NODES[system](context=again.context))
+    again.spin_until(lambda: second.state == 'active')
     assert second.tracker.config == config
     assert dumped(again, f'/{system}') == file.read_text()
     assert 'has no effect' not in capfd.readouterr().err
 
 
-def test_the_detector_has_a_value_for_every_parameter_too(make_bench):
-    pytest.importorskip('marine_acoustic_msgs')
-    bench = make_bench()
-    bench.add(FlsDetectorNode(context=bench.context))
-    dumped(bench, '/fls_detector')
+def test_a_dump_of_the_detector_holds_all_and_loads_again(make_bench, tmp_path, capfd):
+    bench = make_bench('-p', 'image_type:=sensor_msgs/msg/Image', '-p', 'stale_after:=7.5')
+    node = bench.add(FlsDetectorNode(context=bench.context))
+    bench.spin_until(lambda: node.state == 'active')
+    file = tmp_path / 'live.yaml'
+    file.write_text(dumped(bench, '/fls_detector'))
+    assert 'stale_after: 7.5' in file.read_text()
+    again = make_bench('--params-file', str(file))
+    second = again.add(FlsDetectorNode(context=again.context))
+    again.spin_until(lambda: second.state == 'active')
+    assert dumped(again, '/fls_detector') == file.read_text()
+    assert 'has no effect' not in capfd.readouterr().err
 
 
 def test_a_file_for_another_node_is_named(tmp_path):

@@ -14,6 +14,7 @@
 
 """Where a sonar is on its vehicle is kept by a node that is started again."""
 
+from attrs import evolve
 import numpy as np
 import pytest
 
@@ -147,3 +148,32 @@ def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, t
     assert state.life.track_id.tolist() == [1] and state.life.status.tolist() == [1]
     again.send(*told('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
     assert len(again.node.tracker._stream.state.x) == 1
+
+
+def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(make_bench, capfd):
+    bench = make_bench('-p', f'tf_static_type:={ALONE}', '-p', 'frame_id:=map')
+    node = bench.add(DiverNode(context=bench.context))
+    kind = next(entry for entry in inputs_of('diver') if entry.name == 'fix')
+    type_name = next(iter(kind.readers))
+    fixes = bench.peer.create_publisher(message_class(type_name), '/fix', lockstep_qos())
+    said = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
+    bench.spin_until(lambda: fixes.get_subscription_count() and said.get_subscription_count())
+
+    def send(publisher, message):
+        before = node._meter.received.total()
+        publisher.publish(message)
+        bench.spin_until(lambda: node._meter.received.total() > before)
+
+    def fix(second, frame_id):
+        place = Fix(stamp_ns=second * 10**9, position=(1.0, 2.0, 0.0), frame_id=frame_id)
+        return kind.write(evolve(place, covariance=np.eye(2)), make)
+
+    send(fixes, fix(1, 'buoy'))
+    assert node._meter.refused['frame'] == 1
+    assert "'buoy' is not the frame 'map' of the tracks, and no fixed" in capfd.readouterr().err
+    send(said, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
+    send(fixes, fix(2, 'buoy'))
+    assert node._meter.refused['frame'] == 1
+    send(fixes, fix(4, 'odom'))
+    assert node._meter.refused['frame'] == 2
+    assert node.tracker.counts['used'] == 1

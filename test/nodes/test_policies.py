@@ -27,6 +27,12 @@ from sonar_imm.nodes.fls_detector import FlsDetectorNode
 from sonar_imm.nodes.obstacle import ObstacleNode
 
 FOLDER = Path(__file__).resolve().parents[2] / 'config' / 'sros2'
+# So that the nodes start, and hear the same, where messages of others are not installed.
+FRAMES = ['-p', 'tf_static_type:=geometry_msgs/msg/TransformStamped']
+EXTRA = {
+    'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image'],
+    **dict.fromkeys(('bathymetry', 'diver', 'obstacle'), FRAMES),
+}
 NODES = {
     'bathymetry': BathymetryNode,
     'diver': DiverNode,
@@ -56,8 +62,7 @@ def allowed(name, node):
 
 @pytest.mark.parametrize('name', NODES)
 def test_a_policy_allows_what_its_node_does_and_nothing_else(name, make_bench):
-    image = ['-p', 'image_type:=sensor_msgs/msg/Image'] if name == 'fls_detector' else []
-    bench = make_bench('-p', 'use_sim_time:=true', *image)
+    bench = make_bench('-p', 'use_sim_time:=true', *EXTRA.get(name, []))
     node = bench.add(NODES[name](context=bench.context))
     told = allowed(name, node)
     who = node.get_name(), node.get_namespace()

@@ -14,7 +14,6 @@
 
 """A node while its kernels are compiled."""
 
-import threading
 import time
 
 import pytest
@@ -22,37 +21,17 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from helpers.node_bench import Steps  # noqa: E402
 from helpers.walker import WalkerTracker  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 
 from sonar_imm.estimation import jit  # noqa: E402
 from sonar_imm.measurements import Arrivals, Fix  # noqa: E402
-from sonar_imm.nodes.base import TrackerNode, Warming  # noqa: E402
+from sonar_imm.nodes.base import TrackerNode  # noqa: E402
+from sonar_imm.nodes.managed import Warming  # noqa: E402
 from sonar_imm.nodes.qos import output_qos  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures('walker')
-
-
-class Steps:
-    """Steps named after what they wait for; each goes on when it is let go."""
-
-    def __init__(self, **kinds):
-        self.kinds, self.done = kinds, []
-        self.begun = {name: threading.Event() for name in kinds}
-        self.go = {name: threading.Event() for name in kinds}
-
-    def __call__(self, inputs):
-        chosen = [name for name, kind in self.kinds.items() if inputs is None or kind in inputs]
-        return [(name, lambda name=name: self.work(name)) for name in chosen]
-
-    def work(self, name):
-        self.begun[name].set()
-        assert self.go[name].wait(30.0)
-        self.done.append(name)
-
-    def let_go(self):
-        for event in self.go.values():
-            event.set()
 
 
 def kernels_of(steps):
@@ -124,7 +103,7 @@ def test_what_goes_wrong_is_raised_where_somebody_asks():
     while not warming.done():
         time.sleep(0.01)
     with pytest.raises(ZeroDivisionError):
-        warming.ready()
+        warming.trouble()
 
 
 def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):

@@ -67,7 +67,8 @@ def test_a_recorded_mounting_is_that_of_the_parameters(alone, tmp_path, capsys):
     frames = ['--set', 'vehicle_frame=base_link', '--set', 'sonar_frame=sonar']
     lever, rpy = (json.dumps(list(one)) for one in (LEVER, RPY))
     by_hand = ['--set', f'sonar_lever={lever}', '--set', f'sonar_mount_rpy_deg={rpy}']
-    for name, told in (('told', frames), ('by_hand', by_hand), ('plain', [])):
+    deaf = ['--set', 'use_tf_static=false']
+    for name, told in (('told', frames), ('by_hand', by_hand), ('plain', deaf)):
         assert main(['track', str(bag), str(tmp_path / name), '--system', 'obstacle', *told]) == 0
     said = [numbers(tmp_path / name / 'estimate.csv') for name in ('told', 'by_hand', 'plain')]
     assert said[0] == pytest.approx(np.array(said[1]), rel=1e-6, abs=1e-6)

@@ -1,0 +1,203 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A node that a lifecycle manager starts, by real clients of `lifecycle_msgs`."""
+
+from diagnostic_msgs.msg import DiagnosticArray
+from helpers.node_bench import Steps
+from helpers.rig import a_fix, FIX
+from helpers.walker import WalkerTracker
+from lifecycle_msgs.msg import State, Transition, TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+import pytest
+from rcl_interfaces.srv import GetParameters
+from rclpy.lifecycle import TransitionCallbackReturn
+
+from msg_adapters.estimates import read_estimate
+from sonar_imm.measurements import Fix
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.messages import message_class
+from sonar_imm.nodes.qos import output_qos
+
+pytestmark = pytest.mark.usefixtures('walker')
+
+
+class Manager:
+    """What a lifecycle manager does: asks for transitions, one after the other."""
+
+    def __init__(self, bench, *, autostart=False):
+        self.bench = bench
+        self.node = bench.add(TrackerNode('walker', context=bench.context))
+        assert autostart == (self.state() not in ('unconfigured',))
+
+    def state(self):
+        return self.bench.call(
+            GetState, '/walker/get_state', GetState.Request()
+        ).current_state.label
+
+    def available(self):
+        name = '/walker/get_available_transitions'
+        found = self.bench.call(GetAvailableTransitions, name, GetAvailableTransitions.Request())
+        return {each.transition.label for each in found.available_transitions}
+
+    def ask(self, label='', number=0):
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        return self.bench.call(ChangeState, '/walker/change_state', request).success
+
+
+@pytest.fixture
+def manage(make_bench):
+    """A manager of a node that does not start by itself, with these parameters."""
+
+    def begin(*parameters):
+        words = [word for each in ('autostart:=false', *parameters) for word in ('-p', each)]
+        return Manager(make_bench(*words))
+
+    return begin
+
+
+def fixes(manager):
+    return manager.bench.peer.create_publisher(message_class(FIX), '/fix', output_qos())
+
+
+def send(manager, publisher, message, estimates):
+    """Send one fix and wait for its estimate."""
+    bench, before = manager.bench, len(estimates)
+    bench.spin_until(lambda: publisher.get_subscription_count() == 1)
+    publisher.publish(message)
+    bench.spin_until(lambda: len(estimates) > before)
+    return read_estimate(estimates[-1]).state[0, :2].tolist()
+
+
+def test_a_node_starts_by_itself_unless_it_is_told_not_to(make_bench):
+    bench = make_bench()
+    events = bench.listen(TransitionEvent, '/walker/transition_event')
+    manager = Manager(bench, autostart=True)
+    bench.spin_until(lambda: manager.state() == 'active')
+    assert manager.available() == {'deactivate', 'shutdown'}
+    assert manager.ask('deactivate')
+    bench.spin_until(lambda: events and events[-1].goal_state.label == 'inactive')
+    assert events[-1].start_state.id == State.TRANSITION_STATE_DEACTIVATING
+
+
+def test_the_life_of_a_managed_node(manage):
+    manager = manage('diagnostics_period:=0.05')
+    bench, node = manager.bench, manager.node
+    estimates = bench.listen(message_class('sensor_msgs/msg/PointCloud2'), '/walker/estimate', 10)
+    reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    assert manager.available() == {'configure', 'shutdown'}
+    assert not node.count_publishers('/walker/estimate') and not node.count_subscribers('/fix')
+    bench.spin_until(
+        lambda: reports and 'the node is unconfigured' in reports[-1].status[0].message
+    )
+    assert manager.ask('configure') and manager.state() == 'inactive'
+    assert node.count_publishers('/walker/estimate') and not node.count_subscribers('/fix')
+    assert manager.ask(number=Transition.TRANSITION_ACTIVATE) and manager.state() == 'active'
+    publisher = fixes(manager)
+    assert send(manager, publisher, a_fix(1.0, 0.0, 0.0), estimates) == [0.0, 0.0]
+
+    assert manager.ask('deactivate') and manager.state() == 'inactive'
+    bench.spin_until(lambda: publisher.get_subscription_count() == 0)
+    bench.spin_until(lambda: 'the node is inactive' in reports[-1].status[0].message)
+    assert manager.ask('activate')  # it goes on with what it knew
+    assert send(manager, publisher, a_fix(2.0, 4.0, 2.0), estimates) == [2.0, 1.0]
+
+    assert manager.ask('deactivate') and manager.ask('cleanup')
+    assert manager.state() == 'unconfigured'
+    bench.spin_until(lambda: not bench.peer.count_publishers('/walker/estimate'))
+    assert manager.ask('configure') and manager.ask('activate')  # and now it begins anew
+    assert send(manager, publisher, a_fix(3.0, 5.0, 5.0), estimates) == [5.0, 5.0]
+    assert manager.ask('shutdown') and manager.state() == 'finalized'
+    bench.spin_until(lambda: publisher.get_subscription_count() == 0)
+    assert not manager.available()
+
+
+def test_a_transition_that_the_state_does_not_have_is_refused_and_survived(manage, capfd):
+    manager = manage()
+    assert not manager.ask('activate') and not manager.ask(number=77) and not manager.ask('dance')
+    assert not manager.ask(number=Transition.TRANSITION_ON_CONFIGURE_SUCCESS)
+    assert manager.state() == 'unconfigured'
+    assert "no transition 'activate' from unconfigured" in capfd.readouterr().err
+    assert manager.ask('configure')
+    assert not manager.ask('configure') and manager.state() == 'inactive'
+
+
+def test_while_it_configures_the_node_answers_and_refuses_other_transitions(manage, monkeypatch):
+    steps = Steps(fixes=Fix)
+    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
+    manager = manage('diagnostics_period:=0.05')
+    bench = manager.bench
+    reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    client = bench.peer.create_client(ChangeState, '/walker/change_state')
+    bench.spin_until(client.service_is_ready)
+    asked = client.call_async(ChangeState.Request(transition=Transition(label='configure')))
+    try:
+        bench.spin_until(steps.begun['fixes'].is_set)
+        assert manager.state() == 'configuring'
+        assert not manager.ask('activate') and not manager.ask('shutdown')
+        assert not manager.ask(number=Transition.TRANSITION_ON_CONFIGURE_SUCCESS)
+        request = GetParameters.Request(names=['sound_speed'])
+        answer = bench.call(GetParameters, '/walker/get_parameters', request)
+        assert answer.values[0].double_value == 1500.0
+        bench.spin_until(lambda: reports and 'loading kernels' in reports[-1].status[0].message)
+        assert not asked.done()
+    finally:
+        steps.let_go()
+    bench.spin_until(asked.done)
+    assert asked.result().success and manager.state() == 'inactive'
+
+
+def test_what_fails_while_configuring_is_logged_and_can_be_tried_again(manage, tmp_path, capfd):
+    manager = manage(f'state_file:={tmp_path / "folder" / "state"}')
+    assert not manager.ask('configure') and manager.state() == 'unconfigured'
+    assert 'there is no folder' in capfd.readouterr().err
+    (tmp_path / 'folder').mkdir()
+    assert manager.ask('configure') and manager.state() == 'inactive'
+
+
+def test_kernels_that_cannot_be_compiled_leave_the_node_unconfigured(manage, monkeypatch, capfd):
+    def fails():
+        raise ZeroDivisionError('a bug')
+
+    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: [('all', fails)])
+    manager = manage()
+    assert not manager.ask('configure') and manager.state() == 'unconfigured'
+    assert 'ZeroDivisionError: a bug' in capfd.readouterr().err
+    assert not manager.node.count_publishers('/walker/estimate')
+
+
+def test_an_input_that_cannot_be_heard_leaves_the_node_inactive(manage, capfd):
+    manager = manage('qos_overrides./fixes.subscription.depth:=many')
+    assert manager.ask('configure') and not manager.ask('activate')
+    assert manager.state() == 'inactive' and 'depth' in capfd.readouterr().err
+    assert not manager.node.count_subscribers('/fix')
+
+
+def test_the_state_is_saved_by_cleanup_and_loaded_by_configure(manage, tmp_path):
+    manager = manage(f'state_file:={tmp_path / "state"}')
+    bench = manager.bench
+    estimates = bench.listen(message_class('sensor_msgs/msg/PointCloud2'), '/walker/estimate', 10)
+    assert manager.ask('configure') and manager.ask('activate')
+    publisher = fixes(manager)
+    send(manager, publisher, a_fix(1.0, 0.0, 0.0), estimates)
+    assert manager.ask('deactivate') and manager.ask('cleanup') and (tmp_path / 'state').is_file()
+    assert manager.ask('configure') and manager.ask('activate')
+    assert send(manager, publisher, a_fix(2.0, 4.0, 2.0), estimates) == [2.0, 1.0]
+
+
+def test_a_program_can_use_the_verbs_of_rclpy(manage):
+    node = manage().node
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS and node.state == 'active'
+    assert node.trigger_shutdown() == TransitionCallbackReturn.SUCCESS
