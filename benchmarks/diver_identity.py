@@ -14,7 +14,7 @@
 
 """Whose track is whose: three ways to pair fixes and divers on the same scans.
 
-    python -m benchmarks.diver_identity --runs 3 --out docs/results/diver_identity.json
+    python -m benchmarks.diver_identity --out docs/results/diver_identity.json
 
 `buddies` (see `diver_named`): two divers 2 m apart, a scan per second, .5 m on each axis, P_D .9,
 two false fixes in a square of 120 m; from the 20th second on the transponder of the first is heard
@@ -24,12 +24,15 @@ boats on legs of 10 to 30 s at 3 m/s, 2 m on each axis, a scan each 2 s, P_D .9,
 a square of 400 m.
 
 All are told the detection probability, the density of false fixes and the speed of the boats;
-everything else is at its default, `model_set: families` too. Counted are confirmed tracks: GOSPA
+everything else is at its default, `model_set: families` too. In `untold` nobody is told anything.
+Counted are confirmed tracks: GOSPA
 (10 m, 2; of boats 20 m), `with switches` half of the cutoff for each identity switch; switches for
 each hour of the scene; false tracks for each hour; `identities kept` as in `diver_crossing`,
 `named m` the error of the rows with a name against the diver of that name in the last minute. CPU
-of a scan is that of this process. `hypotheses` repeats `buddies` with other numbers of hypotheses
-and `model_set: heading_speed`.
+of a scan is that of this process. In `single` a diver is alone: `clean` a swimmer heard
+every second to 1 m, `usbl` and `wild` as in `diver_families`. `clutter` is the density of false fixes that was learnt at the
+end, over the true one. `hypotheses` repeats `buddies` with other numbers of hypotheses and
+`model_set: heading_speed`.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.diver_crossing import identities_kept, true_paths
+from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
 from benchmarks.diver_named import FALSE, HALF, measured, P_DETECTION, truth_of
 from benchmarks.study import Parts, rms, study
 from sonar_imm.estimates import Estimate
@@ -51,6 +55,7 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 SCENES = ('buddies', 'crossing', 'harbour')
+ALONE = ('clean', 'usbl', 'usbl, named', 'wild')
 COUNTS = (1, 10, 30)
 HOUR = 3600.0
 
@@ -115,15 +120,17 @@ def named_error(made: list[Estimate], truth: tuple[Any, ...]) -> list[float]:
     return error
 
 
-def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
+def case(name: str, runs: int, untold: bool = False, **settings: Any) -> dict[str, Any]:
     """The scores of a way to pair, over all runs of a scene."""
+    learnt: list[float] = []
     scored: list[dict[str, Any]] = []
     kept: list[bool] = []
     named: list[float] = []
     seconds, scans, rows, span = 0.0, 0, 0, 0.0
     for seed in range(runs):
         items, scene, told, cutoff = scene_of(name, seed)
-        tracker = DiverTracker(DiverConfig.from_mapping(told | settings))
+        density = told['clutter_density']
+        tracker = DiverTracker(DiverConfig.from_mapping(({} if untold else told) | settings))
         if not seed:
             tracker.warm()
             tracker.reset()
@@ -132,6 +139,7 @@ def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
             made.append(tracker.process(item)[-1])
             rows = max(rows, len(tracker._stream.state.life))
         seconds, scans = seconds + time.process_time() - begin, scans + len(items)
+        learnt += [found.density / density for _, found in tracker._stream.state.clutter]
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']
@@ -158,22 +166,42 @@ def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
         'named m': rms(named) if named else None,
         'ms a scan': 1e3 * seconds / scans,
         'rows at most': rows,
+        'clutter': float(np.mean(learnt)) if learnt else None,
     }
+
+
+def single(scene: str, association: str, runs: int) -> dict[str, float]:
+    """The scores of a diver who is alone, as `diver_families` counts them."""
+    made = {'clean': lambda seed: swimmer(np.random.default_rng(seed), 1.0, 1.0), 'wild': wild}
+    name = 7 if scene == 'usbl, named' else None
+    path = made.get(scene, usbl)
+    found = [robust(path(seed), name=name, association=association) for seed in range(runs)]
+    kept = 'rmse_m', 'coverage', 'nees', 'followed', 'tracks'
+    return {key: value for key, value in mean_over(found).items() if key in kept}
 
 
 def main(
     runs: int = 3,
+    untold: int = 10,
     scenes: tuple[str, ...] = SCENES,
     associations: tuple[str, ...] = ASSOCIATIONS,
     counts: tuple[int, ...] = COUNTS,
 ) -> Parts:
-    yield {'runs': runs}
+    yield {'runs': runs, 'untold_runs': untold}
     for name in scenes:
         for association in associations:
             found = case(name, runs, association=association)
             yield {'table': {f'{name}, {association}': found}}
+    for name in scenes:
+        for association in associations:
+            count = runs if name == 'harbour' else untold
+            found = case(name, count, untold=True, association=association)
+            yield {'untold': {f'{name}, {association}': {'runs': count, **found}}}
+    for scene in ALONE:
+        for association in ('gnn', 'kbest'):
+            yield {'single': {f'{scene}, {association}': single(scene, association, runs)}}
     for count in counts:
-        settings = {'hypotheses': count, 'model_set': 'heading_speed'}
+        settings: dict[str, Any] = {'hypotheses': count, 'model_set': 'heading_speed'}
         yield {'hypotheses': {str(count): case('buddies', runs, association='kbest', **settings)}}
 
 

@@ -32,7 +32,6 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from . import families, names
-from .config import DiverConfig
 from .coverage import Seen
 from .scan import Positions
 from .state import DiverState
@@ -133,11 +132,11 @@ def joint_weights(
             densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole
         )
         ratio = 0.0 if seen is None else seen.log_ratio
-        nis = np.where(densities.whole + ratio > families.bound(config), apart, np.inf)
+        nis = np.where(densities.whole + ratio > families.bound(fixes), apart, np.inf)
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
     looked = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
-    ratio, detected = mixture / (config.clutter_density + config.birth_density), np.ones(1)
+    ratio, detected = mixture / (fixes.clutter + config.birth_density), np.ones(1)
     detected = detected * config.detection_probability
     if seen is not None:
         detected = np.maximum(seen.tracks, LEAST_DETECTED)
@@ -206,10 +205,11 @@ def known_existence(existence: FloatArray, status: StatusArray) -> FloatArray:
     return np.where(np.isnan(existence), guess, existence)
 
 
-def birth_existence(config: DiverConfig, claimed: FloatArray) -> FloatArray:
+def birth_existence(fixes: Positions, claimed: FloatArray) -> FloatArray:
     """Existence (D,) of tracks that begin at fixes which belong, with the probability `claimed`
     (D,), to others."""
-    new = config.birth_density / (config.birth_density + config.clutter_density)
+    density = fixes.config.birth_density
+    new = density / (density + fixes.clutter)
     return np.asarray(new * (1.0 - claimed))
 
 
