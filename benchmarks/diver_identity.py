@@ -25,14 +25,13 @@ a square of 400 m.
 
 All are told the detection probability, the density of false fixes and the speed of the boats;
 everything else is at its default, `model_set: families` too. In `untold` nobody is told anything.
-Counted are confirmed tracks: GOSPA
-(10 m, 2; of boats 20 m), `with switches` half of the cutoff for each identity switch; switches for
-each hour of the scene; false tracks for each hour; `identities kept` as in `diver_crossing`,
-`named m` the error of the rows with a name against the diver of that name in the last minute. CPU
-of a scan is that of this process. In `single` a diver is alone: `clean` a swimmer heard
-every second to 1 m, `usbl` and `wild` as in `diver_families`. `clutter` is the density of false fixes that was learnt at the
-end, over the true one. `hypotheses` repeats `buddies` with other numbers of hypotheses and
-`model_set: heading_speed`.
+Counted are confirmed tracks: GOSPA (10 m, 2; of boats 20 m), `with switches` half of the cutoff
+for each identity switch; switches for each hour of the scene; false tracks for each hour;
+`identities kept` as in `diver_crossing`, `named m` the error of the rows with a name against the
+diver of that name in the last minute; `clutter` the density of false fixes that was learnt at the
+end, over the true one. CPU of a scan is that of this process. In `single` a diver is alone:
+`clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`.
+`hypotheses` repeats `buddies` with other numbers of hypotheses and `model_set: heading_speed`.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ import numpy as np
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...measurements import NOBODY
-from .config import CLUTTER
+from .config import CLUTTER, DiverConfig
 
 if TYPE_CHECKING:
     from .scan import Positions
@@ -48,6 +48,9 @@ metre in every other scan. Whoever has more has to state it."""
 
 PRIOR_SCANS, PRIOR_AREA = 5.0, 4e4
 """Scans, and m^2, that what is known at first is worth."""
+
+ENOUGH, EVIDENT = 20.0, 0.5
+"""Scans, and false fixes in each, from which `gnn` says that it should not ignore them."""
 
 MEMORY = 100.0
 """Scans after which what was seen counts for 1/e."""
@@ -101,6 +104,12 @@ class Clutter(NamedTuple):
             kept * self.yy + float(own[1, 1]),
         )
 
+    @property
+    def evident(self) -> bool:
+        """Whether there are many more false fixes than where nobody says how many."""
+        many = self.false > EVIDENT * self.scans and self.density > 10.0 * CLUTTER
+        return self.scans >= ENOUGH and many
+
 
 Clutters = tuple[tuple[str, Clutter], ...]
 """What is known of each sensor that showed scans."""
@@ -133,3 +142,16 @@ def without_first_fixes(
         return now
     known[sensor] = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
     return now._replace(clutter=tuple(known.items()))
+
+
+def warnings(known: Clutters, config: DiverConfig) -> list[str]:
+    """Sentences on false fixes that the association does not expect."""
+    if config.association != 'gnn':
+        return []
+    found = [clutter for _, clutter in known if clutter.evident]
+    return [
+        f'some {clutter.false / clutter.scans:.2g} fixes of each scan are of no diver '
+        f'({clutter.density:.1g} for each square metre), and association gnn expects '
+        f'{CLUTTER:g}: use association kbest or jipda, which learn this, or state clutter_density'
+        for clutter in found[:1]
+    ]

@@ -106,6 +106,13 @@ class Association(NamedTuple):
     counted: BoolArray | None = None
     seen: Seen | None = None
 
+    @property
+    def claimed(self) -> FloatArray:
+        """(D,) the probability that each fix is a track's."""
+        if self.weights is None:
+            return 1.0 - self.free
+        return np.asarray(self.weights.beta.sum(axis=0))
+
 
 def joint_weights(
     now: DiverState,

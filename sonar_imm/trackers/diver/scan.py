@@ -150,7 +150,7 @@ class Scan:
         """The scan of `items`; factor: on the covariances of fixes and of arrival times; clutter:
         of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config, factor[0]), []
-        known = dict(clutter)
+        known = dict(clutter) if config.association != 'gnn' else {}
         for at, group in enumerate(fixes):
             if group.target_id is None and group.sensor in known:
                 fixes[at] = evolve(group, learnt=known[group.sensor].density)

@@ -212,6 +212,7 @@ class DiverTracker:
             *state.heights.warnings(self.config),
             *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
             *births.no_room(state, self.config),
+            *clutter.warnings(state.clutter, self.config),
         ]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -241,8 +242,7 @@ class DiverTracker:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
             now = self._update_heights(now, fixes, association)
-            if association.weights is not None:
-                now = clutter.counted(now, fixes, association.weights.beta.sum(axis=0))
+            now = clutter.counted(now, fixes, association.claimed)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
             if association.free.any():

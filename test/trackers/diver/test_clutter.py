@@ -74,11 +74,11 @@ def test_divers_are_no_clutter(association):
 
 def test_what_is_stated_stays_and_gnn_learns_nothing():
     items = scans(20, 4.0, 40.0)
-    for settings in ({'association': 'kbest', 'clutter_density': 1e-4}, {'association': 'gnn'}):
-        tracker = DiverTracker(DiverConfig(model_set='heading_speed', **settings))
-        for item in items:
-            tracker.process(item)
-        assert tracker._stream.state.clutter == ()
+    config = DiverConfig(model_set='heading_speed', association='kbest', clutter_density=1e-4)
+    tracker = DiverTracker(config)
+    for item in items:
+        tracker.process(item)
+    assert tracker._stream.state.clutter == ()
     usual, stated = (
         DiverTracker(DiverConfig(association='gnn', clutter_density=value))
         for value in (0.0, CLUTTER)
@@ -132,3 +132,21 @@ def test_densities_are_bounded():
     for _ in range(3000):
         known = known.after(np.empty((0, 2)), np.empty(0))
     assert known.density == CLUTTER
+
+
+@pytest.mark.parametrize(
+    'false, half, settings, warns',
+    [
+        (6.0, 60.0, {}, True),
+        (6.0, 60.0, {'clutter_density': 4e-4}, False),
+        (6.0, 60.0, {'association': 'kbest'}, False),
+        (0.1, 60.0, {}, False),
+        (1.0, 900.0, {}, False),
+    ],
+)
+def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
+    tracker = DiverTracker(DiverConfig(model_set='cv', **{'association': 'gnn', **settings}))
+    for item in scans(40, false, half):
+        tracker.process(item)
+    (about,) = [text for text in tracker.warnings() if 'clutter_density' in text] or ['']
+    assert bool(about) == warns and (not warns or 'some 6' in about or 'some 5' in about)
