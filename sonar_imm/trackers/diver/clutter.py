@@ -150,7 +150,7 @@ def warnings(known: Clutters, config: DiverConfig) -> list[str]:
         return []
     found = [clutter for _, clutter in known if clutter.evident]
     return [
-        f'some {clutter.false / clutter.scans:.2g} fixes of each scan are of no diver '
+        f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
         f'({clutter.density:.1g} for each square metre), and association gnn expects '
         f'{CLUTTER:g}: use association kbest or jipda, which learn this, or state clutter_density'
         for clutter in found[:1]

@@ -141,8 +141,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((1.0, 3.0, 10.0), '',
         'families: the filter runs in copies, each of which multiplies the covariances of all '
-        'measurements by one of these; with dimensions 3: one copy, times 1',
-        range=(1.0, 1e4), kind='float[]')
+        'measurements by one of these; below 1 (0.1, 0.3) only where errors of fixes are known '
+        'not to last: those look the same; with dimensions 3: one copy, times 1',
+        range=(0.01, 1e4), kind='float[]')
     adaptation: str = parameter('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
         'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',

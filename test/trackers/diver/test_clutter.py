@@ -149,4 +149,6 @@ def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
     for item in scans(40, false, half):
         tracker.process(item)
     (about,) = [text for text in tracker.warnings() if 'clutter_density' in text] or ['']
-    assert bool(about) == warns and (not warns or 'some 6' in about or 'some 5' in about)
+    assert bool(about) == warns
+    # Its own false tracks take a part of them.
+    assert not warns or 0.5 * false < float(about.split()[0]) < 1.2 * false
