@@ -30,12 +30,16 @@ for each identity switch; switches for each hour of the scene; false tracks for 
 `identities kept` as in `diver_crossing`, `named m` the error of the rows with a name against the
 diver of that name in the last minute; `clutter` the density of false fixes that was learnt at the
 end, over the true one. CPU of a scan is that of this process. In `single` a diver is alone:
-`clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`.
-`hypotheses` repeats `buddies` with other numbers of hypotheses and `model_set: heading_speed`.
+`clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`. `recorded`
+are the boats of `real_recordings`. `hypotheses` repeats `buddies` with other numbers of
+hypotheses and `model_set: heading_speed`.
 """
 
 from __future__ import annotations
 
+from itertools import product
+from pathlib import Path
+import tempfile
 import time
 from typing import Any
 
@@ -44,12 +48,14 @@ import numpy as np
 from benchmarks.diver_crossing import identities_kept, true_paths
 from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
 from benchmarks.diver_named import FALSE, HALF, measured, P_DETECTION, truth_of
-from benchmarks.study import Parts, rms, study
+from benchmarks.real_recordings import boat_scores, DATA, load
+from benchmarks.study import final_estimates, Parts, rms, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.recordings.convert import convert_autoferry
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
@@ -179,6 +185,25 @@ def single(scene: str, association: str, runs: int) -> dict[str, float]:
     return {key: value for key, value in mean_over(found).items() if key in kept}
 
 
+def recorded(sensor: str, association: str) -> dict[str, float]:
+    """The scores of two boats recorded in clutter (`real_recordings`), nothing stated but how good
+    the sensor is."""
+    folder = DATA / 'autoferry'
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / sensor
+        convert_autoferry(
+            folder / 'scenario13_detections.json',
+            out,
+            sensors=(sensor,),
+            truth=folder / 'scenario13_groundTruth.json',
+        )
+        items, truth = load(out)
+    fix_std = 4.0 if sensor == 'radar' else 2.0
+    tracker = DiverTracker(DiverConfig(fix_std=fix_std, association=association))
+    found = boat_scores(final_estimates(tracker, items), truth)
+    return dict(zip(('GOSPA', 'missed', 'false', 'tracks', 'RMSE'), map(float, found)))
+
+
 def main(
     runs: int = 3,
     untold: int = 10,
@@ -199,6 +224,9 @@ def main(
     for scene in ALONE:
         for association in ('gnn', 'kbest'):
             yield {'single': {f'{scene}, {association}': single(scene, association, runs)}}
+    if (DATA / 'autoferry').is_dir():
+        for sensor, association in product(('radar', 'lidar'), associations):
+            yield {'recorded': {f'{sensor}, {association}': recorded(sensor, association)}}
     for count in counts:
         settings: dict[str, Any] = {'hypotheses': count, 'model_set': 'heading_speed'}
         yield {'hypotheses': {str(count): case('buddies', runs, association='kbest', **settings)}}
