@@ -27,20 +27,13 @@ some.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from ...estimation.arrays import FloatArray
-from ...estimation.association import TENTATIVE
-from ...measurements import NOBODY
 from .config import CLUTTER, DiverConfig
-
-if TYPE_CHECKING:
-    from .scan import Positions
-    from .state import DiverState
 
 MOST = 1e-2
 """The greatest that is believed, per square metre: one within the usual gate of a fix good to a
@@ -113,35 +106,6 @@ class Clutter(NamedTuple):
 
 Clutters = tuple[tuple[str, Clutter], ...]
 """What is known of each sensor that showed scans."""
-
-
-def counted(now: DiverState, fixes: Positions, claimed: FloatArray) -> DiverState:
-    """With the false ones of a scan, of which each fix is a track's with the probability `claimed`
-    (D,)."""
-    if fixes.config.clutter_density or fixes.target_id is not None or not fixes.whole:
-        return now
-    known = dict(now.clutter)
-    before = known.get(fixes.sensor, Clutter())
-    known[fixes.sensor] = before.after(fixes.z, np.clip(1.0 - claimed, 0.0, 1.0))
-    return now._replace(clutter=tuple(known.items()))
-
-
-def without_first_fixes(
-    before: DiverState, now: DiverState, fixes: Sequence[Positions]
-) -> DiverState:
-    """Without the first fixes of tracks that were confirmed since `before` by `fixes`, which were
-    counted as false ones."""
-    known = dict(now.clutter)
-    sensor = next((group.sensor for group in fixes if group.sensor in known), None)
-    if sensor is None:
-        return now
-    firm = now.life.track_id[(now.life.status != TENTATIVE) & (now.target_id == NOBODY)]
-    was = before.life.track_id[before.life.status != TENTATIVE]
-    new = len(np.setdiff1d(firm, was))
-    if not new:
-        return now
-    known[sensor] = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
-    return now._replace(clutter=tuple(known.items()))
 
 
 def warnings(known: Clutters, config: DiverConfig) -> list[str]:

@@ -32,6 +32,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from . import families, names
+from .clutter import Clutter
 from .coverage import Seen
 from .scan import Positions
 from .state import DiverState
@@ -110,7 +111,7 @@ class Association(NamedTuple):
     def claimed(self) -> FloatArray:
         """(D,) the probability that each fix is a track's."""
         if self.weights is None:
-            return 1.0 - self.free
+            return np.asarray(1.0 - self.free)
         return np.asarray(self.weights.beta.sum(axis=0))
 
 
@@ -295,3 +296,35 @@ def _both_seen(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> bo
     z, R = fixes.z[near], fixes.R[near]
     distance = names.squared(z[:, None] - z[None], R[:, None] + R[None])
     return bool((distance >= NEAR_CONFIRMED).any())
+
+
+# -- false fixes ---------------------------------------------------------------------------------
+
+
+def counted(now: DiverState, fixes: Positions, claimed: FloatArray) -> DiverState:
+    """With the false ones of a scan, of which each fix is a track's with the probability `claimed`
+    (D,)."""
+    if fixes.config.clutter_density or fixes.target_id is not None or not fixes.whole:
+        return now
+    known = dict(now.clutter)
+    before = known.get(fixes.sensor, Clutter())
+    known[fixes.sensor] = before.after(fixes.z, np.clip(1.0 - claimed, 0.0, 1.0))
+    return now._replace(clutter=tuple(known.items()))
+
+
+def without_first_fixes(
+    before: DiverState, now: DiverState, fixes: Sequence[Positions]
+) -> DiverState:
+    """Without the first fixes of tracks that were confirmed since `before` by `fixes`, which were
+    counted as false ones."""
+    known = dict(now.clutter)
+    sensor = next((group.sensor for group in fixes if group.sensor in known), None)
+    if sensor is None:
+        return now
+    firm = now.life.track_id[(now.life.status != TENTATIVE) & (now.target_id == NOBODY)]
+    was = before.life.track_id[before.life.status != TENTATIVE]
+    new = len(np.setdiff1d(firm, was))
+    if not new:
+        return now
+    known[sensor] = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
+    return now._replace(clutter=tuple(known.items()))

@@ -41,7 +41,7 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE, TrackRules
 from ...estimation.hypotheses import Hypotheses
 from ...measurements import NOBODY
-from . import clutter, coverage, families, jipda
+from . import coverage, families, jipda
 from .config import DiverConfig
 from .fix_kernels import expected, finite
 from .scan import Positions
@@ -143,7 +143,7 @@ def branched(
         target_id = np.where(hit, fixes.target_id[detection] if D else NOBODY, target_id)
     history[hit, :-1] = history[hit, 1:]
     history[hit, -1] = now.serial + detection[hit] + 1
-    after = clutter.counted(after, fixes, found.claimed)._replace(
+    after = jipda.counted(after, fixes, found.claimed)._replace(
         existence=np.where(hit, 1.0, left),
         evidence=after.evidence + hit,
         target_id=target_id,

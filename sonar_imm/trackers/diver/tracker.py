@@ -242,7 +242,7 @@ class DiverTracker:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
             now = self._update_heights(now, fixes, association)
-            now = clutter.counted(now, fixes, association.claimed)
+            now = jipda.counted(now, fixes, association.claimed)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
             if association.free.any():
@@ -256,7 +256,7 @@ class DiverTracker:
             now = births.begun_anew(now, ping, free, self.models, layout, self.config)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
         now = self._prune(self._learn(before, now, step, scan), scan)
-        now = clutter.without_first_fixes(before, now, scan.fixes)
+        now = jipda.without_first_fixes(before, now, scan.fixes)
         return self._spawn(now, found, scan.starts)
 
     def _scan(self, before: DiverState, items: Sequence[Measurement]) -> Scan:
