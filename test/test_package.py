@@ -19,6 +19,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+from pathlib import Path
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -189,6 +190,48 @@ def test_the_citation_names_this_version() -> None:
     assert cited['version'] == sonar_imm.__version__
     dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
     assert dated and dated.groups() == (cited['version'], str(cited['date-released']))
+
+
+def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
+    setup_lists: dict[str, list[str]],
+) -> None:
+    recipe = yaml.safe_load((ROOT / 'conda' / 'recipe.yaml').read_text(encoding='utf-8'))
+    assert recipe['package']['version'] == sonar_imm.__version__
+    wanted = {line.replace(' ', '').lower() for line in recipe['requirements']['run']}
+    ros = {line for line in wanted if line.startswith('ros')}
+    named = {line.lower() for line in setup_lists['REQUIRES']}
+    assert wanted - named == ros - named | {'python>=3.10'}
+    assert named <= wanted
+    assert {line for line in ros if line.startswith('ros-')} == {
+        *('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces')
+    }
+
+
+def test_ci_files_call_what_has_to_pass() -> None:
+    """Both only say where; what has to pass stands in .ci/run."""
+    hub = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text(encoding='utf-8'))
+    assert {'run': '.ci/run', 'env': {'PYTHON': 'python'}} in hub['jobs']['run']['steps']
+    lab = yaml.safe_load((ROOT / '.gitlab-ci.yml').read_text(encoding='utf-8'))
+    assert 'PYTHON=python3 .ci/run' in lab['.run']['script']
+
+
+def test_a_release_is_told_what_only_its_owner_can_fill_in(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location('placeholders', ROOT / '.ci/placeholders.py')
+    assert spec and spec.loader
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    for name in ('package.xml', 'CITATION.cff', 'CHANGELOG.rst'):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    missing = list(made.placeholders(tmp_path))
+    assert 'package.xml: maintainers@example.org reaches nobody' in missing
+    text = (tmp_path / 'package.xml').read_text().replace('@example.org', '@sonar.dev')
+    url = '</license>\n  <url type="repository">https://sonar.dev/sonar_imm</url>'
+    (tmp_path / 'package.xml').write_text(text.replace('</license>', url))
+    with (tmp_path / 'CITATION.cff').open('a') as file:
+        file.write('repository-code: https://sonar.dev/sonar_imm\n')
+    assert not [line for line in made.placeholders(tmp_path) if 'CHANGELOG' not in line]
+    (tmp_path / 'CHANGELOG.rst').write_text('Forthcoming\n-----------\n')
+    assert [line for line in made.placeholders(tmp_path) if 'Forthcoming' in line]
 
 
 def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:
