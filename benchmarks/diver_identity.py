@@ -46,10 +46,9 @@ import numpy as np
 
 from benchmarks.diver_crossing import identities_kept, true_paths
 from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
-from benchmarks.diver_named import FALSE, HALF, measured, P_DETECTION, truth_of
+from benchmarks.diver_named import FALSE, HALF, measured, named_errors, P_DETECTION, truth_of
 from benchmarks.real_recordings import autoferry, boat_scores, DATA
-from benchmarks.study import final_estimates, Parts, rms, study
-from sonar_imm.estimates import Estimate
+from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.evaluation.diver.scoring import score
@@ -106,37 +105,18 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
     return [item.measurement for item in scene.measurements], scene, told, cutoff
 
 
-def named_error(made: list[Estimate], truth: tuple[Any, ...]) -> list[float]:
-    """Errors in m of the rows with a name in the last minute."""
-    paths = {path.track_id: path for path in truth if isinstance(path, TrueTrack)}
-    error = []
-    for estimate in made:
-        if estimate.stamp_ns < made[-1].stamp_ns - 60 * 10**9:
-            continue
-        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
-            own = paths[int(estimate.extras['target_id'][row])]
-            at = [
-                np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
-                for axis in (0, 1)
-            ]
-            error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
-    return error
-
-
-def case(
-    name: str, runs: int, first: int = 0, untold: bool = False, **settings: Any
-) -> dict[str, Any]:
-    """The scores of a way to pair, over all runs of a scene; first: the seed of the first one."""
+def case(name: str, runs: int, untold: bool = False, **settings: Any) -> dict[str, Any]:
+    """The scores of a way to pair, over all runs of a scene."""
     learnt: list[float] = []
     scored: list[dict[str, Any]] = []
     kept: list[bool] = []
     named: list[float] = []
     seconds, scans, rows, span = 0.0, 0, 0, 0.0
-    for seed in range(first, first + runs):
+    for seed in range(runs):
         items, scene, told, cutoff = scene_of(name, seed)
         density = told['clutter_density']
         tracker = DiverTracker(DiverConfig.from_mapping(({} if untold else told) | settings))
-        if seed == first:
+        if not seed:
             tracker.warm()
             tracker.reset()
         begin, made = time.process_time(), []
@@ -144,11 +124,13 @@ def case(
             made.append(tracker.process(item)[-1])
             rows = max(rows, len(tracker._stream.state.life))
         seconds, scans = seconds + time.process_time() - begin, scans + len(items)
-        learnt += [found.density / density for _, found in tracker._stream.state.clutter]
+        if settings['association'] != 'gnn':
+            learnt += [found.density / density for _, found in tracker._stream.state.clutter]
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']
-        named += named_error(made, scene.truth)
+        late = made[-1].stamp_ns - 60 * 10**9
+        named += named_errors((e for e in made if e.stamp_ns >= late), truths(scene, TrueTrack))
         if name == 'crossing':
             kept += identities_kept(series, truth)
 
