@@ -59,7 +59,8 @@ def standing_out(model: SetModel, b: FloatArray, gram: FloatArray) -> tuple[Floa
     """b (n,) without the echoes of members elsewhere, gram (n,) of it, and what stands out: its
     gain exceeds what births get at most."""
     n, half, least = len(b), model.separation // 2, math.sqrt(2.0 * model.birth_cap)
-    mirrored = np.concatenate([gram[n - 1 : 0 : -1], gram[:n]])
+    gram = np.pad(gram[:n], (0, n - len(gram[:n])))
+    mirrored = np.concatenate([gram[:0:-1], gram])
     free, left = np.ones(n), b
     at, echoes, a = np.empty(0, np.int64), np.empty((0, n)), np.empty(0)
 
