@@ -35,6 +35,7 @@ before `>>` belongs to all of them:
     &        between the paths of a cell that has several numbers; a path may lead to a list, too
     {a,b}    two paths, one with a and one with b
     [k=v]    as a key: the only item of a list that has v under k
+    a.json   as the first key: the path goes into that file instead
     {row}    the first cell of the row (if empty, of the row above), or its entry in KEYS, which
              are divided by `|`, with `=` where the first cell is the key
     {col}    the head of the column; {n}: its place after the first
@@ -259,6 +260,9 @@ def expanded(paths: str) -> Iterator[str]:
 
 def values_at(content: Any, path: str) -> list[float]:
     """The numbers at a path: none where there is none, several in a list."""
+    first, _, rest = path.strip().partition('>')
+    if first.endswith('.json'):
+        content, path = contents(first), rest
     for key in path.split('>'):
         content = item(content, key.strip())
     found = content if isinstance(content, list) else [content]

@@ -19,6 +19,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+from pathlib import Path
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -191,6 +192,48 @@ def test_the_citation_names_this_version() -> None:
     assert dated and dated.groups() == (cited['version'], str(cited['date-released']))
 
 
+def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
+    setup_lists: dict[str, list[str]],
+) -> None:
+    recipe = yaml.safe_load((ROOT / 'conda' / 'recipe.yaml').read_text(encoding='utf-8'))
+    assert recipe['package']['version'] == sonar_imm.__version__
+    wanted = {line.replace(' ', '').lower() for line in recipe['requirements']['run']}
+    ros = {line for line in wanted if line.startswith('ros')}
+    named = {line.lower() for line in setup_lists['REQUIRES']}
+    assert wanted - named == ros - named | {'python>=3.10'}
+    assert named <= wanted
+    assert {line for line in ros if line.startswith('ros-')} == {
+        *('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces')
+    }
+
+
+def test_ci_files_call_what_has_to_pass() -> None:
+    """Both only say where; what has to pass stands in .ci/run."""
+    hub = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text(encoding='utf-8'))
+    assert {'run': '.ci/run', 'env': {'PYTHON': 'python'}} in hub['jobs']['run']['steps']
+    lab = yaml.safe_load((ROOT / '.gitlab-ci.yml').read_text(encoding='utf-8'))
+    assert 'PYTHON=python3 .ci/run' in lab['.run']['script']
+
+
+def test_a_release_is_told_what_only_its_owner_can_fill_in(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location('placeholders', ROOT / '.ci/placeholders.py')
+    assert spec and spec.loader
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    for name in ('package.xml', 'CITATION.cff', 'CHANGELOG.rst'):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    missing = list(made.placeholders(tmp_path))
+    assert 'package.xml: maintainers@example.org reaches nobody' in missing
+    text = (tmp_path / 'package.xml').read_text().replace('@example.org', '@sonar.dev')
+    url = '</license>\n  <url type="repository">https://sonar.dev/sonar_imm</url>'
+    (tmp_path / 'package.xml').write_text(text.replace('</license>', url))
+    with (tmp_path / 'CITATION.cff').open('a') as file:
+        file.write('repository-code: https://sonar.dev/sonar_imm\n')
+    assert not [line for line in made.placeholders(tmp_path) if 'CHANGELOG' not in line]
+    (tmp_path / 'CHANGELOG.rst').write_text('Forthcoming\n-----------\n')
+    assert [line for line in made.placeholders(tmp_path) if 'Forthcoming' in line]
+
+
 def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:
     assert texts(manifest, 'depend') <= COMMON_INTERFACES | COME_WITH_RCLPY
 
@@ -326,6 +369,25 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
+def test_every_package_says_what_is_public() -> None:
+    """`__all__`: names of the package, or its modules; and the two packages ship their types."""
+    for path in MODULES:
+        if path.name == '__init__.py':
+            (listed,) = (
+                ast.literal_eval(node.value)
+                for node in tree_of(path).body
+                if isinstance(node, ast.Assign) and getattr(node.targets[0], 'id', '') == '__all__'
+            )
+            here = {each.stem for each in path.parent.iterdir()}
+            names = set(listed) - here
+            if names:
+                package = importlib.import_module(module_name(path))
+                assert all(hasattr(package, name) for name in names), path
+    for package in ('sonar_imm', 'sonar_imm_tools'):
+        assert (ROOT / package / 'py.typed').is_file()
+    assert "dict.fromkeys(PACKAGES, ['py.typed'])" in (ROOT / 'setup.py').read_text()
+
+
 def test_the_page_of_commands_names_every_subcommand() -> None:
     from sonar_imm_tools.cli import COMMANDS
 
@@ -336,9 +398,12 @@ def test_the_page_of_commands_names_every_subcommand() -> None:
 
 def test_the_example_of_the_library_runs(capsys: pytest.CaptureFixture[str]) -> None:
     page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
-    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
-    exec(compile(example, 'library.md', 'exec'), {})
-    assert capsys.readouterr().out
+    examples = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    for example in examples:
+        exec(compile(example, 'library.md', 'exec'), {})
+        assert capsys.readouterr().out
+    lines = [line for line in examples[0].splitlines() if line.strip()]
+    assert len(examples) == 2 and len(lines) <= 10
 
 
 def test_topics_page_names_every_input() -> None:

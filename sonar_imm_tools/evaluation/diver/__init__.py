@@ -36,11 +36,13 @@ from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .scoring import fix_series, score
 from .series import series_of
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, seen, summary_sentence
 from .truth import Truth
 
 if TYPE_CHECKING:
     from ..report import Section
+
+__all__ = ['judge', 'LIMIT']
 
 LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 """Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
@@ -65,13 +67,14 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         # plotly, which only a report needs, takes a second to load.
         from .figures import sections
 
-        return sections(run, metrics, series, truth, raw)
+        return sections(run, metrics, series, truth, raw, config.origin())
 
     return Judgement(
         run=run,
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )

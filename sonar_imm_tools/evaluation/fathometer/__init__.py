@@ -28,10 +28,12 @@ from ...offline.run_folder import read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from .records import records_of
 from .scoring import CUTOFF, score
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, SEEN, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
+
+__all__ = ['judge', 'LIMIT']
 
 LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
 """Limit for recordings without one of their own. The best configuration has 0.05 m on average over
@@ -61,6 +63,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=SEEN,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )

@@ -35,10 +35,12 @@ from .deferred import deferred_estimates
 from .motion import motion_metrics
 from .scoring import score
 from .series import Matching, series_of, TruePath, truth_of
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, seen, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
+
+__all__ = ['judge', 'LIMIT']
 
 LIMIT = Limit(2.5, 'm', 'vertical offset RMSE within 50 m', 'vertical_offset_near.rmse_m')
 """Limit for recordings without one of their own. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m on
@@ -78,6 +80,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
