@@ -167,7 +167,8 @@ def begin(
         births = propose_births(model, g, model.birth_share, model.birth_cap)
         return Beginning(*peaks, np.empty(0), births[0], 1.0), births
     worth = np.stack([np.convolve(np.exp(row), model.walk, 'same') for row in levelled(model, g)])
-    births = propose_births(model, np.log(worth[:, : g.shape[1]]), model.walk_share)
+    worth = np.log(np.maximum(worth[:, : g.shape[1]], 1e-300))
+    births = propose_births(model, worth, model.walk_share)
     reach, between = model.separation // 2, (peaks.last[:-1] + peaks.first[1:]) // 2
     first = np.maximum(peaks.first - reach, np.append(0, between))
     last = np.minimum(peaks.last + reach, np.append(between, g.shape[1]))
