@@ -19,7 +19,8 @@
 
 A table with measured numbers has a comment above it, which the site shows below it:
 
-    <!-- numbers: read 2026-11-20; COMMAND -->        what COMMAND printed on that day
+    <!-- numbers: read 2026-11-20 1f; COMMAND -->     what COMMAND printed on that day; 1f is the
+                                                      digest of all numbers of the table
     <!-- numbers: none -->                            nothing in it was measured
     <!-- numbers: sea.json; made by MODULE -->        what `page_of` of that module makes of it
     <!-- numbers: sea.json; CELLS; rows: KEYS -->     each cell is bound to values of that file
@@ -56,6 +57,7 @@ import argparse
 from collections.abc import Iterator
 from datetime import date
 from functools import lru_cache
+import hashlib
 import importlib
 import json
 import math
@@ -92,6 +94,11 @@ class Table:
     @property
     def place(self) -> str:
         return f'{self.page}:{self.line}'
+
+    def digest(self) -> str:
+        """Of all its numbers: what was read by hand has to stay as it was read."""
+        numbers = [number for row in self.rows for cell in row for number in numbers_in(cell)]
+        return hashlib.sha256(' '.join(numbers).encode()).hexdigest()[:6]
 
     def measured(self) -> bool:
         """Whether it looks like measurements: a decimal number or a share somewhere."""
@@ -299,7 +306,14 @@ def doubts(table: Table, sources: dict[str, dict[str, str]]) -> list[str]:
     if kind == 'none':
         return []
     if kind.startswith('read '):
-        return dated(table.place, kind.removeprefix('read ').strip(), rest.strip())
+        day, _, digest = kind.removeprefix('read ').strip().partition(' ')
+        found = dated(table.place, day, rest.strip())
+        if digest != table.digest():
+            found.append(
+                f'{table.place}: not the numbers that were read; those have the digest '
+                f'{table.digest()}'
+            )
+        return found
     if kind not in sources or not (RESULTS / kind).is_file():
         return [f'{table.place}: {SOURCES.name} does not know {kind}']
     if not rest:

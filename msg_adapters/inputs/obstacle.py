@@ -22,6 +22,7 @@ from ..detections import (
     read_detections,
     read_detections_3d,
     read_laser_scan,
+    read_point_cloud,
     read_pose_array,
     read_sonar_detections,
     read_sonar_ranges,
@@ -36,10 +37,17 @@ from ..navigation import (
     write_navigation,
     write_range,
 )
-from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..sonar_images import (
+    read_oculus_ping,
+    read_picture,
+    read_ping360_echo,
+    read_projected_image,
+    read_raw_image,
+    read_sonoptix_echo,
+    write_picture,
+)
 from ..soundings import read_ground, write_ground
 from ..transforms import TF_STATIC
-from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
 
 TOPICS = (
@@ -49,6 +57,7 @@ TOPICS = (
         measurement=Detections,
         readers={
             'sensor_msgs/msg/PointCloud2': read_detections,
+            'sensor_msgs/msg/PointCloud': read_point_cloud,
             'sensor_msgs/msg/LaserScan': read_laser_scan,
             'geometry_msgs/msg/PoseArray': read_pose_array,
             'vision_msgs/msg/Detection3DArray': read_detections_3d,

@@ -66,7 +66,7 @@ def played(monkeypatch):
 def smallest(system):
     sizes = {
         bag: sum(file.stat().st_size for file in bag.rglob('*'))
-        for bag in checking.shipped_bags(system)
+        for bag in checking.shipped_bags(system, Path())
     }
     return min(sizes, key=sizes.__getitem__).name
 
@@ -76,7 +76,7 @@ def test_the_smallest_of_each_system_is_played_to_its_node_first(played, tmp_pat
     systems = ('bathymetry', 'diver', 'fathometer', 'obstacle')
     live = [name for name, to_the_node in played.items() if to_the_node]
     assert live == [smallest(system) for system in systems] == list(played)[:4]
-    assert len(played) == sum(len(checking.shipped_bags(system)) for system in systems)
+    assert len(played) == sum(len(checking.shipped_bags(system, Path())) for system in systems)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(' ')[0] for line in lines] == [*systems, 'report:']
     assert lines[1] == (
@@ -91,7 +91,7 @@ def test_the_smallest_of_each_system_is_played_to_its_node_first(played, tmp_pat
 
 def test_one_system_and_all_of_its_recordings(played, tmp_path, capsys):
     assert main(['demo', '--out', str(tmp_path), '--system', 'diver', '--all']) == 0
-    assert set(played) == {bag.name for bag in checking.shipped_bags('diver')}
+    assert set(played) == {bag.name for bag in checking.shipped_bags('diver', Path())}
     assert all(played.values())
     assert len(capsys.readouterr().out.splitlines()) == 2
 
