@@ -123,6 +123,7 @@ setup(
     python_requires='>=3.10',
     packages=find_packages(include=[f'{top}{rest}' for top in PACKAGES for rest in ('', '.*')]),
     package_data={
+        **dict.fromkeys(PACKAGES, ['py.typed']),
         f'{PACKAGE}.acoustics': ['*.npz'],
         f'{PACKAGE}_tools.evaluation': ['templates/*'],
     },

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 import contextlib
 import io
+import json
 from pathlib import Path
 import re
 import sys
@@ -138,10 +139,25 @@ def made_pages() -> dict[str, str]:
         f'reference/api/{page}.md': api_page(package, title)
         for page, (package, title) in API.items()
     }
+    pages |= {
+        f'examples/{path.stem}.md': notebook(path)
+        for path in sorted((ROOT / 'examples').glob('*.ipynb'))
+    }
     pages['reference/interfaces.md'] = interfaces()
     pages['reference/options.md'] = options()
     pages['reference/bags.md'] = recordings()
     return pages
+
+
+def notebook(path: Path) -> str:
+    """The cells of a notebook as a page, without outputs."""
+    cells = json.loads(path.read_text(encoding='utf-8'))['cells']
+    texts = [
+        text if cell['cell_type'] == 'markdown' else f'```python\n{text}\n```'
+        for cell in cells
+        for text in [''.join(cell['source'])]
+    ]
+    return '\n\n'.join([*texts, f'The notebook is `examples/{path.name}`.']) + '\n'
 
 
 def at_the_root(name: str) -> str:

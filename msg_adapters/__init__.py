@@ -23,5 +23,33 @@ This is a top-level module with a common name: another package in a merged ROS 2
 one too and hide this one. `__owner__` and `__version__` let `sonar_imm` notice.
 """
 
+__all__ = [
+    'array_records',
+    'arrivals',
+    'detections',
+    'displays',
+    'divers',
+    'estimates',
+    'fixes',
+    'geodetic',
+    'headers',
+    'inputs',
+    'interferometer',
+    'labels',
+    'markers',
+    'navigation',
+    'obstacles',
+    'relative',
+    'scans',
+    'snapshots',
+    'sonar_images',
+    'soundings',
+    'starts',
+    'table',
+    'transforms',
+    'vendor_images',
+    'vessel',
+]
+
 __owner__ = 'sonar_imm'
 __version__ = '1.0.0'

@@ -16,7 +16,28 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
 import msg_adapters as _adapters
+
+if TYPE_CHECKING:
+    from .estimation.imm_filter import IMM, MeasurementModel, position, range_bearing
+    from .estimation.motion import ca, ct, cv, hover, Model, Motion
+
+__all__ = [
+    'ca',
+    'ct',
+    'cv',
+    'hover',
+    'IMM',
+    'MeasurementModel',
+    'Model',
+    'Motion',
+    'position',
+    'range_bearing',
+]
+_MOTION = {'ca', 'ct', 'cv', 'hover', 'Model', 'Motion'}
 
 __version__ = '1.0.0'
 
@@ -35,3 +56,11 @@ def _check_adapters() -> None:
 
 
 _check_adapters()
+
+
+def __getattr__(name: str) -> Any:
+    """What `__all__` lists, loaded when it is asked for: numba takes a second."""
+    if name not in __all__:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    module = 'motion' if name in _MOTION else 'imm_filter'
+    return getattr(import_module(f'{__name__}.estimation.{module}'), name)

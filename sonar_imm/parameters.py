@@ -37,8 +37,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import difflib
-from functools import partial
+from functools import lru_cache, partial
+from importlib.metadata import entry_points, EntryPoint
 import math
+import sys
 from typing import Any, TypeVar
 
 import attrs
@@ -46,6 +48,8 @@ from attrs import frozen
 
 C = TypeVar('C', bound='Config')
 
+MODELS = 'sonar_imm.models'
+"""The entry-point group of models of motion, see `trackers.own_models`."""
 KINDS = ('bool', 'int', 'float', 'str', 'float[]', 'int[]', 'str[]')
 MOST_YAML = 1_000_000
 """Characters of a YAML file, and values in it with its anchors written out."""
@@ -63,7 +67,7 @@ class ConfigError(ValueError):
 @frozen
 class ParameterSpec:
     """What is known of one parameter. `kind` is one of KINDS; `low` and `high` are inclusive and
-    hold for every element of an array."""
+    hold for every element of an array. group: entry-point group whose names are choices too."""
 
     name: str
     kind: str
@@ -74,6 +78,7 @@ class ParameterSpec:
     high: float | None = None
     choices: tuple[str, ...] = ()
     read_only: bool = True
+    group: str = ''
 
     def problem(self, value: Any) -> str | None:
         """Say what is wrong with `value`, or None when it is good."""
@@ -96,8 +101,10 @@ class ParameterSpec:
         if kind == 'str':
             if not isinstance(value, str):
                 return f'{name} must be text, got {value!r}'
-            if self.choices and value not in self.choices:
+            if self.choices and value not in self.choices and not self._registered(value):
                 known = ', '.join(self.choices)
+                if self.group:
+                    known += f' or a name that a package registers as {self.group}'
                 hint = did_you_mean(value, self.choices)
                 return f"{name} must be one of {known}, got '{value}'{hint}"
             return None
@@ -115,6 +122,9 @@ class ParameterSpec:
         ):
             return f'{name} must be {self.range_text()}, got {value!r} {self.unit}'.rstrip()
         return None
+
+    def _registered(self, value: str) -> bool:
+        return bool(self.group) and registered(self.group, value) is not None
 
     @property
     def ros_kind(self) -> str:
@@ -156,6 +166,7 @@ def parameter(
     kind: str | None = None,
     choices: tuple[str, ...] = (),
     read_only: bool = True,
+    group: str = '',
 ) -> Any:
     """One field of a `Config`. The kind follows from the default; an empty list needs `kind`.
 
@@ -173,6 +184,7 @@ def parameter(
             high=range[1],
             choices=choices,
             read_only=read_only,
+            group=group,
         )
     )
 
@@ -375,6 +387,21 @@ def markdown_table(specs: Iterable[ParameterSpec]) -> str:
             f'| `{spec.name}` | {spec.ros_kind} | `{default}` | {spec.unit} | {limits} | {text} |'
         )
     return '\n'.join(rows) + '\n'
+
+
+def registered(group: str, name: str) -> EntryPoint | None:
+    """What an installed package registers under that name, None for nothing. Raises `ConfigError`
+    when several packages do, with different things."""
+    return _registered(group, name, tuple(sys.path))
+
+
+@lru_cache(maxsize=64)
+def _registered(group: str, name: str, path: tuple[str, ...]) -> EntryPoint | None:
+    """path: where packages are looked for, which takes milliseconds."""
+    found = {entry.value: entry for entry in entry_points(group=group, name=name)}
+    if len(found) > 1:
+        raise ConfigError(f"'{name}' is registered as {group} by {' and by '.join(sorted(found))}")
+    return next(iter(found.values()), None)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -17,5 +17,7 @@
 The live package `sonar_imm` never imports it.
 """
 
+__all__ = ['SECOND']
+
 SECOND = 10**9
 """Nanoseconds, the unit of every stamp."""

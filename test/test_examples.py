@@ -15,8 +15,10 @@
 """The examples run as they are, without ROS, and draw what they say."""
 
 import ast
+import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -24,8 +26,10 @@ from helpers.source import ROOT
 import pytest
 
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.own_models import BehaviourStep, checked
 
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
+NOTEBOOKS = sorted((ROOT / 'examples').glob('*.ipynb'))
 MOST_LINES = 30
 WITHOUT_ROS = """
 import runpy, sys
@@ -63,3 +67,41 @@ def test_an_example_is_short(path: Path):
     (_, *code) = ast.parse(text).body
     lines = text.splitlines()[code[0].lineno - 1 :]
     assert sum(bool(line.strip()) for line in lines) <= MOST_LINES
+
+
+def cells(path: Path, kind: str) -> list[str]:
+    book = json.loads(path.read_text(encoding='utf-8'))
+    return [''.join(cell['source']) for cell in book['cells'] if cell['cell_type'] == kind]
+
+
+@pytest.mark.parametrize('path', NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_cell_by_cell_and_holds_no_outputs(path: Path):
+    space = {}
+    for number, code in enumerate(cells(path, 'code')):
+        exec(compile(code, f'{path.name}, cell {number}', 'exec'), space)
+    book = json.loads(path.read_text(encoding='utf-8'))
+    assert not any(cell.get('outputs') for cell in book['cells'])
+
+
+def test_the_site_shows_the_notebooks(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
+    import site_pages
+
+    nav = (ROOT / 'mkdocs.yml').read_text(encoding='utf-8')
+    assert len(NOTEBOOKS) == 2
+    for path in NOTEBOOKS:
+        page = site_pages.notebook(path)
+        assert f'examples/{path.stem}.md' in nav and page.startswith('# ')
+        assert page.count('```python') == len(cells(path, 'code')) >= 3
+
+
+def test_the_page_of_own_models_holds():
+    """Its classes satisfy the contracts."""
+    page = (ROOT / 'docs' / 'howto' / 'own_model.md').read_text(encoding='utf-8')
+    space = {}
+    for block in re.findall(r'```python\n(.*?)```', page, re.DOTALL):
+        exec(compile(block, 'own_model.md', 'exec'), space)
+    found = checked(space['Drifting'](config=None))
+    assert found.joint.names == ('cv', 'drift') and found.motion(0.0).F[1, 0, 0] == 1.0
+    step = BehaviourStep(*space['Bottle'](config=None).step(60.0))
+    assert step.keep == pytest.approx(0.3679, abs=1e-4)

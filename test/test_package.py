@@ -326,6 +326,25 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
+def test_every_package_says_what_is_public() -> None:
+    """`__all__`: names of the package, or its modules; and the two packages ship their types."""
+    for path in MODULES:
+        if path.name == '__init__.py':
+            (listed,) = (
+                ast.literal_eval(node.value)
+                for node in tree_of(path).body
+                if isinstance(node, ast.Assign) and getattr(node.targets[0], 'id', '') == '__all__'
+            )
+            here = {each.stem for each in path.parent.iterdir()}
+            names = set(listed) - here
+            if names:
+                package = importlib.import_module(module_name(path))
+                assert all(hasattr(package, name) for name in names), path
+    for package in ('sonar_imm', 'sonar_imm_tools'):
+        assert (ROOT / package / 'py.typed').is_file()
+    assert "dict.fromkeys(PACKAGES, ['py.typed'])" in (ROOT / 'setup.py').read_text()
+
+
 def test_the_page_of_commands_names_every_subcommand() -> None:
     from sonar_imm_tools.cli import COMMANDS
 
@@ -336,9 +355,12 @@ def test_the_page_of_commands_names_every_subcommand() -> None:
 
 def test_the_example_of_the_library_runs(capsys: pytest.CaptureFixture[str]) -> None:
     page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
-    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
-    exec(compile(example, 'library.md', 'exec'), {})
-    assert capsys.readouterr().out
+    examples = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    for example in examples:
+        exec(compile(example, 'library.md', 'exec'), {})
+        assert capsys.readouterr().out
+    lines = [line for line in examples[0].splitlines() if line.strip()]
+    assert len(examples) == 2 and len(lines) <= 10
 
 
 def test_topics_page_names_every_input() -> None:

@@ -58,6 +58,7 @@ def test_every_page_is_in_the_navigation(made: Any) -> None:
         'reference/interfaces.md',
         'reference/options.md',
         'reference/bags.md',
+        *(f'examples/{path.stem}.md' for path in (ROOT / 'examples').glob('*.ipynb')),
     }
 
 

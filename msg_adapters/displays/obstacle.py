@@ -47,7 +47,9 @@ class Displays:
         if is_wanted('obstacles'):
             yield 'obstacles', write_poses(estimate, rows, make)
         yield from self._markers.of(estimate, rows, make, is_wanted)
-        yield from models_of_the_oldest(estimate, rows, make, is_wanted, BEHAVIOURS)
+        own = (name for name in estimate.extras if name.startswith('prob_'))
+        shown = tuple(dict.fromkeys((*BEHAVIOURS, *own)))
+        yield from models_of_the_oldest(estimate, rows, make, is_wanted, shown)
 
     def forget(self, make: Make) -> Drawn:
         return self._markers.forget(make)

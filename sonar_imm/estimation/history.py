@@ -305,6 +305,11 @@ class ReplayHistory(Generic[State, Item]):
         """The state after the newest scan."""
         return self._states[-1] if self._states else self._base
 
+    @property
+    def states(self) -> list[State]:
+        """The state after each scan that is kept, oldest first."""
+        return list(self._states)
+
     def insert(
         self, stamp_ns: int, key: bytes, item: Item, step: Step[State, Item]
     ) -> Inserted[State]:

@@ -34,76 +34,23 @@ sonar_imm.parameters.ConfigError: parameter 'fix_std' must be between 0.0001 and
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, overload, TYPE_CHECKING
 
 from attrs import field, frozen
 
-from ..estimates import Estimate
-from ..intake import KnownFrames
 from ..parameters import Config, ConfigError
+from .protocol import SmoothingTracker, Tracker, WarmStep
 
-WarmStep = tuple[str, Callable[[], object]]
-"""What compiles or loads a part of a tracker's kernels, and the name of that part."""
+if TYPE_CHECKING:
+    from .bathymetry.tracker import BathymetryConfig, BathymetryTracker
+    from .diver.smoothing import SmoothingDiverTracker
+    from .diver.tracker import DiverConfig, DiverTracker
+    from .fathometer.tracker import FathometerConfig, FathometerTracker
+    from .obstacle.tracker import ObstacleConfig, ObstacleTracker
 
-
-class Tracker(Protocol):
-    """The only door to a tracker. `process` has no side effect outside the tracker: no log, no
-    clock, no global state.
-
-    counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``,
-    ``too_late``, ...). STATE: the attributes that hold all it knows, see `state_values`; a tracker
-    that keeps more, which follows from them, has a method ``restored`` that makes it again.
-    """
-
-    STATE: tuple[str, ...]
-    config: Any
-    counts: Counter[str]
-
-    @property
-    def frames(self) -> KnownFrames:
-        """The frames of what was used so far."""
-        ...
-
-    def process(self, measurement: Any) -> list[Estimate]:
-        """Take one measurement in. Gives the estimates it made or revised, oldest first; the last
-        is the newest state.
-
-        Never raises for bad data: what cannot be used is counted in `counts`."""
-        ...
-
-    def reset(self) -> None:
-        """Forget everything: equals a fresh tracker."""
-        ...
-
-    def reconfigure(self, config: Any) -> None:
-        """Take over the parameters that may change while running; keeps the tracks."""
-        ...
-
-    def warm(self, inputs: Collection[type] | None = None) -> None:
-        """Compile or load every kernel that measurements of the classes `inputs` will need, by
-        default of all classes: all of `warm_steps`."""
-        ...
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        """The same in steps, for a caller who tells how far it is or works between them. A step
-        changes nothing of the tracker, and leaves nothing to compile of what it is named after.
-        They can be run in any order, each by itself, in any thread."""
-        ...
-
-    def health(self) -> dict[str, float]:
-        """Numbers for diagnostics: NIS, effective sample size, covariance repairs, tracks, ..."""
-        ...
-
-
-class SmoothingTracker(Tracker, Protocol):
-    """A tracker that remembers a whole recording."""
-
-    def smoothed(self) -> list[Estimate]:
-        """The estimates of all stamps, oldest first, each given all measurements."""
-        ...
+__all__ = ['SmoothingTracker', 'System', 'SYSTEMS', 'Tracker', 'WarmStep']
 
 
 @frozen(kw_only=True)
@@ -148,9 +95,24 @@ class System:
     def config_type(self) -> type[Config]:
         return self._own(self.config)
 
+    @overload
+    def build(self, config: BathymetryConfig) -> BathymetryTracker: ...
+    @overload
+    def build(self, config: DiverConfig) -> DiverTracker: ...
+    @overload
+    def build(self, config: FathometerConfig) -> FathometerTracker: ...
+    @overload
+    def build(self, config: ObstacleConfig) -> ObstacleTracker: ...
+    @overload
+    def build(self, config: Config) -> Tracker: ...
     def build(self, config: Config) -> Tracker:
+        """The tracker with these parameters."""
         return self._own(self.tracker)(config)
 
+    @overload
+    def build_smoother(self, config: DiverConfig) -> SmoothingDiverTracker: ...
+    @overload
+    def build_smoother(self, config: Config) -> SmoothingTracker: ...
     def build_smoother(self, config: Config) -> SmoothingTracker:
         """The tracker that can look back at the end of a recording.
 

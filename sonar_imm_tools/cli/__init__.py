@@ -38,6 +38,8 @@ from sonar_imm.parameters import did_you_mean
 from sonar_imm.texts import visible
 from sonar_imm.threads import one_blas_thread
 
+__all__ = ['COMMANDS', 'main']
+
 PROGRAM = 'sonar-imm'
 
 COMMANDS = {

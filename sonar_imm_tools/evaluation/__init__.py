@@ -13,3 +13,13 @@
 # limitations under the License.
 
 """Runs of recordings: tracked offline, scored against truth, shown in a report, timed."""
+
+__all__ = [
+    'columns',
+    'judging',
+    'numbers',
+    'plotting',
+    'report',
+    'sweep',
+    'tuning',
+]

@@ -44,8 +44,8 @@ from scipy.optimize import linear_sum_assignment
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate, PLACES
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.motion import white_acceleration
 from sonar_imm.measurements import NOBODY
-from sonar_imm.trackers.diver.baselines import white_acceleration
 
 from ..recordings.reader import BagError
 from .run_folder import RUN, run_record, RunFolder

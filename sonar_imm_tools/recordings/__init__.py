@@ -13,3 +13,29 @@
 # limitations under the License.
 
 """Recordings: bags in and out, in replay order; `convert` reads other formats."""
+
+__all__ = [
+    'conversion',
+    'convert',
+    'convert_options',
+    'csv_table',
+    'export',
+    'local_frame',
+    'mcap_records',
+    'mcap_scan',
+    'mcap_sums',
+    'measurements',
+    'messages',
+    'options',
+    'own_files',
+    'polar_rows',
+    'positions',
+    'reader',
+    'scenes',
+    'sniffing',
+    'sources',
+    'topics',
+    'track_files',
+    'truth',
+    'writer',
+]

@@ -14,3 +14,5 @@
 
 """Real nodes fed from recordings: playing at the recorded pace or in lock-step, and hearing what
 they publish."""
+
+__all__ = ['harness', 'link', 'listening', 'lockstep', 'player']

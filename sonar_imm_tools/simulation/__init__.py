@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """Simulated scenes with truth, from a seed: one folder per system, `scene` is what all share."""
+
+__all__ = ['scenario', 'survey']

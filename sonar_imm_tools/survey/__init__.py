@@ -13,3 +13,16 @@
 # limitations under the License.
 
 """Many lines, one chart: crossing adjustment and the grid of looks."""
+
+__all__ = [
+    'adjustment',
+    'chart',
+    'grid',
+    'jobs',
+    'line',
+    'live',
+    'looks',
+    'making',
+    'products',
+    'report',
+]

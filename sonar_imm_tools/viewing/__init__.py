@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """Showing recordings, runs and running nodes: Foxglove over a WebSocket, Rerun as a file."""
+
+__all__ = ['layouts', 'material', 'playback', 'rerun_file', 'server']

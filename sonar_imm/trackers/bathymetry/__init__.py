@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """The bathymetry tracker: the sea floor from side-scan array snapshots."""
+
+__all__ = ['config', 'tracker']

@@ -63,8 +63,8 @@ from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
 from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
-from .. import WarmStep
 from ..navigation import MOST_WAITING, NavigationBuffer
+from ..protocol import WarmStep
 from .config import BathymetryConfig
 from .kernels import Track
 from .ping import (

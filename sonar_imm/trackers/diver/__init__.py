@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """The diver tracker: divers from fixes or raw arrival times."""
+
+__all__ = ['config', 'smoothing', 'tracker']

@@ -32,8 +32,9 @@ import numpy as np
 from ...estimation import markov
 from ...estimation.adaptation import Chain
 from ...estimation.arrays import FloatArray
+from ...estimation.motion import Motion, turning, white_acceleration
 from .config import DiverConfig
-from .state_space import headings, initial_probabilities, ModelSet, Motion, rate_chain
+from .state_space import headings, initial_probabilities, ModelSet, rate_chain
 
 BASELINE_NOISE = {'cv': (0.25,), 'cv_cv': (0.05, 0.6), 'cv_ct': (0.1, 0.3, 0.3)}
 """Acceleration noise, m/s^2, that suits divers: tuned on the scene of the paper's Table 1."""
@@ -105,20 +106,6 @@ def relative_headings(config: DiverConfig) -> ModelSet:
     )
 
 
-def white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:
-    """Process noise of a velocity that walks at random, `rate` (m/s)^2 a second, while it turns by
-    `turn` rad/s: the exact integral, so steps compose."""
-    angle = turn * dt
-    lag = (angle - np.sin(angle)) / angle**3 if abs(angle) > 1e-2 else 1.0 / 6.0 - angle**2 / 120.0
-    along, across = 0.5 * dt**2 * np.sinc(0.5 * angle / np.pi) ** 2, dt**2 * angle * lag
-    Q = np.empty((4, 4))
-    Q[:2, :2] = 2.0 * rate * dt**3 * lag * np.eye(2)
-    Q[:2, 2:] = rate * np.array([[along, across], [-across, along]])
-    Q[2:, :2] = Q[:2, 2:].T
-    Q[2:, 2:] = rate * dt * np.eye(2)
-    return Q
-
-
 def single_direction(config: DiverConfig) -> ModelSet:
     turn = np.deg2rad(config.turn_rate_deg)
     names, turns = {
@@ -133,7 +120,7 @@ def single_direction(config: DiverConfig) -> ModelSet:
 
     def motion(dt: float) -> Motion:
         return Motion(
-            np.stack([_turning(turn, dt) for turn in turns]),
+            np.stack([turning(turn, dt) for turn in turns]),
             np.stack([white_acceleration(*both, dt) for both in zip(rates, turns)]),
             np.zeros((M, 4)),
         )
@@ -147,15 +134,3 @@ def single_direction(config: DiverConfig) -> ModelSet:
         initial_probabilities(config, M),
         motion,
     )
-
-
-def _turning(rate: float, dt: float) -> FloatArray:
-    """Transition of (px, py, vx, vy) under a constant turn rate, rad/s, counter-clockwise."""
-    F = np.eye(4)
-    angle = rate * dt
-    # sin(a)/rate and (1 - cos(a))/rate, whose limits at rate 0 are dt and 0
-    along = dt * np.sinc(angle / np.pi)
-    across = dt * np.sin(0.5 * angle) * np.sinc(0.5 * angle / np.pi)
-    F[:2, 2:] = [[along, -across], [across, along]]
-    F[2:, 2:] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return F

@@ -22,8 +22,9 @@ from typing import Any
 from attrs import evolve, frozen
 
 from ...acoustics.geodesy import Origin
-from ...parameters import inherited, live, parameter
+from ...parameters import inherited, live, MODELS, parameter
 from ..model_checks import chain_problems
+from ..own_models import diver_models
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
 
 MODEL_SETS = (
@@ -104,7 +105,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
     model_set: str = parameter('families', '',
-        'motion models run side by side', choices=MODEL_SETS)
+        'motion models run side by side; also a set that another package registers',
+        choices=MODEL_SETS, group=MODELS)
     target: str = parameter('diver', '',
         'kind of target, for the motion of families: diver, rov, fish, boat or ship set speeds, '
         'accelerations and turns of that kind, wherever a parameter is at its default',
@@ -474,6 +476,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""
+        if self.model_set not in MODEL_SETS:
+            return len(diver_models(self.model_set, self).joint.names)
         if self.model_set in BASELINES:
             return BASELINES[self.model_set]
         hovering = self.model_set.startswith(('heading_speed', 'families'))

@@ -47,17 +47,17 @@ from ...estimation.adaptation import AdaptiveChain, Chain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import gate_threshold, TENTATIVE
 from ...estimation.consider import consider_models
+from ...estimation.motion import Motion, white_acceleration
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import NOBODY
 from . import family_kernels
-from .baselines import white_acceleration
 from .config import DiverConfig
 from .coverage import Seen
 from .family_kernels import HEADING, HOVER, Mixing, VELOCITY
 from .fix_kernels import expected
 from .scan import Positions
 from .state import cross, DiverState
-from .state_space import headings, initial_probabilities, Layout, ModelSet, Motion, rate_chain
+from .state_space import headings, initial_probabilities, Layout, ModelSet, rate_chain
 
 FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
 

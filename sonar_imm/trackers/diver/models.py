@@ -29,7 +29,7 @@ families
     State (x, y, s, unused) or (x, y, vx, vy): two heading_speed sets and three constant velocities
     in one filter, in copies for covariances that are too small; see `families`.
 others
-    To compare with, see `baselines`.
+    Of other packages, see `own_models`; or to compare with, see `baselines`.
 
 Source: docs/diver.md; the multi-directional set after the paper, whose equations are partly lost:
 these are reconstructions.
@@ -42,6 +42,8 @@ import numpy as np
 
 from ...estimation import markov
 from ...estimation.arrays import FloatArray
+from ...estimation.motion import Motion
+from ..own_models import diver_models
 from .baselines import relative_headings, single_direction, world_headings
 from .config import DiverConfig
 from .families import families
@@ -49,7 +51,7 @@ from .state_space import (
     headings,
     initial_probabilities,
     ModelSet,
-    Motion,
+    OUTPUTS,
     rate_chain,
     with_depth,
     with_fix_bias,
@@ -69,10 +71,28 @@ def build_models(config: DiverConfig) -> ModelSet:
         'cv': single_direction,
         'cv_cv': single_direction,
         'cv_ct': single_direction,
-    }[config.model_set](config)
+    }.get(config.model_set, _own)(config)
     if config.dimensions == 3:
         models = with_depth(models, config)
     return with_fix_bias(models, config) if config.fix_bias_std > 0.0 else models
+
+
+def _own(config: DiverConfig) -> ModelSet:
+    own = diver_models(config.model_set, config)
+    names = own.joint.outputs
+    E = np.zeros((len(own.joint.names), len(OUTPUTS), len(own.mean)))
+    for row, name in enumerate(OUTPUTS):
+        if name in names:
+            E[:, row] = own.joint.E[:, names.index(name)]
+    return ModelSet(
+        own.joint.names,
+        E,
+        rate_chain(config, own.transition),
+        own.mean[2:],
+        own.variance[2:],
+        initial_probabilities(config, len(E)),
+        own.motion,
+    )
 
 
 def _outer(v: FloatArray) -> FloatArray:

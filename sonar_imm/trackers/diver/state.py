@@ -29,10 +29,11 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from ...estimation.hypotheses import Hypotheses
+from ...estimation.motion import Motion
 from . import family_kernels
 from .config import DiverConfig
 from .family_kernels import Mixing
-from .state_space import Instruments, ModelSet, Motion
+from .state_space import Instruments, ModelSet
 
 FIXES, ARRIVALS = 0, 1
 """Rows of the learnt scale."""

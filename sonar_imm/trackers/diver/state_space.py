@@ -39,7 +39,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import NamedTuple
 
 from attrs import evolve, field, frozen
 import numpy as np
@@ -49,6 +48,7 @@ from ...estimation import markov
 from ...estimation.adaptation import Chain
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.gauss_markov import gauss_markov
+from ...estimation.motion import Motion
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .family_kernels import Mixing
@@ -68,14 +68,6 @@ that place, so that it has no error of position there."""
 MOST_RECEIVERS = 64
 """Receivers whose errors are part of the state, which grows with its square; those that are heard
 first. More are numbers that wander, not instruments."""
-
-
-class Motion(NamedTuple):
-    """One step of all models: x <- F x + B + N(0, Q). F, Q (M, n, n), B (M, n)."""
-
-    F: FloatArray
-    Q: FloatArray
-    B: FloatArray
 
 
 @frozen(eq=False)

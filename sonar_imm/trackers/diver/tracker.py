@@ -48,8 +48,8 @@ from ...estimation.consistency import ENOUGH, excess
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
-from .. import WarmStep
 from ..model_checks import track_rules
+from ..protocol import WarmStep
 from . import births, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig

@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """The fathometer tracker: sub-bottom reflectors from array noise or traces."""
+
+__all__ = ['config', 'tracker']

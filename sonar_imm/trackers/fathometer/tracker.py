@@ -59,7 +59,7 @@ from ...estimation.set_model import banded_transition, gaussian_walk, SetModel, 
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
-from .. import WarmStep
+from ..protocol import WarmStep
 from .config import FathometerConfig
 from .pressure import Collected, CompanionDepths, MOST_HEAVE, PressureStream
 from .reflectors import (

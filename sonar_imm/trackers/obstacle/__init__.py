@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """The obstacle tracker: obstacles ahead of a vehicle, with their vertical offset."""
+
+__all__ = ['config', 'tracker']

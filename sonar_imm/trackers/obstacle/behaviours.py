@@ -18,6 +18,7 @@ fixed     nothing
 swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
           `sway_time` and has the standard deviation `sway_std`
 moving    e is the velocity, m/s, a random walk of `speed_noise`; horizontal only
+others    of other packages, see `own_models`
 seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
           its own
 
@@ -35,6 +36,7 @@ import math
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
+from ..own_models import obstacle_behaviour
 from . import behaviour_kernels, kernels
 from .behaviour_kernels import COMMON, Motion
 from .config import BEHAVIOURS, ObstacleConfig
@@ -62,19 +64,25 @@ class BehaviourSlices(DepthSlices):
 
     def __init__(self, config: ObstacleConfig):
         super().__init__(config)
-        self.behaviours = tuple(name for name in BEHAVIOURS if name in config.behaviours)
-        switching = [name for name in self.behaviours if name in SWITCHING]
+        self.own = {name: obstacle_behaviour(name, config) for name in config.own_behaviours()}
+        known = (*SWITCHING, *self.own, 'seabed')
+        self.behaviours = tuple(name for name in known if name in config.behaviours)
+        switching = [name for name in self.behaviours if name != 'seabed']
         self.outlier_density = OUTLIER_DENSITY
         self.slices, self.M = config.components, len(switching)
         names = switching * self.slices + ['seabed'] * ('seabed' in self.behaviours)
         self.K = len(names)
         behaviour = np.array(names)
-        self._is = {name: behaviour == name for name in BEHAVIOURS}
+        self._is = {name: behaviour == name for name in known}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
         self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
         self._prior = self._swaying * config.sway_std**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
+        for name, own in self.own.items():
+            self._prior += self._is[name] * own.std**2
+            if own.velocity:
+                self.moves = self.moves | self._is[name]
 
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
@@ -100,7 +108,8 @@ class BehaviourSlices(DepthSlices):
         P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
         mu = np.zeros((B, self.K))
         for some in (known, ~known):
-            prior = {name: PRIOR[name] for name in self.behaviours}
+            shares = PRIOR | {name: own.share for name, own in self.own.items()}
+            prior = {name: shares[name] for name in self.behaviours}
             if some is not known:
                 prior.pop('seabed', None)
             total = sum(prior.values())
@@ -137,13 +146,17 @@ class BehaviourSlices(DepthSlices):
         config, swaying, moving = self.config, self._swaying, self._moving
         phi = math.exp(-dt / config.sway_time)
         swung = config.sway_std**2 * -math.expm1(-2.0 * dt / config.sway_time)
-        return Motion(
+        built_in = Motion(
             keep=swaying * phi + moving,
             step=swaying * (phi - 1.0) + moving * dt,
             push=swaying + moving * (0.5 * dt),
             noise=swaying * swung + moving * (config.speed_noise**2 * dt),
             prior=self._prior,
         )
+        steps = built_in[:4]
+        for name, own in self.own.items():
+            steps = tuple(a + self._is[name] * b for a, b in zip(steps, own.step(dt)))
+        return Motion(*steps, self._prior)
 
 
 def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
@@ -165,7 +178,7 @@ def build_filter(config: ObstacleConfig) -> DepthSlices:
 def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
-    if 'moving' not in filter_.behaviours:
+    if not filter_.moves.any():
         return False
     which = np.flatnonzero(confirmed)
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]

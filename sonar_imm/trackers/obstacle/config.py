@@ -24,7 +24,8 @@ import numpy as np
 from ...acoustics.geometry import AZIMUTH_MODELS
 from ...estimation.arrays import FloatArray
 from ...measurements import BEAM_AXES
-from ...parameters import inherited, live, parameter
+from ...parameters import inherited, live, MODELS, parameter
+from ..own_models import obstacle_behaviour
 from ..shared_parameters import (
     DetectionParameters,
     MountingParameters,
@@ -56,7 +57,8 @@ class ObstacleConfig(
     behaviours: tuple[str, ...] = parameter(BEHAVIOURS, '',
         'behaviours of an obstacle that gaussian_sum considers: fixed, swaying (on its mooring), '
         'moving, seabed (lying on the sea floor); seabed is left out while no altitude is known, '
-        'and needs another beside it', choices=BEHAVIOURS)
+        'and needs another beside it; also behaviours that other packages register',
+        choices=BEHAVIOURS, group=MODELS)
     sway_std: float = parameter(0.5, 'm',
         'behaviour swaying: standard deviation of the position along each axis',
         range=(0.001, 100.0))
@@ -233,7 +235,9 @@ class ObstacleConfig(
         ]
         if self.vertical_beam_width_deg and self.method != 'gaussian_sum':
             problems.append('vertical_beam_width_deg needs the method gaussian_sum')
-        if not set(self.behaviours) & set(BEHAVIOURS[:3]):
+        for name in self.own_behaviours():
+            obstacle_behaviour(name, self)
+        if set(self.behaviours) <= {'seabed'}:
             problems.append('behaviours needs one of fixed, swaying, moving at least')
         if len(self.detection_ranges) != len(self.detection_factors):
             problems.append('detection_ranges and detection_factors need as many values each')
@@ -242,6 +246,10 @@ class ObstacleConfig(
         if len(set(self.behaviours)) < len(self.behaviours):
             problems.append('behaviours names one of them twice')
         return problems
+
+    def own_behaviours(self) -> tuple[str, ...]:
+        """The behaviours that other packages bring."""
+        return tuple(sorted(set(self.behaviours) - set(BEHAVIOURS)))
 
     def detection_at(self, distance: FloatArray) -> FloatArray:
         """Probability that a ping shows obstacles at ranges (T,) in the beam."""

@@ -43,9 +43,9 @@ from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tr
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
-from .. import WarmStep
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
+from ..protocol import WarmStep
 from . import ping_kernels
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike

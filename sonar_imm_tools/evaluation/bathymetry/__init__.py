@@ -40,6 +40,8 @@ from .summary import METRICS, summary_sentence
 if TYPE_CHECKING:
     from ..report import Section
 
+__all__ = ['judge', 'LIMIT']
+
 LIMIT = Limit(0.25, 'm', 'height RMSE', 'height.all.rmse_m')
 """Limit for recordings without one of their own, over all bins with an echo. On the scene of the
 paper the default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""

@@ -42,6 +42,8 @@ from .truth import Truth
 if TYPE_CHECKING:
     from ..report import Section
 
+__all__ = ['judge', 'LIMIT']
+
 LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 """Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
 tracker 0.85 m on average; one recording can be worse than the average."""

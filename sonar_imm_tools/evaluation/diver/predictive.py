@@ -38,7 +38,7 @@ from sonar_imm.estimation import imm_kernels
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.baselines import BASELINE_NOISE
-from sonar_imm.trackers.diver.config import BASELINES, DiverConfig
+from sonar_imm.trackers.diver.config import BASELINES, DiverConfig, MODEL_SETS
 from sonar_imm.trackers.diver.scan import Positions
 from sonar_imm.trackers.diver.state import DiverState
 from sonar_imm.trackers.diver.tracker import Association, DiverTracker
@@ -70,7 +70,7 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             stay = config.baseline_stay_probability
             found.append(Tunable(name='baseline_stay_probability', start=stay, kind='logit'))
         found.append(_of(config, 'velocity_std', usual=False))
-    else:
+    elif config.model_set in MODEL_SETS:
         found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
         if config.model_set.startswith(('families', 'heading_speed')):
             found.append(_of(config, 'speed_mean', std=0.7))

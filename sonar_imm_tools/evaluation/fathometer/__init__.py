@@ -33,6 +33,8 @@ from .summary import METRICS, summary_sentence
 if TYPE_CHECKING:
     from ..report import Section
 
+__all__ = ['judge', 'LIMIT']
+
 LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
 """Limit for recordings without one of their own. The best configuration has 0.05 m on average over
 long drifts; one recording can be worse than the average."""

@@ -40,6 +40,8 @@ from .summary import METRICS, summary_sentence
 if TYPE_CHECKING:
     from ..report import Section
 
+__all__ = ['judge', 'LIMIT']
+
 LIMIT = Limit(2.5, 'm', 'vertical offset RMSE within 50 m', 'vertical_offset_near.rmse_m')
 """Limit for recordings without one of their own. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m on
 average; one recording can be worse than the average."""

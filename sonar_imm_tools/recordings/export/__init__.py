@@ -13,3 +13,5 @@
 # limitations under the License.
 
 """For other programs: soundings as XYZ, LAS, LAZ and GeoTIFF; horizons as CSV, GeoJSON, SEG-Y."""
+
+__all__ = ['horizons', 'obstacles', 'picks', 'points', 'tracks']
