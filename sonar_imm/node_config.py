@@ -16,10 +16,15 @@
 
 from __future__ import annotations
 
+from ipaddress import ip_address
+from socket import AddressFamily, AF_INET, AF_INET6
+
 from attrs import frozen
 
 from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.neighbours import GEO_POSE, TOPICS
 
+from .acoustics.geodesy import Origin
 from .parameters import Config, inherited, live, parameter, ParameterSpec
 from .trackers import System
 
@@ -86,12 +91,68 @@ class BathymetryNodeConfig(PlacedNodeConfig):
 
 
 @frozen(kw_only=True)
-class ReplayNodeConfig(PlacedNodeConfig):
+class TracksNodeConfig(PlacedNodeConfig):
     """A late message has its window computed again: up to a second, while others go on coming."""
 
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+    also_publish: tuple[str, ...] = parameter((), '',
+        'messages of other packages in which the confirmed tracks are published too, where those '
+        'packages are installed; empty: none', kind='str[]', choices=tuple(TOPICS))
+    targets_to: str = parameter('', '',
+        'address, such as 192.168.1.20:10110, to which the confirmed tracks are sent over UDP as '
+        'targets of NMEA 0183; empty: none')
+    targets_period: float = parameter(1.0, 's',
+        'least time between two rounds of targets', range=(0.1, 3600.0))
     # fmt: on
+
+    def check(self) -> list[str]:
+        try:
+            udp_address(self.targets_to or '127.0.0.1:1')
+        except ValueError:
+            return [
+                "parameter 'targets_to' must be the address of a machine in numbers and a port, "
+                f"such as 192.168.1.20:10110, got '{self.targets_to}'"
+            ]
+        return []
+
+
+@frozen(kw_only=True)
+class ObstacleNodeConfig(TracksNodeConfig):
+    """Besides, where the frame of the navigation lies on Earth."""
+
+    # fmt: off
+    targets_as: str = parameter('ttm', '',
+        'sentences of targets: ttm (distance and bearing from the vehicle) or tll (latitude and '
+        'longitude, for which origin_latitude and origin_longitude are needed)',
+        choices=('ttm', 'tll'))
+    origin_latitude: float = parameter(0.0, 'deg',
+        'latitude of the origin of the frame of nav, for targets and messages in latitude and '
+        'longitude; with both latitude and longitude 0: not known', range=(-90.0, 90.0))
+    origin_longitude: float = parameter(0.0, 'deg',
+        'longitude of the origin of the frame of nav, see origin_latitude',
+        range=(-180.0, 180.0))
+    origin_height: float = parameter(0.0, 'm',
+        'height of the origin of the frame of nav above the ellipsoid', range=(-12000.0, 9000.0))
+    # fmt: on
+
+    def origin(self) -> Origin | None:
+        """The origin that is stated, None for none."""
+        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
+            return None
+        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        wanting = {"'targets_as' tll": self.targets_to and self.targets_as == 'tll'}
+        wanting[f"'also_publish' {GEO_POSE}"] = GEO_POSE in self.also_publish
+        if self.origin() is None:
+            problems += [
+                f'parameter {name} needs origin_latitude and origin_longitude'
+                for name, asked in wanting.items()
+                if asked
+            ]
+        return problems
 
 
 @frozen(kw_only=True)
@@ -105,6 +166,19 @@ class DetectorNodeConfig(Config):
     diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
     stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
     # fmt: on
+
+
+def udp_address(text: str) -> tuple[str, int, AddressFamily]:
+    """Host in numbers, port and family of ``host:port``. Raises ValueError.
+
+    A name would have to be looked up, which can take seconds in which the node does nothing else.
+    """
+    host, _, port = text.rpartition(':')
+    host = '127.0.0.1' if host == 'localhost' else host.strip('[]')
+    version = ip_address(host).version
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f'{port!r} is no port')
+    return host, int(port), AF_INET if version == 4 else AF_INET6
 
 
 def node_config_type(system: System) -> type[NodeConfig]:
