@@ -133,8 +133,8 @@ class Neighbours:
         return f'{self._system}_{int(estimate.extras["track_id"][row])}'
 
     def _contact(self, estimate: Estimate, row: int, motion: Motion, make: Make) -> Any:
-        columns = {'above': _above(estimate)} | dict(estimate.extras)
-        shown = {name: columns[name][row] for name in _ATTRIBUTES if columns.get(name) is not None}
+        columns = {**_above(estimate), **estimate.extras}
+        shown = {name: columns[name][row] for name in _ATTRIBUTES if name in columns}
         classification = make(
             'marine_interfaces/msg/Classification', class_id=self._system, probability=1.0
         )
@@ -208,10 +208,11 @@ def _existence(estimate: Estimate, row: int) -> float:
     return value if np.isfinite(value) else 1.0
 
 
-def _above(estimate: Estimate) -> np.ndarray | None:
+def _above(estimate: Estimate) -> dict[str, np.ndarray]:
+    """The probability that an obstacle is above, a column as the others."""
     if 'above' not in estimate.model_names:
-        return None
-    return np.asarray(estimate.probabilities[:, estimate.model_names.index('above')])
+        return {}
+    return {'above': estimate.probabilities[:, estimate.model_names.index('above')]}
 
 
 def _pose(motion: Motion, make: Make) -> Any:
