@@ -16,6 +16,7 @@
 
 from pathlib import Path
 import re
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -24,6 +25,8 @@ PACKAGE = 'sonar_imm'
 PACKAGES = (PACKAGE, f'{PACKAGE}_tools', 'msg_adapters')
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
+# Bytes. What is larger stays in the repository, and the demo of an installation simulates it.
+LARGEST_RECORDING = 850_000
 
 # By their folders, because sonar_imm.trackers cannot be imported before its dependencies are here.
 SYSTEMS = sorted(path.parent.name for path in (ROOT / PACKAGE / 'trackers').glob('*/tracker.py'))
@@ -94,21 +97,26 @@ def shared_files() -> list[tuple[str, list[str]]]:
     }
     for room in ('bags', 'config', 'launch'):
         for path in sorted((ROOT / room).rglob('*')):
-            if path.is_file():
+            if path.is_file() and (room != 'bags' or path.stat().st_size <= LARGEST_RECORDING):
                 name = path.relative_to(ROOT)
                 folder = f'share/{PACKAGE}/{name.parent.as_posix()}'
                 files.setdefault(folder, []).append(name.as_posix())
     return list(files.items())
 
 
+# Who maintains the package, and where it lives, is stated in package.xml only.
+MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
+MAINTAINER = MANIFEST.find('maintainer')
+
 setup(
     name=PACKAGE,
     version=version(),
-    description='Online multiple-model tracking for sonar: library, ROS 2 nodes and a command',
+    description=MANIFEST.findtext('description'),
     long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
-    maintainer='The sonar_imm developers',
-    maintainer_email='maintainers@example.org',  # see package.xml
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get('email'),
+    project_urls={url.get('type', 'website'): url.text for url in MANIFEST.iter('url')},
     license='Apache-2.0',
     classifiers=[
         'Development Status :: 4 - Beta',

@@ -36,8 +36,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bathymetry_layover import FLAT, objects, SIZES
+from benchmarks.layover_tables import circular
 from benchmarks.speed.bathymetry import bench_layover
-from benchmarks.study import Parts, study
+from benchmarks.study import Parts, rms, study
 from sonar_imm.acoustics import array
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
@@ -116,10 +117,6 @@ class Tally:
             'bins_three': len(three),
             'rmse_three_m': rms(three) if len(three) else math.nan,
         }
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def tracked(snapshot: Snapshot, layover: str = 'resolved') -> Estimate:
@@ -231,10 +228,6 @@ def reached(apart: float, decibels: float, pings: int, seed: int) -> dict[str, f
         off.append(estimate.state[pair, 0])
         off.append(estimate.extras['height_2'][pair] - apart)
     return {'caught': caught / (pings * at.sum()), 'rmse_m': rms(np.concatenate(off))}
-
-
-def circular(rng: np.random.Generator, *shape: int) -> FloatArray:
-    return np.asarray(rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5))
 
 
 def main(pings: int = 40, seed: int = 4) -> Parts:

@@ -40,9 +40,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.diver_crossing import identities_kept, true_paths
-from benchmarks.diver_named import FALSE, HALF, measured, P_DETECTION, truth_of
-from benchmarks.study import Parts, rms, study
-from sonar_imm.estimates import Estimate
+from benchmarks.diver_named import FALSE, HALF, measured, named_errors, P_DETECTION, truth_of
+from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.evaluation.diver.scoring import score
@@ -98,23 +97,6 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
     return [item.measurement for item in scene.measurements], scene, told, cutoff
 
 
-def named_error(made: list[Estimate], truth: tuple[Any, ...]) -> list[float]:
-    """Errors in m of the rows with a name in the last minute."""
-    paths = {path.track_id: path for path in truth if isinstance(path, TrueTrack)}
-    error = []
-    for estimate in made:
-        if estimate.stamp_ns < made[-1].stamp_ns - 60 * 10**9:
-            continue
-        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
-            own = paths[int(estimate.extras['target_id'][row])]
-            at = [
-                np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
-                for axis in (0, 1)
-            ]
-            error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
-    return error
-
-
 def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
     """The scores of a way to pair, over all runs of a scene."""
     scored: list[dict[str, Any]] = []
@@ -135,7 +117,8 @@ def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']
-        named += named_error(made, scene.truth)
+        late = made[-1].stamp_ns - 60 * 10**9
+        named += named_errors((e for e in made if e.stamp_ns >= late), truths(scene, TrueTrack))
         if name == 'crossing':
             kept += identities_kept(series, truth)
 

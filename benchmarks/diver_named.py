@@ -27,6 +27,7 @@ before two tracks are one follow from P_D (`names.patience`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 from typing import Any
 
@@ -34,6 +35,7 @@ import numpy as np
 
 from benchmarks.diver_crossing import true_paths
 from benchmarks.study import mean_of, Parts, rms, study, truths
+from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
@@ -97,6 +99,21 @@ def measured(scene: str, truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | 
     return measurements
 
 
+def named_errors(made: Iterable[Estimate], truth: Iterable[TrueTrack]) -> list[float]:
+    """Errors in m of the rows with a name, against the diver of that name."""
+    paths = {path.track_id: path for path in truth}
+    error = []
+    for estimate in made:
+        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
+            own = paths[int(estimate.extras['target_id'][row])]
+            at = [
+                np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
+                for axis in (0, 1)
+            ]
+            error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
+    return error
+
+
 def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
     """The scores of one run."""
     truth = truth_of(scene, seed)
@@ -109,17 +126,8 @@ def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
     )
     tracker = DiverTracker(config)
     made = [tracker.process(item)[-1] for item in measured(scene, truth, seed)]
-    paths = {path.track_id: path for path in truth}
-    error = []
-    for estimate in made[-120:]:
-        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
-            own = paths[int(estimate.extras['target_id'][row])]
-            if estimate.stamp_ns <= own.stamp_ns[-1]:
-                at = [
-                    np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
-                    for axis in (0, 1)
-                ]
-                error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
+    over = truth[0].stamp_ns[-1]
+    error = named_errors([each for each in made[-120:] if each.stamp_ns <= over], truth)
     found = score(series_of(made), true_paths(Scene((), truth)), cutoff=10.0)
     hours = found['span_s'] / 3600.0
     return {

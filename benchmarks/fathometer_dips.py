@@ -39,6 +39,7 @@ import numpy as np
 from benchmarks.fathometer_gaps import (
     BEFORE,
     highest,
+    inside,
     scene,
     SECONDS,
     seen_variance,
@@ -89,10 +90,6 @@ def summary(runs: Sequence[dict[str, Any]]) -> dict[str, float]:
     before = ids[:, BEFORE - 1 : BEFORE]
     known = before[:, 0] > 0
     same = (ids[:, BEFORE:] == before) & (before > 0)
-
-    def inside(errors: FloatArray) -> float:
-        errors = errors[np.isfinite(errors).all(axis=-1)]
-        return float(np.mean(np.abs(errors[:, 0]) <= 2.0 * errors[:, 1]))
 
     def kept(record: int) -> float:
         return float(same[:, record][known].mean()) if known.any() else 0.0

@@ -146,6 +146,12 @@ def tracked(traces: Sequence[Trace], truth: FloatArray, **parameters: Any) -> di
     }
 
 
+def inside(errors: FloatArray) -> float:
+    """Share of errors (..., 2), each with its stated standard deviation, within two of these."""
+    errors = errors[np.isfinite(errors).all(axis=-1)]
+    return float(np.mean(np.abs(errors[:, 0]) <= 2.0 * errors[:, 1]))
+
+
 def summary(runs: Sequence[dict[str, Any]]) -> dict[str, float]:
     right = np.array([run['right'] for run in runs])[:, BEFORE:]
     found = np.array([run['found'] for run in runs])[:, BEFORE:]
@@ -153,11 +159,6 @@ def summary(runs: Sequence[dict[str, Any]]) -> dict[str, float]:
     before = ids[:, BEFORE - 1 : BEFORE]
     same = (ids[:, BEFORE:] == before) & (before > 0)
     known = before[:, 0] > 0
-
-    def inside(errors: FloatArray) -> float:
-        errors = errors[np.isfinite(errors).all(axis=-1)]
-        return float(np.mean(np.abs(errors[:, 0]) <= 2.0 * errors[:, 1]))
-
     return {
         'P, 1st': float(right[:, 0].mean()),
         'P, 2nd': float(right[:, 1].mean()),

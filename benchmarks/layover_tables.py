@@ -53,17 +53,18 @@ def snapshots(
     ratio = 10.0 ** (0.1 * rng.uniform(-12.0, 12.0, bins)) if surfaces == 2 else np.zeros(bins)
     fading = rng.exponential(size=(2, bins))
     first = 10.0 ** (0.1 * decibels) / (1.0 + ratio)
-    y = _circular(rng, bins, staves)
+    y = circular(rng, bins, staves)
     fades = rng.uniform(size=bins) < 0.5
     y[fades] *= np.sqrt(fading[0, fades])[:, None]
     for power, z, height in ((first, fading[0], 0.0), (first * ratio, fading[1], up)):
         sine = direction_sine(HEIGHT - height, ranges, TILT)
-        wave = np.sqrt(power * z)[:, None] * _circular(rng, bins, 1)
+        wave = np.sqrt(power * z)[:, None] * circular(rng, bins, 1)
         y += wave * steering(sine, staves, 0.5)
     return y
 
 
-def _circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
+def circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
+    """Circular normal numbers of unit variance."""
     return rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5)
 
 

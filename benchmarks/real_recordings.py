@@ -144,6 +144,7 @@ def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[floa
     rows = []
     for item in items:
         if isinstance(item, Fix):
+            assert item.covariance is not None
             rows.append((item.stamp_ns * 1e-9, item.position[:2], item.covariance[:2, :2]))
         elif isinstance(item, Arrivals):
             fix = locate(item, np.arange(len(item)), config, config.covariance_scale)

@@ -179,7 +179,7 @@ def write(given: argparse.Namespace, found: Typical, text: str) -> None:
     status = sonar_imm(['simulate', given.system, str(folder), *simulated(given, found.seed)])
     if status:
         sys.exit(status)
-    write_own_limit(folder, found.limit)
+    write_own_limit(folder, found.limit, simulated(given, found.seed))
     (folder / 'README.md').write_text(text, encoding='utf-8')
 
 

@@ -19,7 +19,8 @@
 
 A table with measured numbers has a comment above it, which the site shows below it:
 
-    <!-- numbers: read 2026-11-20; COMMAND -->        what COMMAND printed on that day
+    <!-- numbers: read 2026-11-20 1f; COMMAND -->     what COMMAND printed on that day; 1f is the
+                                                      digest of all numbers of the table
     <!-- numbers: none -->                            nothing in it was measured
     <!-- numbers: sea.json; made by MODULE -->        what `page_of` of that module makes of it
     <!-- numbers: sea.json; CELLS; rows: KEYS -->     each cell is bound to values of that file
@@ -35,6 +36,7 @@ before `>>` belongs to all of them:
     &        between the paths of a cell that has several numbers; a path may lead to a list, too
     {a,b}    two paths, one with a and one with b
     [k=v]    as a key: the only item of a list that has v under k
+    a.json   as the first key: the path goes into that file instead
     {row}    the first cell of the row (if empty, of the row above), or its entry in KEYS, which
              are divided by `|`, with `=` where the first cell is the key
     {col}    the head of the column; {n}: its place after the first
@@ -55,6 +57,7 @@ import argparse
 from collections.abc import Iterator
 from datetime import date
 from functools import lru_cache
+import hashlib
 import importlib
 import json
 import math
@@ -91,6 +94,11 @@ class Table:
     @property
     def place(self) -> str:
         return f'{self.page}:{self.line}'
+
+    def digest(self) -> str:
+        """Of all its numbers: what was read by hand has to stay as it was read."""
+        numbers = [number for row in self.rows for cell in row for number in numbers_in(cell)]
+        return hashlib.sha256(' '.join(numbers).encode()).hexdigest()[:6]
 
     def measured(self) -> bool:
         """Whether it looks like measurements: a decimal number or a share somewhere."""
@@ -259,6 +267,9 @@ def expanded(paths: str) -> Iterator[str]:
 
 def values_at(content: Any, path: str) -> list[float]:
     """The numbers at a path: none where there is none, several in a list."""
+    first, _, rest = path.strip().partition('>')
+    if first.endswith('.json'):
+        content, path = contents(first), rest
     for key in path.split('>'):
         content = item(content, key.strip())
     found = content if isinstance(content, list) else [content]
@@ -295,7 +306,14 @@ def doubts(table: Table, sources: dict[str, dict[str, str]]) -> list[str]:
     if kind == 'none':
         return []
     if kind.startswith('read '):
-        return dated(table.place, kind.removeprefix('read ').strip(), rest.strip())
+        day, _, digest = kind.removeprefix('read ').strip().partition(' ')
+        found = dated(table.place, day, rest.strip())
+        if digest != table.digest():
+            found.append(
+                f'{table.place}: not the numbers that were read; those have the digest '
+                f'{table.digest()}'
+            )
+        return found
     if kind not in sources or not (RESULTS / kind).is_file():
         return [f'{table.place}: {SOURCES.name} does not know {kind}']
     if not rest:

@@ -77,17 +77,18 @@ def main() -> None:
     draw_scene(config, truth)
     draw_spectra(ping, truth, printed, angles)
     draw_multipath()
-    draw_profile(ping, truth, runs)
-    draw_clouds()
+    with plt.rc_context({'font.size': 12}):
+        draw_profile(ping, truth, runs)
+        draw_clouds()
     draw_sensitivity()
     draw_labels()
     draw_ledge()
 
 
-def save(figure, name: str, *, tight: bool = True) -> None:
+def save(figure, name: str, *, tight: bool = True, dpi: int = 80) -> None:
     if tight:
         figure.tight_layout()
-    figure.savefig(IMAGES / name, dpi=80, pil_kwargs={'optimize': True})
+    figure.savefig(IMAGES / name, dpi=dpi, pil_kwargs={'optimize': True})
     print(IMAGES / name)
 
 
@@ -194,19 +195,17 @@ def draw_clouds() -> None:
         seen.models, seen.likelihood, 100, (0, ping.stamp_ns, 0), resample=True, watch=watch
     )
     x = np.array(clouds)  # (T, 2, 100)
-    figure = plt.figure(figsize=(9, 8), layout='constrained')
+    figure = plt.figure(figsize=(9, 9), layout='constrained')
     rows = figure.add_gridspec(3, 4, height_ratios=(2, 1, 1.3))
     top = figure.add_subplot(rows[0, :])
     names = (('0.1 deg', BLUE), ('0.1 to 2 deg', RED))
     for model, (name, colour) in reversed(list(enumerate(names))):
         place = np.repeat(ping.range[::4], 100)
-        top.plot(
-            place, x[::4, model].ravel(), ',', color=colour, alpha=0.5, rasterized=True, label=name
-        )
+        top.plot(place, x[::4, model].ravel(), '.', ms=2, color=colour, alpha=0.5, label=name)
     top.plot(truth.range, np.degrees(truth.angle), color=INK, linewidth=0.6, label='truth')
     top.axvspan(*SHADOW, color=AMBER, alpha=0.3)
     top.set(ylabel='angle [deg]', title='particles of both models; no echo from 35 to 36 m')
-    for handle in top.legend(loc='upper right', fontsize=8).legend_handles:
+    for handle in top.legend(loc='upper right').legend_handles:
         handle.set_marker('o')
     middle = figure.add_subplot(rows[1, :], sharex=top)
     for model, (_, colour) in enumerate(names):
@@ -223,7 +222,7 @@ def draw_clouds() -> None:
             axis.hist(x[t, model], edges, color=colour, alpha=0.6)
         axis.axvline(centre, color=INK, linewidth=0.8)
         axis.set(title=f'{where:g} m', xlabel='angle [deg]')
-    save(figure, 'bathymetry_clouds.png', tight=False)
+    save(figure, 'bathymetry_clouds.png', tight=False, dpi=110)
 
 
 def draw_sensitivity() -> None:
@@ -275,7 +274,7 @@ def draw_labels() -> None:
 
 def draw_profile(ping, truth, runs) -> None:
     """Heights with their bands, and the probability of rough floor, of the corrected sets."""
-    figure, axes = plt.subplots(len(runs) + 1, 1, figsize=(9, 7.2), sharex=True)
+    figure, axes = plt.subplots(len(runs) + 1, 1, figsize=(9, 9.5), sharex=True)
     for axis, (name, estimate) in zip(axes, runs.items()):
         height = columns(estimate)['height']
         std = np.sqrt(estimate.covariance[:, 0, 0])
@@ -295,11 +294,11 @@ def draw_profile(ping, truth, runs) -> None:
         axis.set(ylim=(-2, 2), ylabel='height [m]', title=name)
         rough = estimate.probabilities[:, 0 if name == 'height_rw_ncs' else 1]
         axes[-1].plot(ping.range, rough, linewidth=0.9, label=name)
-    axes[0].legend(loc='upper left', fontsize=8, ncols=3)
+    axes[0].legend(loc='upper left', fontsize=10, ncols=3)
     axes[-1].axvspan(40, 50, color=BLUE, alpha=0.1)
     axes[-1].set(xlabel='slant range [m]', ylabel='P(rough)')
-    axes[-1].legend(loc='upper left', fontsize=8)
-    save(figure, 'bathymetry_profile.png')
+    axes[-1].legend(loc='center left', fontsize=10)
+    save(figure, 'bathymetry_profile.png', dpi=110)
 
 
 def draw_ledge() -> None:

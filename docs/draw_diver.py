@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Draw docs/images/diver_paper.png, the paper's Figures 3 and 4: python docs/draw_diver.py
+"""Draw the pictures of the diver: python docs/draw_diver.py
+
+diver_front.png   for README.md: the dive whose error is the median of 21, with its numbers, which
+                  go to docs/results/diver_front.json as well
+diver_paper.png   the paper's Figures 3 and 4
 
 Figure 3: one simulated dive of Table 1 with the tracks of both kinds of models in one picture.
 Figure 4: RMSE at each scan over 100 runs of that dive, equation (10). The paper does not print its
@@ -22,8 +26,10 @@ Needs matplotlib, which nothing else here does. Run it from the project root.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import sys
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -37,17 +43,29 @@ from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_accuracy import track, tuned  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
-from sonar_imm.trackers.diver.tracker import DiverConfig  # noqa: E402
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker  # noqa: E402
+from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
+    headings_together,
+    model_label,
+    model_order,
+    outlines,
+)
+from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
+from sonar_imm_tools.evaluation.diver.series import Series, series_of  # noqa: E402
+from sonar_imm_tools.evaluation.diver.truth import Truth, TruthPath  # noqa: E402
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate  # noqa: E402
 
-OUT = ROOT / 'docs' / 'images' / 'diver_paper.png'
-BLUE, RED, INK, PALE = '#0072B2', '#D55E00', '#1b2733', '#b8c0c8'
+IMAGES = ROOT / 'docs' / 'images'
+FRONT = ROOT / 'docs' / 'results' / 'diver_front.json'
+FRONT_SEEDS = range(1, 22)
+BLUE, RED, INK, PALE, GREY = '#0072B2', '#D55E00', '#1b2733', '#b8c0c8', '#8593a1'
 SEED, RUNS = 1, 100
 RANGE_STD, BEARING_STD = 0.1, np.radians(2.0)
 
 
 def main() -> None:
-    plt.rcParams.update({'font.size': 9, 'axes.spines.top': False, 'axes.spines.right': False})
+    plt.rcParams.update({'font.size': 11, 'axes.spines.top': False, 'axes.spines.right': False})
+    draw_front()
     path = simulate(scenario('table1'), SEED).truth[0].position[:, :2]
     z, R = observe(path)
     trackers = {
@@ -58,12 +76,90 @@ def main() -> None:
         label: (colour, track(config, z, R)[0][..., :2])
         for label, (colour, config) in trackers.items()
     }
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11.0, 4.2), layout='constrained')
-    draw_dive(left, path, z[0], {label: (c, runs[0]) for label, (c, runs) in tracks.items()})
-    draw_rmse(right, path, {'fixes': (PALE, z), **tracks})
-    figure.savefig(OUT, dpi=130)
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(9.0, 7.6), layout='constrained')
+    draw_dive(top, path, z[0], {label: (c, runs[0]) for label, (c, runs) in tracks.items()})
+    draw_rmse(bottom, path, {'fixes': (PALE, z), **tracks})
+    figure.savefig(IMAGES / 'diver_paper.png', dpi=110)
     for label, (_, runs) in tracks.items():
         print(f'{label}: {np.sqrt(np.mean(squared(runs, path))):.3f} m over all scans')
+
+
+def draw_front() -> None:
+    """A typical dive: map and probabilities of the headings, with what was measured."""
+    dives = {seed: typical(seed) for seed in FRONT_SEEDS}
+    errors = {seed: metrics['position']['rmse_m'] for seed, (*_, metrics) in dives.items()}
+    seed = sorted(errors, key=errors.__getitem__)[len(errors) // 2]
+    series, truth, fixes, metrics = dives[seed]
+    shown = {
+        'seed': seed,
+        'seeds': len(dives),
+        'raw fixes, RMSE m': metrics['raw_fix']['rmse_m'],
+        'track, RMSE m': metrics['position']['rmse_m'],
+        'truth inside 95 % ellipse': metrics['consistency']['coverage']['95'],
+        'NEES': metrics['consistency']['nees_position']['mean'],
+        'NEES believable': [
+            metrics['consistency']['nees_position'][end] for end in ('low', 'high')
+        ],
+    }
+    FRONT.write_text(json.dumps(shown, indent=2) + '\n', encoding='utf-8')
+    print(shown)
+    figure, (top, bottom) = plt.subplots(
+        2, 1, figsize=(9.0, 8.2), layout='constrained', height_ratios=(1.0, 1.25)
+    )
+    top.plot(*fixes.state[:, :2].T, 'x', color=GREY, ms=6, mew=1.2, label='raw fixes')
+    outline = outlines(series.state[:, :2], series.covariance[:, :2, :2])
+    shapes = outline[np.isfinite(outline[:, 0])].reshape(-1, 40, 2)
+    top.fill(*shapes.transpose(2, 1, 0), facecolor=BLUE, alpha=0.12, lw=0)
+    top.plot(*truth.paths[0].state[:, :2].T, color=INK, lw=1.4, ls='--', label='truth')
+    top.plot(*series.state[:, :2].T, color=BLUE, lw=2, label='track with 95 % ellipses')
+    top.set(
+        title=f'raw fixes: {metrics["raw_fix"]["rmse_m"]:.2f} m RMS from the truth, '
+        f'track: {metrics["position"]["rmse_m"]:.2f} m',
+        xlabel='east, m',
+        ylabel='north, m',
+        aspect='equal',
+        adjustable='datalim',
+    )
+    top.legend(frameon=False, ncols=3, loc='lower center')
+    draw_headings(bottom, series, truth)
+    figure.savefig(IMAGES / 'diver_front.png', dpi=100)
+
+
+def typical(seed: int) -> tuple[Series, Truth, Series, dict[str, Any]]:
+    """Track, truth, fixes and scores of one dive of Table 1 with the default parameters."""
+    scene = simulate(scenario('table1'), seed)
+    tracker = DiverTracker(DiverConfig())
+    fixes = [item.measurement for item in scene.measurements]
+    found = [estimate for fix in fixes for estimate in tracker.process(fix)]
+    series, raw = series_of(found), fix_series(fixes)
+    (true,) = scene.truth
+    state = np.column_stack([true.position[:, :2], true.velocity])
+    truth = Truth((TruthPath(true.track_id, true.stamp_ns, state),))
+    return series.confirmed(), truth, raw, score(series, truth, fixes=raw)
+
+
+def draw_headings(ax: Axes, series: Series, truth: Truth) -> None:
+    """The probability of each heading over time, and the true course."""
+    names, values = headings_together(series.model_names, series.probabilities)
+    order = model_order(names)
+    time = (series.stamp_ns - series.scan_ns[0]) / 1e9
+    image = ax.pcolormesh(
+        time, np.arange(len(order)), values[:, order].T, cmap='Blues', vmin=0, vmax=1
+    )
+    path = truth.paths[0]
+    course = np.degrees(np.arctan2(path.state[:, 3], path.state[:, 2])) % 360.0
+    headings = sum(name.startswith('heading_') for name in names)
+    first = len(order) - headings
+    when = (path.stamp_ns - series.scan_ns[0]) / 1e9
+    ax.plot(when, first + course * headings / 360.0, '.', color=RED, ms=4, label='true course')
+    ax.set(
+        title='probability of each motion model',
+        xlabel='time, s',
+        yticks=np.arange(len(order))[::2],
+        yticklabels=[model_label(names[k]) for k in order][::2],
+    )
+    ax.legend(facecolor='white', framealpha=1.0, loc='upper right')
+    ax.figure.colorbar(image, ax=ax, label='probability', pad=0.02)
 
 
 def observe(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +188,7 @@ def draw_dive(
     for label, (colour, run) in tracks.items():
         ax.plot(*run.T, color=colour, lw=1.3, label=label)
     ax.set(title='One dive of Table 1 (Figure 3)', xlabel='x, m', ylabel='y, m', aspect='equal')
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(frameon=False, fontsize=10)
 
 
 def draw_rmse(ax: Axes, path: np.ndarray, tracks: dict[str, tuple[str, np.ndarray]]) -> None:
@@ -105,7 +201,7 @@ def draw_rmse(ax: Axes, path: np.ndarray, tracks: dict[str, tuple[str, np.ndarra
         ylabel='RMSE, m',
         ylim=(0.0, None),
     )
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(frameon=False, fontsize=10)
 
 
 if __name__ == '__main__':

@@ -62,11 +62,17 @@ def main() -> None:
     axes[0].set_ylabel('vertical offset, m below the sonar')
     draw_curves(axes[2])
     figure.savefig(OUT / 'obstacle_offset.png', dpi=130)
-    figure, axes = plt.subplots(2, 3, figsize=(11.0, 6.8), layout='constrained')
-    draw_sphere(*axes[:, 0])
-    draw_image(*axes[:, 1])
-    draw_readings(*axes[:, 2])
-    figure.savefig(OUT / 'obstacle_paper.png', dpi=130)
+    draw_paper()
+
+
+def draw_paper() -> None:
+    """The paper's three figures, a row for each."""
+    with plt.rc_context({'font.size': 11}):
+        figure, axes = plt.subplots(3, 2, figsize=(10.0, 12.5), layout='constrained')
+        draw_sphere(*axes[0])
+        draw_image(*axes[1])
+        draw_readings(*axes[2])
+        figure.savefig(OUT / 'obstacle_paper.png', dpi=100)
 
 
 def draw_band(ax: Axes, name: str, title: str) -> None:

@@ -19,6 +19,8 @@ Run it with ``make docs``; a test compares the files with what the code says now
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+import json
 from pathlib import Path
 import textwrap
 
@@ -51,6 +53,9 @@ Written by `make docs` from the configuration classes; `ros2 param describe` sho
 A parameter that may change while running keeps the tracks; every other one is read at start.
 A wrong value is refused with one sentence that names it, a misspelt name is warned about.
 
+## The ten that matter
+
+{matter}
 ## {part}
 
 {tracker}
@@ -65,6 +70,70 @@ DETECTOR = (
     'parameters are taken from the section `fls_detector` of a parameter file, and from `--set`'
 )
 
+# Parameters that most users set, and when; everything else holds for most sonars.
+MATTER = {
+    'diver': {
+        'fix_std': 'fixes state no covariance: the standard deviation of one, per axis',
+        'covariance_scale': 'a warning says that fixes scatter more, or less, than they state',
+        'target': 'not a diver: `rov`, `fish`, `boat` or `ship`',
+        'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
+        'association': 'several divers who meet in clutter: `kbest`',
+        'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
+        'clutter_density': 'false fixes per square metre and scan, when you know them',
+        'coverage_sector': 'the sensor sees a sector only: who leaves it is not deleted',
+        'sound_speed': 'arrival times: that of your water; with `sound_speed_std` if unsure',
+        'receiver_position_std': 'arrival times: how well receivers were surveyed',
+    },
+    'obstacle': {
+        'sonar_lever': 'where the sonar sits on the vehicle',
+        'sonar_mount_rpy_deg': 'how it is turned there; a pitch of some degrees is usual',
+        'bearing_positive': 'bearings that grow to starboard',
+        'vertical_fov_deg': 'the vertical opening of the beam',
+        'max_range': 'the range that the sonar is set to',
+        'range_std': 'detections state no variance; `bearing_std_deg` likewise',
+        'clutter_density': 'false echoes in a ping per metre of range and radian of bearing',
+        'detection_probability': 'what is seen close by in fewer than nine of ten pings',
+        'sound_speed': 'the sonar assumed another one than your water has',
+        'safety_radius': 'which distance a collision is counted from; with `safety_height`',
+    },
+    'bathymetry': {
+        'sonar_height': 'the height above the sea floor at the start, unless altitudes come',
+        'side': '`port` for an array that looks there',
+        'tilt_deg': 'the tilt of the array below the horizon',
+        'element_spacing_wavelengths': 'staves are not half a wavelength apart',
+        'conjugate': 'the floor comes out mirrored: the phase has the other sign',
+        'sound_speed_profile': 'rays bend: depths and speeds of a cast; else `sound_speed`',
+        'noise_variance': 'measured in the water column if 0; state it when that is not clean',
+        'sonar_lever': 'where the array sits on the ship; with `sonar_mount_rpy_deg`',
+        'layover': '`resolved` for both surfaces of a ledge, four staves or more',
+        'attitude_std_deg': 'how good the motion sensor is: the error of soundings has it',
+    },
+    'fathometer': {
+        'phones': 'the number of hydrophones of the array',
+        'element_spacing': 'metres between them',
+        'frequency_max': 'the highest frequency that is processed; with `frequency_min`',
+        'array_depth': 'the depth of the array, unless it is published; reflectors are below it',
+        'depth_min': 'where the window of depths begins; with `depth_max`',
+        'sound_speed': 'that of the water; with `sound_speed_std`, which depths contain',
+        'order_max': 'the largest number of reflectors at a time',
+        'polarity': '`both` where a layer may be softer than what lies above it',
+        'pulse_width': 'traces of an instrument: the width of its pulse',
+        'record_seconds': 'sound of a vertical array: seconds averaged into one record',
+    },
+    'fls_detector': {
+        'image_scale': 'samples are powers, or levels in decibels',
+        'image_order': 'all ranges of a beam come together',
+        'image_near_range': 'images state no ranges; with `image_far_range` and `image_fov_deg`',
+        'image_first_beam': 'images state no bearings and begin to starboard',
+        'beam_width_deg': 'the width of a beam of your sonar',
+        'range_resolution': 'the length of the echo of a point',
+        'threshold_margin_db': 'too many false echoes on a rough floor, or too few echoes',
+        'join_distance': 'one obstacle gives several echoes, or two give one',
+        'min_range': 'echoes of the own vehicle reach farther',
+        'sweep_sector_deg': 'a scanning sonar: the sector ahead that is used',
+    },
+}
+
 
 def generated() -> dict[str, str]:
     """Give every generated file: its text by its path below the project root."""
@@ -77,6 +146,7 @@ def generated() -> dict[str, str]:
             what=f'{system.name} tracker',
             part='Tracker',
             summary=system.summary[0].upper() + system.summary[1:],
+            matter=matter_table(system.name, tracker),
             tracker=markdown_table(tracker),
             node=markdown_table(node_specs(system)),
         )
@@ -88,10 +158,21 @@ def generated() -> dict[str, str]:
         what='detector of sonar images',
         part='Detector',
         summary=DETECTOR,
+        matter=matter_table('fls_detector', detector),
         tracker=markdown_table(detector),
         node=markdown_table(node),
     )
     return files
+
+
+def matter_table(name: str, specs: Sequence[ParameterSpec]) -> str:
+    """The parameters that most users set, in the order in which they meet them."""
+    found = {spec.name: spec for spec in specs}
+    rows = ['| parameter | default | when to set it |', '|---|---|---|']
+    for parameter, when in MATTER[name].items():
+        default = json.dumps(found[parameter].default)
+        rows.append(f'| `{parameter}` | `{default}` {found[parameter].unit} | {when} |')
+    return '\n'.join(rows).replace('`  |', '` |') + '\n'
 
 
 def parameter_file(system: System) -> str:

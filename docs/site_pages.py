@@ -88,7 +88,7 @@ def caption(mark: str, up: str) -> str:
     if kind == 'none':
         return ''
     if kind.startswith('read '):
-        return f'*Read on {kind.removeprefix("read ").strip()}:* `{rest.strip()}`'
+        return f'*Read on {kind.split()[1]}:* `{rest.strip()}`'
     source = known_sources()[kind]
     return (
         f'*Values of {source["date"]} ({aged(kind)}), [{kind}]({up}results/{kind}):* '

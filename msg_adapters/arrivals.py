@@ -121,10 +121,7 @@ def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
     columns.update(zip(_RX, arrivals.rx.T))
     columns['toa'] = arrivals.toa
     columns['var_toa'] = arrivals.var_toa.astype(np.float32)
-    if not np.isnan(arrivals.bearing).all():
-        columns['bearing'] = arrivals.bearing
-        columns['var_bearing'] = arrivals.var_bearing.astype(np.float32)
-    for name in ('elevation', 'depth'):
+    for name in ('bearing', 'elevation', 'depth'):
         if not np.isnan(getattr(arrivals, name)).all():
             columns[name] = getattr(arrivals, name)
             columns[f'var_{name}'] = getattr(arrivals, f'var_{name}').astype(np.float32)
@@ -151,20 +148,23 @@ def _ids(values: NDArray, name: str) -> NDArray[np.uint16]:
     return values.astype(np.uint16)
 
 
-def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) -> NDArray:
-    """Variances (rows,), NaN where missing or not a variance."""
+def _optional(columns: dict[str, NDArray], name: str, rows: int) -> NDArray:
+    """The column (rows,), NaN where missing or not finite."""
     if name not in columns:
         return np.full(rows, np.nan)
     values = scalar_column(columns, name)
-    return np.where(np.isfinite(values) & (values >= least), values, np.nan)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) -> NDArray:
+    """Variances (rows,), NaN where missing or not a variance."""
+    values = _optional(columns, name, rows)
+    return np.where(values >= least, values, np.nan)
 
 
 def _elevations(columns: dict[str, NDArray], rows: int) -> NDArray:
     """Elevations (rows,), NaN where missing. What is beyond a right angle is refused."""
-    if 'elevation' not in columns:
-        return np.full(rows, np.nan)
-    values = scalar_column(columns, 'elevation')
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = _optional(columns, 'elevation', rows)
     if (np.abs(values) > 0.5 * np.pi + 1e-6).any():
         raise Rejection(
             'out_of_range',
@@ -176,18 +176,13 @@ def _elevations(columns: dict[str, NDArray], rows: int) -> NDArray:
 
 def _depths(columns: dict[str, NDArray], rows: int) -> NDArray:
     """Depth reports (rows,), NaN where missing or deeper than any sea."""
-    if 'depth' not in columns:
-        return np.full(rows, np.nan)
-    values = scalar_column(columns, 'depth')
+    values = _optional(columns, 'depth', rows)
     return np.where(np.abs(values) <= DEEPEST, values, np.nan)
 
 
 def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
     """Bearings (rows,) wrapped into [-pi, pi], NaN where missing. Degrees are refused."""
-    if 'bearing' not in columns:
-        return np.full(rows, np.nan)
-    values = scalar_column(columns, 'bearing')
-    values = np.where(np.isfinite(values), values, np.nan)
+    values = _optional(columns, 'bearing', rows)
     if (np.abs(values) > 2.0 * np.pi + 1e-6).any():
         raise Rejection(
             'out_of_range',

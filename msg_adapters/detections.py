@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import BEAM_AXES, Detections, OPTIONAL_COLUMNS, Rejection
 
-from .headers import Make, stamp_ns
+from .headers import Make, places_of, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 MAX_DETECTIONS = 10_000
@@ -80,9 +80,7 @@ def read_detections(message: Any, *, bearing_positive: str = 'port', **_: Any) -
 
 def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a PoseArray: positions in the sonar's frame, x forward, y to port, z up."""
-    places = np.array(
-        [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
-    ).reshape(-1, 3)
+    places = places_of(pose.position for pose in message.poses)
     return _detections(message, *_polar(*places.T), bearing_positive)
 
 
@@ -100,10 +98,10 @@ def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any
         if best is not None and not (centre.x or centre.y or centre.z):
             centre = best.pose.pose.position
         stated = np.zeros(36) if best is None else np.asarray(best.pose.covariance, np.float64)
-        places.append([centre.x, centre.y, centre.z])
+        places.append(centre)
         covariances.append(stated.reshape(6, 6)[:3, :3])
         scores.append(np.nan if best is None else float(best.hypothesis.score))
-    m, C = np.array(places, np.float64).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
+    m, C = places_of(places), np.array(covariances).reshape(-1, 3, 3)
     distance, bearing = _polar(*m.T)
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         level = np.hypot(m[:, 0], m[:, 1])
@@ -147,9 +145,7 @@ def read_sonar_ranges(
     y to port; ``'auto'``: forward is the one of x and z along which the beams point more.
     """
     distance = np.array(message.ranges, np.float64)
-    beams = np.array(
-        [[beam.x, beam.y, beam.z] for beam in message.beam_unit_vec], np.float64
-    ).reshape(-1, 3)
+    beams = places_of(message.beam_unit_vec)
     if len(beams) != len(distance):
         raise Rejection(
             'bad_shape', f'SonarRanges has {len(distance)} ranges and {len(beams)} beams'

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Position fixes: geometry_msgs PoseWithCovarianceStamped or PointStamped.
+"""Position fixes and starts of tracks: geometry_msgs PoseWithCovarianceStamped or PointStamped.
 
 Publishers fill in covariances in different ways. Of the x-y block a negative variance means
 unknown. All zeros mean that it was not filled in: unknown too, and worth a warning (see
@@ -23,7 +23,7 @@ refused. What is stated of z is used with it, or left out where it cannot be tru
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 from attrs import evolve
 import numpy as np
@@ -35,6 +35,8 @@ from sonar_imm.measurements.checks import check_covariance
 from sonar_imm.measurements.diver import UNKNOWN_VARIANCE
 
 from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, swap_covariance, to_enu
+
+Place = TypeVar('Place', Fix, Start)
 
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
 """Limits of the variance of a fix, m^2: a micrometre and 100,000 km squared."""
@@ -61,13 +63,33 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
     return to_enu(fix, world_frame, _turned)
 
 
-def _turned(fix: Fix) -> Fix:
-    """The same place in ENU, of a fix in NED."""
+def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
+    """Read the start of a track from a PoseWithCovarianceStamped, as RViz sends it by a click; the
+    orientation is not used. Raises `Rejection`, also without a covariance of x and y: how far off
+    the place may be is what a start has to say."""
+    point, covariance = message.pose.pose.position, known_covariance(message)
+    if covariance is None or np.isnan(covariance[0, 0]):
+        raise Rejection(
+            'no_covariance',
+            'the start has no covariance of x and y: state how far off it may be, in m^2',
+        )
+    start = Start(
+        stamp_ns=stamp_ns(message),
+        position=(float(point.x), float(point.y), float(point.z)),
+        covariance=covariance,
+        frame_id=str(message.header.frame_id),
+    )
+    check_size(start, 'start')
+    return to_enu(start, world_frame, _turned)
+
+
+def _turned(fix: Place) -> Place:
+    """The same place in ENU, of one in NED."""
     covariance = None if fix.covariance is None else swap_covariance(fix.covariance)
     return evolve(fix, position=swap_axes(fix.position), covariance=covariance)
 
 
-def check_size(fix: Fix) -> None:
+def check_size(fix: Fix | Start, what: str = 'fix') -> None:
     """Raise `Rejection` for a covariance so small or large that arithmetic with it breaks down."""
     if fix.covariance is None or np.isnan(fix.covariance[0, 0]):
         return
@@ -75,7 +97,7 @@ def check_size(fix: Fix) -> None:
     if least < LEAST_VARIANCE or most > MOST_VARIANCE:
         raise Rejection(
             'out_of_range',
-            'the fix states a standard deviation from '
+            f'the {what} states a standard deviation from '
             f'{np.sqrt(least):g} m to {np.sqrt(most):g} m',
         )
 
@@ -109,6 +131,14 @@ def write_fix(fix: Fix, make: Make) -> Any:
         stated = np.isfinite(fix.covariance)
         covariance[:3, :3][stated] = fix.covariance[stated]
     return make_position(fix, fix.position, covariance, make)
+
+
+def write_start(start: Start, make: Make) -> Any:
+    """Write a start as a PoseWithCovarianceStamped."""
+    covariance = np.diag(np.full(6, UNKNOWN_VARIANCE))
+    stated = np.isfinite(start.covariance)
+    covariance[:3, :3][stated] = start.covariance[stated]
+    return make_position(start, start.position, covariance, make)
 
 
 def make_position(

@@ -27,7 +27,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, cast, Protocol, TypeVar
 
 from attrs import evolve
+import numpy as np
 
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Rejection
 
 Make = Callable[..., Any]
@@ -83,6 +85,11 @@ def make_pose(
         position=make('geometry_msgs/msg/Point', **dict(zip('xyz', place))),
         orientation=make('geometry_msgs/msg/Quaternion', **dict(zip('xyzw', turn))),
     )
+
+
+def places_of(points: Iterable[Any]) -> FloatArray:
+    """x, y, z (n, 3) of points or vectors."""
+    return np.array([[point.x, point.y, point.z] for point in points], np.float64).reshape(-1, 3)
 
 
 def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:

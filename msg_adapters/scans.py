@@ -38,7 +38,16 @@ from numpy.typing import NDArray
 from sonar_imm.measurements import Fixes, in_space, NOBODY, Rejection, usable_fixes
 
 from .fixes import LEAST_VARIANCE, MOST_VARIANCE
-from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, swap_covariance, to_enu
+from .headers import (
+    Make,
+    make_header,
+    make_pose,
+    places_of,
+    stamp_ns,
+    swap_axes,
+    swap_covariance,
+    to_enu,
+)
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
@@ -77,9 +86,7 @@ def read_poses(message: Any, *, world_frame: str = 'enu') -> Fixes:
         raise Rejection(
             'too_large', f'a scan of {len(message.poses)} poses; at most {MAX_FIXES} are read'
         )
-    position = np.array(
-        [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
-    ).reshape(-1, 3)
+    position = places_of(pose.position for pose in message.poses)
     position[:, 2] = np.where(np.isfinite(position[:, 2]), position[:, 2], 0.0)
     return _scan(message, position, None, None, world_frame)
 

@@ -157,11 +157,13 @@ def a_page(
         ('one.json', 'near | 1.25', 'not bound'),
         ('two.json; rmse>{row}', 'near | 1.25', 'does not know two.json'),
         ('none', 'near | 1.24', None),
-        ('read 2026-11-20; sonar-imm bench', 'near | 1.24 m', None),
-        ('read 2026-11-20', 'near | 1.24 m', 'no command'),
-        ('read today; sonar-imm bench', 'near | 1.24 m', 'no date'),
-        ('read 2999-01-01; sonar-imm bench', 'near | 1.24 m', 'not come yet'),
-        ('read 2026-11-20; python -m benchmarks.no', 'near | 1.24 m', 'there is no'),
+        ('read 2026-11-20 c63c00; sonar-imm bench', 'near | 1.24 m', None),
+        ('read 2026-11-20 c63c00; sonar-imm bench', 'near | 1.25 m', 'not the numbers that were'),
+        ('read 2026-11-20; sonar-imm bench', 'near | 1.24 m', 'not the numbers that were'),
+        ('read 2026-11-20 c63c00', 'near | 1.24 m', 'no command'),
+        ('read today c63c00; sonar-imm bench', 'near | 1.24 m', 'no date'),
+        ('read 2999-01-01 c63c00; sonar-imm bench', 'near | 1.24 m', 'not come yet'),
+        ('read 2026-11-20 c63c00; python -m benchmarks.no', 'near | 1.24 m', 'there is no'),
     ],
 )
 def test_what_is_wrong_is_found(a_page: Any, mark: str, row: str, doubt: str | None) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+from pathlib import Path
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -63,6 +64,9 @@ PYPI_OF_KEY = {
     'python3-websockets': 'websockets',
     'python3-yaml': 'PyYAML',
 }
+"""All keys are in rosdep/python.yaml of ros/rosdistro, as of 2026-08-22, with Ubuntu 24.04."""
+RELEASED = {'ament_copyright', 'ament_flake8', 'ament_pep257', 'rclpy'}
+"""Packages of Jazzy besides messages that are named in package.xml."""
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Libraries that some commands need, each with an extra of its own.
@@ -129,6 +133,29 @@ def test_there_is_one_version(manifest: ElementTree.Element) -> None:
     assert re.search(rf'^{re.escape(sonar_imm.__version__)} \(.+\)$', changelog, re.MULTILINE)
 
 
+def test_every_key_of_package_xml_is_one_of_rosdep_or_a_package_of_jazzy(
+    manifest: ElementTree.Element,
+) -> None:
+    keys = {each.text for each in manifest if each.tag.endswith('depend')}
+    assert keys <= {*PYPI_OF_KEY, *RELEASED, *COMMON_INTERFACES, *COME_WITH_RCLPY}
+
+
+def test_catkin_reads_the_package_and_its_changelog() -> None:
+    """As bloom, colcon and rosdoc2 do."""
+    package = pytest.importorskip('catkin_pkg.package')
+    from catkin_pkg.changelog import get_changelog_from_path
+
+    warned: list[str] = []
+    read = package.parse_package(str(ROOT))
+    read.validate(warnings=warned)
+    assert not warned
+    assert (read.name, read.get_build_type()) == ('sonar_imm', 'ament_python')
+    (version,) = [
+        version for version, _, _ in get_changelog_from_path(str(ROOT)).foreach_version()
+    ]
+    assert version == read.version
+
+
 def test_setup_reads_that_version() -> None:
     text = (ROOT / 'sonar_imm' / '__init__.py').read_text(encoding='utf-8')
     assert re.findall(r"^__version__ = '([^']+)'$", text, re.MULTILINE) == [sonar_imm.__version__]
@@ -189,6 +216,48 @@ def test_the_citation_names_this_version() -> None:
     assert cited['version'] == sonar_imm.__version__
     dated = re.search(r'^(\S+) \(([\d-]+)\)$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
     assert dated and dated.groups() == (cited['version'], str(cited['date-released']))
+
+
+def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
+    setup_lists: dict[str, list[str]],
+) -> None:
+    recipe = yaml.safe_load((ROOT / 'conda' / 'recipe.yaml').read_text(encoding='utf-8'))
+    assert recipe['package']['version'] == sonar_imm.__version__
+    wanted = {line.replace(' ', '').lower() for line in recipe['requirements']['run']}
+    ros = {line for line in wanted if line.startswith('ros')}
+    named = {line.lower() for line in setup_lists['REQUIRES']}
+    assert wanted - named == ros - named | {'python>=3.10'}
+    assert named <= wanted
+    assert {line for line in ros if line.startswith('ros-')} == {
+        *('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces')
+    }
+
+
+def test_ci_files_call_what_has_to_pass() -> None:
+    """Both only say where; what has to pass stands in .ci/run."""
+    hub = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text(encoding='utf-8'))
+    assert {'run': '.ci/run', 'env': {'PYTHON': 'python'}} in hub['jobs']['run']['steps']
+    lab = yaml.safe_load((ROOT / '.gitlab-ci.yml').read_text(encoding='utf-8'))
+    assert 'PYTHON=python3 .ci/run' in lab['.run']['script']
+
+
+def test_a_release_is_told_what_only_its_owner_can_fill_in(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location('placeholders', ROOT / '.ci/placeholders.py')
+    assert spec and spec.loader
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    for name in ('package.xml', 'CITATION.cff', 'CHANGELOG.rst'):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    missing = list(made.placeholders(tmp_path))
+    assert 'package.xml: maintainers@example.org reaches nobody' in missing
+    text = (tmp_path / 'package.xml').read_text().replace('@example.org', '@sonar.dev')
+    url = '</license>\n  <url type="repository">https://sonar.dev/sonar_imm</url>'
+    (tmp_path / 'package.xml').write_text(text.replace('</license>', url))
+    with (tmp_path / 'CITATION.cff').open('a') as file:
+        file.write('repository-code: https://sonar.dev/sonar_imm\n')
+    assert not [line for line in made.placeholders(tmp_path) if 'CHANGELOG' not in line]
+    (tmp_path / 'CHANGELOG.rst').write_text('Forthcoming\n-----------\n')
+    assert [line for line in made.placeholders(tmp_path) if 'Forthcoming' in line]
 
 
 def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:

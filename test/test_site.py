@@ -20,6 +20,7 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import sys
 from typing import Any
@@ -140,3 +141,14 @@ def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
     text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
     shown = made.captioned(text, '../')
     assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
+
+
+def test_the_numbers_below_the_picture_of_the_front_are_those_of_the_run() -> None:
+    run = json.loads((ROOT / 'docs/results/diver_front.json').read_text(encoding='utf-8'))
+    caption = (ROOT / 'README.md').read_text(encoding='utf-8').partition('A simulated dive')[2]
+    caption = ' '.join(caption.partition('\n\n')[0].split())
+    assert f'middle one of {run["seeds"]}' in caption
+    for name in ('raw fixes, RMSE m', 'track, RMSE m'):
+        assert f'{run[name]:.2f} m'.lstrip('0') in caption
+    assert f'{100 * run["truth inside 95 % ellipse"]:.0f} % of the time' in caption
+    assert run['NEES low'] < run['NEES'] < run['NEES high']

@@ -14,7 +14,7 @@
 
 """Speed: what ``sonar-imm bench`` measures, beside FilterPy and Stone Soup in the same run.
 
-    python -m benchmarks.speed diver --rounds 5
+    sonar-imm bench diver --rounds 5
 
 Each system has a module here with ``BENCHES``, a tuple of `Bench`. Times depend on the machine and
 its load; the ratio of two programs measured in turn hardly does. How long a live node takes is

@@ -22,7 +22,7 @@ of ``~/estimate``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,13 +30,15 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from ..estimates import write_model_probabilities
-from ..headers import Make
-from ..markers import write_ended, write_no_markers
+from ..headers import Make, make_header
 
 CONFIRMED = 1
 """Least `track_state` of a confirmed track: 0 tentative, 1 confirmed, 2 coasting."""
 MODELS = 'model_probabilities'
 NAMED_SCALARS = 'sensor_msgs/msg/JointState'
+_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
+LIFETIME = 5
+"""Seconds after which a marker vanishes when nothing is published any more."""
 Drawn = Iterator[tuple[str, Any]]
 """Names of topics, without ``~/``, and the messages to publish on them."""
 
@@ -84,3 +86,60 @@ class Markers:
         """What removes all."""
         self._shown = set()
         yield 'markers', write_no_markers(self._frame_id, make)
+
+
+def make_marker(
+    estimate: Estimate,
+    row: int,
+    make: Make,
+    name: str,
+    kind: int,
+    size: tuple[float, float, float],
+    colour_rgba: tuple[float, ...],
+    **more: Any,
+) -> Any:
+    """Make one marker of the track in `row`.
+
+    name: its namespace; kind: a type of visualization_msgs/Marker; size: metres along its axes;
+    colour_rgba: 0 to 1; more: the fields that only this kind has, and the pose.
+    """
+    return make(
+        'visualization_msgs/msg/Marker',
+        header=make_header(estimate.stamp_ns, estimate.frame_id, make),
+        ns=name,
+        id=_number(int(estimate.extras['track_id'][row])),
+        type=kind,
+        action=_ADD,
+        scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', size))),
+        color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour_rgba))),
+        lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
+        **more,
+    )
+
+
+def _number(track_id: int) -> int:
+    """The id of a marker has 31 bits, one less than that of a track."""
+    return track_id & 0x7FFFFFFF
+
+
+def write_ended(frame_id: str, track_ids: Iterable[int], names: Iterable[str], make: Make) -> Any:
+    """Write what removes the markers of tracks that are over; names: the namespaces they have."""
+    markers = [
+        make(
+            'visualization_msgs/msg/Marker',
+            header=make_header(0, frame_id, make),
+            ns=name,
+            id=_number(track_id),
+            action=_DELETE,
+        )
+        for track_id in track_ids
+        for name in names
+    ]
+    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def write_no_markers(frame_id: str, make: Make) -> Any:
+    """Write what removes every marker that was drawn before."""
+    header = make_header(0, frame_id, make)
+    every = make('visualization_msgs/msg/Marker', header=header, action=_DELETE_ALL)
+    return make('visualization_msgs/msg/MarkerArray', markers=[every])

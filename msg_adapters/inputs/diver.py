@@ -31,13 +31,12 @@ from sonar_imm.measurements import (
 )
 
 from ..arrivals import read_arrivals, write_arrivals
-from ..fixes import doubt_fix, doubt_height, read_fix, write_fix
+from ..fixes import doubt_fix, doubt_height, read_fix, read_start, write_fix, write_start
 from ..geodetic import doubt_geodetic, is_geodetic, read_geodetic, read_vessel_fix, write_geodetic
 from ..headers import Make
 from ..navigation import write_navigation
 from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative
 from ..scans import doubt_scan, read_poses, read_scan, write_scan
-from ..starts import read_start, write_start
 from ..transforms import TF_STATIC
 from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic

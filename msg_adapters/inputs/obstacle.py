@@ -36,10 +36,17 @@ from ..navigation import (
     write_navigation,
     write_range,
 )
-from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..sonar_images import (
+    read_oculus_ping,
+    read_picture,
+    read_ping360_echo,
+    read_projected_image,
+    read_raw_image,
+    read_sonoptix_echo,
+    write_picture,
+)
 from ..soundings import read_ground, write_ground
 from ..transforms import TF_STATIC
-from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
 
 TOPICS = (

@@ -16,8 +16,7 @@
 
 Each word is the full name of a node, whose last part says what it is::
 
-    ros2 run sonar_imm composed_node /auv1/diver /auv2/diver /auv2/obstacle --ros-args \\
-        --params-file fleet.yaml
+    ros2 run sonar_imm composed_node /auv1/diver /auv2/diver --ros-args --params-file fleet.yaml
 
 Parameters come from files with a section for each full name (``/auv1/diver:``), as for any process
 with several nodes; ``/**/diver:`` is for all divers. What a node sends and hears is the same as in
@@ -79,7 +78,8 @@ def _explain(args: Sequence[str] | None) -> str | None:
 
 
 def _names(args: Sequence[str] | None) -> list[str]:
-    return remove_ros_args(list(sys.argv if args is None else args))[1:]
+    words = remove_ros_args(list(sys.argv if args is None else args))[1:]
+    return [name for word in words for name in word.split()]  # launch gives a list as one word
 
 
 def main(args: list[str] | None = None) -> int:

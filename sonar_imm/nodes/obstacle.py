@@ -36,7 +36,7 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
-from msg_adapters.obstacles import write_places
+from msg_adapters.displays.obstacle import write_places
 
 from ..acoustics.geodesy import Origin
 from ..estimates import Estimate

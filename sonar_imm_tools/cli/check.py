@@ -95,20 +95,23 @@ def run_checks(
     limit: float | None = None,
     quiet: bool = False,
     jobs: int = 1,
+    live_all: bool = True,
 ) -> list[CheckedRecording]:
     """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`.
 
     jobs: processes that share the recordings, the smallest of each system first; they print
-    nothing but which recording is done. The list is in the order of systems and recordings.
+    nothing but which recording is done. live_all: play all to the node, not only the smallest of
+    each system. The list is in the order of systems and recordings.
     """
     from .checking import instruments_in, play_recording, shipped_bags
 
     todo = [
         (path, system, name, topics)
         for system in systems
-        for path in ([bag] if bag else shipped_bags(system))
+        for path in ([bag] if bag else shipped_bags(system, folder))
         for name, topics in instruments_in(path, system).items()
     ]
+    order, first = _small_ones_first([item[:2] for item in todo])
     plays = [
         functools.partial(
             play_recording,
@@ -119,24 +122,25 @@ def run_checks(
             limit=limit,
             topics=topics,
             quiet=quiet or jobs > 1,
+            live=live_all or number in order[:first],
         )
-        for path, system, name, topics in todo
+        for number, (path, system, name, topics) in enumerate(todo)
     ]
     if jobs == 1:
         return [play().judged() for play in plays]
-    return _shared_out(plays, _small_ones_first([item[:2] for item in todo]), jobs)
+    return _shared_out(plays, order, jobs)
 
 
-def _small_ones_first(todo: list[tuple[Path, str]]) -> list[int]:
-    """In which order to check recordings: the smallest of each system, then the others, of which
-    the largest come first."""
+def _small_ones_first(todo: list[tuple[Path, str]]) -> tuple[list[int], int]:
+    """In which order to check recordings, and how many of them come first: the smallest of each
+    system do, then the others, of which the largest come first."""
     size = [sum(file.stat().st_size for file in path.rglob('*')) for path, _ in todo]
     first = {
         system: min((i for i, item in enumerate(todo) if item[1] == system), key=size.__getitem__)
         for _, system in todo
     }
     others = [i for i in range(len(todo)) if i not in first.values()]
-    return [*first.values(), *sorted(others, key=lambda i: -size[i])]
+    return [*first.values(), *sorted(others, key=lambda i: -size[i])], len(first)
 
 
 def _shared_out(
@@ -163,7 +167,8 @@ def print_checks(recording: CheckedRecording) -> None:
             f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
             f' (wanted: {check.wanted})'
         )
-    say(
-        f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
-        f'p99 {recording.latency_ms["p99"]:.1f} ms'
-    )
+    if recording.latency_ms:
+        say(
+            f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
+            f'p99 {recording.latency_ms["p99"]:.1f} ms'
+        )

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One recording through the real node and through the offline tracker, compared and scored.
+"""One recording through the offline tracker and through the real node, compared and scored.
 
 ``check`` prints the result, ``demo`` makes a report of it.
 """
@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
+import shutil
 from typing import Any
 
 from attrs import asdict, frozen
@@ -34,7 +35,7 @@ from ..evaluation.judging import Check, Judgement
 from ..offline.batch import Job
 from ..offline.run_folder import BAG, CSV, RunFolder
 from ..offline.tracking import final_estimates, InputOptions
-from ..recordings.own_files import own_limit, own_parameters
+from ..recordings.own_files import LIMIT, own_limit, own_parameters, own_recipe
 from ..recordings.reader import BagReader
 from ..recordings.topics import instruments
 from ..replay.harness import LockstepResult, run_lockstep
@@ -48,7 +49,7 @@ from .track import track_one
 class CheckedRecording:
     """All checks of one recording, and the judgement of the offline run.
 
-    `folder` holds the runs ``offline`` and ``live``.
+    `folder` holds the runs ``offline`` and ``live``, the latter where the node was there.
     """
 
     system: str
@@ -76,8 +77,8 @@ class CheckedRecording:
 
 @frozen
 class PlayedRecording:
-    """A recording tracked offline and by the node, `checks` of both against each other, and the
-    largest error allowed, None for that of the system."""
+    """A recording tracked offline and, unless left out, by the node; `checks` of both against each
+    other, and the largest error allowed, None for that of the system."""
 
     system: str
     bag: Path
@@ -96,12 +97,28 @@ class PlayedRecording:
         )
 
 
-def shipped_bags(system: str) -> list[Path]:
-    """The recordings of `system` that come with the package. Raises FileNotFoundError if none."""
-    found = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
-    if not found:
+def shipped_bags(system: str, scratch: Path) -> list[Path]:
+    """The recordings of `system` that come with the package.
+
+    An installation has the small ones only (setup.py): where it has none of a system, the first
+    is simulated into `scratch`. Raises FileNotFoundError if none is known, `BagError` without a
+    recipe.
+    """
+    known = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
+    if not known:
         raise FileNotFoundError(f'no recordings for {system} in {share_folder() / "bags"}')
-    return found
+    installed = [path for path in known if any(path.glob('*.mcap'))]
+    return installed or [_simulated(known[0], system, scratch / 'bags')]
+
+
+def _simulated(folder: Path, system: str, scratch: Path) -> Path:
+    """Make the recording that belongs into `folder`, with its limit, below `scratch`."""
+    from .simulate import command
+
+    made, recipe = scratch / folder.name, own_recipe(folder)
+    command.main([system, str(made), *recipe], standalone_mode=False)
+    shutil.copy(folder / LIMIT, made)
+    return made
 
 
 def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
@@ -125,8 +142,9 @@ def play_recording(
     limit: float | None = None,
     topics: Mapping[str, str] | None = None,
     quiet: bool = False,
+    live: bool = True,
 ) -> PlayedRecording:
-    """Track `bag` offline and by the live node into `folder`, and compare.
+    """Track `bag` offline and, if `live`, by the node too into `folder`, and compare.
 
     params: parameter file; None for the one that comes with the recording, if any. limit: largest
     error allowed, in the unit of the system; None for that of the recording, if it states one, or
@@ -155,8 +173,10 @@ def play_recording(
         ),
         quiet,
     )
+    if not live:
+        return PlayedRecording(system, bag, folder, limit, (), {})
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
-        live = run_lockstep(
+        played = run_lockstep(
             bag,
             system,
             params_file=params,
@@ -164,9 +184,9 @@ def play_recording(
             topics=topics,
             progress=advance,
         )
-    _keep(live, config, system, folder / 'live')
-    checks = (_answered(live, run), _equal(folder), _ended(live))
-    return PlayedRecording(system, bag, folder, limit, checks, live.latency_ms())
+    _keep(played, config, system, folder / 'live')
+    checks = (_answered(played, run), _equal(folder), _ended(played))
+    return PlayedRecording(system, bag, folder, limit, checks, played.latency_ms())
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:

@@ -98,10 +98,11 @@ def command(
 ) -> None:
     """Score the run, or all runs, that `sonar-imm track` left in OUT_DIR.
 
-    Writes metrics.json beside each run and one self-contained HTML report. Without truth only
-    what needs none is scored: the normalised innovations (NIS) and the model probabilities. With
-    --crossing the depths of two lines are compared where they cross; only the figure of that is
-    written, where --report names a file.
+    Writes metrics.json beside each run and an HTML report, which is one file for one run; for
+    several it is a page with a row for each, and their pages lie in a folder beside it, named
+    after it: report_runs. Without truth only what needs none is scored: the normalised innovations
+    (NIS) and the model probabilities. With --crossing the depths of two lines are compared where
+    they cross; only the figure of that is written, where --report names a file.
     """
     from ..offline.batch import run_folders
 

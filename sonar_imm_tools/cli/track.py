@@ -307,13 +307,18 @@ def choose_system(
 ) -> System:
     """The tracker called `name`, or else the one that fits an open recording best. Raises
     `BagError` when none does."""
-    from ..recordings.topics import fitting_systems, instruments
+    from ..recordings.topics import fitting_systems, instruments, knows_inputs
 
     if name is not None:
         return SYSTEMS[name]
     found = fitting_systems(reader, topics)
     if not found:
-        instruments(reader, next(iter(SYSTEMS)), topics)  # says what is there
+        # Whose inputs were named, or whose recording it is, says what is there.
+        inputs = {*(topics or {}).values()}
+        meant = [system for system in SYSTEMS if inputs and knows_inputs(system, inputs)]
+        fits = fitting_systems(reader)
+        best = [system for system in fits if system in meant] or meant or fits or [*SYSTEMS]
+        instruments(reader, best[0], topics)
     return SYSTEMS[found[0]]
 
 

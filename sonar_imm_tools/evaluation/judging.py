@@ -37,7 +37,7 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..offline.run_folder import RunFolder
 from ..recordings.sources import BagError
-from .numbers import cards, Check, fill, lines, Metric, Text
+from .numbers import Card, cards, Check, fill, front, lines, Metric, Text, verdict
 
 if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
     from .report import Part, Section
@@ -87,9 +87,9 @@ class Judgement:
     """Scores and summary of one run.
 
     run: the content of ``run.json``; metrics: that of ``metrics.json``. words: the result in a few
-    sentences. shown: which metrics people see, and how. sections: makes the sections of the
-    report. accuracy: compares the error with a limit (None for `LIMIT` of the system); None
-    without truth.
+    sentences. shown: which metrics people see, and how. seen: what was tracked, in a few words.
+    sections: makes the sections of the report. accuracy: compares the error with a limit (None for
+    `LIMIT` of the system); None without truth.
     """
 
     run: Mapping[str, Any]
@@ -98,6 +98,7 @@ class Judgement:
     shown: Sequence[Metric]
     sections: Callable[[], Iterable[Section]]
     accuracy: Callable[[float | None], Check | None]
+    seen: Text = ''
 
     @property
     def summary(self) -> str:
@@ -109,6 +110,17 @@ class Judgement:
         """Label and value of the most important numbers."""
         return lines(self.shown, self.metrics)
 
+    @property
+    def headline(self) -> str:
+        """What was tracked and how well, in one line."""
+        numbers = (f'{card.title} {card.value}' for card in front(self.cards))
+        return '; '.join([fill(self.seen, self.metrics), *numbers])
+
+    @property
+    def cards(self) -> tuple[Card, ...]:
+        """The key numbers of the report."""
+        return cards(self.shown, self.metrics)
+
     def part(self, checks: Sequence[Check] = ()) -> Part:
         """The part of the report for this run, with further `checks`."""
         from .report import Part
@@ -117,8 +129,10 @@ class Judgement:
             run=self.run,
             metrics=self.metrics,
             summary=self.summary,
+            seen=fill(self.seen, self.metrics),
+            verdict=verdict(self.shown, self.metrics),
             checks=tuple(checks),
-            cards=cards(self.shown, self.metrics),
+            cards=self.cards,
             sections=tuple(self.sections()),
         )
 

@@ -46,6 +46,11 @@ def flatten(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     return result
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words, e.g. ``2 tracks``."""
+    return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
+
+
 def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
     """RMSE, median and 95 % point of non-negative errors; NaN when there are none."""
     if not len(error):
@@ -104,9 +109,13 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     }
 
 
-def coverage_verdict(coverage: float) -> str:
-    """What `coverage`, the share of truth inside the stated 95 % ellipses, says about them."""
-    return 'overconfident' if coverage < 0.90 else 'cautious' if coverage > 0.99 else 'consistent'
+def coverage_verdict(coverage: float, stated: float = 0.95) -> str:
+    """What `coverage`, the share of truth inside bands that state a share, says about them: twice
+    as much outside is overconfident, a fifth cautious."""
+    outside, allowed = round(1.0 - coverage, 9), 1.0 - stated
+    if outside > round(2.0 * allowed, 9):
+        return 'overconfident'
+    return 'cautious' if outside < round(0.2 * allowed, 9) else 'consistent'
 
 
 def coverage_sentence(coverage: float) -> str:
@@ -158,9 +167,11 @@ class Metric:
     """A metric of ``metrics.json`` as people read it, on the terminal, in the report, or in both.
 
     label, line: title and text of the line on the terminal. card, value, remark: title, value and
-    explanation of the key number in the report. when: whether to show it. Without a label it is
-    not on the terminal, without a card not in the report, and without the first number that is
-    named in neither.
+    explanation of the key number in the report. front: whether it is one of the few on the front
+    page of several runs. covers: dotted name of the share of the truth inside a band, and the
+    share that the band states. when: whether to show it. Without a label it is not on the
+    terminal, without a card not in the report, and without the first number that is named in
+    neither.
     """
 
     label: str = ''
@@ -168,6 +179,8 @@ class Metric:
     card: str = ''
     value: str = ''
     remark: Text = ''
+    front: bool = False
+    covers: tuple[str, float] | None = None
     when: Callable[[Mapping[str, Any]], object] = lambda metrics: True
 
 
@@ -178,9 +191,10 @@ class Card:
     value: str
     title: str
     remark: str = ''
+    front: bool = False
 
 
-def error(key: str, label: str, unit: str = 'm', **card: Text) -> Metric:
+def error(key: str, label: str, unit: str = 'm', **card: Any) -> Metric:
     """The `error_summary` at `key`: all of it in a line, RMSE and the rest on a card."""
     names = [f'{{{key}.{name}_{unit}' for name in ('rmse', 'median', 'p95')]
     shown = {'mps': 'm/s'}.get(unit, unit)
@@ -220,10 +234,26 @@ def lines(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[tuple[st
 def cards(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[Card, ...]:
     """The key number of every metric that is known and belongs in the report."""
     return tuple(
-        Card(fill(metric.value, metrics), metric.card, fill(metric.remark, metrics))
+        Card(fill(metric.value, metrics), metric.card, fill(metric.remark, metrics), metric.front)
         for metric in shown
         if metric.card and metric.when(metrics) and _known(metric.value, metrics)
     )
+
+
+def front(cards: Iterable[Card], most: int = 3) -> list[Card]:
+    """The few key numbers for the front page: those that are meant for it, then the others."""
+    return sorted(cards, key=lambda card: not card.front)[:most]
+
+
+def verdict(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> str:
+    """What the share of the truth inside a band says about the stated uncertainty; empty where
+    nothing tells."""
+    for metric in shown:
+        if metric.covers is not None and metric.when(metrics):
+            inside, stated = look_up(metrics, metric.covers[0]), metric.covers[1]
+            if inside is not None and inside == inside:
+                return coverage_verdict(inside, stated)
+    return ''
 
 
 def fill(text: Text, metrics: Mapping[str, Any]) -> str:

@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The report: one HTML file for readers who need not know filters.
+"""The report: HTML for readers who need not know filters.
+
+A run is one file, plotly.js inside, so that it can be mailed and opened offline. Several runs are
+a front page with a row for each, and beside it a folder of their pages, which share plotly.js.
+A plot is unpacked and drawn when it comes into view.
 
 A system provides the key numbers and sections of a run. ``templates/report.html`` adds what is the
 same for all: the comparison with a live node, all numbers, what happened to the input, and its
@@ -21,10 +25,14 @@ provenance.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from functools import partial
+import gzip
 from pathlib import Path
+import re
 from typing import Any
+from urllib.parse import quote
 
 from attrs import frozen
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -34,12 +42,13 @@ import plotly.offline
 from sonar_imm import __version__
 from sonar_imm.files import whole
 
-from .numbers import Card, Check, flatten
+from .numbers import Card, Check, counted, flatten, front
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
 """A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
 only the largest figures of a page are drawn by WebGL."""
+PLOTLYJS = 'plotly.min.js'
 
 
 @frozen
@@ -55,11 +64,14 @@ class Section:
 
 @frozen(kw_only=True)
 class Part:
-    """One run on the page. run: the content of ``run.json``; metrics: that of ``metrics.json``."""
+    """One run of the report. run: the content of ``run.json``; metrics: that of ``metrics.json``;
+    seen: what was tracked, in a few words; verdict: on the stated uncertainty, in one."""
 
     run: Mapping[str, Any]
     metrics: Mapping[str, Any]
     summary: str
+    seen: str = ''
+    verdict: str = ''
     checks: Sequence[Check] = ()
     cards: Sequence[Card] = ()
     sections: Sequence[Section] = ()
@@ -68,6 +80,27 @@ class Part:
     def title(self) -> str:
         """The name of the recording."""
         return Path(self.run['bag']).name
+
+    @property
+    def input(self) -> str:
+        """The topics that were tracked, and what they were read as where their name differs."""
+        return ', '.join(
+            topic if topic.endswith(f'/{name}') else f'{topic} as {name}'
+            for topic, name in self.run['topics'].items()
+        )
+
+    @property
+    def failed(self) -> list[str]:
+        """The checks that failed."""
+        return [check.name for check in self.checks if not check.good]
+
+    @property
+    def outcome(self) -> str:
+        """What the checks and the stated uncertainty say, for the front page."""
+        if self.failed:
+            return f'FAILED: {", ".join(self.failed)}'
+        checked = [f'{counted(len(self.checks), "check")} ok'] if self.checks else []
+        return ', '.join([*checked, self.verdict or 'uncertainty not scored'])
 
     @property
     def check_rows(self) -> list[tuple[str, str, str, str]]:
@@ -85,18 +118,56 @@ class Part:
         """What is needed to repeat the run."""
         names = ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed')
         about = {name: self.run[name] for name in names if name in self.run}
-        topics = [f'{topic} as {name}' for topic, name in self.run['topics'].items()]
-        return about | {'topics': topics} | dict(self.run.get('versions', {}))
+        return about | {'topics': self.input} | dict(self.run.get('versions', {}))
 
 
 def write_report(path: Path, parts: Sequence[Part]) -> None:
-    """Write one report of one or several runs, of one or several systems, to `path`."""
-    with whole(path) as unfinished:
-        unfinished.write_text(report_html(parts), encoding='utf-8')
+    """Write a report of one or several runs, of one or several systems, to `path`.
+
+    Of several, `path` is the front page, and their pages are in a folder beside it, which is
+    ``report_runs`` for ``report.html``.
+    """
+    if len(parts) == 1:
+        _write(path, report_html(parts[0]))
+        return
+    folder = path.with_name(f'{path.stem}_runs')
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / PLOTLYJS, plotly.offline.get_plotlyjs())
+    names = page_names(parts)
+    for part, name in zip(parts, names):
+        _write(folder / name, report_html(part, front_page=f'../{path.name}'))
+    _write(path, front_html(parts, [f'{folder.name}/{name}' for name in names]))
 
 
-def report_html(parts: Sequence[Part]) -> str:
-    """The report as text; the same parts give the same bytes."""
+def page_names(parts: Sequence[Part]) -> list[str]:
+    """A file name for each page, in their order, of letters that every system takes."""
+    digits = len(str(len(parts)))
+    return [
+        f'{number:0{digits}}_{re.sub(r"[^A-Za-z0-9_-]+", "_", part.title)[:80]}.html'
+        for number, part in enumerate(parts, 1)
+    ]
+
+
+def report_html(part: Part, front_page: str = '') -> str:
+    """The page of a run as text; the same part gives the same bytes. front_page: where the front
+    page of several is, which share plotly.js; without one it is inside the page."""
+    figures = [section.figure for section in part.sections if section.figure is not None]
+    return _rendered(
+        'report.html',
+        part=part,
+        front_page=quote(front_page),
+        draw=partial(_packed_figure, _accelerated(figures)),
+        plotlyjs='' if front_page else packed(plotly.offline.get_plotlyjs()),
+    )
+
+
+def front_html(parts: Sequence[Part], links: Sequence[str]) -> str:
+    """The front page of several runs, a row for each, with the address of its page."""
+    rows = [(part, quote(link), front(part.cards)) for part, link in zip(parts, links)]
+    return _rendered('front.html', rows=rows)
+
+
+def _rendered(template: str, **values: Any) -> str:
     pages = Environment(
         loader=FileSystemLoader(Path(__file__).with_name('templates')),
         autoescape=True,
@@ -107,18 +178,22 @@ def report_html(parts: Sequence[Part]) -> str:
     pages.filters['flat'] = flatten
     # A number and its percent sign stay on one line.
     pages.filters['unbroken'] = lambda text: text.replace(' %', '\u00a0%')
-    return pages.get_template('report.html').render(
-        parts=parts,
-        draw=partial(_draw, _accelerated(parts)),
-        plotlyjs=plotly.offline.get_plotlyjs(),
-        version=__version__,
-    )
+    return pages.get_template(template).render(version=__version__, **values)
 
 
-def _accelerated(parts: Sequence[Part]) -> list[go.Figure]:
+def _write(path: Path, text: str) -> None:
+    with whole(path) as unfinished:
+        unfinished.write_text(text, encoding='utf-8')
+
+
+def packed(text: str) -> str:
+    """A text as the page has it: gzip as base64."""
+    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode('ascii')
+
+
+def _accelerated(figures: Sequence[go.Figure]) -> list[go.Figure]:
     """The figures that are drawn by WebGL: the few that have most points."""
-    figures = [section.figure for part in parts for section in part.sections]
-    heavy = [figure for figure in figures if figure and _gl_points(figure) >= LEAST_GL_POINTS]
+    heavy = [figure for figure in figures if _gl_points(figure) >= LEAST_GL_POINTS]
     return sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
 
 
@@ -126,13 +201,11 @@ def _gl_points(figure: go.Figure) -> int:
     return sum(len(trace.x) for trace in figure.data if trace.type == 'scattergl')
 
 
-def _draw(accelerated: Sequence[go.Figure], figure: go.Figure, name: str) -> str:
+def _packed_figure(accelerated: Sequence[go.Figure], figure: go.Figure) -> str:
+    """Data and layout of a figure, `packed`."""
+    content = figure.to_dict()
     if not any(figure is fast for fast in accelerated):
-        content = figure.to_dict()
         for trace in content['data']:
             if trace['type'] == 'scattergl':
                 trace['type'] = 'scatter'
-        figure = go.Figure(content)
-    buttons = ['lasso2d', 'select2d', 'autoScale2d']
-    config = {'displaylogo': False, 'responsive': True, 'modeBarButtonsToRemove': buttons}
-    return figure.to_html(full_html=False, include_plotlyjs=False, div_id=name, config=config)
+    return packed(go.Figure(content).to_json())

@@ -18,16 +18,18 @@ Most recordings fit the defaults of a tracker. Where the sonar is mounted elsewh
 is another one, the tracker needs these parameters: without them its estimates are wrong or
 missing.
 
-The limit is the largest error that `check` allows. A simulated recording is one draw of many: what
+The limit is the largest error that `check` allows, with the arguments of `simulate` that make the
+recording again where an installation left it out. A simulated recording is one draw of many: what
 its error may be follows from the errors of the same scene under other seeds, and not from the
 system.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
+import shlex
 from typing import Any
 
 import yaml
@@ -41,7 +43,8 @@ PARAMETERS = 'parameters.yaml'
 LIMIT = 'check.yaml'
 _HEADS = {
     PARAMETERS: '# Parameters of the tracker that describe the instruments of this recording.\n',
-    LIMIT: '# The largest error that `sonar-imm check` allows on this recording; see README.md.\n',
+    LIMIT: '# The largest error that `sonar-imm check` allows on this recording, and what makes\n'
+    '# it again; see README.md.\n',
 }
 
 
@@ -93,11 +96,7 @@ def own_limit(bag: Path) -> float | None:
     path = bag / LIMIT
     if not path.is_file():
         return None
-    try:
-        stated = yaml_tree(path.read_text(encoding='utf-8'))
-    except (ConfigError, UnicodeDecodeError):
-        raise BagError(f'{path} is not YAML') from None
-    limit = stated.get('limit') if isinstance(stated, dict) else None
+    limit = _stated(path).get('limit')
     if isinstance(limit, bool) or not isinstance(limit, (int, float)):
         raise BagError(f'{path} states no number as limit')
     if not (math.isfinite(limit) and limit >= 0.0):
@@ -105,8 +104,31 @@ def own_limit(bag: Path) -> float | None:
     return float(limit)
 
 
-def write_own_limit(bag: Path, limit: float) -> None:
-    """Write the limit into the folder of a recording."""
+def own_recipe(bag: Path) -> list[str]:
+    """The arguments after ``sonar-imm simulate SYSTEM OUT_BAG`` that make a recording again.
+
+    Raises `BagError` when its folder states none.
+    """
+    path = bag / LIMIT
+    recipe = _stated(path).get('simulate') if path.is_file() else None
+    if not isinstance(recipe, str):
+        raise BagError(f'{path} does not state how the recording is simulated')
+    return shlex.split(recipe)
+
+
+def _stated(path: Path) -> dict[str, Any]:
+    try:
+        stated = yaml_tree(path.read_text(encoding='utf-8'))
+    except (ConfigError, UnicodeDecodeError):
+        raise BagError(f'{path} is not YAML') from None
+    return stated if isinstance(stated, dict) else {}
+
+
+def write_own_limit(bag: Path, limit: float, recipe: Sequence[str] = ()) -> None:
+    """Write the limit, and how the recording is made again, into the folder of a recording."""
+    stated: dict[str, Any] = {'limit': limit}
+    if recipe:
+        stated['simulate'] = shlex.join(recipe)
     with whole(bag / LIMIT) as unfinished:
-        text = _HEADS[LIMIT] + yaml.safe_dump({'limit': limit})
+        text = _HEADS[LIMIT] + yaml.safe_dump(stated, width=1000)
         unfinished.write_text(text, encoding='utf-8')

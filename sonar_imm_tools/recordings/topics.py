@@ -210,6 +210,11 @@ def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, Inpu
     }
 
 
+def knows_inputs(system: str, names: Collection[str]) -> bool:
+    """Whether a tracker, or a node before it, has inputs of all these names."""
+    return {*names} <= {entry.name for entry in (*inputs_of(system), *made_inputs(system))}
+
+
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
     """Check one entry of a topic map."""
     entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}

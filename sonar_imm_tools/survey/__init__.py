@@ -24,5 +24,4 @@ __all__ = [
     'looks',
     'making',
     'products',
-    'report',
 ]

@@ -33,17 +33,9 @@ from .line import line_of
 
 MOST_CELLS = 25_000_000
 BANDS = (
-    'depth',
-    'uncertainty',
-    'count',
-    'lines',
-    'hypotheses',
-    'odds',
-    'competing_depth',
-    'competing_uncertainty',
-    'competing_count',
-    'label',
-)
+    'depth', 'uncertainty', 'count', 'lines', 'hypotheses', 'odds', 'competing_depth',
+    'competing_uncertainty', 'competing_count', 'label',
+)  # fmt: skip
 OF_ONE_RUN = ('depth', 'uncertainty', 'label', 'count', *BANDS[4:9])
 """What `export` writes of a single run, whose `lines` would be 1 throughout."""
 

@@ -120,7 +120,8 @@ def test_a_fresh_process_is_another_one_and_its_errors_arrive():
 @pytest.mark.skipif(not (ROOT / 'docs').is_dir(), reason='reads the source tree')
 def test_every_study_of_the_docs_is_there():
     sources = json.loads((ROOT / 'docs' / 'results' / 'sources.json').read_text())
-    names = [row['command'].split()[2] for row in sources.values() if 'python' in row['command']]
+    commands = [row['command'].split() for row in sources.values()]
+    names = [words[2] for words in commands if words[:2] == ['python', '-m']]
     assert names
     for name in names:
         text = (ROOT / (name.replace('.', '/') + '.py')).read_text(encoding='utf-8')

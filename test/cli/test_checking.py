@@ -15,6 +15,8 @@
 """What `check` says of a node that does not do what the offline tracker does: the node is played
 by estimates that are changed on purpose."""
 
+import shutil
+
 from attrs import evolve
 from helpers.dive_bags import write_dive
 import numpy as np
@@ -25,6 +27,8 @@ pytest.importorskip('rclpy')
 from sonar_imm_tools.cli import checking, main  # noqa: E402
 from sonar_imm_tools.evaluation.judging import Check  # noqa: E402
 from sonar_imm_tools.offline.run_folder import RunFolder  # noqa: E402
+from sonar_imm_tools.recordings.own_files import own_limit  # noqa: E402
+from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
 from sonar_imm_tools.replay.harness import LockstepResult  # noqa: E402
 from sonar_imm_tools.replay.lockstep import Counts  # noqa: E402
 
@@ -122,6 +126,29 @@ def test_a_recording_may_state_its_own_limit(check, dive):
     accuracy = checks['position RMSE against truth']
     assert not good and accuracy.wanted == 'at most 0.001 m'
     assert check()[0]['position RMSE against truth'].wanted == 'at most 1.25 m'
+
+
+def test_a_recording_that_was_not_installed_is_simulated(tmp_path, monkeypatch):
+    """Wheels hold the small recordings only; the others leave their recipe."""
+    recipe = '--scenario small --seed 1 --set records=2'
+    folder = tmp_path / 'share' / 'bags' / 'fathometer_array'
+    folder.mkdir(parents=True)
+    (folder / 'check.yaml').write_text(f'limit: 0.5\nsimulate: {recipe}\n')
+    monkeypatch.setattr(checking, 'share_folder', lambda: tmp_path / 'share')
+    (made,) = checking.shipped_bags('fathometer', tmp_path / 'scratch')
+    with BagReader(made) as reader:
+        assert sum(1 for _ in reader.messages(['/csdm'])) == 2
+    assert own_limit(made) == 0.5
+
+
+def test_what_is_installed_is_used_as_it_is(dive, tmp_path, monkeypatch):
+    share = tmp_path / 'share' / 'bags'
+    shutil.copytree(dive, share / 'diver_a')
+    (share / 'diver_b').mkdir()
+    monkeypatch.setattr(checking, 'share_folder', lambda: tmp_path / 'share')
+    assert checking.shipped_bags('diver', tmp_path) == [share / 'diver_a']
+    with pytest.raises(FileNotFoundError, match='no recordings for obstacle'):
+        checking.shipped_bags('obstacle', tmp_path)
 
 
 @pytest.mark.parametrize('as_json', [False, True])

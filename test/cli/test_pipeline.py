@@ -171,6 +171,20 @@ def test_topics_are_named_and_suggested(call, tmp_path, capsys):
     assert call('evaluate', tmp_path / 'out', '--no-report')['raw_fix']['n'] == 120
 
 
+@pytest.mark.parametrize(
+    'topic, words',
+    [
+        ('fix=/nope', "has no topic '/nope'"),
+        ('nonsense=/fix', "the diver tracker has no input 'nonsense'"),
+        ('detections=/nope', "has no topic '/nope'"),
+    ],
+)
+def test_the_system_that_is_meant_is_named(dive, tmp_path, capsys, topic, words):
+    assert main(['track', str(dive), str(tmp_path / 'run'), '--topic', topic]) == 2
+    said = capsys.readouterr().err
+    assert words in said and 'bathymetry' not in said
+
+
 def test_smoothing_is_recorded_in_the_run(call, dive, tmp_path):
     assert call('track', dive, tmp_path / 'out', '--smooth')['smoothed'] is True
 

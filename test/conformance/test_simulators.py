@@ -16,7 +16,7 @@
 import importlib
 import pickle
 
-from helpers.scenes import small_scene
+from helpers.scenes import small_scene, smaller_scene
 import numpy as np
 import pytest
 
@@ -34,12 +34,26 @@ def scenes(system):
     return importlib.import_module(system.scenes)
 
 
-def test_a_seed_decides_on_every_byte(system):
+@pytest.mark.parametrize(
+    ('system', 'name'),
+    [
+        (system, name)
+        for system in SYSTEMS
+        for name in importlib.import_module(SYSTEMS[system].scenes).SCENARIOS
+    ],
+)
+def test_a_seed_decides_on_every_byte(system, name):
+    """Of every scenario, and when each measurement is received."""
     first, again, other = (
-        [pickle.dumps(item.measurement) for item in small_scene(system, seed)[1].measurements]
+        [
+            (item.received_ns, pickle.dumps(item.measurement))
+            for item in smaller_scene(SYSTEMS[system], name, seed)[1].measurements
+        ]
         for seed in (3, 3, 4)
     )
     assert first == again != other
+    received = [time for time, _ in first]
+    assert received == sorted(received)
 
 
 def test_the_random_state_of_the_process_is_left_alone(system, scenes):

@@ -30,6 +30,8 @@ from sonar_imm.estimation.consistency import (
     interval_coverage,
     nees,
     nis,
+    NIS_MEMORY,
+    NisMemory,
     ospa,
     rmse,
     switches_by_scan,
@@ -196,3 +198,47 @@ def test_switching_gospa_is_the_root_mean_square_with_a_penalty_for_each_switch(
     assert switching_gospa(distance, switches * 0, 5.0) == pytest.approx(np.sqrt(12.5))
     assert switching_gospa(distance, switches, 5.0) == pytest.approx(np.sqrt(37.5))
     assert np.isnan(switching_gospa(np.empty(0), np.empty(0, int), 5.0))
+
+
+# -- mean NIS of a memory, against closed forms and random numbers --------------------------------
+
+
+def test_the_memory_is_a_weighted_mean():
+    rng = np.random.default_rng(2)
+    nis, dof = rng.chisquare(3, 300), rng.integers(1, 4, 300)
+    memory = NisMemory()
+    for k in range(0, 300, 3):
+        memory = memory.after(nis[k : k + 3], dof[k : k + 3])
+    weight = (1.0 - 1.0 / NIS_MEMORY) ** np.arange(299, -1, -1)
+    assert (nis > 9.0 * dof).any()  # some are so far out that they count as nine
+    expected = weight @ np.minimum(nis, 9.0 * dof) / (weight @ dof)
+    assert memory.mean == pytest.approx(expected, rel=1e-12)
+    assert memory.square == pytest.approx(weight**2 @ dof, rel=1e-12)
+    assert memory.after(np.empty(0), 2) == memory
+
+
+def test_its_bounds_are_those_of_the_chi_square_of_the_same_variance():
+    memory = NisMemory()
+    for _ in range(2000):
+        memory = memory.after(np.array([2.0]), 2)
+    equivalent = memory.dof**2 / memory.square
+    assert equivalent == pytest.approx(2.0 * (2.0 * NIS_MEMORY - 1.0), rel=1e-9)
+    tail = 2.866516e-7  # of a Gaussian beyond five sigmas
+    low, high = memory.bounds
+    assert low == pytest.approx(chi2.ppf(tail, equivalent) / equivalent, rel=2e-3)
+    assert high == pytest.approx(chi2.isf(tail, equivalent) / equivalent, rel=2e-3)
+
+
+@pytest.mark.parametrize('factor, verdict', [(1.0, 0), (4.0, 1), (0.25, -1)])
+def test_true_words_are_believed_and_wrong_ones_are_not(factor, verdict):
+    rng = np.random.default_rng(3)
+    memory, verdicts = NisMemory(), []
+    for _ in range(5000):
+        memory = memory.after(factor * rng.chisquare(2, 1), 2)
+        verdicts.append(memory.verdict)
+    assert not any(verdicts[:68])  # too few
+    assert set(verdicts[200:]) == {verdict}
+    assert bool(memory.warnings('echoes', 'look')) == bool(verdict)
+    if verdict:
+        word = 'more' if verdict > 0 else 'less'
+        assert f'echoes miss by {word} than stated' in memory.warnings('echoes', 'look')[0]

@@ -28,15 +28,9 @@ from sonar_imm.estimation.adaptation import AdaptiveChain
 
 ENGINES = [imm, imm_kernels]
 CASES = [
-    'A1_cv_cv',
-    'A2_cv_ct',
-    'A4_world16',
-    'A6_world16_adaptA_guard',
-    'A10_speedstate16',
-    'A12_speedstate16_hover',
-    'A13_ref_only_missed',
-    'A14_ref_only_EM_N0_1',
-]
+    'A1_cv_cv', 'A2_cv_ct', 'A4_world16', 'A6_world16_adaptA_guard', 'A10_speedstate16',
+    'A12_speedstate16_hover', 'A13_ref_only_missed', 'A14_ref_only_EM_N0_1',
+]  # fmt: skip
 ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 EYE2 = np.eye(2)
 

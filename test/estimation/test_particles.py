@@ -14,11 +14,14 @@
 
 """Weighted particles: log weights, effective sample size, moments."""
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from sonar_imm.estimation import particles
+from sonar_imm.estimation.particles import invert, SCHEMES
 
 
 def test_normalise_survives_what_underflows():
@@ -46,3 +49,94 @@ def test_moments_are_those_of_numpy():
     for j in range(3):
         assert mean[j] == pytest.approx(np.average(x[j], axis=1, weights=w[j]))
         assert covariance[j] == pytest.approx(np.cov(x[j], aweights=w[j], ddof=0))
+
+
+# -- resampling schemes: unbiased, bounded scatter, hostile weights -------------------------------
+
+
+W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
+schemes = pytest.mark.parametrize('name', SCHEMES)
+
+
+@schemes
+def test_each_particle_is_drawn_as_often_as_its_weight_says(name):
+    rng = np.random.default_rng(1)
+    runs, count = 20_000, 7
+    copies = np.zeros((runs, len(W)))
+    for run in range(runs):
+        copies[run] = np.bincount(SCHEMES[name](W, count, rng), minlength=len(W))
+    error = copies.std(axis=0) / np.sqrt(runs)
+    assert (np.abs(copies.mean(axis=0) - count * W) <= 4.5 * error + 1e-12).all()
+    assert (copies[:, 1] == 0).all()
+
+
+@schemes
+def test_indices_are_as_many_as_wanted_and_ascend(name):
+    rng = np.random.default_rng(2)
+    for count in (0, 1, 5, 1000):
+        indices = SCHEMES[name](W, count, rng)
+        assert indices.shape == (count,)
+        assert (np.diff(indices) >= 0).all()
+
+
+@schemes
+def test_scale_of_the_weights_does_not_matter(name):
+    first = SCHEMES[name](W, 50, np.random.default_rng(3))
+    other = SCHEMES[name](1e-200 * W, 50, np.random.default_rng(3))
+    assert np.array_equal(first, other)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40).filter(lambda w: sum(w) > 1e-9),
+    st.integers(1, 60),
+    st.integers(0, 2**32),
+)
+def test_systematic_copies_differ_from_the_expectation_by_less_than_one(weights, count, seed):
+    w = np.array(weights)
+    expected = count * w / w.sum()
+    copies = np.bincount(
+        SCHEMES['systematic'](w, count, np.random.default_rng(seed)), minlength=len(w)
+    )
+    assert (copies >= np.floor(expected - 1e-9)).all()
+    assert (copies <= np.ceil(expected + 1e-9)).all()
+
+
+def test_copies_scatter_least_when_systematic_and_most_when_independent():
+    w = np.random.default_rng(4).random(100)
+    w /= w.sum()
+    scatter = {
+        name: np.mean(
+            [
+                np.square(np.bincount(scheme(w, 100, rng), minlength=100) - 100 * w).mean()
+                for rng in map(np.random.default_rng, range(400))
+            ]
+        )
+        for name, scheme in SCHEMES.items()
+    }
+    fraction = 100 * w % 1.0
+    assert scatter['systematic'] == pytest.approx((fraction * (1.0 - fraction)).mean(), rel=0.05)
+    assert scatter['multinomial'] == pytest.approx((100 * w * (1.0 - w)).mean(), rel=0.05)
+    assert scatter['systematic'] < scatter['stratified'] < scatter['residual']
+    assert scatter['residual'] < scatter['multinomial']
+
+
+@schemes
+@pytest.mark.parametrize(
+    'weights', [[], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf], [[1.0, 2.0]]]
+)
+def test_what_are_no_weights_is_refused(name, weights):
+    with pytest.raises(ValueError, match='weights'):
+        SCHEMES[name](weights, 3, np.random.default_rng(0))
+
+
+def test_a_point_on_a_boundary_belongs_to_what_begins_there():
+    """A point of zero, which a generator gives now and then, is not of a particle without weight
+    that happens to be the first."""
+    cumulative = np.cumsum([0.0, 0.25, 0.0, 0.25, 0.5])
+    assert invert(cumulative, np.array([0.0, 0.25, 0.375, 0.5])).tolist() == [1, 3, 3, 4]
+
+
+def test_a_point_at_the_very_end_belongs_to_the_last_particle_with_weight():
+    cumulative = np.cumsum([0.3, 0.7, 0.0])
+    assert invert(cumulative, np.array([0.0, 1.0 - 2.0**-53, 1.0])).tolist() == [0, 1, 1]

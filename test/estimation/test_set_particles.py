@@ -12,8 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The filter for sets against an exact one, its two forms against each other, and what each
-ingredient is good for."""
+"""The filter for sets against an exact one, and what each ingredient is good for."""
 
 import math
 from pathlib import Path
@@ -25,9 +24,22 @@ from oracles.set_particles import propagate, propose, start, weigh
 import pytest
 
 from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
-from sonar_imm.estimation.set_filter import LagSmoother, SetFilter, Weighted
-from sonar_imm.estimation.set_model import banded_transition, gaussian_walk, SetModel, Sets
-from sonar_imm.estimation.set_shifts import Shift
+from sonar_imm.estimation.set_filter import (
+    find_members,
+    LagSmoother,
+    levelled,
+    SetFilter,
+    Weighted,
+)
+from sonar_imm.estimation.set_model import (
+    banded_transition,
+    gaussian_walk,
+    repeated_walk,
+    SetModel,
+    Sets,
+    turnover,
+)
+from sonar_imm.estimation.set_shifts import Shift, ShiftPath
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
 
@@ -362,3 +374,227 @@ def test_models_that_cannot_be_are_refused(model):
 def test_room_counts_the_possible_sets(model):
     pairs = sum(1 for i in range(60) for j in range(i) if i - j >= 3)
     assert [model.room(m) for m in (0, 1, 2)] == [1, 60, pairs]
+
+
+# -- members from the intensity of many sets ------------------------------------------------------
+
+
+def hills(*places):
+    sums = np.zeros((5, 100))
+    for place, mass, amplitude in places:
+        shape = mass * np.exp(-0.5 * (np.arange(100) - place) ** 2)
+        shape *= mass / shape.sum()
+        sums += shape * np.array([[1.0], [amplitude], [amplitude**2 + 0.25], [place], [0.5]])
+    return sums
+
+
+def test_each_hill_is_a_member():
+    found = find_members(hills((20, 0.9, 5.0), (70, 0.6, 2.0)), 10, 5, 0.01)
+    assert found.place[:2] == pytest.approx([20.0, 70.0], abs=0.01)
+    assert found.amplitude[:2] == pytest.approx([5.0, 2.0])
+    assert found.existence[:2] == pytest.approx([0.9, 0.6], abs=1e-3)
+    assert found.prior_variance[:2] == pytest.approx([20.0, 70.0])
+    assert found.foremost[:2] == pytest.approx([0.45, 0.3], abs=1e-3)
+    assert found.covariance[0] == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.25]]), abs=0.01)
+
+
+def test_no_more_than_asked_and_none_that_is_not_believed():
+    sums = hills((20, 0.9, 5.0), (50, 0.3, 1.0), (70, 0.6, 2.0))
+    assert len(find_members(sums, 10, 2, 0.0).place) == 2
+    assert find_members(sums, 10, 9, 0.5).place == pytest.approx([20.0, 70.0], abs=0.01)
+    assert len(find_members(np.zeros((5, 100)), 10, 9, 0.0).place) == 0
+
+
+def test_a_member_at_the_edge_and_a_separation_of_one():
+    sums = np.zeros((5, 4))
+    sums[:, 0] = 0.8, 0.8, 0.9, 1.6, 0.4
+    found = find_members(sums, 1, 3, 0.1)
+    assert found.place == pytest.approx([0.0])
+    assert found.existence == pytest.approx([0.8])
+    assert found.prior_variance == pytest.approx([2.0])
+
+
+def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
+    sums = hills((40, 0.55, 5.0), (52, 0.4, 3.0))
+    mean = find_members(sums, 16, 1, 0.5)
+    assert mean.place == pytest.approx([45.05], abs=0.1) and mean.covariance[0, 0, 0] > 30.0
+    mode = find_members(sums, 16, 1, 0.5, modes=True)
+    assert mode.place == pytest.approx([40.0], abs=0.1)
+    assert mode.amplitude == pytest.approx([5.0], abs=0.01)
+    assert mode.covariance[0] == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.25]]), abs=0.15)
+    # That there is a member is as sure as before, wherever it is.
+    assert mode.existence == pytest.approx(mean.existence) and mode.existence > 0.9
+    assert mode.foremost == pytest.approx(mean.foremost)
+
+
+def test_one_hump_and_what_is_rare_beside_it_stay_whole():
+    sums = hills((40, 0.9, 5.0), (52, 0.05, 3.0))
+    with_modes = find_members(sums, 16, 1, 0.5, modes=True)
+    for found, expected in zip(with_modes, find_members(sums, 16, 1, 0.5)):
+        assert np.array_equal(found, expected)
+
+
+# -- sets over the time of several records, against as many steps of one --------------------------
+
+CELLS, SETS = 400, 20_000
+
+
+@pytest.fixture
+def wide():
+    return SetModel(
+        cells=CELLS,
+        separation=2,
+        order_min=1,
+        transition=banded_transition(4, 0.1),
+        walk=gaussian_walk(2.0),
+        gram=np.exp(-0.5 * (np.arange(CELLS) / 1.5) ** 2),
+    )
+
+
+def test_the_sum_of_walks_is_their_convolution():
+    walk = np.array([0.2, 0.5, 0.3])
+    assert repeated_walk(walk, 2) == pytest.approx(np.convolve(walk, walk), abs=1e-15)
+    long = repeated_walk(gaussian_walk(2.0), 50)
+    place = np.arange(len(long)) - len(long) // 2
+    assert long @ place == pytest.approx(0.0, abs=1e-9)
+    assert np.sqrt(long @ np.square(place)) == pytest.approx(2.0 * np.sqrt(50.0), rel=0.01)
+
+
+@pytest.mark.parametrize('least', [0, 1, 3])
+@pytest.mark.parametrize('records', [1, 2, 7])
+def test_who_left_and_was_replaced(least, records):
+    """Against members that are drawn one by one."""
+    P = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.3, 0.1, 0.6]])
+    found = turnover(P, least, records)
+    orders = found.reshape(3, -1, 3).sum(axis=1)
+    assert orders == pytest.approx(np.linalg.matrix_power(P, records), abs=1e-12)
+    rng, drawn = np.random.default_rng(0), np.zeros_like(found)
+    for first in range(3):
+        for _ in range(3000):
+            old, members, j = set(range(least + first)), list(range(least + first)), first
+            for _ in range(records):
+                j = rng.choice(3, p=P[j])
+                rng.shuffle(members)
+                members = members[: least + j]
+                members += [-1] * (least + j - len(members))
+            extra = least + min(first, j) - len(old & set(members))
+            drawn[first, 3 * extra + j] += 1.0 / 3000
+    assert np.abs(found - drawn).max() < 0.035
+
+
+def prior(wide, steps, records):
+    """Sets of two members, at 100 and 250, after so many steps without any record."""
+    tracker = SetFilter(wide, SETS)
+    b = np.zeros(wide.record_cells)
+    sets = tracker.start(tracker.record(b, (0, 0))).sets
+    sets.order[:], sets.cell[:, :2] = 2, (100, 250)
+    state = Weighted(sets, np.zeros(SETS))
+    for step in range(steps):
+        state = tracker.propagate(state, tracker.record(b, (1, step), records=records))
+    w = np.exp(state.log_weight - state.log_weight.max())
+    w /= w.sum()
+    sets = state.sets
+    member = np.arange(sets.cell.shape[1]) < sets.order[:, None]
+    near = (np.abs(sets.cell - 100) < 20) & member
+    pmf = [w @ (sets.order == m) for m in range(1, 5)]
+    place = np.where(near, sets.cell - 100.0, 0.0)
+    spread = np.sqrt((w @ np.square(place)).sum() / (w @ near).sum())
+    return np.array(pmf), float(w @ near.any(axis=1)), float(spread)
+
+
+def test_one_long_step_is_as_several_short_ones(wide):
+    """The order, whether a member is still there, and how far it has walked."""
+    at_once, by_steps = prior(wide, 1, 5), prior(wide, 5, 1)
+    assert at_once[0] == pytest.approx(by_steps[0], abs=0.02)
+    assert at_once[1] == pytest.approx(by_steps[1], abs=0.02) and at_once[1] < 0.95
+    assert at_once[2] == pytest.approx(by_steps[2], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    'change', [{}, {'negative_probability': 0.3}, {'shift': Shift(std=1.5, memory=0.9)}]
+)
+def test_proposals_after_a_gap_change_no_result(wide, change):
+    """With those that look at the record and those that do not."""
+    changed = evolve(wide, **change)
+    rng = np.random.default_rng(1)
+    b = rng.standard_normal(changed.record_cells)
+    b[95:108] += 4.0 * np.exp(-0.5 * (np.arange(-5, 8) / 1.5) ** 2)
+    found = []
+    for shares in ({}, {'walk_share': 0.0, 'birth_share': 0.0}):
+        tracker = SetFilter(evolve(changed, **shares), 100_000)
+        sets = tracker.start(tracker.record(b, (0, 0))).sets
+        sets.order[:], sets.cell[:, :2], sets.sign[:] = 2, (100, 250), 1
+        record = tracker.record(b, (1, 1), records=6)
+        step = tracker.weigh(tracker.propagate(Weighted(sets, np.zeros(100_000)), record), record)
+        summary = tracker.summarise(step)
+        found.append((step.log_evidence, summary.pmf, summary.sums[0, 90:115].sum()))
+    assert found[0][0] == pytest.approx(found[1][0], abs=0.05)
+    assert found[0][1] == pytest.approx(found[1][1], abs=0.02)
+    assert found[0][2] == pytest.approx(found[1][2], abs=0.02)
+
+
+def test_peaks_are_lowered_and_keep_their_shape(wide):
+    g = np.zeros((1, CELLS))
+    g[0, 100], g[0, 101], g[0, 200] = 300.0, 290.0, 5.0
+    low = levelled(evolve(wide, separation=8), g)[0]
+    assert low[100] - low[101] == pytest.approx(10.0)
+    # Nine cells at the cap are worth what the peak is.
+    assert low[100] == pytest.approx(wide.birth_cap + np.log(9.0), abs=1e-3)
+    assert low[200] == 5.0 and (low[110:190] == 0.0).all()
+
+
+def test_amplitudes_and_shifts_are_forgotten_by_the_time(wide):
+    tracker = SetFilter(evolve(wide, amplitude_memory=0.9, shift=Shift(std=1.5, memory=0.8)), 10)
+    record = tracker.record(np.zeros(tracker.model.record_cells), (0, 0), records=4)
+    assert record.passage.shift.memory == pytest.approx(0.8**4)
+    sets = tracker.start(record).sets
+    sets.prior_mean[:], sets.prior_variance[:] = 2.0, 0.5
+    aged = tracker._aged(sets, record)
+    assert aged.prior_mean[0, 0] == pytest.approx(2.0 * 0.9**3)
+    fresh = (1.0 - 0.9**6) * wide.amplitude_std**2
+    assert aged.prior_variance[0, 0] == pytest.approx(0.9**6 * 0.5 + fresh)
+
+
+# -- the offset between members and the shift they share, drawn anew ------------------------------
+
+
+@pytest.mark.parametrize('step', [1, 4])
+def test_an_offset_drawn_anew_leaves_its_distribution(step):
+    """Paths of shifts and how likely they are with each offset, by the sum over the grid; drawn
+    from that, offsets drawn anew are distributed as before, also where they are less than a
+    step."""
+    shift, N, rng = Shift(std=3.0, memory=0.6, step=step), 40_000, np.random.default_rng(3)
+    innovation = math.sqrt(1.0 - 0.6**2) * 3.0
+    grid = shift.places
+    for records in (1, 4, 60):
+        shape = rng.integers(-1, 2, records).cumsum()
+        paths = shape[None] + grid[:, None]
+        log_p = -0.5 * np.square(paths[:, 0] / 3.0)
+        log_p -= 0.5 * np.square((paths[:, 1:] - 0.6 * paths[:, :-1]) / innovation).sum(axis=1)
+        p = np.exp(log_p - log_p.max())
+        p[(paths[:, -1] < grid[0]) | (paths[:, -1] > grid[-1])] = 0.0
+        p /= p.sum()
+        which = rng.choice(len(grid), N, p=p)
+        place = (paths[which] + shift.pad).astype(np.int64)
+        path = ShiftPath.begin(shift, place[:, 0])
+        for k in range(1, records):
+            path = path.then(shift, place[:, k - 1], place[:, k])
+        free = np.full(N, -1000), np.full(N, 1000)
+        d, after = path.draw(shift, place[:, -1], free, rng.random((N, 2)))
+        assert (d % step == 0).all()
+        now = which + d // step
+        # The first shift may lie beyond the grid, which costs four standard deviations.
+        assert ((now < 0) | (now >= len(grid))).mean() < 1e-3
+        drawn = np.bincount(now.clip(0, len(grid) - 1), minlength=len(grid)) / N
+        assert 0.5 * np.abs(drawn - p).sum() < 0.02
+        assert records > 30 or (d != 0).mean() > 0.3
+        # The path is that of the shifts it has come to.
+        moved = ShiftPath.begin(shift, place[:, 0] + d)
+        for k in range(1, records):
+            moved = moved.then(shift, place[:, k - 1] + d, place[:, k] + d)
+        assert after.pull == pytest.approx(moved.pull)
+        assert after.precision == pytest.approx(moved.precision)
+        held = path.draw(
+            shift, place[:, -1], (np.full(N, 0), np.full(N, step)), rng.random((N, 2))
+        )
+        assert set(np.unique(held[0])) <= {0, step}

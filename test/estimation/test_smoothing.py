@@ -23,7 +23,7 @@ from oracles.smoothing import rts_smooth
 import pytest
 
 from sonar_imm.estimation import imm, kalman
-from sonar_imm.estimation.smoothing import imm_smooth
+from sonar_imm.estimation.smoothing import imm_smooth, smooth_modes
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 
@@ -443,3 +443,47 @@ def test_on_the_heading_set_smoothing_lowers_the_error_and_stays_honest():
     assert smoother_rmse < 0.75 * filter_rmse
     assert 3.2 < np.mean(nees, axis=0)[1] < 4.8
     assert np.mean(hits, axis=0)[1] > np.mean(hits, axis=0)[0] + 0.05
+
+
+# -- Kim's pass over model probabilities ----------------------------------------------------------
+
+
+P = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
+
+
+def filtered(likelihood, mu):
+    out = []
+    for row in likelihood:
+        mu = (mu @ P) * row
+        mu = mu / mu.sum()
+        out.append(mu)
+    return np.array(out)
+
+
+def test_a_hidden_markov_chain_is_smoothed_exactly():
+    rng = np.random.default_rng(1)
+    likelihood, mu0 = rng.random((6, 3)), np.array([0.2, 0.5, 0.3])
+    weights = np.zeros((6, 3))
+    for path in np.ndindex(*(3,) * 7):
+        weight = mu0[path[0]]
+        for k in range(6):
+            weight *= P[path[k], path[k + 1]] * likelihood[k, path[k + 1]]
+        for k in range(6):
+            weights[k, path[k + 1]] += weight
+    exact = weights / weights.sum(axis=1, keepdims=True)
+    assert smooth_modes(filtered(likelihood, mu0), P) == pytest.approx(exact)
+
+
+def test_a_chain_at_rest_knows_what_it_will_know():
+    mu = filtered(np.random.default_rng(2).random((5, 3)), np.full(3, 1 / 3))
+    mu[2] = mu[1]
+    smoothed = smooth_modes(mu, P, np.array([True, True, False, True, True]))
+    assert smoothed[1] == pytest.approx(smoothed[2])
+    assert smoothed == pytest.approx(smooth_modes(np.delete(mu, 2, 0), P)[[0, 1, 1, 2, 3]])
+
+
+def test_impossible_models_and_short_rows_are_no_trouble():
+    mu = np.array([[1.0, 0.0], [0.0, 1.0]])
+    assert np.isfinite(smooth_modes(mu, np.eye(2))).all()
+    assert smooth_modes(mu[:1], np.eye(2)) == pytest.approx(mu[:1])
+    assert smooth_modes(mu[:0], np.eye(2)).shape == (0, 2)

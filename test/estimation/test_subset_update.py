@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All inlier/outlier subsets: vectors, brute force, wild numbers."""
+"""The oracles of robust updates: all inlier/outlier subsets, and heavy tails."""
 
 from itertools import product
 
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.student_t import student_t_constant, student_t_maximum
 from oracles.subset_update import subset_update
 import pytest
 
@@ -89,3 +90,53 @@ def test_evidence_is_the_sum_over_all_subsets():
         total += weight
     got = subset_update(v['x'], v['P'], numbers, **law, prune=np.inf)
     assert got.log_evidence == pytest.approx(np.log(total))
+
+
+# -- heavy tails: the maximum, weights and Laplace covariance of the vectors ----------------------
+
+FLAT = 1e8
+
+
+def student_t_case():
+    """x, y and the emission, whose prior is flat."""
+    v = vectors('robust')
+
+    def measure(rx):
+        def of(x):
+            d = np.array([*(x[:2] - rx[:2]), float(v['z']) - rx[2]])
+            r = np.sqrt(d @ d)
+            return r + x[2], np.array([d[0] / r, d[1] / r, 1.0])
+
+        return of
+
+    variance = float(v['sigma']) ** 2
+    numbers = [(measure(rx), float(y), variance) for rx, y in zip(v['rx'], v['path'])]
+    P = np.zeros((3, 3))
+    P[:2, :2], P[2, 2] = v['prior_cov'], FLAT
+    return v, np.append(v['prior_mean'], 0.0), P, numbers
+
+
+def test_the_maximum_of_the_vectors():
+    v, mean, P, numbers = student_t_case()
+    got = student_t_maximum(mean, P, numbers, [mean, np.append(v['out_least_squares'], 0.0)])
+    np.testing.assert_allclose(got.x[:2], v['out_map'], atol=1e-5)
+    assert got.x[2] == pytest.approx(float(v['out_te']), abs=1e-5)
+    np.testing.assert_allclose(got.weights, v['out_weights'], atol=1e-5)
+    np.testing.assert_allclose(got.P[:2, :2], v['out_cov_laplace'], atol=1e-5)
+    # The evidence of the vectors has no constants of the prior nor of the t density.
+    constants = 6 * student_t_constant(float(v['sigma']) ** 2, float(v['nu']))
+    bare = got.log_evidence - constants + 0.5 * np.log(np.linalg.det(P)) + 1.5 * np.log(2 * np.pi)
+    assert bare == pytest.approx(float(v['out_log_evidence_laplace']), abs=1e-4)
+
+
+def test_a_start_elsewhere_is_not_believed_over_a_better_one():
+    v, mean, P, numbers = student_t_case()
+    far = mean + [300.0, 300.0, 0.0]
+    got = student_t_maximum(mean, P, numbers, [far, mean])
+    np.testing.assert_allclose(got.x[:2], v['out_map'], atol=1e-4)
+
+
+def test_the_wild_number_weighs_next_to_nothing():
+    v, mean, P, numbers = student_t_case()
+    got = student_t_maximum(mean, P, numbers, [mean])
+    assert got.weights[2] < 0.01 and (np.delete(got.weights, 2) > 1.0).all()

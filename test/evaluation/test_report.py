@@ -12,24 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The page: whole, safe, the same each time."""
+"""The pages: whole, safe, the same each time."""
 
+import base64
+import gzip
 from html.parser import HTMLParser
+import json
 
 from helpers.dive_scenes import single_run
 import numpy as np
+import pytest
 
 from msg_adapters.fixes import write_fix
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.diver import figures
 from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of
-from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
+from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sentence
 from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
-from sonar_imm_tools.evaluation.report import Part, report_html, Section
+from sonar_imm_tools.evaluation.report import (
+    front_html,
+    page_names,
+    Part,
+    PLOTLYJS,
+    report_html,
+    Section,
+    write_report,
+)
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 RUN = {
@@ -50,6 +63,7 @@ def judged(series, truth=None, **changes):
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=lambda: figures.sections(run, metrics, series, truth),
         accuracy=lambda limit: None,
     )
@@ -61,28 +75,46 @@ def part(truth=True, count=60, checks=(), **changes):
     return judged(series_of(estimates), known, **changes).part(checks)
 
 
-def html(*parts):
-    return report_html(parts)
+def html(part):
+    return report_html(part)
+
+
+def unpacked(text):
+    return gzip.decompress(base64.b64decode(text)).decode()
 
 
 class Page(HTMLParser):
-    """Headings, ids and whatever the page would load from elsewhere."""
+    """Headings, ids, figures, cells and whatever the page would load from elsewhere."""
 
     def __init__(self, text):
         super().__init__()
         self.headings, self.ids, self.loads, self._open = [], [], [], None
+        self.figures, self.cells, self.plotlyjs, self._inside_cell = [], [], '', False
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         attributes = dict(attrs)
         self.ids += [attributes['id']] if 'id' in attributes else []
         self.loads += [attributes[name] for name in ('src', 'href') if name in attributes]
-        self._open = tag
+        if 'data-figure' in attributes:
+            self.figures.append(json.loads(unpacked(attributes['data-figure'])))
+        self._open = attributes.get('id') if tag == 'script' else tag
+        if tag == 'td':
+            self.cells.append('')
+            self._inside_cell = True
+
+    def handle_endtag(self, tag):
+        if tag == 'td':
+            self._inside_cell = False
 
     def handle_data(self, data):
         if self._open in ('h1', 'h2'):
             self.headings.append(data)
             self._open = None
+        elif self._open == 'plotlyjs':
+            self.plotlyjs = data
+        elif self._inside_cell:
+            self.cells[-1] += data.rstrip('\n')
 
 
 def test_the_page_is_whole_and_loads_nothing():
@@ -96,6 +128,7 @@ def test_the_page_is_whole_and_loads_nothing():
         'Which motion model held',
         'Normalised innovations (NIS)',
     ]
+    assert unpacked(page.plotlyjs).startswith('/**\n* plotly.js')
     assert 'Refused input' in page.headings
     assert 'not &lt;b&gt;finite' in text and 'not <b>finite' not in text
 
@@ -110,11 +143,76 @@ def test_without_truth_the_stated_uncertainty_is_shown():
     assert 'Error, and the predicted error' not in page.headings
 
 
-def test_several_runs_share_a_page_without_sharing_ids():
-    page = Page(html(part(), part(bag='other.bag')))
-    assert 'other.bag' in page.headings
-    figure_ids = [name for name in page.ids if name.startswith('figure-')]
-    assert len(figure_ids) == len(set(figure_ids)) == 8
+def test_figures_are_packed_with_what_they_show():
+    page = Page(html(part()))
+    assert len(page.figures) == 4
+    names = [trace.get('name') for trace in page.figures[0]['data']]
+    assert 'truth' in names and any(str(name).startswith('track ') for name in names)
+    assert page.figures[0]['layout']['height'] == 640
+
+
+def test_the_page_of_a_run_is_below_three_megabytes():
+    assert len(html(part())) < 3e6
+
+
+def test_several_runs_have_a_front_page_and_a_page_each(tmp_path):
+    failed = [Check('bytes', 'other', 'equal', False), Check('end', '0', '0', True)]
+    parts = [part(), part(bag='/data/other.bag', checks=failed), part(bag='/data/other.bag')]
+    write_report(tmp_path / 'all.html', parts)
+    pages = sorted(path.name for path in (tmp_path / 'all_runs').iterdir())
+    assert pages == ['1_my_dive_bag.html', '2_other_bag.html', '3_other_bag.html', PLOTLYJS]
+    text = (tmp_path / 'all.html').read_text()
+    front = Page(text)
+    assert front.loads == [f'all_runs/{name}' for name in pages[:3]]
+    assert 'my &lt;dive&gt;.bag' in text and len(text) < 50_000
+    assert 'FAILED: bytes' in front.cells and text.count('class="bad"') == 1
+    run = (tmp_path / 'all_runs' / pages[1]).read_text()
+    assert Page(run).loads == ['../all.html'] and not Page(run).plotlyjs
+    assert 'other.bag' in Page(run).headings and len(run) < 3e6
+    assert (tmp_path / 'all_runs' / PLOTLYJS).read_text().startswith('/**\n* plotly.js')
+
+
+def test_one_run_is_one_file(tmp_path):
+    write_report(tmp_path / 'a' / 'run.html', [part()])
+    assert [path.name for path in (tmp_path / 'a').iterdir()] == ['run.html']
+
+
+def test_the_front_page_has_three_numbers_and_a_verdict_of_each_run():
+    row = part()
+    cells = Page(front_html([row], ['page.html'])).cells
+    assert cells[0] == 'my <dive>.bag' and cells[1] == 'diver'
+    assert cells[2].startswith('1 track of 1 diver, ')
+    assert cells[3] in ('consistent', 'cautious', 'overconfident') and cells[3] == row.verdict
+    titles = ('Position error, RMS', 'Truth inside the 95 % ellipse', 'Velocity error, RMS')
+    assert len(cells) == 7
+    for cell, title in zip(cells[4:], titles):
+        assert cell.replace('\u00a0', ' ').endswith(title)
+
+
+def test_names_of_pages_sort_and_suit_every_file_system():
+    names = page_names([part(bag=f'/data/{name}') for name in ('a b', '../x', 'p\u00e9 "q"')] * 4)
+    assert names[:3] == ['01_a_b.html', '02_x.html', '03_p_q_.html']
+    assert names == sorted(set(names))
+
+
+def test_a_run_with_an_origin_is_drawn_in_degrees():
+    estimates, true_rows, _ = single_run(count=60)
+    series, truth = series_of(estimates), Truth.from_series(series_of(true_rows))
+    origin = Origin(60.0, 10.0)
+    metres = figures.map_figure(series, truth, None)
+    degrees = figures.in_degrees(figures.map_figure(series, truth, None), origin)
+    for plain, drawn in zip(metres.data, degrees.data):
+        back = [
+            origin.local(latitude, longitude)[:2]
+            for latitude, longitude in zip(drawn.y[:5], drawn.x[:5])
+        ]
+        expected = np.column_stack([plain.x[:5], plain.y[:5]])
+        np.testing.assert_allclose(back, expected, atol=1e-2)  # the Earth is round
+    assert degrees.layout.yaxis.scaleratio == pytest.approx(2.0)
+    bar = degrees.data[-1]
+    ends = [origin.local(y, x)[0] for x, y in zip(bar.x, bar.y)]
+    assert bar.name == f'{ends[1] - ends[0]:.0f} m'
+    assert [figures.scale_length(x) for x in (0.7, 1.0, 4.9, 72.0)] == [0.5, 1.0, 2.0, 50.0]
 
 
 def test_a_run_without_tracks_still_makes_a_page():
@@ -129,7 +227,7 @@ def test_checks_against_the_live_node_come_first():
     assert page.headings[1] == 'Live node against offline tracker'
 
 
-def test_runs_of_several_systems_share_a_page():
+def test_a_part_of_another_system_makes_a_page():
     other = Part(
         run={**RUN, 'system': 'whale', 'bag': 'whale.bag'},
         metrics={'size': {'rmse_m': 2.0}},
@@ -137,11 +235,11 @@ def test_runs_of_several_systems_share_a_page():
         cards=[Card('30 m', 'Length')],
         sections=[Section('Whale', 'Seen from the side.')],
     )
-    text = html(part(), other)
+    text = html(other)
     page = Page(text)
     assert page.headings.index('whale.bag') < page.headings.index('Whale')
-    assert 'sonar_imm · diver tracker' in text and 'sonar_imm · whale tracker' in text
-    assert 'size.rmse_m' in text
+    assert 'sonar_imm · whale tracker' in text and 'size.rmse_m' in text
+    assert 'Length' in front_html([part(), other], ['1.html', '2.html'])
 
 
 SCRIPT = '<script>alert(1)</script>'

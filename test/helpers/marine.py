@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The messages of marine_acoustic_msgs that are read, as rosbags makes them of a definition that a
-bag brings along: the package need not be installed."""
+"""Messages of packages that need not be installed, as rosbags makes them of the definition that a
+bag brings along: those of marine_acoustic_msgs, and of single drivers and simulators."""
 
 from functools import cache
 
@@ -31,6 +31,15 @@ DEFINITIONS = {
     'SonarRanges': 'std_msgs/Header header\nPingInfo ping_info\nDetectionFlag[] flags\n'
     'float32[] transmit_delays\nfloat32[] intensities\n'
     'geometry_msgs/Vector3[] beam_unit_vec\nfloat32[] ranges',
+    'Dvl': (
+        'std_msgs/Header header\nuint8 DVL_MODE_BOTTOM=1\nuint8 DVL_MODE_WATER=2\n'
+        'uint8 velocity_mode\nuint8 dvl_type\ngeometry_msgs/Vector3 velocity\n'
+        'float64[9] velocity_covar\nfloat64 altitude\nfloat64 course_gnd\nfloat64 speed_gnd\n'
+        'uint8 num_good_beams\nfloat64 sound_speed\nbool beam_ranges_valid\n'
+        'bool beam_velocities_valid\ngeometry_msgs/Vector3[] beam_unit_vec\nfloat32[] range\n'
+        'float32[] range_covar\nfloat32[] beam_quality\nfloat32[] beam_velocity\n'
+        'float32[] beam_velocity_covar\n'
+    ),
     'SonarImageData': 'bool is_bigendian\nuint32 dtype\nuint32 beam_count\nuint8[] data',
     'RawSonarImage': 'std_msgs/Header header\nPingInfo ping_info\nfloat32 sample_rate\n'
     'uint32 samples_per_beam\nuint32 sample0\nfloat32[] tx_delays\n'
@@ -39,18 +48,6 @@ DEFINITIONS = {
     'geometry_msgs/Vector3[] beam_directions\nfloat32[] ranges\n'
     'SonarImageData image',
 }
-
-
-@cache
-def typestore():
-    types = get_typestore(Stores.ROS2_JAZZY)
-    found = {}
-    for name, text in DEFINITIONS.items():
-        found |= get_types_from_msg(text, PACKAGE + name)
-    for name, text in OTHERS.items():
-        found |= get_types_from_msg(text, name)
-    types.register(found)
-    return types
 
 
 OTHERS = {
@@ -68,8 +65,85 @@ OTHERS = {
     'dave_interfaces/msg/DVLTarget': 'string type\nfloat64 range',
     'dave_interfaces/msg/DVL': 'std_msgs/Header header\nstring type\nDVLTarget target\n'
     'geometry_msgs/TwistWithCovariance velocity',
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
+    'vision_msgs/msg/ObjectHypothesisWithPose': (
+        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+    ),
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
+    'vision_msgs/msg/Detection3D': (
+        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
+        'vision_msgs/BoundingBox3D bbox\nstring id\n'
+    ),
+    'vision_msgs/msg/Detection3DArray': (
+        'std_msgs/Header header\nvision_msgs/Detection3D[] detections\n'
+    ),
+    'geographic_msgs/msg/GeoPoint': 'float64 latitude\nfloat64 longitude\nfloat64 altitude\n',
+    'geographic_msgs/msg/GeoPose': (
+        'geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation\n'
+    ),
+    'geographic_msgs/msg/GeoPoseWithCovariance': (
+        'geographic_msgs/GeoPose pose\nfloat64[36] covariance\n'
+    ),
+    'geographic_msgs/msg/GeoPointStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPoint position\n'
+    ),
+    'geographic_msgs/msg/GeoPoseStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPose pose\n'
+    ),
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPoseWithCovariance pose\n'
+    ),
+    'marine_interfaces/msg/Classification': 'string class_id\nfloat32 probability\n',
+    'marine_interfaces/msg/Kinematics': (
+        'geometry_msgs/PoseWithCovariance pose\nuint8 orientation_availability\n'
+        'geometry_msgs/TwistWithCovariance twist\n'
+    ),
+    'marine_interfaces/msg/Shape': (
+        'uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n'
+    ),
+    'marine_interfaces/msg/Contact': (
+        'std_msgs/Header header\nstring id\nfloat32 existence_probability\n'
+        'marine_interfaces/Classification[] classification\n'
+        'marine_interfaces/Kinematics kinematics\nmarine_interfaces/Shape shape\n'
+        'geographic_msgs/GeoPose geo_pose\nstring source\nuint8 origin_kind\nuint8 status\n'
+        'string note\nstring[] observation_ids\ndiagnostic_msgs/KeyValue[] attributes\n'
+    ),
+    'marine_interfaces/msg/ContactArray': (
+        'std_msgs/Header header\nmarine_interfaces/Contact[] contacts\n'
+    ),
+    'seatrac_interfaces/msg/ModemRec': (
+        'std_msgs/Header header\nuint8 msg_id\nbool position_flt_error\nuint8 src_id\n'
+        'int16 attitude_yaw\nint16 depth_local\nuint16 vos\nbool includes_range\n'
+        'uint16 range_dist\nbool includes_usbl\nint16 usbl_azimuth\nint16 usbl_elevation\n'
+        'int16 usbl_fit_error\nbool includes_position\nint16 position_easting\n'
+        'int16 position_northing\nint16 position_depth\n'
+    ),
+    'acomms_msgs/msg/UsblData': (
+        'std_msgs/Header header\nfloat64 current_time\nfloat64 measurement_time\n'
+        'int32 remote_address\ngeometry_msgs/Vector3 xyz\ngeometry_msgs/Vector3 enu\n'
+        'geometry_msgs/Quaternion orientation\nfloat64 propagation_time\nfloat64 rssi\n'
+        'int32 integrity\nfloat64 accuracy\n'
+    ),
+    'stonefish_ros2/msg/BeaconInfo': (
+        'std_msgs/Header header\nuint8 beacon_id\nfloat32 range\nfloat32 azimuth\n'
+        'float32 elevation\ngeometry_msgs/Point relative_position\n'
+        'geometry_msgs/Quaternion local_orientation\nfloat32 local_depth\n'
+    ),
 }
 """Messages of single drivers and simulators; of the DVL without their beams."""
+
+
+@cache
+def typestore():
+    """A store that knows the types of Jazzy and these."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    found = {}
+    for name, text in DEFINITIONS.items():
+        found |= get_types_from_msg(text, PACKAGE + name)
+    for name, text in OTHERS.items():
+        found |= get_types_from_msg(text, name)
+    types.register(found)
+    return types
 
 
 def floats(values):
@@ -136,3 +210,39 @@ def sent(message):
     """The message after a way through CDR, as a bag gives it."""
     types, name = typestore(), message.__msgtype__
     return types.deserialize_cdr(bytes(types.serialize_cdr(message, name)), name)
+
+
+def driver_message(name, **values):
+    """A message with the fields `values`, by dotted names (``position.latitude``); others zero."""
+    message = _zero(name)
+    for path, value in values.items():
+        *way, last = path.split('__')
+        target = message
+        for step in way:
+            target = getattr(target, step)
+        object.__setattr__(target, last, value)
+    return message
+
+
+def _zero(name):
+    store = typestore()
+    made = []
+    for _, (node, detail) in store.fielddefs[name][1]:
+        if node.name == 'NAME':
+            made.append(_zero(detail))
+        elif node.name == 'ARRAY':
+            made.append(np.zeros(detail[1]))
+        elif node.name == 'SEQUENCE':
+            made.append([])
+        else:
+            kind = detail[0]
+            made.append(
+                ''
+                if kind == 'string'
+                else 0.0
+                if 'float' in kind
+                else False
+                if kind == 'bool'
+                else 0
+            )
+    return store.types[name](*made)

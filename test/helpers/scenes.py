@@ -23,6 +23,24 @@ SMALL = {
 }
 """Scenario and overrides that make it small, by system."""
 
+SMALLER = {
+    'bathymetry': {'pings': 2},
+    'diver': {'duration': 20.0},
+    'fathometer': {'records': 2, 'phones': 6, 'snapshot_seconds': 0.1, 'frequency_max': 1000.0},
+    'obstacle': {'first_range': 60.0, 'last_range': 50.0},
+}
+"""Overrides that make any scenario small, by system."""
+
+
+def smaller_scene(system, name, seed):
+    """(parameters, scene) of any scenario of a system."""
+    scenes = importlib.import_module(system.scenes)
+    overrides = dict(SMALLER[system.name])
+    if scenes.SCENARIOS[name][1].get('level') == 'pressure':
+        overrides |= {'records': 1, 'record_seconds': 1.0, 'sample_rate': 4000.0}
+    config = scenes.scenario(name, overrides)
+    return config, scenes.simulate(config, seed)
+
 
 def small_scene(system, seed):
     """(parameters, scene) of a system."""

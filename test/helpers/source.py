@@ -29,18 +29,9 @@ MODULES = sorted(
 )
 
 COMMON_INTERFACES = {
-    'actionlib_msgs',
-    'diagnostic_msgs',
-    'geometry_msgs',
-    'nav_msgs',
-    'sensor_msgs',
-    'shape_msgs',
-    'std_msgs',
-    'std_srvs',
-    'stereo_msgs',
-    'trajectory_msgs',
-    'visualization_msgs',
-}
+    'actionlib_msgs', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'shape_msgs',
+    'std_msgs', 'std_srvs', 'stereo_msgs', 'trajectory_msgs', 'visualization_msgs',
+}  # fmt: skip
 COME_WITH_RCLPY = {'builtin_interfaces', 'lifecycle_msgs', 'rcl_interfaces', 'rosgraph_msgs'}
 ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
 

@@ -21,9 +21,8 @@ import json
 import warnings
 
 from helpers.dive_bags import write_dive
-from helpers.hostile import extremes
 from helpers.hostile.mutations import MUTATIONS
-from helpers.hostile.runs import Bad, BATCH, batches, run, Tally
+from helpers.hostile.runs import Bad, BATCH, batches, run, run_extreme, Tally
 from helpers.hostile.streams import stream, templates, VARIANTS
 from hypothesis import given, HealthCheck, settings
 import numpy as np
@@ -55,7 +54,7 @@ def test_no_message_breaks_a_tracker(system):
 def test_no_parameter_breaks_a_tracker(system):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        ran = [extremes.run(system, seed) for seed in range(15)]
+        ran = [run_extreme(system, seed) for seed in range(15)]
     assert sum(bool(one) for one in ran) > 5
 
 

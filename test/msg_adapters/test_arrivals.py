@@ -172,24 +172,10 @@ def test_writing_and_reading_gives_the_same_arrivals(bearing):
 
 NASTY = np.array(
     [
-        0.1,
-        0.2,
-        0.5,
-        1.0,
-        3.0,
-        0.0,
-        -1.0,
-        1e-30,
-        1e9,
-        1e30,
-        -1e30,
-        45.0,
-        7e4,
-        np.nan,
-        np.inf,
+        0.1, 0.2, 0.5, 1.0, 3.0, 0.0, -1.0, 1e-30, 1e9, 1e30, -1e30, 45.0, 7e4, np.nan, np.inf,
         -np.inf,
     ]
-)
+)  # fmt: skip
 ALL = COLUMNS
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.displays import displays_of
-from msg_adapters.divers import NAMES, write_markers, write_poses
+from msg_adapters.displays.diver import NAMES, write_markers, write_poses
 from sonar_imm.estimates import Estimate
 from sonar_imm_tools.recordings.messages import ros_message
 

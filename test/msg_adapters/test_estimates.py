@@ -92,30 +92,10 @@ def test_an_estimate_is_packed_as_the_table_of_its_columns(rows, nan):
 def test_the_columns_are_those_of_the_contract():
     message = write_estimate(estimate(), ros_message)
     assert [field.name for field in message.fields] == [
-        'x',
-        'y',
-        'z',
-        'px',
-        'py',
-        'vx',
-        'vy',
-        'cov_px_px',
-        'cov_px_py',
-        'cov_px_vx',
-        'cov_px_vy',
-        'cov_py_py',
-        'cov_py_vx',
-        'cov_py_vy',
-        'cov_vx_vx',
-        'cov_vx_vy',
-        'cov_vy_vy',
-        'prob_heading_000',
-        'prob_heading_022',
-        'prob_hover',
-        'track_id',
-        'track_state',
-        'nis',
-    ]
+        'x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px', 'cov_px_py', 'cov_px_vx', 'cov_px_vy',
+        'cov_py_py', 'cov_py_vx', 'cov_py_vy', 'cov_vx_vx', 'cov_vx_vy', 'cov_vy_vy',
+        'prob_heading_000', 'prob_heading_022', 'prob_hover', 'track_id', 'track_state', 'nis',
+    ]  # fmt: skip
     assert [field.datatype for field in message.fields] == [7] * 3 + [8] * 17 + [6, 2, 8]
 
 

@@ -186,24 +186,9 @@ def test_writing_and_reading_gives_the_same_fix(covariance):
 
 
 NASTY = (
-    1.0,
-    2.0,
-    4.0,
-    0.5,
-    0.0,
-    -0.0,
-    -1.0,
-    1e-300,
-    1e-12,
-    1e9,
-    1e300,
-    1e-160,
-    math.nan,
-    math.inf,
-    -math.inf,
-    1 / 3,
-    100.0,
-)
+    1.0, 2.0, 4.0, 0.5, 0.0, -0.0, -1.0, 1e-300, 1e-12, 1e9, 1e300, 1e-160, math.nan, math.inf,
+    -math.inf, 1 / 3, 100.0,
+)  # fmt: skip
 
 
 @given(

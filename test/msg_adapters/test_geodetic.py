@@ -14,7 +14,7 @@
 
 """Latitude and longitude from messages, and estimates as NavSatFix."""
 
-from helpers.driver_messages import driver_message
+from helpers.marine import driver_message
 import numpy as np
 import pytest
 

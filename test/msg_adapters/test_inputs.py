@@ -16,7 +16,7 @@ import subprocess
 import sys
 from typing import get_args
 
-from helpers.driver_messages import DEFINITIONS, driver_message
+from helpers.marine import driver_message, OTHERS
 import pytest
 
 from msg_adapters.inputs import inputs_of
@@ -34,7 +34,7 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
             for name, read in topic.readers.items():
                 if name.startswith(FOREIGN):  # see test_detections.py, test_navigation.py
                     continue
-                if name in DEFINITIONS:
+                if name in OTHERS:
                     empty = driver_message(name)
                 else:
                     assert name in typestore().types

@@ -17,7 +17,7 @@
 import numpy as np
 
 from msg_adapters.inputs import inputs_of
-from msg_adapters.labels import Labels, tag_numbers
+from msg_adapters.inputs.topic import Labels, tag_numbers
 from sonar_imm.measurements import Fix, Fixes, NOBODY
 
 BOTH = ('tags', 'sensors')

@@ -14,7 +14,7 @@
 
 """Tracks in messages of other packages, with their definitions; the messages go through CDR."""
 
-from helpers.driver_messages import driver_types
+from helpers.marine import typestore
 import numpy as np
 import pytest
 
@@ -32,7 +32,7 @@ STAMP = 7 * 10**9 + 5
 
 @pytest.fixture
 def make(monkeypatch):
-    monkeypatch.setattr(messages, 'typestore', driver_types)
+    monkeypatch.setattr(messages, 'typestore', typestore)
     messages._layout.cache_clear()
     yield messages.ros_message
     messages._layout.cache_clear()
@@ -82,7 +82,7 @@ def obstacle(velocity=(1.0, 0.5), z=-8.0):
 
 def published(estimate, make, system='diver', types=tuple(TOPICS), origin=HARBOUR):
     """All messages by topic, written to CDR and read again."""
-    found, store = {}, driver_types()
+    found, store = {}, typestore()
     for topic, message in Neighbours(system, types, lambda: origin).of(
         estimate, make, lambda name: True
     ):

@@ -14,7 +14,7 @@
 
 """Positions from transceivers: what each driver means, and what it flags."""
 
-from helpers.driver_messages import driver_message
+from helpers.marine import driver_message
 import numpy as np
 import pytest
 

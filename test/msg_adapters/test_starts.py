@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from msg_adapters.starts import read_start, write_start
+from msg_adapters.fixes import read_start, write_start
 from sonar_imm.measurements import Rejection, Start
 from sonar_imm_tools.recordings.messages import ros_message
 

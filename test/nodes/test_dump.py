@@ -56,6 +56,7 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     settings = ('-p', 'stale_after:=7.5', '-p', 'frame_id:=harbour')
     bench = make_bench(*settings)
     node = bench.add(NODES[system](context=bench.context))
+    bench.spin_until(lambda: node.state == 'active')  # inputs have parameters from then on
     file = tmp_path / 'live.yaml'
     file.write_text(dumped(bench, f'/{system}'))
     config, told = load_config(SYSTEMS[system], file, {})
@@ -63,6 +64,7 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     assert (told.stale_after, told.frame_id) == (7.5, 'harbour')
     again = make_bench('--params-file', str(file))
     second = again.add(NODES[system](context=again.context))
+    again.spin_until(lambda: second.state == 'active')
     assert second.tracker.config == config
     assert dumped(again, f'/{system}') == file.read_text()
     assert 'has no effect' not in capfd.readouterr().err
@@ -70,12 +72,14 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
 
 def test_a_dump_of_the_detector_holds_all_and_loads_again(make_bench, tmp_path, capfd):
     bench = make_bench('-p', 'image_type:=sensor_msgs/msg/Image', '-p', 'stale_after:=7.5')
-    bench.add(FlsDetectorNode(context=bench.context))
+    node = bench.add(FlsDetectorNode(context=bench.context))
+    bench.spin_until(lambda: node.state == 'active')
     file = tmp_path / 'live.yaml'
     file.write_text(dumped(bench, '/fls_detector'))
     assert 'stale_after: 7.5' in file.read_text()
     again = make_bench('--params-file', str(file))
-    again.add(FlsDetectorNode(context=again.context))
+    second = again.add(FlsDetectorNode(context=again.context))
+    again.spin_until(lambda: second.state == 'active')
     assert dumped(again, '/fls_detector') == file.read_text()
     assert 'has no effect' not in capfd.readouterr().err
 

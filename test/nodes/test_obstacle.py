@@ -23,10 +23,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.detections import write_detections
+from msg_adapters.displays.obstacle import band, write_markers, write_poses
+from msg_adapters.displays.tracks import write_ended
 from msg_adapters.estimates import read_estimate
-from msg_adapters.markers import write_ended
 from msg_adapters.navigation import write_navigation, write_range
-from msg_adapters.obstacles import band, write_markers, write_poses
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.nodes.messages import make, message_class

@@ -21,8 +21,7 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.estimates import read_estimate
-from msg_adapters.fixes import write_fix
-from msg_adapters.starts import write_start
+from msg_adapters.fixes import write_fix, write_start
 from sonar_imm.measurements import Fix, Start
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make

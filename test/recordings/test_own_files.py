@@ -25,6 +25,7 @@ from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.own_files import (
     own_limit,
     own_parameters,
+    own_recipe,
     unusual,
     write_own_limit,
     write_own_parameters,
@@ -139,6 +140,21 @@ def test_a_limit_that_is_written_is_read_and_without_a_file_there_is_none(tmp_pa
     assert own_limit(tmp_path) is None
     write_own_limit(tmp_path, 0.88)
     assert own_limit(tmp_path) == 0.88
+
+
+def test_how_a_recording_is_made_again_is_kept(tmp_path):
+    recipe = ['--scenario', 'a scene', '--set', 'fading=']
+    write_own_limit(tmp_path, 0.5, recipe)
+    assert own_recipe(tmp_path) == recipe
+    assert own_limit(tmp_path) == 0.5
+
+
+def test_a_recording_without_a_recipe_is_one_sentence(tmp_path):
+    with pytest.raises(BagError, match='does not state how'):
+        own_recipe(tmp_path)
+    write_own_limit(tmp_path, 0.5)
+    with pytest.raises(BagError, match='does not state how'):
+        own_recipe(tmp_path)
 
 
 @pytest.mark.parametrize(

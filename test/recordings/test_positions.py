@@ -16,7 +16,7 @@
 
 import json
 
-from helpers.driver_messages import driver_message, driver_types
+from helpers.marine import driver_message, typestore
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -48,8 +48,8 @@ def write_bag(path, records):
         for stamp_ns, topic, message in sorted(records, key=lambda one: one[0]):
             name = message.__msgtype__
             if topic not in links:
-                links[topic] = writer.add_connection(topic, name, typestore=driver_types())
-            raw = driver_types().serialize_cdr(message, name)
+                links[topic] = writer.add_connection(topic, name, typestore=typestore())
+            raw = typestore().serialize_cdr(message, name)
             writer.write(links[topic], stamp_ns, raw)
     return path
 

@@ -60,7 +60,7 @@ def test_two_robots_in_one_process_have_their_own_parameters_and_end_cleanly(
     fleet.write_text(FLEET)
     nodes = ['/auv1/diver', '/auv2/diver', '/auv2/obstacle']
     with reserved_domain_id() as domain, log.open('wb') as out:
-        arguments = [*nodes, '--ros-args', '--params-file', str(fleet)]
+        arguments = [' '.join(nodes[:2]), nodes[2], '--ros-args', '--params-file', str(fleet)]
         process = composed(*arguments, domain=domain, log=out)
         try:
             end = time.monotonic() + 300.0

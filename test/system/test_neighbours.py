@@ -19,7 +19,7 @@ import subprocess
 import sys
 
 from helpers import interfaces
-from helpers.driver_messages import DEFINITIONS
+from helpers.marine import OTHERS
 import pytest
 
 pytest.importorskip('rclpy')
@@ -35,7 +35,7 @@ pytestmark = [
 
 
 def test_nodes_hear_and_send_the_types_of_others(tmp_path, request):
-    interfaces.write_sources(tmp_path, DEFINITIONS)
+    interfaces.write_sources(tmp_path, OTHERS)
     environment = interfaces.build(tmp_path)
     with reserved_domain_id() as domain:
         done = subprocess.run(

@@ -43,8 +43,8 @@ from helpers.moved_scenes import (
 import numpy as np
 import pytest
 
+from msg_adapters.displays.obstacle import write_markers, write_poses
 from msg_adapters.estimates import read_estimate, write_estimate
-from msg_adapters.obstacles import write_markers, write_poses
 from msg_adapters.soundings import read_soundings, write_soundings
 from sonar_imm.measurements import Fix
 from sonar_imm.soundings import soundings_of

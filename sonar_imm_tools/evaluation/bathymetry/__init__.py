@@ -35,7 +35,7 @@ from ...offline.run_folder import read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .profiles import profiles_of
 from .scoring import score
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, SEEN, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -70,6 +70,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=SEEN,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )

@@ -60,7 +60,7 @@ METRICS = (
     Metric(card='Bins with an echo', value='{heard_share:.0%}', when=_unscored),
     Metric(card='Stated uncertainty, median', value='{height_std_median_m:.2f} m', when=_unscored),
     Metric(card='Bins labelled rough', value='{rough_share:.0%}', when=_unscored),
-    error('height.all', 'height error, all', card='Height error, RMS'),
+    error('height.all', 'height error, all', card='Height error, RMS', front=True),
     error('height.smooth', 'height error, smooth'),
     Metric(card='On smooth floor, RMS', value='{height.smooth.rmse_m:.2f} m', when=_patches),
     error('height.patch', 'height error, patch'),
@@ -80,12 +80,15 @@ METRICS = (
         card='Truth inside two standard deviations',
         value='{inside_band.all:.0%}',
         remark='95 % would be perfect',
+        front=True,
+        covers=('inside_band.all', 0.95),
     ),
     Metric(
         label='overlap of the rough patches',
         line='{segmentation.iou:.2f}',
         card='Overlap of the rough patches',
         value='{segmentation.iou:.2f}',
+        front=True,
         remark='noticed {segmentation.bins_late_in:.0f} bins late, left '
         '{segmentation.bins_late_out:.0f} bins late',
         when=lambda metrics: look_up(metrics, 'segmentation.patches'),
@@ -110,6 +113,9 @@ METRICS = (
         when=lambda metrics: look_up(metrics, 'gate.shadow_bins'),
     ),
 )
+
+
+SEEN = '{pings} pings, {bins} range bins, {heard_share:.0%} with an echo'
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

@@ -36,7 +36,7 @@ from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .scoring import fix_series, score
 from .series import series_of
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, seen, summary_sentence
 from .truth import Truth
 
 if TYPE_CHECKING:
@@ -67,13 +67,14 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         # plotly, which only a report needs, takes a second to load.
         from .figures import sections
 
-        return sections(run, metrics, series, truth, raw)
+        return sections(run, metrics, series, truth, raw, config.origin())
 
     return Judgement(
         run=run,
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )

@@ -21,6 +21,7 @@ from typing import Any
 
 from ..numbers import (
     chi2,
+    counted,
     coverage_sentence,
     each,
     error,
@@ -62,8 +63,8 @@ METRICS = (
         remark='{stamps} stamps in {span_s:.0f} s',
         when=_unscored,
     ),
-    error('position', 'position error', card='Position error, RMS'),
-    error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes'),
+    error('position', 'position error', card='Position error, RMS', front=True),
+    error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes', front=True),
     error('velocity', 'velocity error', 'mps', card='Velocity error, RMS', remark=''),
     error('depth', 'depth error', remark=''),
     chi2('depth.nees_3d', 'NEES, three coordinates'),
@@ -76,6 +77,11 @@ METRICS = (
         card='Truth inside the 95 % ellipse',
         value='{consistency.coverage.95:.0%}',
         remark='95 % would be perfect',
+        front=True,
+    ),
+    Metric(
+        covers=('consistency.coverage.95', 0.95),
+        when=lambda metrics: look_up(metrics, 'consistency.verdict') is not None,
     ),
     Metric(
         label='best lag of the estimates',
@@ -101,6 +107,14 @@ METRICS = (
         ),
     ),
 )
+
+
+def seen(metrics: Mapping[str, Any]) -> str:
+    """What was tracked, in a few words."""
+    true = look_up(metrics, 'tracks.true_targets')
+    of = '' if true is None else f' of {counted(true, "diver")}'
+    found = counted(metrics['tracks_confirmed'], 'track') + of
+    return fill(f'{found}, {{stamps}} stamps in {{span_s:.0f}} s', metrics)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

@@ -36,6 +36,7 @@ METRICS = (
         line='{order_right:.1%}',
         card='Number of reflectors right',
         value='{order_right:.0%}',
+        front=True,
     ),
     Metric(
         label='OSPA',
@@ -43,6 +44,7 @@ METRICS = (
         card='OSPA',
         value='{ospa_m:.3f} m',
         remark='cutoff {cutoff_m:g} m',
+        front=True,
     ),
     Metric(
         label='false / missed per record',
@@ -56,6 +58,8 @@ METRICS = (
         card='Depth error, RMS',
         value='{depth.rmse_m:.3f} m',
         remark='{depth.inside_2_sigma:.0%} within two stated sigma',
+        front=True,
+        covers=('depth.inside_2_sigma', 0.95),
     ),
     Metric(
         label='amplitude error, median / 95 %',
@@ -65,6 +69,9 @@ METRICS = (
     ),
     Metric(label='identity switches', line='{identity_switches}'),
 )
+
+
+SEEN = '{reflectors_mean:.1f} reflectors per record, {records} records'
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

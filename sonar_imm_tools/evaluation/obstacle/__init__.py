@@ -35,7 +35,7 @@ from .deferred import deferred_estimates
 from .motion import motion_metrics
 from .scoring import score
 from .series import Matching, series_of, TruePath, truth_of
-from .summary import METRICS, summary_sentence
+from .summary import METRICS, seen, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -80,6 +80,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         words=summary_sentence,
         shown=METRICS,
+        seen=seen,
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )

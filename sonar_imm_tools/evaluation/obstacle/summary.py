@@ -21,7 +21,7 @@ from typing import Any
 
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
-from ..numbers import chi2, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
+from ..numbers import chi2, counted, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
 from .scoring import NEAR
 
 METRICS = (
@@ -38,6 +38,7 @@ METRICS = (
         'vertical_offset_near',
         f'the same within {NEAR:.0f} m',
         card=f'Height error within {NEAR:.0f} m, RMS',
+        front=True,
     ),
     chi2('consistency.nees_offset', 'NEES, vertical offset', card='NEES of the offset'),
     chi2('consistency.nees_state', 'NEES, whole state'),
@@ -48,6 +49,8 @@ METRICS = (
         card='Truth inside the 90 % band',
         value='{consistency.band_coverage:.0%}',
         remark='90 % would be perfect',
+        front=True,
+        covers=('consistency.band_coverage', 0.9),
     ),
     Metric(label='Brier score of P(above)', line='{above.brier:.3f}'),
     *(
@@ -79,6 +82,7 @@ METRICS = (
         line='{gospa.mean_m:.2f} m',
         card='GOSPA',
         value='{gospa.mean_m:.2f} m',
+        front=True,
         remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping',
     ),
     Metric(
@@ -92,6 +96,15 @@ METRICS = (
         ('true_obstacles', 'found_obstacles', 'tracks', 'false_tracks', 'identity_switches'),
     ),
 )
+
+
+def seen(metrics: Mapping[str, Any]) -> str:
+    """What was tracked, in a few words."""
+    true = look_up(metrics, 'tracks.true_obstacles')
+    found = counted(metrics['tracks_confirmed'], 'obstacle')
+    if true is not None:
+        found = f'{metrics["tracks"]["found_obstacles"]} of {counted(true, "obstacle")}'
+    return fill(f'{found}, {{pings}} pings in {{span_s:.0f}} s', metrics)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:

@@ -17,5 +17,5 @@
 A fault is a function of the messages before, during and after it: it gives what is sent instead,
 in two lists, the disturbed part and the rest. `Rig` sends both in lock-step to a node that runs as
 a process and compares what it publishes in the rest with an undisturbed run. To add a fault, write
-that function in `streams.py` or `actions.py` and a line in `table.py`.
+that function and a line of the table in `table.py`.
 """

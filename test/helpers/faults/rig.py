@@ -30,6 +30,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomic
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from scipy.stats import chi2
 from std_srvs.srv import SetBool, Trigger
 
 from sonar_imm.estimates import Estimate
@@ -45,7 +46,6 @@ from sonar_imm_tools.replay.link import Link
 from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
 from .cases import Action, Case, Message, SECOND, Step
-from .closeness import agrees
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
@@ -313,3 +313,61 @@ def _until_held(held: list[bool]) -> int | None:
     if not held or not held[-1]:
         return None
     return len(held) - int(np.argmin([*held[::-1], False]))
+
+
+# -- whether two estimates of one stamp agree as far as they say that they know -------------------
+
+
+GATE, SHARE = 0.99, 0.9
+"""A row agrees inside this probability; estimates agree where this share of rows does."""
+WIDER = 2.0
+"""A standard deviation this many times the expected one is not yet as good."""
+SLOW = ('vertical_offset',)
+"""States that take a whole approach to learn: as sure as before is not asked of them."""
+
+
+def agrees(found: Estimate, expected: Estimate) -> bool:
+    """Whether nearly every row of each has its like in the other: inside of what both say of their
+    errors, and what is found is as sure of itself as what was expected, or nearly so. Rows that
+    nobody would use yet, as tentative tracks, do not count."""
+    a, b = (_certain(one) for one in (found, expected))
+    if not len(a.state) or not len(b.state):
+        return len(a.state) == len(b.state)
+    near = _near(a, b)
+    return bool(near.any(axis=1).mean() >= SHARE and near.any(axis=0).mean() >= SHARE)
+
+
+def _near(a: Estimate, b: Estimate) -> np.ndarray:
+    """(rows of a, rows of b): which rows agree."""
+    apart = a.state[:, None] - b.state[None]
+    covariance = a.covariance[:, None] + b.covariance[None]
+    n = apart.shape[-1]
+    weighed = np.linalg.solve(covariance + 1e-12 * np.eye(n), apart[..., None])[..., 0]
+    inside = np.einsum('...i,...i->...', apart, weighed) <= chi2.ppf(GATE, n)
+    spread_a, spread_b = (np.diagonal(one.covariance, axis1=1, axis2=2) for one in (a, b))
+    quick = [k for k, name in enumerate(a.state_names) if name not in SLOW]
+    sure = (spread_a[:, None] <= WIDER**2 * spread_b[None] + 1e-12)[..., quick].all(axis=2)
+    near: np.ndarray = inside & sure
+    if 'range' in a.extras:  # a bin of a swath is itself, whichever other one is like it
+        near &= a.extras['range'][:, None] == b.extras['range'][None]
+    return near
+
+
+def _certain(estimate: Estimate) -> Estimate:
+    """The rows that somebody would use."""
+    extras, keep = estimate.extras, np.ones(len(estimate), bool)
+    if 'track_state' in extras:
+        keep &= extras['track_state'] > 0
+    if 'existence' in extras:
+        keep &= ~(extras['existence'] <= 0.5)  # NaN where it is not estimated
+    if 'valid' in extras:
+        keep &= extras['valid'] > 0
+    return Estimate(
+        stamp_ns=estimate.stamp_ns,
+        frame_id=estimate.frame_id,
+        xyz=estimate.xyz[keep],
+        state_names=estimate.state_names,
+        state=estimate.state[keep],
+        covariance=estimate.covariance[keep],
+        extras={name: column[keep] for name, column in extras.items()},
+    )

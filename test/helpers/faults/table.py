@@ -17,13 +17,220 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import functools
+from typing import Any
 
 from attrs import frozen
+import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from . import actions, streams
-from .cases import Case, CASES
-from .streams import Disturbance
+from msg_adapters.table import decode_table, encode_table
+from sonar_imm.nodes.messages import make
+
+from .cases import Action, Case, CASES, Message, SECOND, Step
+
+Parts = tuple[list[Step], list[Step]]
+Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
+
+
+def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
+    """Make a disturbance of a function of the messages during it; what it was given else stays."""
+
+    def told(*arguments: Any) -> Disturbance:
+        def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+            return [*before, *change(during, *arguments)], list(after)
+
+        return disturb
+
+    return functools.wraps(change)(told)
+
+
+# -- what is sent: messages lost, repeated, moved in time or spoilt -------------------------------
+
+
+@middle
+def each(during: list[Message], change: Callable[[Message], Message]) -> list[Step]:
+    """Every message on the primary input changed."""
+    return [change(one) if one.primary else one for one in during]
+
+
+@middle
+def dropped(during: list[Message], topic: str) -> list[Step]:
+    """An input that is silent for a while."""
+    return [one for one in during if one.topic != topic]
+
+
+@middle
+def twice(during: list[Message]) -> list[Step]:
+    """Every message comes two times."""
+    return [one for one in during for _ in range(2)]
+
+
+@middle
+def late(during: list[Message], places: int = 3) -> list[Step]:
+    """Every fourth message on the primary input comes `places` of them later."""
+    held: list[tuple[int, Message]] = []
+    sent: list[Step] = []
+    count = 0
+    for one in during:
+        count += one.primary
+        if one.primary and count % 4 == 0:
+            held.append((count + places, one))
+        else:
+            sent.append(one)
+        sent += [message for due, message in held if due <= count]
+        held = [(due, message) for due, message in held if due > count]
+    return sent + [message for _, message in held]
+
+
+@middle
+def shuffled(during: list[Message], size: int = 4) -> list[Step]:
+    """Messages in any order inside of blocks with `size` of the primary input each."""
+    rng = np.random.default_rng(5)
+    blocks: list[list[Message]] = [[]]
+    for one in during:
+        if sum(message.primary for message in blocks[-1]) == size:
+            blocks.append([])
+        blocks[-1].append(one)
+    return [block[k] for block in blocks for k in rng.permutation(len(block))]
+
+
+def clock_set(seconds: float) -> Disturbance:
+    """The clock of the sensors is set anew after the first third."""
+
+    def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+        return list(before), [one.moved(seconds) for one in [*during, *after]]
+
+    return disturb
+
+
+def looped(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+    """The recording is played again from its beginning."""
+    whole = [*before, *during, *after]
+    return list(whole), list(whole)
+
+
+@middle
+def second_publisher(during: list[Message], seconds: float) -> list[Step]:
+    """Every message comes again from a sender whose clock is late."""
+    return [step for one in during for step in (one, one.moved(-seconds))]
+
+
+def frame(name: str) -> Callable[[Message], Message]:
+    """Another frame_id."""
+    return lambda one: one.changed(lambda content: setattr(content.header, 'frame_id', name))
+
+
+def columns(**factors: float) -> Callable[[Message], Message]:
+    """Columns of a table in another unit."""
+
+    def change(content: Any) -> None:
+        table = dict(decode_table(content))
+        for name, factor in factors.items():
+            table[name] = (table[name] * factor).astype(table[name].dtype)
+        stamp = content.header.stamp
+        stamp_ns = stamp.sec * SECOND + stamp.nanosec
+        made = encode_table(table, stamp_ns=stamp_ns, frame_id=content.header.frame_id, make=make)
+        content.fields, content.data = made.fields, made.data
+        content.point_step, content.row_step = made.point_step, made.row_step
+
+    return lambda one: one.changed(change)
+
+
+# -- what is done to a node between its messages --------------------------------------------------
+
+
+@middle
+def burst(during: list[Message]) -> list[Step]:
+    """All messages at once, as after a stall of the network."""
+    return [Action(lambda rig: rig.send_at_once(during))]
+
+
+@middle
+def sensor_restarted(during: list[Message]) -> list[Step]:
+    """A driver ends, and another process of it begins after a while."""
+    third = len(during) // 3
+    return [*during[:third], Action(lambda rig: rig.new_publishers()), *during[2 * third :]]
+
+
+@middle
+def node_reset(during: list[Message]) -> list[Step]:
+    """The service ~/reset in the middle of the stream."""
+    return [*during[:-1], Action(lambda rig: rig.reset()), during[-1]]
+
+
+@middle
+def disabled(during: list[Message]) -> list[Step]:
+    """Input is not used for a while: ~/enable with false, then with true."""
+    return [
+        Action(lambda rig: rig.enable(False)),
+        *during,
+        Action(lambda rig: rig.enable(True)),
+    ]
+
+
+@middle
+def parameter_storm(during: list[Message]) -> list[Step]:
+    """Good, bad and mixed changes of parameters between all messages."""
+
+    def storm(rig: Any) -> None:
+        before = rig.parameters('stale_after', 'max_wait')
+        good, bad = rig.set_parameters(stale_after=before[0] + 1.0, max_wait=-1.0)
+        assert good.successful and not bad.successful and 'max_wait' in bad.reason
+        both = {'stale_after': before[0] + 2.0, 'max_wait': -1.0}
+        (mixed,) = rig.set_parameters(atomically=True, **both)
+        assert not mixed.successful
+        assert rig.parameters('stale_after', 'max_wait') == [before[0] + 1.0, before[1]]
+        for wrong in (float('nan'), 'soon', 10**30 * 1.0, True):
+            assert not rig.set_parameters(max_wait=wrong)[0].successful
+        (back,) = rig.set_parameters(atomically=True, stale_after=before[0], max_wait=before[1])
+        assert back.successful
+
+    return [step for one in during for step in ([one, Action(storm)] if one.primary else [one])]
+
+
+@middle
+def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
+    """One more publisher on the input, whose quality of service does not fit."""
+
+    def publish(rig: Any) -> None:
+        peer = rig.peer(rig.case.primary, qos)
+        try:
+            for one in during:
+                if one.primary:
+                    peer.publish(one.moved(0.001).content)
+            rig.heard_of('quality of service')
+        finally:
+            rig.link.node.destroy_publisher(peer)
+
+    return [Action(publish), *during]
+
+
+def simulated_clock(seconds: float) -> Disturbance:
+    """/clock follows the stamps, and jumps with them after the first third."""
+
+    def told(message: Message) -> list[Step]:
+        return [Action(lambda rig: rig.tell_clock(message.stamp_ns)), message]
+
+    def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
+        rest = [one.moved(seconds) for one in [*during, *after]]
+        first = Action(lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0))
+        return (
+            [step for one in before for step in told(one)],
+            [first, *(step for one in rest for step in told(one))],
+        )
+
+    return disturb
+
+
+@middle
+def long_enough(during: list[Message]) -> list[Step]:
+    """Nothing but time, until the node says that it cannot save its state."""
+    return [*during, Action(lambda rig: rig.heard_of('the state cannot be saved'))]
+
+
+# -- the table ------------------------------------------------------------------------------------
+
 
 HOUR = 3600.0
 
@@ -55,87 +262,87 @@ IN_ORDER = ('diver', 'obstacle', 'fathometer')
 SIMULATED = ('-p', 'use_sim_time:=true')
 
 FAULTS = (
-    Fault(name='sensor restarted', disturb=lambda case: actions.sensor_restarted()),
+    Fault(name='sensor restarted', disturb=lambda case: sensor_restarted()),
     Fault(
         name='input disabled, then enabled',
-        disturb=lambda case: actions.disabled(),
+        disturb=lambda case: disabled(),
         counted=['ignored_while_disabled'],
         says='input is ignored',
     ),
-    Fault(name='~/reset', disturb=lambda case: actions.node_reset(), says='reset on request'),
+    Fault(name='~/reset', disturb=lambda case: node_reset(), says='reset on request'),
     Fault(
         name='every message twice',
-        disturb=lambda case: streams.twice(),
+        disturb=lambda case: twice(),
         counted=['duplicate', 'repeated'],
         settle=0,
         systems=IN_ORDER,
     ),
     Fault(
         name='every ping twice, no ping needs another',
-        disturb=lambda case: streams.twice(),
+        disturb=lambda case: twice(),
         settle=0,
         systems=['bathymetry'],
     ),
     Fault(
         name='late messages, inside the window',
-        disturb=lambda case: streams.late(),
+        disturb=lambda case: late(),
         settle=0,
         systems=ANY_ORDER,
     ),
     Fault(
         name='late messages, no window',
-        disturb=lambda case: streams.late(),
+        disturb=lambda case: late(),
         counted=['too_late'],
         systems=ONCE,
     ),
     Fault(
         name='shuffled inside the window',
-        disturb=lambda case: streams.shuffled(),
+        disturb=lambda case: shuffled(),
         settle=0,
         systems=ANY_ORDER,
     ),
     Fault(
         name='shuffled, no window',
-        disturb=lambda case: streams.shuffled(),
+        disturb=lambda case: shuffled(),
         counted=['too_late'],
         systems=ONCE,
     ),
-    Fault(name='a burst', disturb=lambda case: actions.burst(), settle=0),
+    Fault(name='a burst', disturb=lambda case: burst(), settle=0),
     Fault(
         name='sensor clock two hours ahead',
-        disturb=lambda case: streams.clock_set(2.0 * HOUR),
+        disturb=lambda case: clock_set(2.0 * HOUR),
     ),
     Fault(
         name='sensor clock two hours back',
-        disturb=lambda case: streams.clock_set(-2.0 * HOUR),
+        disturb=lambda case: clock_set(-2.0 * HOUR),
     ),
     Fault(
         name='/clock and stamps an hour back',
-        disturb=lambda case: actions.simulated_clock(-HOUR),
+        disturb=lambda case: simulated_clock(-HOUR),
         says='/clock is back',
         arguments=SIMULATED,
     ),
     Fault(
         name='/clock and stamps an hour ahead',
-        disturb=lambda case: actions.simulated_clock(HOUR),
+        disturb=lambda case: simulated_clock(HOUR),
         arguments=SIMULATED,
     ),
-    Fault(name='looped recording', disturb=lambda case: streams.looped),
+    Fault(name='looped recording', disturb=lambda case: looped),
     Fault(
         name='no navigation for a while',
-        disturb=lambda case: streams.dropped('nav'),
+        disturb=lambda case: dropped('nav'),
         systems=['obstacle'],
     ),
     Fault(
         name='another frame for a while',
-        disturb=lambda case: streams.each(streams.frame('elsewhere')),
+        disturb=lambda case: each(frame('elsewhere')),
         counted=['refused: frame', 'other_frame'],
         level='WARN',
         says='frame',
     ),
     Fault(
         name='a second publisher, its clock late',
-        disturb=lambda case: streams.second_publisher(case.window + 3.0),
+        disturb=lambda case: second_publisher(case.window + 3.0),
         counted=['too_late'],
         level='WARN',
         says='not used: too_late',
@@ -144,7 +351,7 @@ FAULTS = (
     ),
     Fault(
         name='bearings in degrees',
-        disturb=lambda case: streams.each(streams.columns(bearing=57.29578)),
+        disturb=lambda case: each(columns(bearing=57.29578)),
         counted=['refused: out_of_range'],
         level='WARN',
         says='out_of_range',
@@ -152,7 +359,7 @@ FAULTS = (
     ),
     Fault(
         name='ranges in millimetres',
-        disturb=lambda case: streams.each(streams.columns(range=1000.0)),
+        disturb=lambda case: each(columns(range=1000.0)),
         counted=['refused: out_of_range'],
         level='WARN',
         says='out_of_range',
@@ -160,7 +367,7 @@ FAULTS = (
     ),
     Fault(
         name='sound speed in feet per second',
-        disturb=lambda case: streams.each(streams.columns(sound_speed=3.28084)),
+        disturb=lambda case: each(columns(sound_speed=3.28084)),
         counted=['refused: out_of_range'],
         level='WARN',
         says='out_of_range',
@@ -168,7 +375,7 @@ FAULTS = (
     ),
     Fault(
         name='depths in feet',
-        disturb=lambda case: streams.each(streams.columns(depth=3.28084)),
+        disturb=lambda case: each(columns(depth=3.28084)),
         counted=['other_depths'],
         level='WARN',
         says='not used: other_depths',
@@ -176,7 +383,7 @@ FAULTS = (
     ),
     Fault(
         name='depths in millimetres',
-        disturb=lambda case: streams.each(streams.columns(depth=1000.0)),
+        disturb=lambda case: each(columns(depth=1000.0)),
         counted=['refused: out_of_range'],
         level='WARN',
         says='out_of_range',
@@ -184,7 +391,7 @@ FAULTS = (
     ),
     Fault(
         name='a publisher that cannot be heard (QoS)',
-        disturb=lambda case: actions.unheard_publisher(
+        disturb=lambda case: unheard_publisher(
             QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         ),
         level='WARN',
@@ -193,13 +400,13 @@ FAULTS = (
     ),
     Fault(
         name='storm of parameters',
-        disturb=lambda case: actions.parameter_storm(),
+        disturb=lambda case: parameter_storm(),
         says='parameters changed',
         settle=0,
     ),
     Fault(
         name='the state cannot be saved (read-only disk)',
-        disturb=lambda case: actions.long_enough(),
+        disturb=lambda case: long_enough(),
         level='WARN',
         says='the state cannot be saved',
         settle=0,

@@ -35,8 +35,7 @@ import numpy as np
 
 from sonar_imm.trackers import SYSTEMS
 
-from . import extremes
-from .runs import BATCH, batches, run, Tally
+from .runs import BATCH, batches, run, run_extreme, Tally
 
 MOST_EXAMPLES = 500
 """Batches of one search of hypothesis, which remembers those it has tried."""
@@ -90,7 +89,7 @@ def parameters(system, draws):
     failures, start, ran, estimates = [], process_time(), 0, 0
     for number in range(draws):
         try:
-            found = extremes.run(system, number)
+            found = run_extreme(system, number)
         except Exception as error:
             failures.append(_told(error))
             continue

@@ -25,9 +25,8 @@ from types import SimpleNamespace
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import get_types_from_msg
 
-from .. import driver_messages, marine
+from .. import marine
 
 NUMBERS = {
     'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1',
@@ -36,28 +35,12 @@ NUMBERS = {
 }  # fmt: skip
 """The numpy type of each number on the wire."""
 
-DVL = (
-    'std_msgs/Header header\nuint8 DVL_MODE_BOTTOM=1\nuint8 DVL_MODE_WATER=2\n'
-    'uint8 velocity_mode\nuint8 dvl_type\ngeometry_msgs/Vector3 velocity\n'
-    'float64[9] velocity_covar\nfloat64 altitude\nfloat64 course_gnd\nfloat64 speed_gnd\n'
-    'uint8 num_good_beams\nfloat64 sound_speed\nbool beam_ranges_valid\n'
-    'bool beam_velocities_valid\ngeometry_msgs/Vector3[] beam_unit_vec\nfloat32[] range\n'
-    'float32[] range_covar\nfloat32[] beam_quality\nfloat32[] beam_velocity\n'
-    'float32[] beam_velocity_covar\n'
-)
-
 
 @cache
 def definitions():
     """The fields of every message type that an adapter reads: (name, node) by type."""
-    store = marine.typestore()
-    found = {}
-    for name, text in driver_messages.DEFINITIONS.items():
-        if name not in store.fielddefs:
-            found |= get_types_from_msg(text, name)
-    found |= get_types_from_msg(DVL, 'marine_acoustic_msgs/msg/Dvl')
-    store.register({name: found[name] for name in found if name not in store.fielddefs})
-    return {name: tuple(fields) for name, (_, fields) in store.fielddefs.items()}
+    defined = marine.typestore().fielddefs
+    return {name: tuple(fields) for name, (_, fields) in defined.items()}
 
 
 def blank(type_name):

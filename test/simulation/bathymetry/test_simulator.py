@@ -30,11 +30,8 @@ def run(name='paper', seed=1, **overrides):
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
-def test_every_scenario_is_the_same_for_the_same_seed(name):
-    first, again, other = (run(name, seed) for seed in (5, 5, 6))
-    assert all((a.iq == b.iq).all() for (a, _), (b, _) in zip(first, again))
-    assert not any((a.iq == b.iq).all() for (a, _), (b, _) in zip(first, other))
-    for snapshot, true in first:
+def test_the_truth_of_every_scenario_is_that_of_its_snapshots(name):
+    for snapshot, true in run(name, seed=5):
         assert snapshot.stamp_ns == true.stamp_ns
         assert snapshot.frame_id == ('sonar' if name.startswith('moving') else true.frame_id)
         assert snapshot.usable.all() and (snapshot.range == true.range).all()
@@ -156,18 +153,12 @@ def test_a_conjugated_array_looks_mirrored():
         ({'patch_start': 60.0}, 'patch_end'),
         ({'shadows': [30.0]}, 'pairs'),
         ({'shadows': [30.0, 20.0]}, 'pairs'),
-        ({'stave': 8}, "did you mean 'staves'"),
         ({'staves': 1}, 'between 2 and 64'),
     ],
 )
 def test_mistakes_are_named(overrides, word):
     with pytest.raises(ConfigError, match=word):
         scenario('paper', overrides)
-
-
-def test_an_unknown_scenario_is_named():
-    with pytest.raises(ConfigError, match="did you mean 'shadow'"):
-        scenario('shadows')
 
 
 def test_noise_that_does_not_fade_is_the_same_everywhere():

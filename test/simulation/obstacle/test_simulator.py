@@ -14,14 +14,18 @@
 
 """Obstacle scenes: the same for the same seed, and physically what they say."""
 
+from functools import cache
+
+from helpers.scenes import smaller_scene
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, SCENARIOS, simulate
 
 EXACT = {
@@ -40,21 +44,14 @@ def of(scene, kind):
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
-def test_scenes_repeat_and_differ_by_seed(name):
-    config = scenario(name)
-    one, same, other = simulate(config, 3), simulate(config, 3), simulate(config, 4)
-    for a, b in zip(one.measurements, same.measurements, strict=True):
-        assert a.received_ns == b.received_ns
-        for key in ('range', 'bearing', 'position', 'orientation', 'altitude'):
-            if hasattr(a.measurement, key):
-                assert np.array_equal(getattr(a.measurement, key), getattr(b.measurement, key))
-    assert len(one.truth) == config.obstacles
+def test_each_obstacle_has_its_truth_and_the_sea_another_motion_by_seed(name):
+    config, first = smaller_scene(SYSTEMS['obstacle'], name, 3)
+    other = simulate(config, 4)
+    assert len(first.truth) == config.obstacles
     assert any(
         not np.array_equal(a.position, b.position)
-        for a, b in zip(of(one, Navigation), of(other, Navigation))
+        for a, b in zip(of(first, Navigation), of(other, Navigation))
     )
-    received = [each.received_ns for each in one.measurements]
-    assert received == sorted(received)
 
 
 @pytest.mark.parametrize('model', geometry.AZIMUTH_MODELS)
@@ -170,8 +167,275 @@ def test_clutter_misses_and_gaps():
     assert steps.max() > 2.9
 
 
-def test_wrong_names_are_told():
-    with pytest.raises(ConfigError, match='did you mean'):
-        scenario('aproach')
-    with pytest.raises(ConfigError, match='vertical_ofset'):
-        scenario('approach', {'vertical_ofset': 1.0})
+# -- what sonar and navigation say, from the definitions of ENU, FLU and scipy's rotations --------
+
+
+LEVER, MOUNT = np.array([1.3, -0.4, 0.7]), (4.0, -3.0, 6.0)
+TURNED = {
+    **EXACT,
+    'altitude_std': 0.0,
+    'sonar_lever': tuple(LEVER),
+    'sonar_mount_rpy_deg': MOUNT,
+    'course_deg': 70.0,
+    'roll_rms_deg': 4.0,
+    'vertical_offset': -4.0,
+}
+
+
+def run(name='approach', seed=1, **overrides):
+    return simulate(scenario(name, overrides), seed)
+
+
+class Vehicle:
+    """The vehicle between its poses, and a point as its sonar sees it, FLU."""
+
+    def __init__(self, scene):
+        poses = of(scene, Navigation)
+        self.first = poses[0].stamp_ns
+        self.t = np.array([(one.stamp_ns - self.first) * 1e-9 for one in poses])
+        self.place = np.array([one.position for one in poses])
+        self.turn = Slerp(self.t, Rotation.from_quat([one.orientation for one in poses]))
+        # Extrinsic x, y, z: roll first, yaw last, about axes that stand still.
+        self.mount = Rotation.from_euler('xyz', MOUNT, degrees=True)
+
+    def sees(self, point, seconds):
+        turn = self.turn(seconds)
+        sonar = np.array([np.interp(seconds, self.t, axis) for axis in self.place.T])
+        sonar = sonar + turn.apply(LEVER)
+        return (turn * self.mount).inv().apply(point - sonar), sonar
+
+
+def bearing_of(m, model):
+    """To port: of the vertical plane through the point, or of the cone around the array."""
+    return np.arctan2(m[1], m[0]) if model == 'plane' else np.arcsin(m[1] / np.linalg.norm(m))
+
+
+@pytest.mark.parametrize('model', ['plane', 'cone'])
+@pytest.mark.parametrize('timing', ['instant', 'two_way'])
+def test_an_echo_is_where_the_navigation_says_the_obstacle_is(model, timing):
+    scene = run(**TURNED, azimuth_model=model, ping_timing=timing)
+    vehicle, truth, checked = Vehicle(scene), scene.truth[0], 0
+    for ping in of(scene, Detections):
+        seconds = (ping.stamp_ns - vehicle.first) * 1e-9
+        out, sonar = vehicle.sees(truth.position[0], seconds)
+        k = int(np.searchsorted(truth.stamp_ns, ping.stamp_ns))
+        assert truth.range[k] == pytest.approx(np.linalg.norm(out), abs=1e-3)
+        assert truth.vertical_offset[k] == pytest.approx(sonar[2] - truth.position[0, 2], abs=1e-3)
+        if not len(ping):
+            continue
+        d, bearing = np.linalg.norm(out), bearing_of(out, model)
+        if timing == 'two_way':
+            for _ in range(4):  # the echo comes back to where the sonar is by then
+                back, _ = vehicle.sees(truth.position[0], seconds + 2.0 * d / 1500.0)
+                d = 0.5 * (np.linalg.norm(out) + np.linalg.norm(back))
+                bearing = bearing_of(back, model)
+        assert ping.range[0] == pytest.approx(d, abs=1e-3)
+        assert ping.bearing[0] == pytest.approx(bearing, abs=1e-4)
+        checked += 1
+    assert checked > 40
+
+
+def test_the_two_ways_to_time_a_ping_differ_by_half_the_way_travelled():
+    """At 1.5 m/s an echo from 75 m takes 0.1 s: the sonar is 0.15 m nearer when it comes back."""
+    at_once, later = (
+        run(**{**TURNED, 'ping_timing': timing, 'roll_rms_deg': 0.0, 'pitch_rms_deg': 0.0,
+               'yaw_rms_deg': 0.0, 'heave_rms': 0.0, 'sway_rms': 0.0})
+        for timing in ('instant', 'two_way')
+    )  # fmt: skip
+    for one, other in zip(of(at_once, Detections), of(later, Detections)):
+        if len(one) and len(other) and one.range[0] > 40.0:
+            shorter = one.range[0] - other.range[0]
+            assert shorter == pytest.approx(1.5 * one.range[0] / 1500.0, rel=0.05)
+
+
+def test_a_beam_is_a_box_of_elevation_azimuth_and_range():
+    scene = run('six', **{**TURNED, 'max_range': 80.0}, clutter=0.0)
+    vehicle, inside = Vehicle(scene), 0
+    for truth in scene.truth:
+        for stamp, seen in zip(truth.stamp_ns, truth.in_beam):
+            m, _ = vehicle.sees(truth.position[0], (int(stamp) - vehicle.first) * 1e-9)
+            d = np.linalg.norm(m)
+            margins = np.array([
+                np.radians(7.5) - abs(np.arcsin(m[2] / d)),
+                np.radians(22.5) - abs(np.arctan2(m[1], m[0])),
+                (80.0 - d) / 100.0,
+            ])  # fmt: skip
+            if np.abs(margins).min() > 1e-4:  # not just on the edge
+                assert seen == (margins > 0.0).all()
+            inside += seen
+    assert inside > 100
+
+
+@pytest.mark.statistics
+def test_errors_of_echoes_are_as_large_as_told():
+    told = {**TURNED, 'range_std': 0.2, 'bearing_std_deg': 0.4, 'roll_rms_deg': 0.0}
+    range_errors, bearing_errors = [], []
+    for seed in range(12):
+        exact, noisy = run(seed=seed, **{**TURNED, 'roll_rms_deg': 0.0}), run(seed=seed, **told)
+        for one, other in zip(of(exact, Detections), of(noisy, Detections), strict=True):
+            if len(one):
+                range_errors.append(other.range[0] - one.range[0])
+                bearing_errors.append(np.degrees(other.bearing[0] - one.bearing[0]))
+    n = len(range_errors)
+    assert n > 400
+    assert np.std(range_errors) == pytest.approx(0.2, rel=0.1)
+    assert np.std(bearing_errors) == pytest.approx(0.4, rel=0.1)
+    assert abs(np.mean(range_errors)) < 4.0 * 0.2 / np.sqrt(n)
+    assert abs(np.mean(bearing_errors)) < 4.0 * 0.4 / np.sqrt(n)
+
+
+def test_ranges_and_bearings_come_in_steps():
+    pings = of(run(range_step=0.5, bearing_step_deg=1.5), Detections)
+    ranges = np.concatenate([ping.range for ping in pings]) / 0.5
+    bearings = np.degrees(np.concatenate([ping.bearing for ping in pings])) / 1.5
+    np.testing.assert_allclose(ranges, np.round(ranges), atol=1e-9)
+    np.testing.assert_allclose(bearings, np.round(bearings), atol=1e-9)
+    assert len(set(np.round(ranges))) > 20
+
+
+@pytest.mark.statistics
+def test_a_wrong_sound_speed_scales_all_ranges_of_a_run_alike():
+    scales = []
+    for seed in range(60):
+        right = run(seed=seed, **TURNED, last_range=80.0)
+        wrong = run(seed=seed, **{**TURNED, 'sound_speed_error': 0.02}, last_range=80.0)
+        ratio = [
+            other.range[0] / one.range[0]
+            for one, other in zip(of(right, Detections), of(wrong, Detections))
+            if len(one) and len(other)
+        ]
+        assert np.ptp(ratio) < 1e-12
+        scales.append(ratio[0] - 1.0)
+    assert np.std(scales) == pytest.approx(0.02, rel=0.3)
+    assert abs(np.mean(scales)) < 4.0 * 0.02 / np.sqrt(60)
+
+
+@pytest.mark.statistics
+def test_echoes_from_elsewhere_and_misses_come_as_often_as_told():
+    lost = wild = n = 0
+    for seed in range(12):
+        seen = run(seed=seed, **TURNED, detection_probability=0.7, outlier_probability=0.25)
+        truth = seen.truth[0]
+        for ping, d, there in zip(of(seen, Detections), truth.range, truth.in_beam):
+            n += there
+            lost += there and not len(ping)
+            if len(ping):
+                off = abs(ping.range[0] - d)
+                assert off <= 8.0 + 1e-9
+                wild += off > 1e-6
+    assert n > 400
+    assert lost / n == pytest.approx(0.3, abs=0.07)
+    assert wild / (n - lost) == pytest.approx(0.25, abs=0.08)
+
+
+def test_false_echoes_fill_the_sector_evenly():
+    scene = run(detection_probability=0.0, clutter=20.0)
+    pings = of(scene, Detections)
+    ranges = np.concatenate([ping.range for ping in pings])
+    bearings = np.degrees(np.concatenate([ping.bearing for ping in pings]))
+    assert len(ranges) / len(pings) == pytest.approx(20.0, rel=0.1)
+    for values, low, high in ((ranges, 1.0, 100.0), (bearings, -22.5, 22.5)):
+        counts, _ = np.histogram(values, 10, (low, high))
+        assert counts.sum() == pytest.approx(len(values), abs=20)
+        assert ((counts - counts.mean()) ** 2 / counts.mean()).sum() < 27.9  # 99.9 % of 9
+
+
+# -- navigation -----------------------------------------------------------------------------------
+
+SILENT = {
+    'log_scale_error': 0.0,
+    'log_bias': 0.0,
+    'log_noise': 0.0,
+    'attitude_std_deg': 0.0,
+    'attitude_bias_deg': 0.0,
+    'yaw_bias_deg': 0.0,
+    'depth_std': 0.0,
+}
+
+
+def path(seed, **errors):
+    """Positions (n, 3) that the navigation states along a course of 70 degrees."""
+    scene = run(seed=seed, course_deg=70.0, navigation_rate=4.0, **errors)
+    return np.array([one.position for one in of(scene, Navigation)])
+
+
+@cache
+def true_path(seed):
+    return path(seed, ideal_navigation=True)
+
+
+def ends(seeds, **errors):
+    """Along and across the course, how far the last pose is off (seeds, 2), m; and the way."""
+    ahead = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])  # east, north
+    axes = np.column_stack([ahead, [-ahead[1], ahead[0]]])
+    off = [
+        (path(seed, **{**SILENT, **errors})[-1] - true_path(seed)[-1])[:2] @ axes
+        for seed in range(seeds)
+    ]
+    return np.array(off), float(np.linalg.norm((true_path(0)[-1] - true_path(0)[0])[:2]))
+
+
+def test_without_errors_dead_reckoning_is_the_path():
+    off, way = ends(3)
+    assert way > 80.0 and np.abs(off).max() < 0.03
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(
+    'errors, along, across',
+    [
+        ({'log_scale_error': 0.01}, lambda way: 0.01 * way, lambda way: 0.0),
+        ({'yaw_bias_deg': 1.0}, lambda way: 0.0, lambda way: np.radians(1.0) * way),
+        ({'log_bias': 0.02}, lambda way: 0.02 * way / 1.5, lambda way: 0.02 * way / 1.5),
+        ({'log_noise': 0.05}, lambda way: 0.05 * (way / 1.5) ** 0.5,
+         lambda way: 0.05 * (way / 1.5) ** 0.5),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else '',
+)  # fmt: skip
+def test_errors_of_the_navigation_grow_as_their_kind_does(errors, along, across):
+    """A scale error along the way, a yaw bias across it, a bias with time, noise with its root."""
+    off, way = ends(100, **errors)
+    for found, expected in zip(off.std(axis=0), (along(way), across(way))):
+        assert found == pytest.approx(expected, rel=0.28, abs=0.05)
+
+
+@pytest.mark.statistics
+def test_attitudes_and_depths_have_the_errors_told():
+    angles, depths = [], []
+    for seed in range(30):
+        told = {**SILENT, 'attitude_bias_deg': 0.5, 'yaw_bias_deg': 0.8, 'depth_std': 0.1}
+        noisy, ideal = run(seed=seed, **told), run(seed=seed, ideal_navigation=True)
+        pairs = list(zip(of(noisy, Navigation), of(ideal, Navigation)))
+        turned = [
+            [Rotation.from_quat(one.orientation).as_euler('xyz', degrees=True) for one in pair]
+            for pair in pairs[::20]
+        ]
+        off = np.array([a - b for a, b in turned])
+        assert np.ptp(off, axis=0).max() < 1e-6  # a bias stays
+        angles.append(off[0])
+        depths += [one.position[2] - other.position[2] for one, other in pairs]
+    assert np.std(angles, axis=0) == pytest.approx([0.5, 0.5, 0.8], rel=0.4)
+    assert np.std(depths) == pytest.approx(0.1, rel=0.05)
+
+
+def test_poses_may_be_late_by_stamp_and_by_radio():
+    plain = run(ideal_navigation=True)
+    late = run(ideal_navigation=True, navigation_delay=0.2, navigation_latency=0.7)
+    one, other = (
+        [each for each in scene.measurements if isinstance(each.measurement, Navigation)]
+        for scene in (plain, late)
+    )
+    for a, b in zip(one, other, strict=True):
+        assert np.array_equal(a.measurement.position, b.measurement.position)
+        assert b.measurement.stamp_ns - a.measurement.stamp_ns == 200_000_000
+        assert b.received_ns - b.measurement.stamp_ns == 700_000_000
+        assert a.received_ns == a.measurement.stamp_ns
+
+
+def test_the_altitude_is_that_above_the_floor_below():
+    scene = run(**{**TURNED, 'depth': 30.0, 'altitude': 12.0}, dive=2.0)
+    heights = {one.stamp_ns: one.position[2] for one in of(scene, Navigation)}
+    pairs = [(one.altitude, heights[one.stamp_ns]) for one in of(scene, Altitude)]
+    assert len(pairs) > 50 and np.ptp([z for _, z in pairs]) > 2.0
+    for altitude, z in pairs:
+        assert altitude == pytest.approx(z + 42.0, abs=1e-9)

@@ -12,12 +12,24 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Input at ten times what a node can process."""
+"""Input at ten times what a node can process, at the pace of the clock instead of in lock-step."""
 
-from helpers.faults.cases import CASES
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import itertools
+import time
+from typing import NamedTuple
+
+from helpers.faults.cases import Case, CASES, Message, SECOND
 from helpers.faults.figures import long_form
-from helpers.faults.flood import flooded
+from helpers.faults.rig import Rig
+import numpy as np
 import pytest
+from sensor_msgs.msg import PointCloud2
+
+from sonar_imm.nodes.qos import lockstep_qos
 
 pytestmark = pytest.mark.system
 
@@ -37,3 +49,111 @@ def test_a_flooded_node_answers_soon_counts_what_it_drops_and_recovers(system, f
     patience = max(1.0, 6.0 / flood.capacity)  # a loaded machine is slow with each message
     assert flood.latency_max < MAX_WAIT + patience
     assert flood.recovered < patience
+
+
+_USUAL = 20
+"""Messages by which it is measured how fast a node is."""
+
+
+class Flood(NamedTuple):
+    """capacity, rate: messages per second that can be processed, and that were sent; sent, used,
+    dropped, lost: messages, the latter two as /diagnostics counts them; latency_max, latency_p50:
+    s, from sending a message to its estimate; recovered: s from the end of the flood until a
+    message is answered as quickly as before it; warned: whether /diagnostics said so."""
+
+    capacity: float
+    rate: float
+    sent: int
+    used: int
+    dropped: int
+    lost: int
+    latency_max: float
+    latency_p50: float
+    recovered: float
+    warned: bool
+
+
+def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flood:
+    """Send messages to the node of `case` for a while, `times` as fast as it can process them."""
+    with Rig(case, ('-p', f'max_wait:={max_wait}'), lossless=False) as rig:
+        rig.play(case.messages())
+        stream = endless(case)
+        start = time.monotonic()
+        for one in itertools.islice(stream, _USUAL):
+            rig.send(one)
+        usual = (time.monotonic() - start) / _USUAL
+        many = list(itertools.islice(stream, int(seconds * times / usual) + 1))
+        told = Told(rig)
+        before = told.counts()
+        start = time.monotonic()
+        for k, one in enumerate(many):
+            told.send(one)
+            rig.link.wait_for(lambda: False, start + (k + 1) * usual / times - time.monotonic())
+        ended = time.monotonic()
+        recovered = next(
+            (told.sent[one.stamp_ns] - ended for one in stream if told.soon(one, 5.0 * usual)),
+            np.inf,
+        )
+        rig.fresh_diagnostics()
+        after = told.counts() - before
+        waits = np.array([*told.latency.values()])
+        return Flood(
+            capacity=1.0 / usual,
+            rate=len(many) / (ended - start),
+            sent=len(told.sent),
+            used=after['received'] - after['dropped'],
+            dropped=after['dropped'],
+            lost=after['lost'],
+            latency_max=float(waits.max()),
+            latency_p50=float(np.median(waits)),
+            recovered=float(recovered),
+            warned='WARN' in rig.diagnostics.levels,
+        )
+
+
+class Told:
+    """When messages were sent, and how long it took to hear of each. sent: s of the steady clock,
+    latency: s, both by stamp."""
+
+    def __init__(self, rig: Rig):
+        self._rig = rig
+        self.sent: dict[int, float] = {}
+        self.latency: dict[int, float] = {}
+        topic = f'/{rig.case.system}/estimate'
+        rig.link.node.create_subscription(PointCloud2, topic, self._heard, lockstep_qos())
+        rig.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
+        rig.diagnostics.forget()
+
+    def send(self, one: Message) -> None:
+        self.sent[one.stamp_ns] = time.monotonic()
+        self._rig.publishers[one.topic].publish(one.content)
+
+    def soon(self, one: Message, limit: float) -> bool:
+        """Whether the answer to a message comes within `limit`; waits for that time at least."""
+        self.send(one)
+        self._rig.link.wait_for(lambda: one.stamp_ns in self.latency, limit)
+        return one.stamp_ns in self.latency
+
+    def counts(self) -> Counter[str]:
+        """Messages on the primary input so far: received, and of these dropped; lost."""
+        self._rig.fresh_diagnostics()
+        told, topic = self._rig.diagnostics.counts(), self._rig.case.primary
+        return Counter(
+            received=told[f'{topic} received'],
+            dropped=told[f'{topic} dropped, waited too long'],
+            lost=told[f'lost on {topic}'] + told[f'lost on /{topic}'],
+        )
+
+    def _heard(self, message: PointCloud2) -> None:
+        stamp = message.header.stamp
+        stamp_ns = stamp.sec * SECOND + stamp.nanosec
+        if stamp_ns in self.sent:
+            self.latency.setdefault(stamp_ns, time.monotonic() - self.sent[stamp_ns])
+
+
+def endless(case: Case) -> Iterator[Message]:
+    """The messages of a case again and again after they were sent once, their stamps moved on."""
+    messages = case.messages()
+    length = (messages[-1].stamp_ns - messages[0].stamp_ns) / SECOND + case.period
+    for turn in itertools.count(1):
+        yield from (one.moved(turn * length) for one in messages)

@@ -14,17 +14,31 @@
 
 """Signals at random moments of a node's life, and the start after them."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+import contextlib
+from pathlib import Path
 import signal
+import subprocess
 import time
+from typing import Any
 
 from helpers.faults.cases import CASES
 from helpers.faults.figures import count
-from helpers.faults.nodes import ended, heeds_signals, reason_unclean, Running
 from helpers.live import own_words
 import numpy as np
 import pytest
 
-from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
+from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm_tools.replay.harness import (
+    local_discovery,
+    NodeProcess,
+    reserved_domain_id,
+    START_LIMIT,
+)
+from sonar_imm_tools.replay.link import Link
+from sonar_imm_tools.replay.lockstep import LockStep
 
 pytestmark = pytest.mark.system
 
@@ -91,3 +105,135 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
     )
     assert not unclean and early > 0
     assert ended()
+
+
+# -- several nodes as processes, without lock-step ------------------------------------------------
+
+
+END_LIMIT = 120.0
+"""Seconds a node may take to end."""
+
+
+class Running:
+    """Nodes in a ROS domain of their own, ready and connected; ended by ``with``."""
+
+    def __init__(self, systems: Iterable[str]):
+        self._stack = contextlib.ExitStack()
+        self.nodes: dict[str, NodeProcess] = {}
+        self._lockstep: dict[str, LockStep] = {}
+        self._publishers: dict[tuple[str, str], Any] = {}
+        try:
+            self._start([*systems])
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def __enter__(self) -> Running:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def send(self, system: str, messages: int) -> None:
+        """Publish the first messages of a case and wait for none of them."""
+        for one in CASES[system].messages()[:messages]:
+            self._publishers[system, one.topic].publish(one.content)
+
+    def step(self, system: str) -> None:
+        """Send one message, and wait for its answer."""
+        one = CASES[system].messages()[0]
+        self._lockstep[system].step(self._publishers[system, one.topic], one.content)
+
+    def start_again(self) -> None:
+        """Start all nodes anew, under the names of those that were killed, with a new link and in
+        another domain: that of before takes them for alive for a while, and Fast DDS 2.14 may spin
+        without end on the shared memory that they left there."""
+        self._start([*self.nodes])
+
+    def stop(self) -> list[tuple[str, str]]:
+        """End all nodes; gives what was wrong with that."""
+        for node in self.nodes.values():
+            node.process.send_signal(signal.SIGINT)
+        return [why for node in self.nodes.values() for why in reason_unclean(node, 0)]
+
+    def _start(self, systems: list[str]) -> None:
+        domain = self._stack.enter_context(reserved_domain_id())
+        with local_discovery():
+            self._link = self._stack.enter_context(Link('rig', domain_id=domain))
+        for system in systems:
+            for topic, cls in {m.topic: type(m.content) for m in CASES[system].messages()}.items():
+                self._publishers[system, topic] = self._link.node.create_publisher(
+                    cls, f'/{system}/{topic}', lockstep_qos()
+                )
+        for system in systems:
+            topics = [topic for name, topic in self._publishers if name == system]
+            remaps = [f'{topic}:=/{system}/{topic}' for topic in topics]
+            qos = [f'qos_overrides./{system}/{topic}.subscription' for topic in topics]
+            arguments = [word for remap in remaps for word in ('-r', remap)]
+            arguments += [
+                word
+                for name in qos
+                for policy in ('history:=keep_all', 'reliability:=reliable')
+                for word in ('-p', f'{name}.{policy}')
+            ]
+            with local_discovery():
+                self.nodes[system] = self._stack.enter_context(
+                    NodeProcess(system, domain_id=domain, arguments=arguments)
+                )
+        for system in systems:
+            step = LockStep(self._link, f'/{system}', trouble=self.nodes[system].trouble)
+            publishers = [p for (name, _), p in self._publishers.items() if name == system]
+            step.connect(publishers, START_LIMIT)
+            self._lockstep[system] = step
+
+
+def reason_unclean(node: NodeProcess, expected: int) -> list[tuple[str, str]]:
+    """What was wrong with the end of a node, with its name; nothing where it was clean."""
+    try:
+        code = node.process.wait(END_LIMIT)
+    except subprocess.TimeoutExpired:
+        told = f'it did not end within {END_LIMIT:g} s: {_doing(node.process.pid)}, {node.log()}'
+        return [(node.system, told[-1000:])]
+    if code != expected:
+        return [(node.system, f'exit code {code}: {node.log()[-500:]}')]
+    said = own_words(node.log())
+    words = [word for word in ('Traceback', 'Error', 'terminate called') if word in said]
+    return [(node.system, f'{words}: {said[-500:]}')] if words else []
+
+
+def _doing(pid: int) -> str:
+    """State and CPU seconds of each thread: whether a process hangs or only gets no processor."""
+    told = []
+    for task in Path(f'/proc/{pid}/task').iterdir():
+        words = (task / 'stat').read_text().rpartition(')')[2].split()
+        told.append(f'{words[0]} {(int(words[11]) + int(words[12])) / 100.0:g} s')
+    return ', '.join(told)
+
+
+def heeds_signals(process: subprocess.Popen[bytes]) -> bool:
+    """Whether the process takes SIGTERM itself: Python alone never does."""
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    caught = next(line.split()[1] for line in status.splitlines() if line.startswith('SigCgt'))
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def ended(limit: float = END_LIMIT) -> bool:
+    """Whether this process has no children left, zombies not counted."""
+    end = time.monotonic() + limit
+    while time.monotonic() < end:
+        if not [pid for pid in _children() if _alive(pid)]:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def _children() -> list[int]:
+    path = Path('/proc/self/task')
+    return [int(pid) for one in path.iterdir() for pid in (one / 'children').read_text().split()]
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
