@@ -53,14 +53,18 @@ EXTRAS = {
         'mkdocs-material>=9.5',
         'mkdocstrings[python]>=0.26',
     ],
+    # Brings Qt and notebooks along, 1.7 GB; docs/reference/formats.md says how to do without them.
+    'echosounders': ['themachinethatgoesping>=0.33; python_version >= "3.11"'],
     'nmea': ['pyais>=2.7', 'pynmea2>=1.18'],
     'parquet': ['pyarrow>=14'],
+    'pictures': ['pillow>=9.1'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',
         'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
+        'pillow>=9.1',
         'pyais>=2.7',
         'pyarrow>=14',
         'pynmea2>=1.18',
@@ -68,6 +72,7 @@ EXTRAS = {
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',
+        'pyxtf>=1.4',
         'rasterio>=1.3',
         'segyio>=1.9',
         'soundfile>=0.12',
@@ -80,6 +85,7 @@ EXTRAS = {
     'sound': ['soundfile>=0.12'],
     'view': ['foxglove-sdk>=0.20'],
     'sweep': ['dask[distributed]>=2024.1'],
+    'xtf': ['pyxtf>=1.4'],
 }
 
 

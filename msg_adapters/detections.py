@@ -84,6 +84,26 @@ def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -
     return _detections(message, *_polar(*places.T), bearing_positive)
 
 
+def read_point_cloud(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
+    """Read a sensor_msgs/PointCloud, the older of the two, as drivers of scanning sonars publish:
+    points in the sonar's frame, x forward, y to port; a channel called intensity, or one whose
+    name begins so, has their strength. Raises `Rejection`."""
+    if len(message.points) > MAX_DETECTIONS:
+        raise Rejection(
+            'too_large',
+            f'a ping of {len(message.points)} detections; at most {MAX_DETECTIONS} are read',
+        )
+    places = np.array([[p.x, p.y, p.z] for p in message.points], np.float64).reshape(-1, 3)
+    found = [
+        np.array(channel.values, np.float64)
+        for channel in message.channels
+        if str(channel.name).lower().startswith('intensit')
+        and len(channel.values) == len(message.points)
+    ]
+    extra = {'intensity': found[0]} if found else {}
+    return _detections(message, *_polar(*places.T), bearing_positive, **extra)
+
+
 def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a vision_msgs/Detection3DArray: centres of boxes in the sonar's frame, x forward, y to
     port, z up, each of which has an elevation.

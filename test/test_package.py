@@ -56,6 +56,7 @@ PYPI_OF_KEY = {
     'python3-pytest': 'pytest',
     'python3-pytest-benchmark': 'pytest-benchmark',
     'python3-pytest-xdist': 'pytest-xdist',
+    'python3-pil': 'pillow',
     'python3-rasterio': 'rasterio',
     'python3-rich': 'rich',
     'python3-rosbags-pip': 'rosbags',
@@ -79,6 +80,8 @@ PEERS = {
     'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
+    'sonar_imm_tools.recordings.convert.sonar_files': {'PIL'},
+    'sonar_imm_tools.recordings.foreign': {'pyxtf', 'themachinethatgoesping'},
     'sonar_imm_tools.recordings.export.horizons': {'rasterio'},
     'sonar_imm_tools.recordings.export.picks': {'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
@@ -192,7 +195,8 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
-        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'segyio', 'soundfile')
+        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio'),
+        'soundfile',
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 

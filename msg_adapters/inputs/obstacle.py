@@ -22,6 +22,7 @@ from ..detections import (
     read_detections,
     read_detections_3d,
     read_laser_scan,
+    read_point_cloud,
     read_pose_array,
     read_sonar_detections,
     read_sonar_ranges,
@@ -56,6 +57,7 @@ TOPICS = (
         measurement=Detections,
         readers={
             'sensor_msgs/msg/PointCloud2': read_detections,
+            'sensor_msgs/msg/PointCloud': read_point_cloud,
             'sensor_msgs/msg/LaserScan': read_laser_scan,
             'geometry_msgs/msg/PoseArray': read_pose_array,
             'vision_msgs/msg/Detection3DArray': read_detections_3d,

@@ -27,7 +27,7 @@ import click
 from sonar_imm.texts import visible
 from sonar_imm.trackers import SYSTEMS
 
-from ..recordings.convert_options import FROM_BAGS, OPTIONS
+from ..recordings.convert_options import DETECTING, FROM_BAGS, OPTIONS
 from ..recordings.options import Group, Option, spec_of
 from .common import (
     BAG,
@@ -205,7 +205,7 @@ def _detector(source: Path, overrides: dict[str, str]) -> dict[str, Any]:
 
 def _sources(kind: str, source: Path) -> list[Path] | None:
     """What lies in a folder of several recordings, by path; None for a single one."""
-    if not source.is_dir():
+    if not source.is_dir() or kind == 'pictures':
         return None
     inside = sorted(path for path in source.iterdir() if not path.name.startswith('.'))
     if kind not in FROM_BAGS:
@@ -221,7 +221,7 @@ def convert_file(
     """Convert a recording. Raises `BagError`."""
     from ..recordings.convert import KINDS
 
-    if kind == 'images':
+    if kind in DETECTING:
         options = {**options, 'parameters': _detector(source, options.get('parameters', {}))}
     return KINDS[kind](source, out_bag, **options)
 

@@ -146,7 +146,7 @@ def _export_map(
     as_json: bool,
 ) -> None:
     """The obstacles that are known at the end of a run; record: its run.json."""
-    from ..recordings.export.obstacles import write_obstacles
+    from ..recordings.export.tracks import write_obstacles
     from ..recordings.sources import BagError
 
     if kind != 'geojson':

@@ -93,6 +93,24 @@ def _bearing_std() -> Any:
     return option(None, 'DEGREES', help, flag='bearing-std', kind='float', above=0.0)
 
 
+def _detector() -> Any:
+    help = 'Change one parameter of the detector; may be given several times.'
+    return option({}, 'NAME=VALUE', help, flag='set', kind='pairs')
+
+
+def _element_spacing() -> Any:
+    help = 'Distance between staves, to be stated in the snapshots.'
+    return option(None, 'METRES', help, kind='float', range=(1e-5, 10.0))
+
+
+def _phase_scale() -> Any:
+    help = (
+        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
+        'full circle over their range.'
+    )
+    return option(None, 'RAD', help, flag='phase-scale', kind='float')
+
+
 @frozen(kw_only=True)
 class FixesOptions:
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
@@ -324,12 +342,8 @@ class InterferometerOptions:
         'Where something stands in the messages, e.g. phase=sidescan.phase.', flag='field',
         kind='pairs')
     side: str = option('', '', 'Of the array.', choices=('port', 'starboard'))
-    radians_per_count: float | None = option(None, 'RAD',
-        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
-        'full circle over their range.', flag='phase-scale', kind='float')
-    element_spacing: float | None = option(None, 'METRES',
-        'Distance between staves, to be stated in the snapshots.', kind='float',
-        range=(1e-5, 10.0))
+    radians_per_count: float | None = _phase_scale()
+    element_spacing: float | None = _element_spacing()
     sound_speed: float = option(1500.0, '',
         'Speed of sound in m/s, where a message states none.', kind='float',
         range=(1300.0, 1700.0))
@@ -411,6 +425,85 @@ class TracesOptions:
         'Traces per second, when an archive has no stamps.', kind='float', range=(1e-6, 1e6))
     frame_id: str = option('array', '', 'Frame of the traces.')
     storage: str = _storage()
+
+@frozen(kw_only=True)
+class XtfOptions:
+    """Side scan in an XTF file to /detections, /nav and /altitude. Needs pyxtf.
+
+    Each ping of --side is an image of one beam abeam, in which echoes are found; --set changes the
+    detector (docs/parameters/fls_detector.md). Where a side has a channel whose name says phase,
+    it becomes /port/snapshot or /starboard/snapshot too: one channel of stave 1 against stave 0,
+    or one for each stave.
+    """
+
+    EXAMPLES: ClassVar = ('line.xtf line.bag', 'line.xtf line.bag --side port')
+    side: str = option('starboard', '', 'Side whose echoes are found.',
+        choices=('starboard', 'port'))
+    port_samples: str = option('far', '',
+        'Which sample of a port channel comes first: most programs write the farthest.',
+        choices=('far', 'near'))
+    radians_per_count: float | None = _phase_scale()
+    element_spacing: float | None = _element_spacing()
+    parameters: Mapping[str, Any] = _detector()
+    frame_id: str = option('sonar', '', 'Frame of the sonar.')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class Ek80Options:
+    """Raw file of a Simrad EK80 with complex samples to /snapshot and /nav. Needs
+    themachinethatgoesping.
+
+    The sectors of a split beam are summed to its starboard and its port half; --staves says other
+    sums. Chirps are left out: they are not compressed. Of several channels the first is taken, or
+    the one that --channel names.
+    """
+
+    EXAMPLES: ClassVar = ('D20221108.raw line.bag', 'D20221108.raw line.bag --channel ES70')
+    channel: str = option('', 'TEXT', 'Part of the name of the channel.')
+    staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
+        'Sectors, from 0, of each stave; those joined by + are summed.', parse=_staves)
+    element_spacing: float | None = _element_spacing()
+    frame_id: str = option('sonar', '', 'Frame of the array.')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class KongsbergOptions:
+    """Soundings of a KMALL or .all file of a Kongsberg multibeam to /ground, and /nav. Needs
+    themachinethatgoesping.
+
+    They are a reference, or the ground of the obstacle tracker: no tracker takes them alone.
+    """
+
+    EXAMPLES: ClassVar = ('0077.kmall reference.bag', '0077.all reference.bag')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class PicturesOptions:
+    """Folder of PNG and JPEG pictures of a forward-looking sonar to /detections and /nav. Needs
+    Pillow.
+
+    A CSV in the folder says file and stamp of each, and where the vehicle was: x, y or latitude,
+    longitude [deg], heading [deg, clockwise from north], optional depth. near_range, far_range
+    [m] and fov [deg] stand there too, or are options. Rows of a picture are ranges from near to
+    far, columns beams from port to starboard; fans drawn on paper are none. --set changes the
+    detector (docs/parameters/fls_detector.md).
+    """
+
+    EXAMPLES: ClassVar = ('frames dive.bag --far-range 40 --fov 90',)
+    table: Path | str | None = option(None, '', 'The CSV, where there are several.', kind='file')
+    near_range: float = option(0.0, 'METRES',
+        'Range of the first row, for rows that state none.', kind='float', range=(0.0, 1e4))
+    far_range: float | None = option(None, 'METRES',
+        'Range of the last row, for rows that state none.', kind='float', range=(0.1, 1e4))
+    fov: float | None = option(None, 'DEGREES',
+        'Width of the sector, for rows that state none.', kind='float', range=(0.1, 360.0))
+    options: CsvOptions = group(CsvOptions)
+    parameters: Mapping[str, Any] = _detector()
+    frame_id: str = option('sonar', '', 'Frame of the sonar.')
+    storage: str = _storage()
 # fmt: on
 
 
@@ -426,9 +519,15 @@ OPTIONS: dict[str, type] = {
     'images': ImagesOptions,
     'interferometer': InterferometerOptions,
     'segy': SegyOptions,
+    'xtf': XtfOptions,
+    'ek80': Ek80Options,
+    'kongsberg': KongsbergOptions,
+    'pictures': PicturesOptions,
     'hydrophones': HydrophonesOptions,
     'traces': TracesOptions,
 }
 """The options by the kind of conversion."""
 FROM_BAGS = ('images', 'interferometer')
-"""The kinds that read a bag; the others read a file."""
+"""The kinds that read a bag; the others read a file, or a folder of pictures."""
+DETECTING = ('images', 'xtf', 'pictures')
+"""The kinds that find echoes in images."""

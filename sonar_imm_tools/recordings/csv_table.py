@@ -105,6 +105,10 @@ USUAL_NAMES = {
     'std_elevation': 'sigma_elevation',
     'var_depth': '',
     'std_depth': 'sigma_depth',
+    'file': 'filename file_name image picture frame',
+    'near_range': 'range_min min_range',
+    'far_range': 'range_max max_range',
+    'fov': 'field_of_view sector horizontal_fov',
 }
 ALIASES = {name: (name, *others.split()) for name, others in USUAL_NAMES.items()}
 """The names of the columns of all kinds of table: those by which each quantity is found."""

@@ -31,13 +31,13 @@ from .sources import BagError, SUFFIXES
 from .topics import made_topics
 from .track_files import kind_of_text, START
 
-NO_READER = {
-    'ek80': 'a raw file of a Simrad EK60 or EK80',
-    'kmall': 'a KMALL file of a Kongsberg multibeam',
-    'all': 'an .all file of a Kongsberg multibeam',
-    'xtf': 'an XTF file',
+SONAR_FILES = {
+    'ek80': 'a raw file of a Simrad EK80',
+    'kongsberg': 'a KMALL or .all file of a Kongsberg multibeam',
+    'xtf': 'side scan in XTF',
 }
-"""What is recognised and not read."""
+"""Binary files of sonars, by the kind of conversion."""
+PICTURES = ('.png', '.jpg', '.jpeg')
 
 
 @frozen
@@ -50,6 +50,8 @@ class Guess:
 
 def sniff(path: Path) -> Guess:
     """What a file is. Raises `BagError` with what it could be and what would settle it."""
+    if path.is_dir() and any(each.suffix.lower() in PICTURES for each in path.iterdir()):
+        return Guess('pictures', 'a folder of pictures')
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return _of_bag(path)
     try:
@@ -65,11 +67,8 @@ def sniff(path: Path) -> Guess:
         return _of_archive(path)
     if _is_segy(start):
         return Guess('segy', 'traces in SEG-Y')
-    if unread := _unread(start):
-        raise BagError(
-            f'{path} is {NO_READER[unread]}, which has no reader here; programs that read it '
-            'write its samples into a numpy archive, for sonar-imm convert snapshots'
-        )
+    if kind := _of_sonar(start):
+        return Guess(kind, SONAR_FILES[kind])
     if kind := kind_of_text(path):
         if kind == 'json':
             return Guess('autoferry', 'scans in JSON')
@@ -116,13 +115,14 @@ def _is_segy(start: bytes) -> bool:
     return 1 <= code <= 16 and any(start[3220:3222])
 
 
-def _unread(start: bytes) -> str:
+def _of_sonar(start: bytes) -> str:
+    """The kind of a binary file of a sonar; empty for another."""
     if start[4:8] in (b'XML0', b'CON0', b'FIL1'):
         return 'ek80'
     if start[4:5] == b'#' and start[5:8].isalpha() and start[5:8].isupper():
-        return 'kmall'
+        return 'kongsberg'
     if start[4:6] in (b'\x02I', b'\x02i'):
-        return 'all'
+        return 'kongsberg'
     return 'xtf' if start[0] == 123 and b'\0' in start[1:200] else ''
 
 

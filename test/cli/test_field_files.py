@@ -19,6 +19,7 @@ import itertools
 from pathlib import Path
 
 from helpers.dive_scenes import legs
+from helpers.sonar_files import ek80, side_scan
 import numpy as np
 import pytest
 
@@ -122,6 +123,60 @@ def test_from_sound_to_reflectors(tmp_path, capsys):
     parameters += ['--set', 'particles=200']
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *parameters]) == 0
     assert 'fathometer <- /pressure as pressure' in capsys.readouterr().out
+
+
+def pictures(folder):
+    """An echo on the bow that comes nearer as the vehicle goes east."""
+    image = pytest.importorskip('PIL.Image')
+    rng, rows = np.random.default_rng(2), ['file,time_utc,x,y,heading,depth']
+    folder.mkdir()
+    for k in range(30):
+        pixels = np.round(3.0 * np.sqrt(rng.exponential(size=(200, 41))))
+        pixels[150 - k, 20] = 200.0
+        image.fromarray(pixels.astype('u1')).save(folder / f'{k:02d}.png')
+        rows.append(f'{k:02d}.png,{BEGIN + 0.2 * k:.1f},{0.2 * k:.1f},0,90,3')
+    (folder / 'stamps.csv').write_text('\n'.join(rows))
+
+
+def xtf(path):
+    pytest.importorskip('pyxtf')
+    side_scan(path)
+
+
+def split_beam(path):
+    """Two halves that hear a level floor."""
+    pytest.importorskip('themachinethatgoesping')
+    rng = np.random.default_rng(4)
+    shape = (4, 400, 4)
+    noise = 0.05 * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
+    echo = rng.normal(size=shape[:2]) + 1j * rng.normal(size=shape[:2])
+    angle = np.arccos(np.clip(4.0 / np.maximum(np.arange(400) * 0.0298, 4.0), 0.0, 1.0))
+    turn = np.exp(0.5j * np.pi * np.sin(angle))[None, :, None] ** np.array([1.0, -1.0, -1.0, 1.0])
+    ek80(path, (noise + echo[..., None] * turn).astype(np.complex64))
+
+
+SONARS = {
+    'line.xtf': (xtf, [], 'obstacle'),
+    'frames': (pictures, ['--far-range', '40', '--fov', '60'], 'obstacle'),
+    'd.raw': (split_beam, ['--element-spacing', '0.0106'], 'bathymetry'),
+}
+
+
+@pytest.mark.parametrize('name', SONARS)
+def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
+    make, options, system = SONARS[name]
+    make(tmp_path / name)
+    bag, run, report = tmp_path / 'bag', tmp_path / 'run', tmp_path / 'report.html'
+    assert main(['convert', str(tmp_path / name), str(bag), *options]) == 0
+    capsys.readouterr()
+    assert main(['info', str(bag)]) == 0
+    suggested = capsys.readouterr().out.split('to track it: sonar-imm ')[1].splitlines()[0]
+    assert suggested.startswith('track') and f'--system {system}' in suggested
+    assert main(suggested.replace('OUT_DIR', str(run)).split()) == 0
+    said = capsys.readouterr().out
+    assert f'{system} <- ' in said and 'no track' not in said
+    assert main(['evaluate', str(run), '--report', str(report)]) == 0
+    assert '<html' in report.read_text().lower()
 
 
 def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):

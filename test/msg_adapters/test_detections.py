@@ -27,6 +27,7 @@ from msg_adapters.detections import (
     read_detections,
     read_detections_3d,
     read_laser_scan,
+    read_point_cloud,
     read_pose_array,
     read_sonar_detections,
     read_sonar_ranges,
@@ -240,6 +241,28 @@ def test_a_pose_array_is_read_by_its_places():
     )
     assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
     assert len(read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header()))) == 0
+
+
+def test_the_older_point_cloud_is_read_by_its_places_and_intensities():
+    def cloud(points, **channels):
+        return ros_message(
+            'sensor_msgs/msg/PointCloud',
+            header=header(),
+            points=[ros_message('geometry_msgs/msg/Point32', x=x, y=y, z=z) for x, y, z in points],
+            channels=[
+                ros_message('sensor_msgs/msg/ChannelFloat32', name=name, values=values)
+                for name, values in channels.items()
+            ],
+        )
+
+    places = [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (6.0, -8.0, 0.0)]
+    ping = read_point_cloud(cloud(places, other=[9.0, 9.0, 9.0], intensities=[1.0, 2.0, 3.0]))
+    assert ping.range.tolist() == [5.0, 10.0] and ping.intensity.tolist() == [1.0, 3.0]
+    assert ping.bearing == pytest.approx([np.arctan2(3, 4), np.arctan2(-8, 6)])
+    ping = read_point_cloud(cloud(places[:1], intensity=[1.0, 2.0]), bearing_positive='starboard')
+    assert np.isnan(ping.intensity).all() and ping.bearing[0] < 0.0
+    assert len(read_point_cloud(cloud([]))) == 0
+    assert reason(read_point_cloud, cloud([(1.0, 1.0, 0.0)] * 10_001)) == 'too_large'
 
 
 # -- vision_msgs -------------------------------------------------------------------------------

@@ -46,6 +46,11 @@ FILES = {
     'segy ': segy(b'C'),
     'hydrophones': b'RIFF\0\0\0\0WAVEfmt ',
     'hydrophones ': b'fLaC\0',
+    'ek80': b'\0\0\0\x10XML0' + bytes(100),
+    'ek80 ': b'\0\0\0\x10CON0' + bytes(100),
+    'kongsberg': b'\0\0\0\x10#IIP' + bytes(100),
+    'kongsberg ': b'\0\0\0\x10\x02I' + bytes(100),
+    'xtf': b'\x7b\x01' + bytes(1100),
 }
 
 
@@ -69,10 +74,6 @@ def test_archives(tmp_path):
     'content, wanted',
     [
         (b'', 'is empty'),
-        (b'\0\0\0\x10XML0' + bytes(100), 'EK60 or EK80'),
-        (b'\0\0\0\x10#IIP' + bytes(100), 'KMALL'),
-        (b'\0\0\0\x10\x02I' + bytes(100), '.all'),
-        (b'\x7b\x01' + bytes(1100), 'XTF'),
         (b'Zeit,Ost,Nord\n1,2,3\n', '--column stamp=HEADER'),
         (b'stamp,Rechtswert,Hochwert\n', '--column x=HEADER'),
         (bytes(range(256)) * 4, 'no text'),

@@ -36,6 +36,7 @@ from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
 from .snapshots import convert_snapshots
+from .sonar_files import convert_ek80, convert_kongsberg, convert_pictures, convert_xtf
 from .traces import convert_traces
 from .truth import convert_truth
 
@@ -43,16 +44,20 @@ __all__ = [
     'convert_arrivals',
     'convert_autoferry',
     'convert_detections',
+    'convert_ek80',
     'convert_fixes',
     'convert_hydrophones',
     'convert_images',
     'convert_interferometer',
+    'convert_kongsberg',
     'convert_nmea',
+    'convert_pictures',
     'convert_relative',
     'convert_segy',
     'convert_snapshots',
     'convert_traces',
     'convert_truth',
+    'convert_xtf',
     'ConversionReport',
     'CsvOptions',
     'KINDS',
@@ -70,6 +75,10 @@ KINDS: dict[str, Callable[..., ConversionReport]] = {
     'images': convert_images,
     'interferometer': convert_interferometer,
     'segy': convert_segy,
+    'xtf': convert_xtf,
+    'ek80': convert_ek80,
+    'kongsberg': convert_kongsberg,
+    'pictures': convert_pictures,
     'hydrophones': convert_hydrophones,
     'traces': convert_traces,
 }

@@ -26,6 +26,7 @@ import csv
 from datetime import datetime, timezone
 import json
 from pathlib import Path
+from typing import Any
 
 from attrs import frozen
 import numpy as np
@@ -175,10 +176,8 @@ def write_geojson(path: Path, picks: Picks) -> int:
             # JSON has no NaN.
             **{name: round(v, 3) if np.isfinite(v) else None for name, v in extra.items()},
         }
-        geometry = {'type': 'Point', 'coordinates': place}
-        features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
-    content = {'type': 'FeatureCollection', 'features': features}
-    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
+        features.append(feature('Point', place, properties))
+    write_features(path, features)
     return int((~there).sum())
 
 
@@ -201,6 +200,18 @@ def _projected(picks: Picks, epsg: int | None) -> tuple[FloatArray, FloatArray]:
 
 def _number(value: float, digits: int) -> str:
     return f'{value:.{digits}f}' if np.isfinite(value) else ''
+
+
+def feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    """A feature of GeoJSON; kind: of its geometry."""
+    geometry = {'type': kind, 'coordinates': coordinates}
+    return {'type': 'Feature', 'geometry': geometry, 'properties': properties}
+
+
+def write_features(path: Path, features: list[dict[str, Any]], **members: Any) -> None:
+    """Write GeoJSON (RFC 7946); members: of the collection, before its features."""
+    content = {'type': 'FeatureCollection', **members, 'features': features}
+    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
 
 
 def utc_text(stamp_ns: int) -> str:

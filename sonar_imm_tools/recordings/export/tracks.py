@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 import csv
-import json
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -35,7 +34,8 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..sources import BagError
-from .horizons import utc_text
+from .horizons import feature, utc_text, write_features
+from .points import degrees_of
 
 Degrees = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Longitude and latitude (n,) of places (n, 2) in metres."""
@@ -205,20 +205,18 @@ def _write_geojson(path: Path, tracks: Tracks, name: str) -> None:
         style = {'stroke': COLOURS[turn % len(COLOURS)], 'stroke-width': 2}
         points = [tracks.row(int(k)) for k in rows]
         if len(points) > 1:
-            line = {'type': 'LineString', 'coordinates': [_place(point) for point in points]}
             about = {
                 'track_id': number,
                 'begin_utc': points[0]['time_utc'],
                 'end_utc': points[-1]['time_utc'],
             }
-            features.append({'type': 'Feature', 'geometry': line, 'properties': about | style})
+            places = [_place(point) for point in points]
+            features.append(feature('LineString', places, about | style))
         for point in points:
-            place = {'type': 'Point', 'coordinates': _place(point)}
             about = {key: value for key, value in point.items() if key not in _PLACE}
             about |= {'marker-color': style['stroke'], 'marker-size': 'small'}
-            features.append({'type': 'Feature', 'geometry': place, 'properties': about})
-    content = {'type': 'FeatureCollection', 'name': name, 'features': features}
-    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
+            features.append(feature('Point', _place(point), about))
+    write_features(path, features, name=name)
 
 
 _PLACE = ('latitude', 'longitude', 'z')
@@ -289,3 +287,34 @@ def _write_kml(path: Path, tracks: Tracks, name: str) -> None:
 def _write_xml(path: Path, root: ElementTree.Element) -> None:
     ElementTree.indent(root, ' ')
     ElementTree.ElementTree(root).write(path, encoding='utf-8', xml_declaration=True)
+
+
+def write_obstacles(
+    path: Path,
+    landmarks: Sequence[dict[str, Any]],
+    epsg: int,
+    origin: tuple[float, float, float],
+) -> None:
+    """Points (RFC 7946), the third coordinate the height in the frame of the navigation.
+
+    landmarks: as run.json has them, see `trackers.obstacle.memory.Landmark.row`; origin: of their
+    frame in the coordinate system `epsg`. Raises `BagError`. Needs rasterio."""
+    places = np.array([[each[axis] for axis in 'xyz'] for each in landmarks]) + origin
+    longitude, latitude = degrees_of(places[:, :2], epsg)
+    features = []
+    for k, each in enumerate(landmarks):
+        std = {f'{axis}_std_m': each[f'cov_{axis}_{axis}'] ** 0.5 for axis in 'xyz'}
+        band = {f'{name}_m': each[name] + origin[2] for name in ('z_low', 'z_high')}
+        properties = {
+            'track_id': int(each['track_id']),
+            'existence': round(each['existence'], 4),
+            **{name: round(value, 3) for name, value in (std | band).items()},
+            'last_seen_utc': utc_text(int(each['seen_ns'])),
+        }
+        place = [
+            round(float(longitude[k]), 8),
+            round(float(latitude[k]), 8),
+            round(float(places[k, 2]), 3),
+        ]
+        features.append(feature('Point', place, properties))
+    write_features(path, features)

@@ -1,0 +1,299 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Files of sonars and folders of pictures as bags: what is taken, and what is said of bad ones."""
+
+import os
+import pickle
+
+from helpers.sonar_files import ek80, side_scan, xtf_head, xtf_ping
+import numpy as np
+import pytest
+
+from msg_adapters.soundings import read_ground
+from sonar_imm.measurements import Detections, Navigation, Snapshot
+from sonar_imm_tools.recordings import foreign
+from sonar_imm_tools.recordings.convert import (
+    convert_ek80,
+    convert_kongsberg,
+    convert_pictures,
+    convert_xtf,
+    sonar_files,
+)
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sniffing import sniff
+from sonar_imm_tools.recordings.sources import BagError
+
+SIDES = [('port', 'port', 'uint16'), ('stbd', 'starboard', 'uint16')]
+
+
+def read(bag, system, kind):
+    with BagReader(bag) as reader:
+        found = [item.measurement for item in measurements_of(reader, system)]
+    return [item for item in found if isinstance(item, kind)]
+
+
+def echo(at, bins=500):
+    """Noise, the same in every ping, with an echo in bin `at`; none for a negative one."""
+    row = np.round(200.0 * np.sqrt(np.random.default_rng(3).exponential(size=bins)))
+    if at >= 0:
+        row[at] = 20_000.0
+    return row.astype('u2')
+
+
+def xtf(path, pings, channels=SIDES):
+    path.write_bytes(b''.join([xtf_head(channels).to_bytes(), *pings]))
+    return path
+
+
+def some(count, **more):
+    return [xtf_ping(0.2 * k, [echo(-1), echo(300)], **more) for k in range(count)]
+
+
+class TestXtf:
+    pytestmark = [pytest.mark.filterwarnings('ignore')]
+
+    @pytest.fixture(autouse=True)
+    def _library(self):
+        pytest.importorskip('pyxtf')
+
+    def test_echoes_of_a_side_navigation_and_altitude(self, tmp_path):
+        report = convert_xtf(side_scan(tmp_path / 'a.xtf'), tmp_path / 'bag')
+        assert report.messages == {'/detections': 60, '/nav': 60, '/altitude': 60}
+        assert report.notes['samples'].startswith('magnitude only')
+        pings = read(tmp_path / 'bag', 'obstacle', Detections)
+        seen = np.array([len(ping) for ping in pings])
+        assert seen.sum() >= 9 and not seen[:20].any() and not seen[40:].any()
+        found = pings[30]
+        assert found.range == pytest.approx([30.05], abs=0.06) and found.bearing[0] == 0.0
+        nav = read(tmp_path / 'bag', 'obstacle', Navigation)[-1]
+        # 60 pings at 0.2 s and 0.5 m/s, heading east, 5 m deep
+        assert nav.position == pytest.approx([5.9, 0.0, -5.0], abs=0.05)
+        assert nav.orientation == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-9)
+        assert pings[0].stamp_ns == 1_717_149_600 * 10**9
+
+    @pytest.mark.parametrize('order, at', [('far', 199), ('near', 300)])
+    def test_the_order_of_port_samples(self, tmp_path, order, at):
+        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(300), echo(-1)])])
+        convert_xtf(path, tmp_path / 'bag', side='port', port_samples=order)
+        (ping,) = read(tmp_path / 'bag', 'obstacle', Detections)
+        assert ping.range == pytest.approx([(at + 0.5) * 0.1], abs=0.06)
+
+    def test_a_channel_of_phases_makes_snapshots(self, tmp_path):
+        channels = [('amplitude', 'starboard', 'uint16'), ('phase 1', 'starboard', 'float32')]
+        turn = np.linspace(-3.0, 3.0, 500).astype('f4')
+        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [echo(-1), turn])], channels)
+        report = convert_xtf(path, tmp_path / 'bag', element_spacing=0.0017)
+        assert report.notes['samples'] == 'amplitudes and phases'
+        (snapshot,) = read(tmp_path / 'bag', 'bathymetry', Snapshot)
+        loud = np.abs(snapshot.iq[:, 0]) > 0.0
+        angle = np.angle(snapshot.iq[:, 1] * snapshot.iq[:, 0].conj())
+        assert angle[loud] == pytest.approx(turn[loud], abs=1e-5)
+        assert np.abs(snapshot.iq[:, 0]) == pytest.approx(echo(-1))
+        assert snapshot.side == 'starboard' and snapshot.staves == 2
+        assert snapshot.range[0] == pytest.approx(0.05) and snapshot.frequency == 450e3
+
+    def test_what_came_before_the_damage_is_kept(self, tmp_path):
+        whole = xtf(tmp_path / 'a.xtf', some(5)).read_bytes()
+        (tmp_path / 'cut.xtf').write_bytes(whole[:-900])
+        report = convert_xtf(tmp_path / 'cut.xtf', tmp_path / 'bag')
+        assert report.messages['/detections'] == 4
+        assert 'gives up' in report.problems[0] and 'kept' in report.problems[0]
+
+    def test_a_packet_without_a_length_ends_the_file(self, tmp_path):
+        pings = some(3)
+        pings[2] = pings[2][:10] + bytes(4) + pings[2][14:]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
+        assert report.messages['/detections'] == 2 and len(report.problems) == 1
+
+    @pytest.mark.parametrize(
+        'content, wanted',
+        [
+            (b'', 'ended|gives up|shorter'),
+            (b'\x7b' + bytes(100), 'gives up'),
+            (b'\x7a' + bytes(2000), 'version of the file is 122'),
+            (b'\x7b' + bytes(1023), 'holds no ping'),
+        ],
+    )
+    def test_nothing_of_use_is_one_sentence(self, tmp_path, content, wanted):
+        (tmp_path / 'a.xtf').write_bytes(content)
+        with pytest.raises(BagError, match=wanted) as caught:
+            convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag')
+        assert '\n' not in str(caught.value) and not (tmp_path / 'bag').exists()
+
+    def test_positions_at_zero_are_none_and_are_counted(self, tmp_path):
+        pings = [*some(3, place=(0.0, 0.0)), xtf_ping(0.8, [echo(-1), echo(300)])]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
+        assert report.messages['/nav'] == 1 and report.messages['/detections'] == 4
+        assert any('3 pings have no position' in problem for problem in report.problems)
+
+    def test_a_clock_that_is_off_once_and_one_that_was_set(self, tmp_path):
+        seconds = [0.0, 0.2, 1e8, 0.4, 0.6, 7200.0, 7200.2, 7200.4]
+        pings = [xtf_ping(second, [echo(-1), echo(300)]) for second in seconds]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
+        assert report.messages['/detections'] == 7 and report.reasons == {'clock off': 1}
+        assert any('jumps by 7199.4 s and stays' in problem for problem in report.problems)
+
+    def test_a_ping_without_a_time_is_counted(self, tmp_path):
+        pings = [*some(2), xtf_ping(0.4, [echo(-1), echo(3)], Month=13)]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
+        assert report.reasons == {'no time': 1} and report.messages['/detections'] == 2
+
+    def test_an_index_beside_the_file_is_not_unpickled(self, tmp_path):
+        class Trap:
+            def __reduce__(self):
+                return os.mkdir, (str(tmp_path / 'sprung'),)
+
+        path = xtf(tmp_path / 'a.xtf', some(2))
+        (tmp_path / 'a.pyxtf_idx').write_bytes(pickle.dumps(Trap()))
+        assert convert_xtf(path, tmp_path / 'bag').messages['/detections'] == 2
+        assert not (tmp_path / 'sprung').exists()
+
+    def test_a_reader_that_hangs_is_stopped(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(foreign, 'SILENCE', 3.0)
+        os.mkfifo(tmp_path / 'a.xtf')
+        with pytest.raises(BagError, match='stopped after 3 s'):
+            convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag')
+
+    def test_a_reader_that_wants_too_much_memory_is_stopped(self, tmp_path):
+        """A packet that states 3 GB, in a file that has them."""
+        pings = some(2)
+        huge = bytearray(pings[0][:14])
+        huge[2], huge[10:14] = 200, (3 << 30).to_bytes(4, 'little')
+        path = xtf(tmp_path / 'a.xtf', [*pings, bytes(huge)])
+        os.truncate(path, path.stat().st_size + (3 << 30))
+        report = convert_xtf(path, tmp_path / 'bag')
+        assert report.messages['/detections'] == 2
+        assert 'needs more than 1024 MB' in report.problems[0]
+
+
+def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
+    for name in ('pyxtf', 'themachinethatgoesping'):
+        (tmp_path / f'{name}.py').write_text('raise ImportError("not here")')
+    (tmp_path / 'a').write_bytes(b'\x7b' + bytes(2000))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(BagError, match=r'a needs pyxtf: .*sonar_imm\[xtf\]'):
+        convert_xtf(tmp_path / 'a', tmp_path / 'bag')
+    for convert in (convert_ek80, convert_kongsberg):
+        with pytest.raises(BagError, match=r'sonar_imm\[echosounders\]'):
+            convert(tmp_path / 'a', tmp_path / 'bag')
+
+
+class TestEk80:
+    @pytest.fixture(autouse=True)
+    def _library(self):
+        pytest.importorskip('themachinethatgoesping')
+
+    @pytest.fixture
+    def samples(self):
+        rng = np.random.default_rng(1)
+        return rng.normal(size=(3, 200, 4)) + 1j * rng.normal(size=(3, 200, 4))
+
+    def test_halves_of_a_split_beam(self, tmp_path, samples):
+        report = convert_ek80(ek80(tmp_path / 'a.raw', samples), tmp_path / 'bag')
+        assert report.messages == {'/nav': 3, '/snapshot': 3}
+        snapshots = read(tmp_path / 'bag', 'bathymetry', Snapshot)
+        halves = np.stack([samples[..., [0, 3]].sum(-1), samples[..., [1, 2]].sum(-1)], -1)
+        for snapshot, iq in zip(snapshots, halves):
+            assert snapshot.iq == pytest.approx(iq[1:], rel=1e-5, abs=1e-5)
+        first = snapshots[0]
+        assert (first.sound_speed, first.frequency) == pytest.approx((1490.0, 70e3))
+        assert first.range[99] == pytest.approx(100 * 0.5 * 1490.0 * 4e-5, rel=1e-5)
+        assert snapshots[1].stamp_ns - first.stamp_ns == pytest.approx(2e8, abs=1e4)
+
+    def test_all_four_sectors_on_demand(self, tmp_path, samples):
+        path = ek80(tmp_path / 'a.raw', samples)
+        convert_ek80(path, tmp_path / 'bag', staves=[[0], [1], [2], [3]])
+        assert read(tmp_path / 'bag', 'bathymetry', Snapshot)[0].staves == 4
+
+    def test_chirps_and_other_channels_are_said(self, tmp_path, samples):
+        with pytest.raises(BagError, match='it is a chirp'):
+            convert_ek80(ek80(tmp_path / 'a.raw', samples, chirp=True), tmp_path / 'bag')
+        with pytest.raises(BagError, match='no ping that could be converted'):
+            convert_ek80(ek80(tmp_path / 'b.raw', samples), tmp_path / 'bag', channel='ES38')
+
+    def test_what_came_before_the_cut_is_kept(self, tmp_path, samples):
+        path = ek80(tmp_path / 'a.raw', samples)
+        path.write_bytes(path.read_bytes()[:-500])
+        assert convert_ek80(path, tmp_path / 'bag').messages['/snapshot'] == 2
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Pictures of 100 ranges by 41 beams, an echo ahead that comes nearer."""
+    image = pytest.importorskip('PIL.Image')
+    inside, rows = tmp_path / 'frames', ['file,time_utc,x,y,heading,depth']
+    inside.mkdir()
+    rng = np.random.default_rng(2)
+    for k in range(6):
+        pixels = np.round(3.0 * np.sqrt(rng.exponential(size=(100, 41))))
+        pixels[60 - k, 5] = 200.0
+        image.fromarray(pixels.astype('u1')).save(inside / f'{k}.png')
+        rows.append(f'{k}.png,{1_717_149_600 + k},{0.4 * k},0,90,3')
+    (inside / 'stamps.csv').write_text('\n'.join(rows))
+    return inside
+
+
+def test_a_folder_of_pictures(tmp_path, folder):
+    assert sniff(folder).kind == 'pictures'
+    report = convert_pictures(folder, tmp_path / 'bag', far_range=40.0, fov=82.0)
+    assert report.messages == {'/detections': 6, '/nav': 6}
+    pings = read(tmp_path / 'bag', 'obstacle', Detections)
+    assert [ping.range[0] for ping in pings] == pytest.approx(0.4 * (60.5 - np.arange(6)), abs=0.2)
+    assert pings[0].bearing[0] == pytest.approx(np.radians(30.0), abs=0.02)
+    nav = read(tmp_path / 'bag', 'obstacle', Navigation)[5]
+    assert nav.position == pytest.approx([2.0, 0.0, -3.0])
+
+
+def test_pictures_that_cannot_be_used_are_counted(tmp_path, folder):
+    (folder / '1.png').write_bytes(b'no picture')
+    (folder / '2.png').unlink()
+    text = (folder / 'stamps.csv').read_text()
+    (folder / 'stamps.csv').write_text(text.replace('3.png', '../../etc/passwd'))
+    report = convert_pictures(folder, tmp_path / 'bag', far_range=40.0, fov=82.0)
+    assert report.messages['/detections'] == 3 and report.reasons == {'no picture': 3}
+    assert 'outside of the folder' in ' '.join(report.problems)
+    with pytest.raises(BagError, match='--far-range and --fov'):
+        convert_pictures(folder, tmp_path / 'none')
+    (folder / 'other.csv').write_text('file\n')
+    with pytest.raises(BagError, match='2 CSV files; name the one'):
+        convert_pictures(folder, tmp_path / 'none')
+
+
+def test_soundings_of_a_multibeam_lie_beside_the_ship(tmp_path, monkeypatch):
+    """Heading east: forward is east, starboard south. The reader itself is not in this test."""
+    (tmp_path / 'a.kmall').write_bytes(b'\0\0\0\x10#IIP')
+    ping = {
+        'kind': 'ping',
+        'units': 'degrees',
+        'heading': 90.0,
+        'pitch': 0.0,
+        'roll': 0.0,
+        'depth': 1.0,
+        'altitude': float('nan'),
+        'soundings': np.array([[2.0, 10.0, 20.0], [np.nan, 0.0, 0.0]]),
+    }
+    lost = {'soundings': None, 'place': (10.0, 54.0)}
+    records = [
+        {**ping, 'stamp_ns': 1_717_149_600 * 10**9, 'place': (10.0, 54.0)},
+        {**ping, 'stamp_ns': 1_717_149_601 * 10**9, 'place': (0.0, 0.0)},
+        {**ping, 'stamp_ns': 1_717_149_602 * 10**9, **lost},
+    ]
+    monkeypatch.setattr(sonar_files, 'read_apart', lambda reader, path: iter(records))
+    report = convert_kongsberg(tmp_path / 'a.kmall', tmp_path / 'bag')
+    assert report.messages == {'/nav': 1, '/ground': 1} and report.bad_rows == 2
+    with BagReader(tmp_path / 'bag') as bag:
+        (found,) = [read_ground(item.message) for item in bag.messages(['/ground'])]
+    assert found.position == pytest.approx(np.array([[2.0, -10.0, -21.0]]), abs=1e-6)
