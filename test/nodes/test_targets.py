@@ -252,3 +252,13 @@ def test_a_node_sends_its_divers_to_a_plotter(make_bench, plotter):
     assert not node.work_report()['warnings']
     node.release()
     assert [s.data[-2] for s in heard(plotter)][-1:] == ['L']
+
+
+def test_a_type_that_is_not_installed_is_a_sentence(make_bench):
+    name = 'marine_interfaces/msg/Contact'
+    try:
+        message_class(name)
+    except ImportError:
+        bench = make_bench('-p', f'also_publish:=[{name}]')
+        with pytest.raises(ConfigError, match=f"^parameter 'also_publish': .*{name} is not"):
+            DiverNode(context=bench.context)
