@@ -51,17 +51,17 @@ from sonar_imm_tools.simulation.obstacle.simulator import (
     TrueObstacle,
 )
 
-CASES: dict[str, dict[str, Any]] = {
-    'float, 3 m below': {},
-    'float, over the beam': {'vertical_offset': 0.0, 'offset_spread': 5.5},
-    'point of 18 dB, 3 m below': {'target': 'point', 'target_snr_db': 18.0},
-    'point of 18 dB, over the beam': {
-        'target': 'point',
-        'target_snr_db': 18.0,
-        'vertical_offset': 0.0,
-        'offset_spread': 5.5,
-    },
+_POINT = {'target': 'point', 'target_snr_db': 18.0}
+_OVER_THE_BEAM = {'vertical_offset': 0.0, 'offset_spread': 5.5}
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    'float, 3 m below': ('images', {}),
+    'float, over the beam': ('images', _OVER_THE_BEAM),
+    'point of 18 dB, 3 m below': ('images', _POINT),
+    'point of 18 dB, over the beam': ('images', {**_POINT, **_OVER_THE_BEAM}),
+    'chain, rough sea floor': ('rough_chain', {}),
+    'wreck on a rough sea floor': ('rough_wreck', {}),
 }
+"""Scene, and what differs from it."""
 NUMBERS = ('range', 'bearing', 'offset')
 
 
@@ -131,10 +131,10 @@ def main(
     centre: Sequence[float] = (bodies.CENTRE,),
 ) -> Parts:
     yield {'first seed': first}
-    for name, changes in CASES.items():
+    for name, (kind, changes) in CASES.items():
         if not any(part in name for part in cases):
             continue
-        setting = scenario('images', changes)
+        setting = scenario(kind, changes)
         rows: dict[float, list[dict[str, float]]] = {share: [] for share in centre}
         for seed in range(first, first + runs):
             scene = simulate(setting, seed)

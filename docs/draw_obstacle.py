@@ -17,6 +17,8 @@
 obstacle_offset.png   the offset while the range closes, and the deferred estimate
 obstacle_paper.png    the paper's Figures 3, 4 and 5 from our scenes; the distributions are those
                       of docs/results/obstacle_section5.json (benchmarks.obstacle_section5)
+obstacle_fig3.png     Figure 3 with the panels and the altitude of the paper
+obstacle_fig4.png     Figure 4 with the diagram of the obstacle and its image
 
 Needs matplotlib, which nothing else here does. Run it from the project root.
 """
@@ -26,6 +28,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import sys
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -38,14 +41,15 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
-from benchmarks.obstacle_section5 import echoes, encounter, OFFSETS, read  # noqa: E402
+from benchmarks.obstacle_section5 import echoes, encounter, EXACT, OFFSETS, read  # noqa: E402
+from benchmarks.study import truths  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
 from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
@@ -63,6 +67,8 @@ def main() -> None:
     draw_curves(axes[2])
     figure.savefig(OUT / 'obstacle_offset.png', dpi=130)
     draw_paper()
+    draw_figure_3()
+    draw_figure_4()
 
 
 def draw_paper() -> None:
@@ -79,7 +85,7 @@ def draw_band(ax: Axes, name: str, title: str) -> None:
     """What is known of the offset while the range closes."""
     setting = scenario(name)
     scene = simulate(setting, SEED)
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     rows = []
     for stamp, estimate in sorted(track(scene, config_of(setting)).items()):
         ping = int(np.flatnonzero(truth.stamp_ns == stamp)[0])
@@ -145,7 +151,7 @@ def draw_sphere(above: Axes, below: Axes) -> None:
     floor = setting.depth + setting.altitude
     estimated = floor - poses.position[0, 2] - found.best
     above.axhline(estimated, color=BLUE, label='sphere, by the deferred estimate')
-    true = floor + scene.truth[0].position[0, 2]
+    true = floor + truths(scene, TrueObstacle)[0].position[0, 2]
     above.axhline(true, color=BLUE, ls='--', lw=1, label='sphere, true')
     above.set(title='Figure 3: a moored sphere', xlabel='ping', ylabel='above the sea floor, m')
     above.legend(frameon=False, loc='lower left')
@@ -155,7 +161,7 @@ def draw_sphere(above: Axes, below: Axes) -> None:
         (found.best, BLUE, f'predicted, {found.best:.1f} m below'),
         (setting.altitude, RED, 'predicted, on the sea floor'),
     ):
-        m = geometry.to_world(first, geometry.reconstruct(*z[0], offset, first.R))
+        m = geometry.to_world(first, geometry.reconstruct(z[0, 0], z[0, 1], offset, first.R))
         _, azimuth = geometry.project(geometry.to_body(poses, m))
         below.plot(ping, np.degrees(azimuth), color=colour, label=label)
     below.plot(ping, np.degrees(z[:, 1]), '.', color=INK, ms=3, label='measured')
@@ -168,7 +174,7 @@ def draw_image(above: Axes, below: Axes) -> None:
     what the detector finds in it, and what it finds in a whole approach."""
     setting, scene = encounter('large', {}, SEED)
     _, poses = echoes(setting, scene)
-    middle = geometry.flip_world(scene.truth[0].position[0])
+    middle = geometry.flip_world(truths(scene, TrueObstacle)[0].position[0])
     course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
     across = np.array([-np.sin(course), np.cos(course), 0.0])
     floats = [middle + side * across - [0.0, 0.0, 4.0] for side in (-5.0, 0.0, 5.0)]
@@ -208,7 +214,7 @@ def draw_image(above: Axes, below: Axes) -> None:
     below.text(-24.0, 41.5, 'detections of every fourth ping')
 
 
-def show(ax: Axes, found: np.ndarray, marker: str, **style: object) -> None:
+def show(ax: Axes, found: np.ndarray, marker: str, **style: Any) -> None:
     """Draw detections (n, 2), range and azimuth to starboard, as seen from above."""
     d, azimuth = found.T
     ax.plot(d * np.sin(azimuth), d * np.cos(azimuth), marker, color=RED, **style)
@@ -250,6 +256,148 @@ def draw_readings(above: Axes, below: Axes) -> None:
         xlabel='deferred estimate, m',
     )
     below.invert_yaxis()
+
+
+MOORED = {'altitude': 15.5}
+"""Figure 3: the vehicle swims 15.5 m above the sea floor, the sphere is on a tether of 15 m."""
+MOORED_SEED = 196
+"""Of 200 encounters the one whose estimates, by eye and by the detector, are nearest to the truth,
+as the paper's were; what they are elsewhere is in the results of section 5."""
+
+
+def draw_figure_3() -> None:
+    """Figure 3 as printed: RMSD against the offset and altitude by ping above, and below the
+    points that are predicted for the estimate beside those measured."""
+    setting, scene = encounter('sphere', MOORED, MOORED_SEED)
+    exact, poses = echoes(setting, scene)
+    figure, panels = plt.subplot_mosaic(
+        [['curve', 'altitude'], ['points', 'points']], figsize=(9.0, 7.0), layout='constrained'
+    )
+    for name, colour in (('by eye', BLUE), ('detector', RED)):
+        found = deferred(
+            read(exact, name, MOORED_SEED), poses, config_of(setting), offsets=OFFSETS
+        )
+        label = f'{name}: {found.best:.2f} m'
+        panels['curve'].plot(found.offset, found.rmsd, color=colour, label=label)
+        panels['curve'].plot(found.best, found.least, 'o', color=colour)
+    panels['curve'].axvline(
+        setting.vertical_offset, color=INK, ls='--', lw=1, label='truth: 0.5 m'
+    )
+    panels['curve'].set(
+        xlabel='offset tried, m below the sonar', ylabel='RMSD, pixels', xlim=(-0.4, 10.0)
+    )
+    panels['curve'].set_ylim(0.0, 12.0)
+    panels['curve'].legend(frameon=False, loc='upper center')
+    heights = [item.measurement for item in scene.measurements]
+    altitude = [item.altitude for item in heights if isinstance(item, Altitude)][: len(exact)]
+    panels['altitude'].plot(altitude, color=INK, lw=1)
+    panels['altitude'].set(xlabel='ping', ylabel='altitude of the sonar, m', ylim=(0.0, 20.0))
+    z = read(exact, 'detector', MOORED_SEED)
+    offset = deferred(z, poses, config_of(setting), offsets=OFFSETS).best
+    first = Pose(poses.position[0], poses.R[0])
+    m = geometry.to_world(first, geometry.reconstruct(z[0, 0], z[0, 1], offset, first.R))
+    predicted = np.column_stack(geometry.project(geometry.to_body(poses, m)))
+    for each, marker, colour, label in (
+        (z, '.', BLUE, 'measured by the detector'),
+        (predicted, '+', GREEN, f'predicted from the first echo, {offset:.1f} m below the sonar'),
+    ):
+        panels['points'].plot(
+            np.degrees(each[:, 1]), each[:, 0], marker, color=colour, ms=5, label=label
+        )
+    panels['points'].set(xlabel='azimuth, deg to starboard', ylabel='range, m')
+    panels['points'].legend(frameon=False)
+    figure.savefig(OUT / 'obstacle_fig3.png', dpi=130)
+
+
+FLOATS = (-5.0, 0.0, 5.0)
+"""Figure 4: m to starboard of the middle of the obstacle."""
+TOP, BAR = 4.0, 13.0
+"""Depth of floats and bar below the sonar, m."""
+
+
+def large_obstacle(rng: np.random.Generator) -> np.ndarray:
+    """Glints (n, 2) of three floats, their chains and a bar: m across, and m below the sonar."""
+    ball = rng.normal(size=(8, 2))
+    ball *= 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
+    parts = [[side, TOP] + ball for side in FLOATS]
+    links = np.arange(TOP + 1.0, BAR, 0.75)
+    parts += [np.column_stack([np.full(len(links), side), links]) for side in FLOATS]
+    along = np.arange(FLOATS[0], FLOATS[-1] + 0.1, 0.4)
+    parts.append(np.column_stack([along, np.full(len(along), BAR)]))
+    return np.concatenate(parts)
+
+
+def draw_figure_4() -> None:
+    """Figure 4 as printed: a diagram of the large obstacle, and its image."""
+    setting, scene = encounter('large', {}, SEED)
+    _, poses = echoes(setting, scene)
+    glints = large_obstacle(np.random.default_rng(SEED))
+    middle = geometry.flip_world(truths(scene, TrueObstacle)[0].position[0])
+    course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
+    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    ping = 40
+    pose = Pose(poses.position[ping], poses.R[ping])
+    level = np.array([middle[0], middle[1], pose.position[2]])
+    places = [level + side * across + [0.0, 0.0, down] for side, down in glints]
+    looks = scenario(
+        'images',
+        {
+            'target_fading': 'rayleigh',
+            'target_snr_db': 18.0,
+            'max_range': 100.0,
+            'image_beams': 256,
+            'image_bins': 600,
+            'vertical_fov_deg': EXACT['vertical_fov_deg'],
+        },
+    )
+    sonar = ImageSonar(looks, np.random.default_rng(SEED))
+    pixels = sonar.image(pose, places, 1.0)
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(7.0, 9.0), layout='constrained', height_ratios=(1.0, 1.3)
+    )
+    above.plot(FLOATS, np.full(len(FLOATS), TOP), 'o', ms=16, color='#E69F00', label='floats')
+    for number, side in enumerate(FLOATS):
+        label = 'chains' if number == 0 else None
+        above.plot([side, side], [TOP, BAR], color=INK, ls=(0, (1, 1)), lw=2.5, label=label)
+    above.plot([FLOATS[0], FLOATS[-1]], [BAR, BAR], color=RED, lw=5, label='bar')
+    above.axhline(0.0, color=BLUE, ls='--', lw=1)
+    above.text(-9.0, -0.3, 'depth of the sonar', color=BLUE)
+    above.set(xlim=(-11.0, 11.0), ylim=(16.0, -2.0), aspect='equal')
+    above.set(
+        xlabel='m to starboard', ylabel='m below the sonar', title='the obstacle, from ahead'
+    )
+    above.legend(frameon=False, loc='center right')
+    d, azimuth = sonar.range[:, None], -sonar.bearing
+    below.pcolormesh(
+        d * np.sin(azimuth), d * np.cos(azimuth), np.sqrt(pixels), cmap='Greys', rasterized=True
+    )
+    image = SonarImage(
+        stamp_ns=1, range=sonar.range, bearing=sonar.bearing, amplitude=pixels.astype(float)
+    )
+    rules = DetectorConfig.from_mapping(looks.feeder_instruments(), ignore_unknown=True)
+    echo = detect(image, rules)
+    show(below, np.column_stack([echo.range, -echo.bearing]), 'o', mfc='none', ms=12)
+    # Where the parts lie in the image: as far as they are, whatever their depth.
+    m = geometry.to_body(pose, np.array(places))
+    distance, turned = geometry.project(m)
+    x, y = distance * np.sin(turned), distance * np.cos(turned)
+    below.set(xlim=(x.mean() - 11.0, x.mean() + 11.0), ylim=(y.min() - 5.0, y.max() + 6.0))
+    marks = {'float': [*range(4, 4 + 8 * len(FLOATS), 8)], 'bar': [len(glints) - 8]}
+    for name, rows in marks.items():
+        side = -1.0 if name == 'float' else 1.0
+        for row in rows:
+            below.annotate(
+                name,
+                (x[row], y[row] + 0.6 * side),
+                xytext=(0, 30 * side),
+                textcoords='offset points',
+                ha='center',
+                color=BLUE,
+                arrowprops={'arrowstyle': '-', 'color': BLUE, 'lw': 0.8},
+            )
+    below.set(xlabel='m to starboard', ylabel='m ahead', aspect='equal')
+    below.set_title('in the image; circled: what the detector finds')
+    figure.savefig(OUT / 'obstacle_fig4.png', dpi=130)
 
 
 if __name__ == '__main__':

@@ -20,10 +20,10 @@ pulse: white noise passed through both. Its mean power is ``1 + reverberation (1
 where the sea floor is in the beam, that of patches of gamma distributed power (K distribution).
 The patches lie in the world, so the same rough spot comes back in ping after ping.
 
-Obstacles are points: the pattern of a beam with sidelobes times the envelope of the pulse. A chain
-or a float is a group of them with amplitudes drawn anew in every ping, since between two pings its
-glints move by many wavelengths against each other. All are seen through the vertical pattern of
-the sonar, out and back.
+Obstacles are points: the pattern of a beam with sidelobes times the envelope of the pulse. A
+chain, a float or the outline of a wreck is a group of them with amplitudes drawn anew in every
+ping, since between two pings its glints move by many wavelengths against each other. All are seen
+through the vertical pattern of the sonar, out and back.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ from .scenario import ObstacleScenario
 
 _TEXTURE = 256
 """Patches of the sea floor along each axis before they repeat."""
-_GLINTS = {'point': 1, 'chain': 60, 'float': 10}
+_GLINTS = {'point': 1, 'chain': 60, 'float': 10, 'wreck': 80}
+_HULL = np.array([[0.5, 0.0], [0.2, 0.12], [-0.5, 0.12], [-0.5, -0.12], [0.2, -0.12], [0.5, 0.0]])
+"""Corners of the outline of a wreck, along it and across, in lengths: bow ahead, stern flat."""
 _FAR_SIDELOBES = 6.0
 """Sidelobes farther than this many beam widths from the beam are left out of speckle."""
 
@@ -51,7 +53,7 @@ class ImageSonar:
     """Makes the images of one scene; every call of `image` draws from the same generator.
 
     range (R,) m: centres of the bins; bearing (B,) rad, positive to port, port first; heading:
-    rad from north of the line of a chain.
+    rad from north of the line of a chain or a wreck.
     """
 
     def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
@@ -137,7 +139,7 @@ class ImageSonar:
             fading = np.sqrt(self._rng.exponential(size=n))
         # The power of a group is that of all its glints where one beam holds them all.
         amplitude = phase * fading * np.sqrt(power / (n if config.target == 'float' else 1))
-        if config.target == 'chain':
+        if config.target in ('chain', 'wreck'):
             amplitude *= np.sqrt(self._share_of_a_beam(float(centre)))
         along = self._pulse(self.range[:, None] - d * sound)
         across = self._beam(self.bearing + azimuth[:, None])
@@ -150,12 +152,21 @@ class ImageSonar:
         if self.config.target == 'chain':
             line = np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
             return self._chain[:, None] * line
+        if self.config.target == 'wreck':
+            sine, cosine = np.sin(self.heading), np.cos(self.heading)
+            turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+            outline = _along(_HULL, _GLINTS['wreck'])
+            outline = self.config.target_size * (outline - outline.mean(axis=0))
+            return np.column_stack([outline, np.zeros(len(outline))]) @ turn.T
         return np.zeros((1, 3))
 
     def _share_of_a_beam(self, distance: float) -> float:
-        """Share of a chain's glints that fall into one beam and pulse, one at least."""
+        """Share of the glints of a line that fall into one beam and pulse, one at least."""
         inside = max(distance * np.radians(self.config.beam_width_deg), self.config.pulse_length)
-        glints = _GLINTS['chain'] * min(1.0, inside / max(self.config.target_size, 1e-9))
+        length = max(self.config.target_size, 1e-9)
+        if self.config.target == 'wreck':
+            length *= np.linalg.norm(np.diff(_HULL, axis=0), axis=1).sum()
+        glints = _GLINTS[self.config.target] * min(1.0, inside / length)
         return 1.0 / max(1.0, glints)
 
     def _pulse(self, off: FloatArray) -> FloatArray:
@@ -220,6 +231,13 @@ class _BeamPattern:
     def __call__(self, off: FloatArray) -> FloatArray:
         phase = 2.0 * np.pi * self._scale * np.multiply.outer(off, self._place)
         return np.cos(phase) @ self._weight / self._weight.sum()
+
+
+def _along(corners: FloatArray, count: int) -> FloatArray:
+    """Points (count, 2) evenly along the line through corners (n, 2)."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at = (np.arange(count) + 0.5) * (way[-1] / count)
+    return np.column_stack([np.interp(at, way, corners[:, i]) for i in range(2)])
 
 
 def _unit(pattern: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario
 
-TARGETS = ('point', 'chain', 'float')
+TARGETS = ('point', 'chain', 'float', 'wreck')
 FADINGS = ('steady', 'rayleigh')
 
 
@@ -49,10 +49,10 @@ class ImageScenario(Scenario):
     pulse_length: float = parameter(0.3, 'm',
         '-3 dB width of the echo of a point in range', range=(0.001, 10.0))
     target: str = parameter('point', '',
-        'what obstacles are: a point, a chain of 60 glints along a level line, or a float of 10 '
-        'glints', choices=TARGETS)
+        'what obstacles are: a point, a chain of 60 glints along a level line, a float of 10 '
+        'glints, or the outline of a wreck of 80 glints', choices=TARGETS)
     target_size: float = parameter(6.0, 'm',
-        'length of a chain or diameter of a float', range=(0.0, 100.0))
+        'length of a chain or wreck, or diameter of a float', range=(0.0, 100.0))
     target_snr_db: float = parameter(18.0, 'dB',
         'peak power of an echo on the axis of the sonar over the mean power around it',
         range=(-20.0, 80.0))
@@ -271,6 +271,18 @@ _FIELD = {
     'random_course': True,
     'passing_distance': 12.0,
 }
+_IMAGES = {
+    'images': True,
+    'image_beams': 128,
+    'image_bins': 330,
+    'max_range': 55.0,
+    'first_range': 52.0,
+    'last_range': 12.0,
+    'altitude': 6.0,
+    'roll_rms_deg': 3.0,
+    'target_snr_db': 26.0,
+}
+_ROUGH = {'seabed_shape': 1.5}
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'approach': ('an obstacle 3 m below the sonar', {}),
@@ -360,18 +372,21 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     'images': (
         'an obstacle 3 m below in images of a small sonar, over a sea floor',
+        {**_IMAGES, 'target': 'float', 'target_size': 0.5},
+    ),
+    'rough_chain': (
+        'a chain of 6 m in images over a rough sea floor',
+        {**_IMAGES, **_ROUGH, 'target': 'chain', 'target_size': 6.0},
+    ),
+    'rough_wreck': (
+        'the outline of a wreck of 12 m in images of a rough sea floor, on which it lies',
         {
-            'images': True,
-            'image_beams': 128,
-            'image_bins': 330,
-            'max_range': 55.0,
-            'first_range': 52.0,
-            'last_range': 12.0,
-            'altitude': 6.0,
-            'roll_rms_deg': 3.0,
-            'target': 'float',
-            'target_size': 0.5,
-            'target_snr_db': 26.0,
+            **_IMAGES,
+            **_ROUGH,
+            'target': 'wreck',
+            'target_size': 12.0,
+            'placement': 'seabed',
+            'altitude': 2.5,
         },
     ),
     'late': (

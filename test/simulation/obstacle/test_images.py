@@ -125,6 +125,22 @@ def test_a_fading_point_is_rayleigh_and_glints_wander():
     assert np.std(centres) > 0.005
 
 
+def test_a_wreck_is_the_outline_of_a_hull():
+    small = {**NOWHERE, 'image_bins': 240, 'image_beams': 128, 'horizontal_fov_deg': 22.5}
+    wreck = {'target': 'wreck', 'target_size': 12.0, 'target_snr_db': 30.0}
+    one = sonar(**{**small, **wreck, 'image_gain': 4.0})
+    one.heading = 0.0  # bow away from the sonar
+    power = powers(one, 12, [np.array([40.0, 0.0, 20.0])])
+    row = np.searchsorted(one.range, 40.0)
+    beams = [np.argmin(np.abs(one.bearing - side / 40.0)) for side in (-1.44, 0.0, 1.44)]
+    port, inside, starboard = power[row - 2 : row + 3][:, beams].mean(axis=0)
+    assert min(port, starboard) > 4.0 * inside
+    # As long as asked for: 7 m from the middle, beyond bow and stern, there is nothing.
+    along = power.max(axis=1)
+    near, far = (np.abs(one.range - 40.0) < limit for limit in (5.0, 7.0))
+    assert along[near].min() > 3.0 * along[~far].max()
+
+
 def test_the_sea_floor_is_patchy_and_its_patches_stay_in_the_world():
     values = {**NOWHERE, 'altitude': 6.0, 'seabed_shape': 0.5, 'image_gain': 8.0}
     one = sonar(**values)
