@@ -15,6 +15,7 @@
 """Messages of other packages between real nodes, with types that colcon builds for this test."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -36,11 +37,12 @@ pytestmark = [
 
 def test_nodes_hear_and_send_the_types_of_others(tmp_path, request):
     interfaces.write_sources(tmp_path, OTHERS)
-    environment = interfaces.build(tmp_path)
+    environment, root = interfaces.build(tmp_path), request.config.rootpath
+    environment['PYTHONPATH'] += f'{os.pathsep}{root / "test"}'
     with reserved_domain_id() as domain:
         done = subprocess.run(
             [sys.executable, '-m', 'helpers.neighbours_live'],
-            cwd=request.config.rootpath / 'test',
+            cwd=root,
             env=environment | {'ROS_DOMAIN_ID': str(domain), 'ROS_PYTHON_CHECK_FIELDS': '1'},
             capture_output=True,
             text=True,
