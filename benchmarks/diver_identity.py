@@ -14,7 +14,7 @@
 
 """Whose track is whose: three ways to pair fixes and divers on the same scans.
 
-    python -m benchmarks.diver_identity --runs 3 --out docs/results/diver_identity.json
+    python -m benchmarks.diver_identity --out docs/results/diver_identity.json
 
 `buddies` (see `diver_named`): two divers 2 m apart, a scan per second, .5 m on each axis, P_D .9,
 two false fixes in a square of 120 m; from the 20th second on the transponder of the first is heard
@@ -24,24 +24,31 @@ boats on legs of 10 to 30 s at 3 m/s, 2 m on each axis, a scan each 2 s, P_D .9,
 a square of 400 m.
 
 All are told the detection probability, the density of false fixes and the speed of the boats;
-everything else is at its default, `model_set: families` too. Counted are confirmed tracks: GOSPA
-(10 m, 2; of boats 20 m), `with switches` half of the cutoff for each identity switch; switches for
-each hour of the scene; false tracks for each hour; `identities kept` as in `diver_crossing`,
-`named m` the error of the rows with a name against the diver of that name in the last minute. CPU
-of a scan is that of this process. `hypotheses` repeats `buddies` with other numbers of hypotheses
-and `model_set: heading_speed`.
+everything else is at its default, `model_set: families` too. In `untold` nobody is told anything.
+Counted are confirmed tracks: GOSPA (10 m, 2; of boats 20 m), `with switches` half of the cutoff
+for each identity switch; switches for each hour of the scene; false tracks for each hour;
+`identities kept` as in `diver_crossing`, `named m` the error of the rows with a name against the
+diver of that name in the last minute; `clutter` the density of false fixes that was learnt at the
+end, over the true one. CPU of a scan is that of this process. In `single` a diver is alone:
+`clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`. `cost` is
+of four divers 10 m apart, .7 m on each axis, and two false fixes in a square of 160 m. `recorded`
+are the boats of `real_recordings`. `hypotheses` repeats `buddies` with other numbers of
+hypotheses and `model_set: heading_speed`.
 """
 
 from __future__ import annotations
 
+from itertools import product
 import time
 from typing import Any
 
 import numpy as np
 
 from benchmarks.diver_crossing import identities_kept, true_paths
+from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
 from benchmarks.diver_named import FALSE, HALF, measured, named_errors, P_DETECTION, truth_of
-from benchmarks.study import Parts, rms, study, truths
+from benchmarks.real_recordings import autoferry, boat_scores, DATA
+from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.evaluation.diver.scoring import score
@@ -50,6 +57,7 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 SCENES = ('buddies', 'crossing', 'harbour')
+ALONE = ('clean', 'usbl', 'usbl, named', 'wild')
 COUNTS = (1, 10, 30)
 HOUR = 3600.0
 
@@ -97,15 +105,17 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
     return [item.measurement for item in scene.measurements], scene, told, cutoff
 
 
-def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
+def case(name: str, runs: int, untold: bool = False, **settings: Any) -> dict[str, Any]:
     """The scores of a way to pair, over all runs of a scene."""
+    learnt: list[float] = []
     scored: list[dict[str, Any]] = []
     kept: list[bool] = []
     named: list[float] = []
     seconds, scans, rows, span = 0.0, 0, 0, 0.0
     for seed in range(runs):
         items, scene, told, cutoff = scene_of(name, seed)
-        tracker = DiverTracker(DiverConfig.from_mapping(told | settings))
+        density = told['clutter_density']
+        tracker = DiverTracker(DiverConfig.from_mapping(({} if untold else told) | settings))
         if not seed:
             tracker.warm()
             tracker.reset()
@@ -114,6 +124,8 @@ def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
             made.append(tracker.process(item)[-1])
             rows = max(rows, len(tracker._stream.state.life))
         seconds, scans = seconds + time.process_time() - begin, scans + len(items)
+        if settings['association'] != 'gnn':
+            learnt += [found.density / density for _, found in tracker._stream.state.clutter]
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']
@@ -141,22 +153,88 @@ def case(name: str, runs: int, **settings: Any) -> dict[str, Any]:
         'named m': rms(named) if named else None,
         'ms a scan': 1e3 * seconds / scans,
         'rows at most': rows,
+        'clutter': float(np.mean(learnt)) if learnt else None,
     }
+
+
+def single(scene: str, association: str, runs: int) -> dict[str, float]:
+    """The scores of a diver who is alone, as `diver_families` counts them."""
+    made = {'clean': lambda seed: swimmer(np.random.default_rng(seed), 1.0, 1.0), 'wild': wild}
+    name = 7 if scene == 'usbl, named' else None
+    path = made.get(scene, usbl)
+    found = [robust(path(seed), name=name, association=association) for seed in range(runs)]
+    kept = 'rmse_m', 'coverage', 'nees', 'followed', 'tracks'
+    return {key: value for key, value in mean_over(found).items() if key in kept}
+
+
+def recorded(sensor: str, association: str) -> dict[str, float]:
+    """The scores of two boats recorded in clutter (`real_recordings`), nothing stated but how good
+    the sensor is."""
+    items, truth = autoferry(sensor)
+    fix_std = 4.0 if sensor == 'radar' else 2.0
+    tracker = DiverTracker(DiverConfig(fix_std=fix_std, association=association))
+    found = boat_scores(final_estimates(tracker, items), truth)
+    return dict(zip(('GOSPA', 'missed', 'false', 'tracks', 'RMSE'), map(float, found)))
+
+
+def cost(association: str, minutes: int = 10, **settings: Any) -> dict[str, float]:
+    """What an hour of four divers in clutter costs, from the first minutes of it."""
+    values: dict[str, Any] = {
+        'motion': 'legs',
+        'sensor': 'scans',
+        'divers': 4,
+        'speed': 0.75,
+        'start': [0.0, 0.0],
+        'turn_deg': 60.0,
+        'duration': 60.0 * minutes,
+        'step': 1.0,
+        'spacing': 10.0,
+        'detection_probability': 0.9,
+        'fix_std': 0.7,
+        'clutter': 2.0,
+        'clutter_range': 80.0,
+    }
+    scene = simulate(scenario('table1', values), 3)
+    tracker, rows = DiverTracker(DiverConfig(association=association, **settings)), 0
+    tracker.warm()
+    tracker.reset()
+    begin = time.process_time()
+    for item in scene.measurements:
+        tracker.process(item.measurement)
+        rows += len(tracker._stream.state.life)
+    seconds, count = time.process_time() - begin, len(scene.measurements)
+    return {'CPU s per hour': seconds / count * HOUR, 'rows': rows / count}
 
 
 def main(
     runs: int = 3,
+    untold: int = 10,
     scenes: tuple[str, ...] = SCENES,
     associations: tuple[str, ...] = ASSOCIATIONS,
     counts: tuple[int, ...] = COUNTS,
 ) -> Parts:
-    yield {'runs': runs}
+    yield {'runs': runs, 'untold_runs': untold}
     for name in scenes:
         for association in associations:
             found = case(name, runs, association=association)
             yield {'table': {f'{name}, {association}': found}}
+    for name in scenes:
+        for association in associations:
+            count = runs if name == 'harbour' else untold
+            found = case(name, count, untold=True, association=association)
+            yield {'untold': {f'{name}, {association}': {'runs': count, **found}}}
+    for scene in ALONE:
+        for association in ('gnn', 'kbest'):
+            yield {'single': {f'{scene}, {association}': single(scene, association, runs)}}
+    if (DATA / 'autoferry').is_dir():
+        for sensor, association in product(('radar', 'lidar'), associations):
+            yield {'recorded': {f'{sensor}, {association}': recorded(sensor, association)}}
+    for association in associations:
+        yield {'cost': {association: cost(association)}}
+    for count in counts[:-1]:
+        yield {'cost': {f'kbest, {count}': cost('kbest', hypotheses=count)}}
     for count in counts:
-        settings = {'hypotheses': count, 'model_set': 'heading_speed'}
+        settings: dict[str, Any] = {'hypotheses': count, 'model_set': 'heading_speed'}
         yield {'hypotheses': {str(count): case('buddies', runs, association='kbest', **settings)}}
 
 

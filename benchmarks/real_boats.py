@@ -25,19 +25,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from pathlib import Path
-import tempfile
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, HEADINGS, load, row
+from benchmarks.real_recordings import autoferry, boat_scores, BOATS, DATA, header, HEADINGS, row
 from benchmarks.study import final_estimates
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm_tools.recordings.convert import convert_autoferry
 
 STDS, LIVES = (2.0, 3.0, 4.0, 6.0), ((3, 5), (4, 6))
 OFFSETS = {'radar': (0.0, -1.5), 'lidar': (0.0,)}
@@ -141,17 +138,8 @@ def half(final: dict[int, Estimate], middle_ns: int, second: bool) -> dict[int, 
     return {stamp: estimate for stamp, estimate in final.items() if (stamp >= middle_ns) == second}
 
 
-def sensor_table(sensor: str, offset: float, folder: Path) -> None:
-    with tempfile.TemporaryDirectory() as scratch:
-        out = Path(scratch) / sensor
-        convert_autoferry(
-            folder / 'scenario13_detections.json',
-            out,
-            sensors=(sensor,),
-            truth=folder / 'scenario13_groundTruth.json',
-            time_offset_ns=round(offset * 1e9),
-        )
-        items, truth = load(out)
+def sensor_table(sensor: str, offset: float) -> None:
+    items, truth = autoferry(sensor, round(offset * 1e9))
     stamps = sorted(item.stamp_ns for item in items)
     middle = stamps[len(stamps) // 2]
     later = f', stamps {offset:+g} s' if offset else ''
@@ -175,12 +163,11 @@ def sensor_table(sensor: str, offset: float, folder: Path) -> None:
 
 
 def main() -> None:
-    folder = DATA / 'autoferry'
-    if not folder.is_dir():
+    if not (DATA / 'autoferry').is_dir():
         raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
     for sensor, offsets in OFFSETS.items():
         for offset in offsets:
-            sensor_table(sensor, offset, folder)
+            sensor_table(sensor, offset)
 
 
 if __name__ == '__main__':

@@ -230,31 +230,37 @@ def row(name: str, values: list[float]) -> None:
     print(f'| {name} | {" | ".join(f"{v:.2f}".removesuffix(".00") for v in values)} |')
 
 
-def boats(folder: Path) -> None:
+def autoferry(sensor: str, time_offset_ns: int = 0) -> tuple[list, np.ndarray]:
+    """The scans of radar or lidar in Autoferry scenario 13, and the truth, as `load` has them."""
     with tempfile.TemporaryDirectory() as scratch:
-        for sensor in ('radar', 'lidar'):
-            out = Path(scratch) / sensor
-            convert_autoferry(
-                folder / 'scenario13_detections.json',
-                out,
-                sensors=(sensor,),
-                truth=folder / 'scenario13_groundTruth.json',
+        out = Path(scratch) / sensor
+        convert_autoferry(
+            DATA / 'autoferry/scenario13_detections.json',
+            out,
+            sensors=(sensor,),
+            truth=DATA / 'autoferry/scenario13_groundTruth.json',
+            time_offset_ns=time_offset_ns,
+        )
+        return load(out)
+
+
+def boats() -> None:
+    for sensor in ('radar', 'lidar'):
+        items, truth = autoferry(sensor)
+        print(
+            f'\n### Autoferry scenario 13, {sensor}: {len(items)} scans, '
+            f'{sum(map(len, items))} fixes\n'
+        )
+        header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
+        for name, values in OF_BOATS.items():
+            config = DiverConfig(
+                fix_std=4.0 if sensor == 'radar' else 2.0,
+                clutter_density=1e-5,
+                confirm_hits=4,
+                confirm_window=6,
+                **values,
             )
-            items, truth = load(out)
-            print(
-                f'\n### Autoferry scenario 13, {sensor}: {len(items)} scans, '
-                f'{sum(map(len, items))} fixes\n'
-            )
-            header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
-            for name, values in OF_BOATS.items():
-                config = DiverConfig(
-                    fix_std=4.0 if sensor == 'radar' else 2.0,
-                    clutter_density=1e-5,
-                    confirm_hits=4,
-                    confirm_window=6,
-                    **values,
-                )
-                row(name, boat_scores(final_estimates(DiverTracker(config), items), truth))
+            row(name, boat_scores(final_estimates(DiverTracker(config), items), truth))
 
 
 def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
@@ -308,7 +314,7 @@ def main() -> None:
                 truth,
             )
         seeds_table(pings, truth)
-    boats(DATA / 'autoferry')
+    boats()
 
 
 if __name__ == '__main__':

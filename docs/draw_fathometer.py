@@ -58,6 +58,7 @@ LINES = (
     'MET_NS-SN_SBP_L9_SN_20180313161627.seg',
 )
 BLUE, RED, GREEN, AMBER, INK = '#0072B2', '#D55E00', '#009E73', '#E69F00', '#1b2733'
+PASS = (174, 186)
 COLOURS = (BLUE, RED, GREEN, '#CC79A7', AMBER, '#56B4E9')
 
 
@@ -68,6 +69,7 @@ def main() -> None:
     draw_paper(processed)
     draw_orders(processed)
     draw_fixed_orders(processed['mvdr'])
+    draw_ship(drift(3, range(150, 206), PASS))
     if DATA.exists():
         draw_lines()
 
@@ -192,10 +194,10 @@ def _draw_image(axes, value, extent, vmax=12.0) -> None:
     axes.imshow(value, aspect='auto', cmap='gray_r', vmin=0.0, vmax=vmax, extent=extent)
 
 
-def _draw_found(axes, records, size=2.0) -> None:
+def _draw_found(axes, records, size=2.0, first=0.0) -> None:
     for k, record in enumerate(records):
         axes.scatter(
-            np.full(len(record.found), k),
+            np.full(len(record.found), first + k),
             record.found.depth,
             s=size,
             linewidths=0,
@@ -203,14 +205,15 @@ def _draw_found(axes, records, size=2.0) -> None:
         )
 
 
-def drift(seed):
+def drift(seed, shown=range(300), ship_pass=()):
     """The drift of the paper as cross-spectra, processed twice and tracked: by processor, records,
     responses (depths, records) in units of the noise and depths; and the true numbers.
 
-    A quarter of the snapshot with four times as many says as much and is made four times as fast;
+    shown: the records that are made; ship_pass: the first and the last while a ship passes. A
+    quarter of the snapshot with four times as many says as much and is made four times as fast;
     noise is measured in the mirror window, since lags fold earlier.
     """
-    config = FathometerScenario(snapshot_seconds=0.35, snapshots=256)
+    config = FathometerScenario(snapshot_seconds=0.35, snapshots=256, ship_pass=ship_pass)
     rng = np.random.default_rng(seed)
     floor = drift_of(config, rng)
     settings = {
@@ -229,14 +232,14 @@ def drift(seed):
         for name in low
     }
     records, columns = {name: [] for name in low}, {name: [] for name in low}
-    for record in range(config.records):
+    for record in shown:
         spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
         for name, tracker in trackers.items():
             records[name] += tracker.process(spectra)
             columns[name].append(tracker.response.amplitude / tracker.response.sigma)
     depth = trackers['mvdr'].response.depth
     return {
-        'number': floor.present.sum(axis=1),
+        'number': floor.present.sum(axis=1)[shown],
         **{name: (records_of(records[name]), np.array(columns[name]).T, depth) for name in low},
     }
 
@@ -290,6 +293,30 @@ def draw_orders(processed) -> None:
         axis.set_title(f'({letter})', loc='left')
     axes[0].set(ylabel='number of reflectors', title='probability; red: truth')
     save(figure, 'fathometer_orders.png')
+
+
+def draw_ship(processed) -> None:
+    """A ship that passes, as around record 180 of the paper's Figure 1, by both processors: the
+    response with the tracks, and the PMF of the number of reflectors."""
+    figure, axes = plt.subplots(2, 2, figsize=(12, 6.5), height_ratios=(1.6, 1.0), sharex=True)
+    for name, (upper, lower) in zip(('conventional', 'mvdr'), axes.T):
+        records, value, depth = processed[name]
+        first, last = PASS[0] - 24 - 0.5, PASS[0] - 24 + len(records) - 0.5
+        _draw_image(upper, value, (first, last, depth[-1], depth[0]), 8.0 + 7.0 * (name == 'mvdr'))
+        _draw_found(upper, records, 5.0, first + 0.5)
+        upper.set(title={'mvdr': 'MVDR, 50-4000 Hz'}.get(name, 'conventional, 200-4000 Hz'))
+        pmf = np.array([record.pmf for record in records]).T
+        shape = {'extent': (first, last, 0.5, len(pmf) + 0.5), 'origin': 'lower'}
+        lower.imshow(pmf, aspect='auto', cmap='Blues', vmin=0.0, vmax=1.0, **shape)
+        there = np.arange(len(records)) + first + 0.5
+        lower.step(there, processed['number'], color=RED, lw=1, where='mid')
+        for axis in (upper, lower):
+            for edge in (PASS[0] - 0.5, PASS[1] + 0.5):
+                axis.axvline(edge, color=AMBER, lw=1.5)
+        lower.set(xlabel='record; amber: the ship', ylim=(0.5, 12.5))
+    axes[0, 0].set(ylabel='depth [m]')
+    axes[1, 0].set(ylabel='number of reflectors')
+    save(figure, 'fathometer_ship.png')
 
 
 def draw_fixed_orders(processed) -> None:

@@ -44,7 +44,7 @@ from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .imm import pairs_inside
 from .jit import kernel
 
@@ -318,16 +318,18 @@ class Tracks:
     def only(self, kept: BoolArray) -> Tracks:
         """The tracks where `kept` (T,) is True. For callers that end tracks by rules of their
         own."""
-        if kept.all():
-            return self
+        return self if kept.all() else self.at(np.flatnonzero(kept))
+
+    def at(self, rows: IndexArray) -> Tracks:
+        """The tracks of those numbers, each as often as it is named."""
         return evolve(
             self,
-            track_id=self.track_id[kept],
-            status=self.status[kept],
-            age=self.age[kept],
-            seen=self.seen[kept],
-            misses=self.misses[kept],
-            last_hit_ns=self.last_hit_ns[kept],
+            track_id=self.track_id[rows],
+            status=self.status[rows],
+            age=self.age[rows],
+            seen=self.seen[rows],
+            misses=self.misses[rows],
+            last_hit_ns=self.last_hit_ns[rows],
         )
 
 

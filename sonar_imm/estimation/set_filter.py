@@ -73,13 +73,13 @@ from typing import NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from . import set_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise, systematic
 from .set_model import repeated_walk, SetModel, Sets, turnover, Walks
-from .set_scatter import fit_scatter, guide, NO_SCATTER, ScatterFit
+from .set_proposals import begin, gains, levelled, Peaks, propose_births
+from .set_scatter import fit_scatter, NO_SCATTER, ScatterFit
 from .set_shifts import Shift, shift_tables, ShiftPath, ShiftTables
 
 _STEP, _START, _RESAMPLE, _MOVE = range(4)
@@ -102,7 +102,8 @@ class Record(NamedTuple):
     """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
     key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign that
     walks look at, see `gains`; amplitudes: how members answer in it; background: of its scatter;
-    proposals: its tables, walks not filled in; passage: since the record before."""
+    proposals: its tables, walks not filled in; passage: since the record before; found: gains
+    (S, n) by sign before they were levelled, and what stands out."""
 
     b: FloatArray
     key: tuple[int, int]
@@ -111,6 +112,7 @@ class Record(NamedTuple):
     background: ScatterFit
     proposals: kernels.Proposals
     passage: Passage
+    found: tuple[FloatArray, Peaks]
 
 
 class Weighted(NamedTuple):
@@ -177,7 +179,7 @@ class SetFilter:
         )
         self._charge = np.array(
             [
-                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(model.cells)
+                math.log(max(model.room(m), 1)) - m * math.log(model.cells)
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
@@ -221,26 +223,31 @@ class SetFilter:
         walks = walks or passage.walks
         amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
         background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
-        g = gains(model, b, background)
+        g, peaks = gains(model, b, background, amplitudes.gram)
         walked = levelled(model, g) if walks.wide else g
         shape = model.record_cells * len(model.signs), walks.probability.shape[1]
         if self._tables[0].shape != shape:
             self._tables = np.empty(shape), np.empty(shape)
-        births = propose_births(model, walked if records > 1 else g)
+        births = propose_births(
+            model, walked if records > 1 else g, model.birth_share, model.birth_cap
+        )
         driven = np.exp(walked) if walks.wide else np.empty((len(walked), 0))
         proposals = kernels.Proposals(*self._tables, *births, passage.shifts, walks, driven)
-        return Record(b, key, walked, amplitudes, background, proposals, passage)
+        return Record(b, key, walked, amplitudes, background, proposals, passage, (g, peaks))
 
     def start(self, record: Record) -> Weighted:
         """Sets before the first record, drawn where it will want them."""
         model, sets = self.model, Sets.empty(self.model, self.particles)
-        uniform = _generator(record.key, _START).random(
-            (self.particles, 1 + model.order_max + (model.shift is not None))
+        beginning, births = begin(model, *record.found)
+        proposals = record.proposals._replace(
+            birth=births[0], birth_ratio=births[1], birth_positive=births[2]
         )
+        needed = 1 + model.order_max + (model.shift is not None) + len(beginning.sure)
+        uniform = _generator(record.key, _START).random((self.particles, needed))
         log_ratio, motion = np.zeros(self.particles), self._passage(1).motion
         self._split(
             lambda first, last: kernels.start(
-                first, last, motion, self._charge, record.proposals, uniform, sets, log_ratio
+                first, last, motion, self._charge, proposals, beginning, uniform, sets, log_ratio
             )
         )
         # An impossible set has members that mean nothing; it must not walk.
@@ -370,46 +377,6 @@ class SetFilter:
             return
         edges = np.linspace(0, self.particles, self.threads + 1).astype(int).tolist()
         list(self._pool.map(work, edges[:-1], edges[1:]))
-
-
-def gains(model: SetModel, b: FloatArray, fit: ScatterFit) -> FloatArray:
-    """g (S, n) for each sign: the best log likelihood ratio of one member alone at each cell."""
-    if model.scatter:
-        b = guide(fit, b)
-    return np.stack([0.5 * np.square(np.maximum(sign * b, 0.0)) for sign in model.signs])
-
-
-def levelled(model: SetModel, g: FloatArray) -> FloatArray:
-    """The gains g (S, n), lowered where the sum of ``exp(g)`` over a peak exceeds what it were if
-    all of it were at `birth_cap`. What lies within half of the separation is one peak, and is
-    lowered by as much, so that it keeps its shape."""
-    half = model.separation // 2
-    around = sliding_window_view(np.pad(g, ((0, 0), (half, half))), 2 * half + 1, axis=1)
-    height, width = np.pad(g, ((0, 0), (half, half))), 1
-    while width < 2 * half + 1:
-        step = min(width, 2 * half + 1 - width)
-        height = np.maximum(height[:, :-step], height[:, step:])
-        width += step
-    low = g.copy()
-    # Elsewhere no sum exceeds it.
-    high = height > model.birth_cap
-    top = height[high]
-    mass = top + np.log(np.exp(around[high] - top[:, None]).mean(axis=1))
-    low[high] -= np.maximum(mass - model.birth_cap, 0.0)
-    return low
-
-
-def propose_births(model: SetModel, g: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `set_kernels.Proposals`, from
-    the gains g (S, n)."""
-    prior = np.array(list(model.signs.values()))[:, None]
-    data_driven = prior * np.exp(np.minimum(g, model.birth_cap))
-    weight = (
-        model.birth_share * data_driven / data_driven.sum()
-        + (1.0 - model.birth_share) * prior / model.cells
-    )
-    running = np.append(0.0, np.cumsum(weight.sum(axis=0)))
-    return running, -np.log(model.cells * weight / prior), weight[0]
 
 
 class LagSmoother:

@@ -28,6 +28,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_model import Sets, Walks
+from .set_proposals import Beginning
 from .set_scatter import against, ScatterFit
 from .set_shifts import draw_shift, empty_memory, ShiftTables
 
@@ -189,18 +190,38 @@ def _search(cumulative: FloatArray, low: int, high: int, point: float) -> int:
 
 
 @kernel
+def _placed(
+    low: int, high: int, left: float, birth: FloatArray, offset: int, proposals: Proposals
+) -> tuple[int, int, float]:
+    """(cell, sign, log ratio) of a birth in low .. high - 1, where the running sum of the weights
+    of births passes `left` from low on. offset: from cells of the lattice to those of the
+    record."""
+    point = birth[low + offset] + left
+    place = _search(birth[offset:], low, high, point) - 1
+    place = max(low, min(place, high - 1))
+    negative = 0
+    if proposals.birth_ratio.shape[0] > 1:
+        # What is left of the random number within the cell chooses the sign.
+        inside = point - birth[place + offset]
+        negative = int(inside >= proposals.birth_positive[place + offset])
+    return place, 1 - 2 * negative, proposals.birth_ratio[negative, place + offset]
+
+
+@kernel
 def _birth(
     cells: IntArray,
     m: int,
     separation: int,
+    running: FloatArray,
     proposals: Proposals,
     uniform: float,
     offset: int,
 ) -> tuple[int, int, int, float]:
     """(position in cells, cell, sign, log ratio) of one more member of cells[:m]; position -1 when
-    there is no room. offset: from cells of the lattice to those of the record."""
-    birth = proposals.birth[offset:]
-    n = proposals.birth.shape[0] - 1 - proposals.shifts.step * (len(proposals.shifts.start) - 1)
+    there is no room. running (n + 1,): sum of the weights of births; offset: from cells of the
+    lattice to those of the record."""
+    birth = running[offset:]
+    n = len(running) - 1 - proposals.shifts.step * (len(proposals.shifts.start) - 1)
     total, last = 0.0, -1
     for k in range(m + 1):
         low = 0 if k == 0 else cells[k - 1] + separation
@@ -217,15 +238,8 @@ def _birth(
         if high > low:
             weight = birth[high] - birth[low]
             if left < weight or k == last:
-                place = _search(birth, low, high, birth[low] + left) - 1
-                place = max(low, min(place, high - 1))
-                negative = 0
-                if proposals.birth_ratio.shape[0] > 1:
-                    # What is left of the random number within the cell chooses the sign.
-                    inside = birth[low] + left - birth[place]
-                    negative = int(inside >= proposals.birth_positive[place + offset])
-                paid = proposals.birth_ratio[negative, place + offset] + math.log(total)
-                return k, place, 1 - 2 * negative, paid
+                place, sign, paid = _placed(low, high, left, running, offset, proposals)
+                return k, place, sign, paid + math.log(total)
             left -= weight
     return -1, 0, 1, -math.inf
 
@@ -237,34 +251,64 @@ def start(
     motion: SetMotion,
     charge: FloatArray,
     proposals: Proposals,
+    beginning: Beginning,
     uniform: FloatArray,
     sets: Sets,
     log_ratio: FloatArray,
 ) -> None:
     """Sets drawn where the first record will want them, and log_ratio (N,) of model to proposal;
     charge (orders,): what sets of each size cost in it. Of `proposals` only births are used."""
-    orders, separation = motion.cumulative.shape[0], motion.separation
+    orders, separation, J = motion.cumulative.shape[0], motion.separation, sets.cell.shape[1]
+    G = len(proposals.shifts.start)
+    n = len(proposals.birth) - 1 - proposals.shifts.step * (G - 1)
     for i in range(first, last):
-        chosen = min(int(uniform[i, 0] * orders), orders - 1)
-        m = motion.order_min + chosen
-        ratio, here, sign, offset = 0.0, sets.cell[i], sets.sign[i], 0
-        if len(proposals.shifts.start) > 1:
-            G, drawn_at = len(proposals.shifts.start), uniform[i, 1 + sets.cell.shape[1]]
-            offset = min(_search(proposals.shifts.start, 0, G, drawn_at), G - 1)
+        u, m, ratio, here, sign = uniform[i], 0, 0.0, sets.cell[i], sets.sign[i]
+        offset = 0
+        if G > 1:
+            offset = min(_search(proposals.shifts.start, 0, G, u[1 + J]), G - 1)
             offset *= proposals.shifts.step
         sets.shift[i] = offset
-        for k in range(m):
+        for k in range(len(beginning.sure)):
+            low, high = max(beginning.first[k] - offset, 0), min(beginning.last[k] - offset, n)
+            if not low < high:
+                continue
+            weight = proposals.birth[high + offset] - proposals.birth[low + offset]
+            sure, drawn = beginning.sure[k], u[len(u) - 1 - k]
+            if drawn >= sure:
+                ratio -= math.log1p(-sure)
+                continue
+            here[m], sign[m], paid = _placed(
+                low, high, drawn / sure * weight, proposals.birth, offset, proposals
+            )
+            ratio += paid + math.log(weight / sure)
+            if m > 0 and here[m] - here[m - 1] < separation:
+                ratio = -math.inf
+            m += 1
+        least = max(0, motion.order_min - m)
+        most = motion.order_min + orders - 1 - m
+        total, chance, more = 0.0, 1.0, least
+        for _ in range(least, most + 1):
+            total += chance
+            chance *= beginning.decay
+        left, chance = u[0] * total, 1.0
+        while left >= chance and more < most:
+            left -= chance
+            chance *= beginning.decay
+            more += 1
+        ratio += math.log(total / chance / orders) - math.lgamma(more + 1.0)
+        for k in range(more):
             at, place, drawn, paid = _birth(
-                here, k, separation, proposals, uniform[i, 1 + k], offset
+                here, m, separation, beginning.elsewhere, proposals, u[1 + k], offset
             )
             ratio += paid
             if at < 0:
                 break
-            for j in range(k, at, -1):
+            for j in range(m, at, -1):
                 here[j], sign[j] = here[j - 1], sign[j - 1]
             here[at], sign[at] = place, drawn
-        sets.order[i] = m
-        log_ratio[i] = ratio - charge[chosen]
+            m += 1
+        sets.order[i] = max(m, motion.order_min)
+        log_ratio[i] = ratio - charge[sets.order[i] - motion.order_min]
 
 
 @kernel
@@ -337,7 +381,7 @@ def propagate(
             if ratio > -math.inf:
                 count = left + k
                 at, place, drawn, paid = _birth(
-                    here, count, separation, proposals, u[1 + deaths + k], offset
+                    here, count, separation, proposals.birth, proposals, u[1 + deaths + k], offset
                 )
                 ratio += paid
                 if at >= 0:

@@ -236,6 +236,12 @@ class SetModel:
         return int(np.abs(rows - columns).max())
 
     @property
+    def mean_changes(self) -> float:
+        """By how many members the order changes from record to record, on average over orders."""
+        orders = np.arange(len(self.transition))
+        return float((self.transition * np.abs(orders[:, None] - orders)).sum(axis=1).mean())
+
+    @property
     def uniforms(self) -> int:
         """Random numbers a particle needs for one record."""
         return 1 + self.most_changes + self.order_max + (self.shift is not None)

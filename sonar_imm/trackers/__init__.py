@@ -168,8 +168,8 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
-            kernels={'records': (14, 465)},
-            all_kernels=(14, 465),
+            kernels={'records': (15, 515)},
+            all_kernels=(15, 515),
         ),
         System(
             name='obstacle',

@@ -282,7 +282,7 @@ def _what(messages: dict[str, int]) -> str:
 
 def _print(report: ConversionReport) -> None:
     from ..recordings.reader import BagReader
-    from ..recordings.topics import fitting_systems
+    from ..recordings.topics import ready_systems
 
     say(f'{report.path}: {_what(report.messages)}, from {report.rows} rows')
     for key, value in report.notes.items():
@@ -293,7 +293,7 @@ def _print(report: ConversionReport) -> None:
         why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
         say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))
     with BagReader(report.path) as bag:
-        for system in fitting_systems(bag)[:1]:
+        for system in ready_systems(bag)[:1]:
             say(f'to track it: {track_line(str(report.path), system, {})}')
 
 

@@ -142,6 +142,15 @@ def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> 
     return sorted(found, key=lambda system: found[system], reverse=True)
 
 
+def ready_systems(bag: BagReader) -> list[str]:
+    """Those of `fitting_systems` for which no input that the tracker needs is missing."""
+    return [
+        system
+        for system in fitting_systems(bag)
+        if any(_evidence(bag, system, each)[0] for each in instruments(bag, system).values())
+    ]
+
+
 def _evidence(
     bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
 ) -> tuple[bool, bool, int]:

@@ -16,6 +16,7 @@
 
 import json
 
+from helpers.report_pages import figures
 import numpy as np
 import pytest
 
@@ -98,7 +99,9 @@ def test_runs_without_soundings_and_files_in_the_way_are_named(tracked, tmp_path
     assert 'there already' in capsys.readouterr().err
     assert run('export', tracked, tmp_path / 'a.xyz', '--overwrite') == 0
     assert run('evaluate', tracked) == 0
-    assert 'track of the ship' in (tracked / 'report.html').read_text()
+    drawn = figures((tracked / 'report.html').read_text())
+    names = [trace.get('name') for figure in drawn for trace in figure['data']]
+    assert 'track of the ship' in names
 
 
 def test_obstacles_of_a_run_as_geojson(tmp_path, capsys):

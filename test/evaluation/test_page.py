@@ -14,11 +14,7 @@
 
 """The page of a report: what the browser is asked to draw."""
 
-import base64
-import gzip
-import json
-import re
-
+from helpers.report_pages import figures
 import plotly.graph_objects as go
 
 from sonar_imm_tools.evaluation.report import (
@@ -32,13 +28,11 @@ from sonar_imm_tools.evaluation.report import (
 
 def kinds(sizes):
     """The kinds of traces on a page with a figure of each size."""
-    figures = [go.Figure(go.Scattergl(x=list(range(n)), y=list(range(n)))) for n in sizes]
+    drawn = [go.Figure(go.Scattergl(x=list(range(n)), y=list(range(n)))) for n in sizes]
     run = {'system': 'diver', 'bag': 'run', 'topics': {}}
-    sections = [Section('figure', 'text', figure) for figure in figures]
+    sections = [Section('figure', 'text', figure) for figure in drawn]
     html = report_html(Part(run=run, metrics={}, summary='', sections=sections))
-    packed = re.findall(r'data-figure="([^"]+)"', html)
-    drawn = [json.loads(gzip.decompress(base64.b64decode(text))) for text in packed]
-    return [figure['data'][0]['type'] for figure in drawn]
+    return [figure['data'][0]['type'] for figure in figures(html)]
 
 
 def test_only_the_largest_figures_use_the_graphics_card():

@@ -14,12 +14,11 @@
 
 """The pages: whole, safe, the same each time."""
 
-import base64
-import gzip
 from html.parser import HTMLParser
 import json
 
 from helpers.dive_scenes import single_run
+from helpers.report_pages import unpacked
 import numpy as np
 import pytest
 
@@ -77,10 +76,6 @@ def part(truth=True, count=60, checks=(), **changes):
 
 def html(part):
     return report_html(part)
-
-
-def unpacked(text):
-    return gzip.decompress(base64.b64decode(text)).decode()
 
 
 class Page(HTMLParser):

@@ -90,7 +90,9 @@ def table(**columns):
     return encode_table(columns, stamp_ns=START, frame_id='array', make=make)
 
 
-def test_traces_become_reflectors_with_ids_and_displays(rig):
+def test_traces_become_reflectors_with_ids_and_displays(make_bench):
+    # Of an array of another band: with the pulse of that of `rig` a side lobe is a reflector.
+    rig = rig_of(make_bench, 'particles:=2000')
     responses = rig.bench.listen(PointCloud2, '/fathometer/response')
     numbers = rig.bench.listen(JointState, '/fathometer/model_probabilities')
     rig.bench.spin_until(
@@ -106,8 +108,12 @@ def test_traces_become_reflectors_with_ids_and_displays(rig):
     assert estimate.stamp_ns == measured[-1].stamp_ns
     assert np.allclose(np.sort(estimate.state[:, 0]), np.sort(truth[-1].depth), atol=0.2)
     assert len(set(estimate.extras['track_id'])) == 4
-    best = int(np.argmax(numbers[-1].position))
-    assert numbers[-1].name[best] == 'order_4'
+    orders = {
+        name: position
+        for name, position in zip(numbers[-1].name, numbers[-1].position)
+        if name.startswith('order')
+    }
+    assert max(orders, key=lambda name: orders[name]) == 'order_4'
     shown = read_trace(responses[-1])
     assert len(shown) == len(measured[-1])
     assert np.corrcoef(shown.amplitude, measured[-1].amplitude)[0, 1] > 0.999
@@ -290,7 +296,7 @@ def test_hostile_records_are_named_and_counted_and_harm_nobody(rig):
 
 
 def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
-    rig = rig_of(make_bench, *SMALL, 'particles:=5000', 'loading:=0.0', 'diagnostics_period:=0.05')
+    rig = rig_of(make_bench, *SMALL, 'loading:=0.0', 'diagnostics_period:=0.05')
     heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     scene = simulate(scenario('small', {'records': 4, 'fading': (), 'depth_companion': False}), 2)
     records = [one.measurement for one in scene.measurements]

@@ -21,9 +21,9 @@ import math
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray, IntArray
-from sonar_imm.estimation.set_filter import gains, propose_births
 from sonar_imm.estimation.set_kernels import Proposals
 from sonar_imm.estimation.set_model import SetModel, Sets, Walks
+from sonar_imm.estimation.set_proposals import begin, Beginning, gains, propose_births
 from sonar_imm.estimation.set_scatter import fit_scatter, NO_SCATTER, ScatterFit
 from sonar_imm.estimation.set_shifts import shift_tables, ShiftTables
 
@@ -40,7 +40,7 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     n, radius = model.record_cells, len(model.walk) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
-    gained = gains(model, b, background(model, b))
+    gained, _ = gains(model, b, background(model, b), model.gram)
     K = np.where(there, model.walk, 0.0)
     signs = len(model.signs)
     g = np.where(there, gained[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
@@ -53,37 +53,76 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
         ratio = np.where(q > 0.0, K / q, 0.0)
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
     shifts = shift_tables(model.shift, log_sum, model.walk_share)
-    births, walks = propose_births(model, gained), Walks.alike(model.walk, n)
+    births = propose_births(model, gained, model.birth_share, model.birth_cap)
+    walks = Walks.alike(model.walk, n)
     return Proposals(np.cumsum(q, axis=1), ratio, *births, shifts, walks, np.empty((signs, 0)))
 
 
-def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
+def start(
+    model: SetModel, proposals: Proposals, b: FloatArray, uniform: FloatArray
+) -> tuple[Sets, FloatArray]:
     """sets before the first record, drawn where it will want them, and the log
     ratio (N,).
 
-    uniform (N, 1 + J), or one more with a shift: the order, one for each member, and the shift.
+    uniform (N, 1 + J + K), or one more with a shift: how many members are elsewhere, one for each
+    of them, the shift, and one for each of the K peaks, the last first.
     """
-    N = len(uniform)
-    orders = len(model.transition)
-    sets = Sets.empty(model, N)
-    sets.order[:] = model.order_min + np.minimum((uniform[:, 0] * orders).astype(int), orders - 1)
-    log_ratio = np.zeros(N)
+    N, J = len(uniform), model.order_max
+    sets, log_ratio = Sets.empty(model, N), np.zeros(N)
+    beginning, births = begin(model, *gains(model, b, background(model, b), model.gram))
+    inside = proposals._replace(birth=births[0], birth_ratio=births[1], birth_positive=births[2])
+    outside = inside._replace(birth=beginning.elsewhere)
     for i in range(N):
-        m = int(sets.order[i])
         if model.shift:
-            place = np.searchsorted(proposals.shifts.start, uniform[i, -1], 'right')
+            place = np.searchsorted(proposals.shifts.start, uniform[i, 1 + J], 'right')
             sets.shift[i] = min(int(place), model.shift.count - 1) * model.shift.step
-        members: list[int] = []
-        sign: dict[int, int] = {}
-        for k in range(m):
-            born = _birth(model, proposals, members, sign, uniform[i, 1 + k], int(sets.shift[i]))
-            log_ratio[i] += born
+        offset = int(sets.shift[i])
+        drawn = uniform[i, ::-1][: len(beginning.sure)]
+        members, sign, paid = _peaks(model, inside, beginning, drawn, offset)
+        apart = all(b - a >= model.separation for a, b in zip(members, members[1:]))
+        log_ratio[i] = paid if apart else IMPOSSIBLE
+        least = max(0, model.order_min - len(members))
+        counts = np.arange(least, J - len(members) + 1)
+        chance = beginning.decay ** (counts - least)
+        running = np.cumsum(chance)
+        chosen = int(np.searchsorted(running, uniform[i, 0] * running[-1], 'right'))
+        more = int(counts[min(chosen, len(counts) - 1)])
+        log_ratio[i] -= math.log(len(model.transition) * chance[more - least] / running[-1])
+        for k in range(more):
+            log_ratio[i] += _birth(model, outside, members, sign, uniform[i, 1 + k], offset)
+        m = sets.order[i] = max(len(members), model.order_min)
         sets.cell[i, : len(members)] = members
         sets.sign[i, : len(members)] = [sign[z] for z in members]
-        # Births charge 1/n each; possible sets of one size are equally likely in any order.
-        charge = math.log(math.factorial(m) * model.room(m)) - m * math.log(model.cells)
+        # Births charge 1/n each; possible sets of one size are equally likely. Those elsewhere
+        # may come in any order.
+        charge = math.log(math.factorial(more) * model.room(m)) - m * math.log(model.cells)
         log_ratio[i] -= charge
     return sets, log_ratio
+
+
+def _peaks(
+    model: SetModel, births: Proposals, beginning: Beginning, drawn: FloatArray, offset: int
+) -> tuple[list[int], dict[int, int], float]:
+    """The members that a set begins with in the peaks of the record, by the random numbers drawn
+    (K,), their signs, and the log ratio."""
+    members, sign, paid = [], {}, 0.0
+    for k, sure in enumerate(beginning.sure):
+        cells = np.arange(beginning.first[k], beginning.last[k])
+        cells = cells[(cells >= offset) & (cells < offset + model.cells)]
+        if not len(cells):
+            continue
+        if drawn[k] >= sure:
+            paid -= math.log(1.0 - sure)
+            continue
+        running = births.birth[cells[0] : cells[-1] + 2]
+        point = running[0] + drawn[k] / sure * (running[-1] - running[0])
+        z = int(cells[min(int(np.searchsorted(running, point, 'right')) - 1, len(cells) - 1)])
+        negative = len(model.signs) > 1 and point - births.birth[z] >= births.birth_positive[z]
+        members.append(z - offset)
+        sign[z - offset] = -1 if negative else 1
+        paid += births.birth_ratio[int(negative), z]
+        paid += math.log((running[-1] - running[0]) / sure)
+    return members, sign, paid
 
 
 def propagate(

@@ -91,6 +91,9 @@ RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
 SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density', 'coverage_file')
 """Parameters that may differ from sensor to sensor, as `coverage_sector` may."""
 
+CLUTTER = 1e-6
+"""False fixes per square metre and scan where nobody says how many there are."""
+
 SECTOR = 6
 """Numbers of a sector."""
 
@@ -140,8 +143,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((1.0, 3.0, 10.0), '',
         'families: the filter runs in copies, each of which multiplies the covariances of all '
-        'measurements by one of these; with dimensions 3: one copy, times 1',
-        range=(1.0, 1e4), kind='float[]')
+        'measurements by one of these; below 1 (0.1, 0.3) only where errors of fixes are known '
+        'not to last: those look the same; with dimensions 3: one copy, times 1',
+        range=(0.01, 1e4), kind='float[]')
     adaptation: str = parameter('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
         'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',
@@ -264,6 +268,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         range=(1e-2, 1e6))
 
     # -- association -----------------------------------------------------------------------------
+    clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
+        range=(0.0, 1e4),
+        description='number of false fixes expected in a scan, per square metre; 0: jipda and '
+        'kbest learn it from the fixes that are no track of theirs, else 1e-6')
     association: str = parameter('gnn', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
         'jipda (all pairings weighed, tracks confirmed by their probability of existence, for '
@@ -319,7 +327,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         "coverage_file of each of the sensors, '' for none; empty: as coverage_file",
         kind='str[]')
     sensor_clutter_density: tuple[float, ...] = parameter((), '1/m^2',
-        'clutter_density of each of the sensors; empty: as clutter_density', range=(1e-12, 1e4),
+        'clutter_density of each of the sensors; empty: as clutter_density', range=(0.0, 1e4),
         kind='float[]')
 
     # -- latitude and longitude ------------------------------------------------------------------
@@ -450,8 +458,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                 problems.append(
                     f"{name}: '{bad[0]}' cannot be part of a topic; letters, digits and _ can"
                 )
-        if self.association == 'kbest' and (self.coverage_sector or self.coverage_file):
-            problems.append('association kbest needs a sensor that sees everywhere: no coverage_')
         return problems
 
     def origin(self) -> Origin | None:
@@ -473,6 +479,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         if sectors := self.sensor_coverage_sector:
             own['coverage_sector'] = sectors[SECTOR * place : SECTOR * (place + 1)]
         return evolve(self, **own)
+
+    @property
+    def usual_clutter(self) -> float:
+        """The density of false fixes where none is learnt."""
+        return self.clutter_density or CLUTTER
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""

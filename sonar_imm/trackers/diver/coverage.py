@@ -215,6 +215,11 @@ class Seen(NamedTuple):
         return np.log(self.fixes)[None] - np.log1p(-self.tracks)[:, None] - usual
 
     @property
+    def unseen(self) -> BoolArray:
+        """(T,) whether a track is where the sensor does not see."""
+        return np.asarray(2.0 * self.tracks < self.usual)
+
+    @property
     def looks(self) -> FloatArray:
         """(T,) how many misses of the usual probability one of each track is worth, 1 at most."""
         return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.usual), 1.0)

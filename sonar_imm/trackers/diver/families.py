@@ -229,11 +229,11 @@ def densities(
     return Densities(copies, whole)
 
 
-def bound(config: DiverConfig) -> float:
+def bound(fixes: Positions) -> float:
     """The logarithm of the density from which it is more probable that a diver was seen than that
     he was missed and the fix is false."""
-    p = config.detection_probability
-    return math.log(config.clutter_density) + math.log1p(-p) - math.log(p)
+    p = fixes.config.detection_probability
+    return math.log(fixes.clutter) + math.log1p(-p) - math.log(p)
 
 
 def fit(
@@ -250,7 +250,7 @@ def fit(
     ratio = 0.0 if seen is None else seen.log_ratio
     if found is not None:
         fit = found.whole + ratio
-        return np.where(fit > bound(fixes.config), fit, -np.inf)
+        return np.where(fit > bound(fixes), fit, -np.inf)
     threshold = gate_threshold(fixes.config.gate_probability, 2)
     return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
 
@@ -370,11 +370,11 @@ def reacquired(
     models: ModelSet,
     chain: AdaptiveChain,
     layout: Layout,
-    unseen: BoolArray,
+    seen: Seen | None,
 ) -> tuple[DiverState, bool]:
     """What becomes of tracks that were not `hit` (T,) by a group of fixes of which some are `left`
-    (D,), and whether one began anew; whole (T, D) as in `Densities`; unseen (T,): tracks where the
-    sensor does not see, who may have done anything there.
+    (D,), and whether one began anew; whole (T, D) as in `Densities`; seen: whoever
+    is where the sensor does not see (`Seen.unseen`) may have done anything there.
 
     A fix that may have been a track's own and was not believed is remembered. One that agrees with
     it, as the next fix of a track that began at the first would, begins the track anew.
@@ -387,7 +387,8 @@ def reacquired(
     for track, row in _refusals(now, fixes, hit, left, whole):
         z, R = fixes.z[row], fixes.R[row]
         parts = None
-        lost = _reaches(now, track, z, fixes) if unseen[track] else _may_be_lost(now, track, fixes)
+        hidden = seen is not None and seen.unseen[track]
+        lost = _reaches(now, track, z, fixes) if hidden else _may_be_lost(now, track, fixes)
         if np.isfinite(refused[track, 0]) and lost:
             parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
         refused = refused.copy()
@@ -464,12 +465,12 @@ def _anew(
     *_, last = cross(models, chain, alone, dt, fixes.config.longest_step)
     alone = alone._replace(x=last.x, P=last.P, mu=last.mu)
     h = expected(alone.x, layout.H)
-    if densities(alone, h, layout, z[None], R[None]).whole[0, 0] <= bound(fixes.config):
+    if densities(alone, h, layout, z[None], R[None]).whole[0, 0] <= bound(fixes):
         return None
     if fixes.target_id is None and fixes.config.max_tracks > 1:
         _, covariance = imm_kernels.combine(alone.x, alone.P, alone.mu, layout.H[0])
         area = math.pi * REACH * math.sqrt(np.linalg.det(covariance[0] + R))
-        if fixes.config.clutter_density * area > MISTAKEN:
+        if fixes.clutter * area > MISTAKEN:
             return None
     return last.x[0], last.P[0], last.mu[0]
 
@@ -481,7 +482,7 @@ def doubtful(now: DiverState, config: DiverConfig) -> tuple[BoolArray, BoolArray
     A copy with large covariances takes what lies far away, so that hits alone mean little. The
     odds of a track are those of a new diver against a false fix, and what its fixes made of them.
     """
-    odds = now.score + math.log(config.birth_density / config.clutter_density)
+    odds = now.score + math.log(config.birth_density / config.usual_clutter)
     open_ = (now.life.status == TENTATIVE) & (now.target_id == NOBODY) & np.isnan(now.existence)
     return open_ & (odds < _log_odds(CONFIRMS)), open_ & (odds < _log_odds(ENDS))
 

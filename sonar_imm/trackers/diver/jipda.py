@@ -32,7 +32,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from . import families, names
-from .config import DiverConfig
+from .clutter import Clutter
 from .coverage import Seen
 from .scan import Positions
 from .state import DiverState
@@ -107,6 +107,13 @@ class Association(NamedTuple):
     counted: BoolArray | None = None
     seen: Seen | None = None
 
+    @property
+    def claimed(self) -> FloatArray:
+        """(D,) the probability that each fix is a track's."""
+        if self.weights is None:
+            return np.asarray(1.0 - self.free)
+        return np.asarray(self.weights.beta.sum(axis=0))
+
 
 def joint_weights(
     now: DiverState,
@@ -133,11 +140,11 @@ def joint_weights(
             densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole
         )
         ratio = 0.0 if seen is None else seen.log_ratio
-        nis = np.where(densities.whole + ratio > families.bound(config), apart, np.inf)
+        nis = np.where(densities.whole + ratio > families.bound(fixes), apart, np.inf)
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
     looked = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
-    ratio, detected = mixture / (config.clutter_density + config.birth_density), np.ones(1)
+    ratio, detected = mixture / (fixes.clutter + config.birth_density), np.ones(1)
     detected = detected * config.detection_probability
     if seen is not None:
         detected = np.maximum(seen.tracks, LEAST_DETECTED)
@@ -206,10 +213,11 @@ def known_existence(existence: FloatArray, status: StatusArray) -> FloatArray:
     return np.where(np.isnan(existence), guess, existence)
 
 
-def birth_existence(config: DiverConfig, claimed: FloatArray) -> FloatArray:
+def birth_existence(fixes: Positions, claimed: FloatArray) -> FloatArray:
     """Existence (D,) of tracks that begin at fixes which belong, with the probability `claimed`
     (D,), to others."""
-    new = config.birth_density / (config.birth_density + config.clutter_density)
+    density = fixes.config.birth_density
+    new = density / (density + fixes.clutter)
     return np.asarray(new * (1.0 - claimed))
 
 
@@ -288,3 +296,35 @@ def _both_seen(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> bo
     z, R = fixes.z[near], fixes.R[near]
     distance = names.squared(z[:, None] - z[None], R[:, None] + R[None])
     return bool((distance >= NEAR_CONFIRMED).any())
+
+
+# -- false fixes ---------------------------------------------------------------------------------
+
+
+def counted(now: DiverState, fixes: Positions, claimed: FloatArray) -> DiverState:
+    """With the false ones of a scan, of which each fix is a track's with the probability `claimed`
+    (D,)."""
+    if fixes.config.clutter_density or fixes.target_id is not None or not fixes.whole:
+        return now
+    known = dict(now.clutter)
+    before = known.get(fixes.sensor, Clutter())
+    known[fixes.sensor] = before.after(fixes.z, np.clip(1.0 - claimed, 0.0, 1.0))
+    return now._replace(clutter=tuple(known.items()))
+
+
+def without_first_fixes(
+    before: DiverState, now: DiverState, fixes: Sequence[Positions]
+) -> DiverState:
+    """Without the first fixes of tracks that were confirmed since `before` by `fixes`, which were
+    counted as false ones."""
+    known = dict(now.clutter)
+    sensor = next((group.sensor for group in fixes if group.sensor in known), None)
+    if sensor is None:
+        return now
+    firm = now.life.track_id[(now.life.status != TENTATIVE) & (now.target_id == NOBODY)]
+    was = before.life.track_id[before.life.status != TENTATIVE]
+    new = len(np.setdiff1d(firm, was))
+    if not new:
+        return now
+    known[sensor] = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
+    return now._replace(clutter=tuple(known.items()))

@@ -28,6 +28,7 @@ tell.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 import math
 from typing import NamedTuple
 
@@ -36,11 +37,11 @@ import numpy as np
 
 from ...estimation import hypotheses
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE, TrackRules
 from ...estimation.hypotheses import Hypotheses
 from ...measurements import NOBODY
-from . import families, jipda
+from . import coverage, families, jipda
 from .config import DiverConfig
 from .fix_kernels import expected, finite
 from .scan import Positions
@@ -77,28 +78,38 @@ class Branched(NamedTuple):
 
 
 def branched(
-    now: DiverState, fixes: Positions, models: ModelSet, chain: AdaptiveChain, layout: Layout
+    now: DiverState,
+    fixes: Positions,
+    models: ModelSet,
+    chain: AdaptiveChain,
+    layout: Layout,
+    covered: Mapping[str, coverage.Coverage],
 ) -> Branched:
-    """Pair all hypotheses with `fixes`."""
+    """Pair all hypotheses with `fixes`; covered: what is stated of sensors (`coverage`)."""
     config, D = fixes.config, len(fixes.z)
     h, densities = expected(now.x, layout.H), None
+    seen = coverage.detectable(covered, fixes.sensor, now, config, fixes.z, fixes.R)
     if models.mixing is not None:
         densities = families.densities(now, h, layout, fixes.z, fixes.R)
-        believed = densities.whole > families.bound(config)
+        believed = np.isfinite(families.fit(now, fixes, h, layout.H, densities, seen))
         # A track that nothing can be of is lost where two fixes agree that nobody takes.
         hit, left = np.asarray(believed.any(axis=1)), np.asarray(~believed.any(axis=0))
-        unseen = np.zeros(len(h), bool)
         now, again = families.reacquired(
-            now, fixes, hit, left, densities.whole, models, chain, layout, unseen
+            now, fixes, hit, left, densities.whole, models, chain, layout, seen
         )
         if again:
             h = expected(now.x, layout.H)
             densities = families.densities(now, h, layout, fixes.z, fixes.R)
+            seen = coverage.detectable(covered, fixes.sensor, now, config, fixes.z, fixes.R)
     excluded = np.zeros(len(h), bool)
     if config.named_tracks == 'alone' and fixes.target_id is None:
         excluded = now.target_id != NOBODY
-    ratio = families.fit(now, fixes, h, layout.H, densities)
-    ratio = ratio - math.log(config.clutter_density + config.birth_density)
+    ratio, p = families.fit(now, fixes, h, layout.H, densities, seen), np.ones(len(h))
+    p *= config.detection_probability
+    if seen is not None:
+        p = np.maximum(seen.tracks, jipda.LEAST_DETECTED)
+        ratio = ratio - seen.log_ratio + np.log(seen.fixes)[None] - np.log(p)[:, None]
+    ratio = ratio - math.log(fixes.clutter + config.birth_density)
     ratio[excluded] = -np.inf
     reserved = np.zeros(ratio.shape, bool)
     if fixes.target_id is not None:
@@ -108,29 +119,31 @@ def branched(
         if densities is None:
             ratio = np.where(reserved, np.maximum(ratio, TAKEN), ratio)
     existence = jipda.known_existence(now.existence, now.life.status)
-    p = config.detection_probability
     looked = ~excluded & fixes.whole
     found = hypotheses.paired(
         now.hypotheses,
         now.life.track_id.astype(np.int64),
         ratio,
         np.minimum(existence, 1.0 - 1e-9),
-        np.full(len(ratio), p),
+        p,
         np.where(looked, p, 0.0),
         reserved,
         config.hypotheses,
     )
     source, detection = found.source, found.detection
-    after = taken(now, source)
-    hit = detection >= 0
-    r, named = existence[source], after.target_id != NOBODY
-    left = np.where(looked[source] & ~named, r * (1.0 - p) / (1.0 - r * p), r)
+    after = now.at(source, now.life.at(source))
+    hit, look = detection >= 0, looked[source]
+    if seen is not None and fixes.whole and fixes.target_id is None:
+        own = seen._replace(tracks=seen.tracks[source])
+        after = coverage.missed(after, own, np.where(look & ~hit, 1.0, 0.0), layout.mask)
+    r, p, named = existence[source], p[source], after.target_id != NOBODY
+    left = np.where(look & ~named, r * (1.0 - p) / (1.0 - r * p), r)
     target_id, history = after.target_id, after.history.copy()
     if fixes.target_id is not None:
         target_id = np.where(hit, fixes.target_id[detection] if D else NOBODY, target_id)
     history[hit, :-1] = history[hit, 1:]
     history[hit, -1] = now.serial + detection[hit] + 1
-    after = after._replace(
+    after = jipda.counted(after, fixes, found.claimed)._replace(
         existence=np.where(hit, 1.0, left),
         evidence=after.evidence + hit,
         target_id=target_id,
@@ -155,7 +168,7 @@ def branched(
         h[source],
         after.score,
         free,
-        existence=jipda.birth_existence(config, np.zeros(D)),
+        existence=jipda.birth_existence(fixes, np.zeros(D)),
         densities=densities,
         counted=shown_rows(found.hypotheses),
     )
@@ -190,21 +203,6 @@ def learnt(
     return after
 
 
-def taken(now: DiverState, rows: IndexArray) -> DiverState:
-    """The rows of those numbers, each as often as it is named. Hypotheses are left as they are."""
-    life = now.life
-    life = evolve(
-        life,
-        track_id=life.track_id[rows],
-        status=life.status[rows],
-        age=life.age[rows],
-        seen=life.seen[rows],
-        misses=life.misses[rows],
-        last_hit_ns=life.last_hit_ns[rows],
-    )
-    return now.at(rows, life)
-
-
 def shown_rows(now: Hypotheses) -> BoolArray:
     """The rows (T,) of the hypotheses that are shown, of several in a cluster the likeliest."""
     rank = np.where(now.shown, now.log_weight + 1e6, now.log_weight)
@@ -222,6 +220,24 @@ def decided(now: DiverState) -> DiverState:
     """With the hypotheses that are shown taken for true: for what is paired otherwise."""
     now = now.only(shown_rows(now.hypotheses))
     return now._replace(hypotheses=Hypotheses.none().with_alone(len(now.life)))
+
+
+def one_past(scans: Sequence[DiverState]) -> list[DiverState]:
+    """Successive states with one row of each track: the one from which that of the next state
+    comes, of tracks that end there the one that is shown."""
+    found: list[DiverState] = []
+    later: dict[int, int] = {}
+    for now in reversed(scans):
+        rows, ids = np.flatnonzero(shown_rows(now.hypotheses)), now.life.track_id
+        chosen = dict(zip(ids[rows].tolist(), rows.tolist())) | later
+        kept = np.array(sorted(chosen.values()), np.intp)
+        alone = Hypotheses.none().with_alone(len(kept))
+        single = now.at(kept, now.life.at(kept))
+        single = single._replace(existence=presence(now)[kept], hypotheses=alone)
+        later = dict(zip(single.life.track_id.tolist(), single.came_from.tolist()))
+        later = {track: row for track, row in later.items() if row >= 0}
+        found.append(single)
+    return found[::-1]
 
 
 def _of_tracks(now: DiverState, value: FloatArray) -> FloatArray:

@@ -252,7 +252,7 @@ def _by_rank(
     takings: dict[int, Taking] = {}
     score = now.score + len(pairs) * np.log1p(-p)
     gain = np.log(p / (1.0 - p))
-    gain -= 0.5 * np.log(config.clutter_density)
+    gain -= 0.5 * np.log(config.usual_clutter)
     for turn in np.unique(rank[rank != EXCLUDED]):
         tracks = np.flatnonzero(rank == turn)
         owner = _owners(tracks, fit, near & ~taken, pairs, config)
@@ -288,7 +288,7 @@ def _owners(
             target, detection = np.nonzero(inside)
             likelihood = fit[np.ix_(tracks, members)][target, detection]
             cost = association_cost(
-                likelihood, config.detection_probability, math.sqrt(config.clutter_density)
+                likelihood, config.detection_probability, math.sqrt(config.usual_clutter)
             )
             chosen = assign(target, detection, cost, len(tracks), len(members))
             hit = np.flatnonzero(chosen >= 0)

@@ -27,13 +27,14 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, Start
-from .config import DiverConfig
+from .clutter import Clutters
+from .config import CLUTTER, DiverConfig
 from .ping_kernels import PingMeasurements
 from .state_space import Layout, ModelSet
 
@@ -102,7 +103,7 @@ class Positions:
     multiplied by to give R; target_id: (D,) whose fixes they are, None when that is not known of
     any; whole: whether they are all that there was to see, so that a diver without a fix was
     missed; heights: what they state of z, None where nothing, or depth is no state; sensor: its
-    name.
+    name; learnt: the density of false fixes where `clutter_density` is not stated.
     """
 
     z: FloatArray
@@ -113,6 +114,12 @@ class Positions:
     whole: bool
     heights: Heights | None = None
     sensor: str = ''
+    learnt: float = CLUTTER
+
+    @property
+    def clutter(self) -> float:
+        """The density of false fixes, 1/m^2."""
+        return self.config.clutter_density or self.learnt
 
 
 @frozen(eq=False)
@@ -134,10 +141,19 @@ class Scan:
 
     @classmethod
     def of(
-        cls, items: Sequence[Measurement], config: DiverConfig, factor: tuple[float, float]
+        cls,
+        items: Sequence[Measurement],
+        config: DiverConfig,
+        factor: tuple[float, float],
+        clutter: Clutters = (),
     ) -> Scan:
-        """The scan of `items`; factor: on the covariances of fixes and of arrival times."""
+        """The scan of `items`; factor: on the covariances of fixes and of arrival times; clutter:
+        of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config, factor[0]), []
+        known = dict(clutter) if config.association != 'gnn' else {}
+        for at, group in enumerate(fixes):
+            if group.target_id is None and group.sensor in known:
+                fixes[at] = evolve(group, learnt=known[group.sensor].density)
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()

@@ -26,8 +26,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from ...parameters import ConfigError
-from .config import DiverConfig
+from . import kbest
 from .state import cross, DiverState
 from .tracker import DiverTracker
 
@@ -81,11 +80,6 @@ class SmoothingDiverTracker(DiverTracker):
     For recordings: memory grows with their length, 10 kB a diver and scan.
     """
 
-    def __init__(self, config: DiverConfig):
-        if config.association == 'kbest':
-            raise ConfigError('association kbest keeps several pasts of a track: no smoother')
-        super().__init__(config)
-
     def reset(self) -> None:
         super().reset()
         self._passed: dict[int, DiverState] = {}
@@ -115,6 +109,8 @@ class SmoothingDiverTracker(DiverTracker):
             scan = self._passed[stamp]
             x, P = layout.widened(scan.x, scan.P)
             scans.append(scan._replace(x=x, P=P, instruments=newest.instruments))
+        if self._keeps_hypotheses:
+            scans = kbest.one_past(scans)
         smooth = [
             scan._replace(x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
         ]

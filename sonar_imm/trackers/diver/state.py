@@ -31,6 +31,7 @@ from ...estimation.consistency import NisMemory
 from ...estimation.hypotheses import Hypotheses
 from ...estimation.motion import Motion
 from . import family_kernels
+from .clutter import Clutters
 from .config import DiverConfig
 from .family_kernels import Mixing
 from .state_space import Instruments, ModelSet
@@ -219,7 +220,8 @@ class DiverState(NamedTuple):
     (`coverage`); scale (2, 2): for fixes and for arrivals the sum of squared residuals in units
     of their stated variance, and their number; fixes, arrivals: what innovations say of the
     stated covariances of either; excess: of `estimation.consistency`, that those of arrivals are
-    too small; heights: how many z of fixes could be used; last_named: names and the stamp of each
+    too small; heights: how many z of fixes could be used; clutter: what each sensor
+    showed that was nobody's; last_named: names and the stamp of each
     one's last measurement; broken: tracks ended so far because their numbers were not finite;
     not_started: starts so far for which there was no room;
     repairs: covariances repaired so far (`estimation.covariance`).
@@ -254,6 +256,7 @@ class DiverState(NamedTuple):
     instruments: Instruments = Instruments()
     hypotheses: Hypotheses = Hypotheses.none()
     serial: int = 0
+    clutter: Clutters = ()
     last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
     not_started: int = 0

@@ -50,7 +50,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
 from ..protocol import WarmStep
-from . import births, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
+from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -212,6 +212,7 @@ class DiverTracker:
             *state.heights.warnings(self.config),
             *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
             *births.no_room(state, self.config),
+            *clutter.warnings(state.clutter, self.config),
         ]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -241,6 +242,7 @@ class DiverTracker:
                 association = self._associate(now, fixes)
             now = self._update(now, fixes, association)
             now = self._update_heights(now, fixes, association)
+            now = jipda.counted(now, fixes, association.claimed)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
             if association.free.any():
@@ -253,16 +255,14 @@ class DiverTracker:
             layout = self._layout(now.instruments)
             now = births.begun_anew(now, ping, free, self.models, layout, self.config)
             found += births.births_from_ping(ping, free, self.config, scan.factor)
-        now = self._learn(before, now, step, scan)
-        now = self._prune(now, scan)
+        now = self._prune(self._learn(before, now, step, scan), scan)
+        now = jipda.without_first_fixes(before, now, scan.fixes)
         return self._spawn(now, found, scan.starts)
 
     def _scan(self, before: DiverState, items: Sequence[Measurement]) -> Scan:
-        stated = self.config.covariance_scale
-        if not self.config.estimate_covariance_scale:
-            return Scan.of(items, self.config, (stated, stated))
-        fixes, arrivals = before.factor()
-        return Scan.of(items, self.config, (stated * fixes, stated * arrivals))
+        stated, learns = self.config.covariance_scale, self.config.estimate_covariance_scale
+        fixes, arrivals = before.factor() if learns else (1.0, 1.0)
+        return Scan.of(items, self.config, (stated * fixes, stated * arrivals), before.clutter)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> tuple[DiverState, Step]:
         """The tracks as this scan should show them, and the step that led there."""
@@ -301,7 +301,7 @@ class DiverTracker:
             tracks, row = np.nonzero(now.target_id[:, None] == fixes.target_id[None])
             free = ~np.isin(np.arange(len(fixes.z)), row)
             if densities is not None:
-                good = densities.whole[tracks, row] > families.bound(config)
+                good = densities.whole[tracks, row] > families.bound(fixes)
                 tracks, row = tracks[good], row[good]
             return Association(tracks, row, expected, now.score, free, densities=densities)
         excluded = now.target_id != NOBODY
@@ -312,16 +312,16 @@ class DiverTracker:
         if config.association == 'jipda':
             weights = jipda.joint_weights(now, fixes, expected, H, excluded, densities, seen)
             claimed = weights.beta.sum(axis=0)
-            existence = jipda.birth_existence(config, claimed)
+            existence = jipda.birth_existence(fixes, claimed)
             tracks, likeliest = weights.likeliest()
             free = claimed < 0.5
             by_weights = free, existence, weights, densities
             return Association(tracks, likeliest, expected, now.score, *by_weights, seen=seen)
         fit = families.fit(now, fixes, expected, H, densities, seen)
         fit[excluded] = -np.inf
-        p, clutter = config.detection_probability, config.clutter_density
-        chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
-        logs = np.log1p(-p), np.log(p / (1.0 - p)), np.log(clutter)
+        p, false = config.detection_probability, fixes.clutter
+        chosen = assign_fits(fit, now.life.status == TENTATIVE, p, false)
+        logs = np.log1p(-p), np.log(p / (1.0 - p)), np.log(false)
         score = fix_kernels.scores(now.score, fit, chosen, excluded, *logs)
         if seen is not None:
             score = score + np.where(excluded, 0.0, np.log1p(-seen.tracks) - logs[0])
@@ -343,7 +343,7 @@ class DiverTracker:
     def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
         """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
         layout = self._layout(now.instruments)
-        found = kbest.branched(now, fixes, self.models, self._chain, layout)
+        found = kbest.branched(now, fixes, self.models, self._chain, layout, self._covered)
         now = self._update(found.state, fixes, found.association)
         now = self._update_heights(now, fixes, found.association)
         new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
@@ -356,23 +356,20 @@ class DiverTracker:
         """The tracks, those that were lost where two fixes say that they are, and whether there
         was one."""
         seen, weights = association.seen, association.weights
-        if (
-            association.densities is None
-            or not len(now.x)
-            or (weights is not None and seen is None)
-        ):
+        sure = weights is not None and seen is None
+        if association.densities is None or not len(now.x) or sure:
             return now, False
         hit, left = np.zeros(len(now.x), bool), np.ones(len(fixes.z), bool)
         hit[association.tracks] = True
         firm = now.life.status != TENTATIVE
-        unseen = np.zeros(len(now.x), bool) if seen is None else 2.0 * seen.tracks < seen.usual
         if weights is None:
             left[association.detection[firm[association.tracks]]] = False
         else:
             # Whom the sensor sees is not lost: his existence tells.
-            hit, left = hit | ~unseen, weights.beta[firm].sum(axis=0) < 0.5
+            left = weights.beta[firm].sum(axis=0) < 0.5
+            hit = hit if seen is None else hit | ~seen.unseen
         layout, whole = self._layout(now.instruments), association.densities.whole
-        parts = self.models, self._chain, layout, unseen
+        parts = self.models, self._chain, layout, seen
         return families.reacquired(now, fixes, hit, left, whole, *parts)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:

@@ -389,9 +389,12 @@ class FathometerTracker:
         return particles.move(step, record)
 
     def _bridged(self, records: int) -> bool:
-        """Whether sets can be followed over so many records: a short enough time, and not more
-        walks than there is room for. Otherwise they begin anew."""
-        assert self._lattice is not None
+        """Whether sets can be followed over so many records: a short enough time, in which fewer
+        than half of the most reflectors come and go, and not more walks than there is room for.
+        Otherwise they begin anew."""
+        assert self._filter is not None and self._lattice is not None
+        if records > 1 and 2.0 * records * self._filter.model.mean_changes > self.config.order_max:
+            return False
         reach = walk_reach(math.sqrt(records) * self.config.depth_std / self._lattice.step)
         tables = self._lattice.cells * (2.0 * reach + 1.0)
         return records == 1 or (records <= LONGEST_GAP and tables <= MAX_MOVES)

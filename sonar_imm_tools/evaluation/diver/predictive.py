@@ -47,8 +47,13 @@ from ..tuning import Scores, Tunable
 
 
 def for_tuning(config: DiverConfig) -> DiverConfig:
-    """One copy: the scale is what is fitted."""
-    return evolve(config, covariance_scales=(1.0,))
+    """One copy: the scale is what is fitted. One density of false fixes, that it can be too; and a
+    single history, which `Scored` can follow."""
+    association = 'gnn' if config.association == 'kbest' else config.association
+    density = config.usual_clutter
+    return evolve(
+        config, covariance_scales=(1.0,), clutter_density=density, association=association
+    )
 
 
 def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
@@ -86,7 +91,7 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             found.append(_of(config, 'family_switch_rate', usual=False))
     scans = any(isinstance(item, Fixes) and len(item) != 1 for item in measurements)
     found.append(_of(config, 'detection_probability', kind='logit', usual=scans))
-    found.append(_of(config, 'clutter_density', usual=scans))
+    found.append(Tunable(name='clutter_density', start=config.usual_clutter, usual=scans))
     found.append(_of(config, 'birth_density', usual=False))
     edge = (0.0, 1.0)
     return [t for t in found if t.start > 0.0 and not (t.kind == 'logit' and t.start in edge)]
@@ -123,7 +128,7 @@ class Scored(DiverTracker):
     def _score(self, now: DiverState, fixes: Positions, found: Association) -> tuple[float, int]:
         config = fixes.config
         p, m = config.detection_probability, len(fixes.z)
-        density = config.clutter_density + config.birth_density
+        density = fixes.clutter + config.birth_density
         log_f = np.full(len(now.x), -np.inf)
         if len(found.tracks):
             if found.densities is not None:

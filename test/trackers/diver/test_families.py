@@ -186,6 +186,19 @@ def test_scale_of_the_stated_covariances(stated):
         assert 1.0 <= scale < 1.6 and 'times as far as they state' not in said
 
 
+def test_scales_below_one_find_out_what_is_stated_too_large():
+    """Only where they are asked for: errors that last, of a source that filters, look the same."""
+    items, error = path(150, speed=0.9, std=0.3, scale=10.0), {}
+    for scales in ((1.0, 3.0, 10.0), (0.1, 0.3, 1.0, 3.0, 10.0)):
+        tracker = DiverTracker(config(covariance_scales=scales))
+        made = run(tracker, items)[60:]
+        off = [e.state[0, :2] - (0.9 * (60 + k), 0.0) for k, e in enumerate(made)]
+        nees = [d @ np.linalg.solve(e.covariance[0, :2, :2], d) for d, e in zip(off, made)]
+        error[scales[0]] = np.mean(nees), np.mean([e.extras['covariance_scale'][0] for e in made])
+    assert error[1.0][1] < 1.6 and 0.08 < error[0.1][1] < 0.35
+    assert error[1.0][0] < 0.6 * error[0.1][0] and error[0.1][0] < 3.0
+
+
 def test_a_name_does_not_make_a_fix_good():
     """The same fixes with and without a name give the same diver."""
     plain, named = path(200, std=0.9), path(200, std=0.9, target_id=7)
@@ -337,7 +350,7 @@ def test_depth_is_a_state_beside_families():
 @pytest.mark.parametrize(
     ('values', 'says'),
     [
-        ({'covariance_scales': (0.5, 1.0)}, 'covariance_scales'),
+        ({'covariance_scales': (0.001, 1.0)}, 'covariance_scales'),
         ({'covariance_scales': ()}, 'one value at least'),
         ({'initial_probabilities': (1.0,)}, '37 values'),
         ({'transition_matrix': (0.5, 0.5)}, '37 x 37'),

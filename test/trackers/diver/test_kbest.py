@@ -18,6 +18,7 @@ of divers side by side, state files, and limits."""
 from itertools import product
 import math
 
+from attrs import evolve
 from helpers.diver_runs import run, SECOND
 from helpers.estimates import same
 import numpy as np
@@ -25,7 +26,6 @@ import pytest
 
 from sonar_imm.estimation import hypotheses as rules
 from sonar_imm.measurements import Fix, Fixes, Start
-from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver import jipda, kbest
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -257,10 +257,12 @@ CROSSING = DiverConfig(
 )
 
 
-@pytest.mark.parametrize('model_set', ['heading_speed', 'families'])
-def test_shuffled_scans_give_the_bits_of_sorted_ones(model_set):
+@pytest.mark.parametrize(
+    'model_set, density', [('heading_speed', 10 / 160.0**2), ('families', 0.0)]
+)
+def test_shuffled_scans_give_the_bits_of_sorted_ones(model_set, density):
     config = DiverConfig(
-        model_set=model_set, association='kbest', clutter_density=10 / 160.0**2, history=20.0
+        model_set=model_set, association='kbest', clutter_density=density, history=20.0
     )
     scans = crossing(duration=15.0)
     late = [scans[k] for k in (0, 2, 1, 5, 4, 3, *range(6, len(scans)))]
@@ -268,22 +270,23 @@ def test_shuffled_scans_give_the_bits_of_sorted_ones(model_set):
         assert same(one, other)
 
 
-def test_a_tracker_goes_on_from_its_state(tmp_path):
-    scans = crossing()
-    tracker = DiverTracker(CROSSING)
+@pytest.mark.parametrize('density', [10 / 160.0**2, 0.0])
+def test_a_tracker_goes_on_from_its_state(tmp_path, density):
+    scans, config = crossing(), evolve(CROSSING, clutter_density=density)
+    tracker = DiverTracker(config)
     for item in scans[:25]:
         tracker.process(item)
     assert len(tracker._stream.state.hypotheses.cluster) > 4
     saved = Saved(
         system='diver',
-        parameters=json_parameters(CROSSING),
+        parameters=json_parameters(config),
         saved_ns=1,
         newest_ns=scans[24].stamp_ns,
         state=frozen_state(tracker),
         extras={},
     )
     write_state(tmp_path / 'state', saved)
-    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['diver'], CROSSING)
+    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['diver'], config)
     for item in scans[25:]:
         one, other = tracker.process(item), again.process(item)
         assert len(one) == len(other) and all(map(same, one, other))
@@ -294,6 +297,19 @@ def test_reset_is_a_fresh_tracker():
     first = run(tracker, scans)
     tracker.reset()
     assert all(map(same, first, run(tracker, scans)))
+
+
+def errors_of(made, ids, truth):
+    """RMSE of tracks, each against the path nearest to it in the end, from the tenth scan on."""
+    paths, squared = np.array([path.position[:, :2] for path in truth]), []
+    for number in ids:
+        rows = [each.state[each.extras['track_id'] == number, :2] for each in made]
+        apart = np.linalg.norm(paths[:, len(made) - 1] - rows[-1], axis=1)
+        own = paths[apart.argmin()]
+        squared += [
+            np.sum((row - own[k]) ** 2) for k, row in enumerate(rows) if k > 9 and len(row)
+        ]
+    return np.sqrt(np.mean(squared))
 
 
 def knot(second, rng, count):
@@ -363,9 +379,17 @@ def test_a_start_among_hypotheses():
     assert len(set(made.extras['track_id'].tolist())) == len(made)
 
 
-def test_several_pasts_have_no_smoother():
-    with pytest.raises(ConfigError, match='kbest'):
-        SmoothingDiverTracker(CROSSING)
+def test_the_past_that_led_to_the_end_is_smoothed():
+    scene = simulate(scenario('crossing', {'duration': 40.0}), 3)
+    tracker = SmoothingDiverTracker(CROSSING)
+    live = [tracker.process(item.measurement)[-1] for item in scene.measurements]
+    smoothed = tracker.smoothed()
+    assert [each.stamp_ns for each in smoothed] == [each.stamp_ns for each in live]
+    assert smoothed[-1].state == pytest.approx(live[-1].state, abs=1e-9)
+    last = smoothed[-1].extras['track_id'][smoothed[-1].extras['track_state'] > 0]
+    assert len(last) == 4
+    before, after = (errors_of(made, last, scene.truth) for made in (live, smoothed))
+    assert after < 0.8 * before
 
 
 def test_fixes_in_another_order_are_the_same_tracks():

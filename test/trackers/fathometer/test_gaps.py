@@ -50,6 +50,19 @@ def test_a_gap_that_is_taken_for_a_record_loses_layers():
     assert right[BEFORE - 5 : BEFORE].all() and not right[BEFORE : BEFORE + 2].any()
 
 
+def test_where_half_may_have_come_and_gone_the_set_begins_anew_and_names_stay():
+    """Followed over 120 missing records, one set of 2000 is left."""
+    traces, _ = scene(120, 0.1, 4)
+    tracker, found = run(traces[:BEFORE], particles=2000)
+    before = max(found.values(), key=lambda each: each.stamp_ns).extras['track_id']
+    tracker.process(traces[BEFORE])
+    assert tracker.health()['effective_sample_size'] > 30.0
+    (estimate,) = tracker.process(traces[BEFORE + 1])
+    assert (
+        len(estimate) == len(LAYERS) and len(set(before) & set(estimate.extras['track_id'])) >= 5
+    )
+
+
 def test_after_too_long_a_gap_all_is_new():
     traces, _ = scene(0, 0.1, 2)
     tracker, found = run(traces[:10], max_gap=1e8, **OPTIONS)

@@ -99,7 +99,7 @@ def test_the_mirror_lies_at_negative_lags(vectors):
 def test_the_noise_of_a_trace_is_what_its_reflectors_leave():
     scene = sea_scene('negative')
     traces = list(scene.traces(range(25), sigma=False))
-    options = {'particles': 5000, 'polarity': 'both', **MIRROR}
+    options = {'particles': 2000, 'polarity': 'both', **MIRROR}
     _, found = run(traces, **options)
     assert score_scene(found, scene, after=5).right >= 0.9
     measured = np.mean([each.extras['sigma'][0] for each in found.values()])
