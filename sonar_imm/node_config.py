@@ -37,8 +37,8 @@ class NodeConfig(Config):
     queue_depth: int = parameter(50, '',
         'messages that an input queue holds while the tracker is busy', range=(1, 100000))
     max_wait: float = live(0.0, 's',
-        'a message that waited longer than this while the tracker was busy is dropped, and '
-        'counted, so that the output does not lag; 0: never', range=(0.0, 1e6))
+        'messages that waited longer for a busy tracker are dropped and counted, so that the '
+        'output does not lag; 0: never', range=(0.0, 1e6))
     frame_id: str = parameter('', '',
         'frame that the input must be in; empty: the frame of the first message accepted')
     world_frame_convention: str = parameter('enu', '',
@@ -46,27 +46,26 @@ class NodeConfig(Config):
         'ned (world x north, y east, z down; vehicle x forward, y starboard, z down); the output '
         'is always enu', choices=('enu', 'ned'))
     publish_revisions: bool = live(True, '',
-        'when late input changes estimates already published, publish those again, oldest first; '
-        'false: only the newest')
+        'publish estimates again that late input changed, oldest first; false: only the newest')
     max_revisions: int = live(100, '',
-        'largest number of earlier estimates published again after one late message: the newest '
-        'ones, the others are counted; 0: all', range=(0, 1_000_000))
+        'most estimates published again after one late message, the newest ones; others are '
+        'counted; 0: all', range=(0, 1_000_000))
     autostart: bool = parameter(True, '',
         'configure and activate the node when it starts; false: a lifecycle manager or '
         '`ros2 lifecycle set` does')
     diagnostics_period: float = parameter(1.0, 's',
-        'time between two messages on /diagnostics', range=(0.05, 3600.0))
+        'time between messages on /diagnostics', range=(0.05, 3600.0))
     stale_after: float = live(10.0, 's',
-        'time without input after which diagnostics call the input stale', range=(0.01, 1e6))
+        'time after which diagnostics call an input stale', range=(0.01, 1e6))
     state_file: str = parameter('', '',
-        'file in which the state of the tracker is saved, so that a node that is started again '
-        'continues its tracks; empty: none')
+        'file that keeps the state of the tracker, so that a node started again continues its '
+        'tracks; empty: none')
     state_interval: float = parameter(10.0, 's',
-        'time between two saves to state_file while running; the state at the end is saved in any '
-        'case', range=(0.1, 86400.0))
+        'time between saves to state_file; the last state is saved in any case',
+        range=(0.1, 86400.0))
     state_max_age: float = parameter(300.0, 's',
-        'the state in state_file is not used when it was saved longer ago than this, or when the '
-        'first measurement is further than this from its last one', range=(0.0, 1e6))
+        'the state in state_file is not used when saved longer ago than this, or further than '
+        'this from the first measurement', range=(0.0, 1e6))
     # fmt: on
 
 
@@ -76,8 +75,8 @@ class PlacedNodeConfig(NodeConfig):
 
     # fmt: off
     use_tf_static: bool = parameter(True, '',
-        'listen to /tf_static, where its type is installed, and transform what comes in another '
-        'frame that is fixed to the expected one instead of refusing it')
+        'listen to /tf_static, where its type is installed, and transform what comes in a frame '
+        'fixed to the expected one')
     # fmt: on
 
 
