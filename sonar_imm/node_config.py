@@ -16,10 +16,15 @@
 
 from __future__ import annotations
 
+from ipaddress import ip_address
+from socket import AddressFamily, AF_INET, AF_INET6
+
 from attrs import frozen
 
 from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.neighbours import GEO_POSE, TOPICS
 
+from .acoustics.geodesy import Origin
 from .parameters import Config, inherited, live, parameter, ParameterSpec
 from .trackers import System
 
@@ -32,8 +37,8 @@ class NodeConfig(Config):
     queue_depth: int = parameter(50, '',
         'messages that an input queue holds while the tracker is busy', range=(1, 100000))
     max_wait: float = live(0.0, 's',
-        'a message that waited longer than this while the tracker was busy is dropped, and '
-        'counted, so that the output does not lag; 0: never', range=(0.0, 1e6))
+        'messages that waited longer for a busy tracker are dropped and counted, so that the '
+        'output does not lag; 0: never', range=(0.0, 1e6))
     frame_id: str = parameter('', '',
         'frame that the input must be in; empty: the frame of the first message accepted')
     world_frame_convention: str = parameter('enu', '',
@@ -41,27 +46,26 @@ class NodeConfig(Config):
         'ned (world x north, y east, z down; vehicle x forward, y starboard, z down); the output '
         'is always enu', choices=('enu', 'ned'))
     publish_revisions: bool = live(True, '',
-        'when late input changes estimates already published, publish those again, oldest first; '
-        'false: only the newest')
+        'publish estimates again that late input changed, oldest first; false: only the newest')
     max_revisions: int = live(100, '',
-        'largest number of earlier estimates published again after one late message: the newest '
-        'ones, the others are counted; 0: all', range=(0, 1_000_000))
+        'most estimates published again after one late message, the newest ones; others are '
+        'counted; 0: all', range=(0, 1_000_000))
     autostart: bool = parameter(True, '',
         'configure and activate the node when it starts; false: a lifecycle manager or '
         '`ros2 lifecycle set` does')
     diagnostics_period: float = parameter(1.0, 's',
-        'time between two messages on /diagnostics', range=(0.05, 3600.0))
+        'time between messages on /diagnostics', range=(0.05, 3600.0))
     stale_after: float = live(10.0, 's',
-        'time without input after which diagnostics call the input stale', range=(0.01, 1e6))
+        'time after which diagnostics call an input stale', range=(0.01, 1e6))
     state_file: str = parameter('', '',
-        'file in which the state of the tracker is saved, so that a node that is started again '
-        'continues its tracks; empty: none')
+        'file that keeps the state of the tracker, so that a node started again continues its '
+        'tracks; empty: none')
     state_interval: float = parameter(10.0, 's',
-        'time between two saves to state_file while running; the state at the end is saved in any '
-        'case', range=(0.1, 86400.0))
+        'time between saves to state_file; the last state is saved in any case',
+        range=(0.1, 86400.0))
     state_max_age: float = parameter(300.0, 's',
-        'the state in state_file is not used when it was saved longer ago than this, or when the '
-        'first measurement is further than this from its last one', range=(0.0, 1e6))
+        'the state in state_file is not used when saved longer ago than this, or further than '
+        'this from the first measurement', range=(0.0, 1e6))
     # fmt: on
 
 
@@ -71,8 +75,8 @@ class PlacedNodeConfig(NodeConfig):
 
     # fmt: off
     use_tf_static: bool = parameter(True, '',
-        'listen to /tf_static, where its type is installed, and transform what comes in another '
-        'frame that is fixed to the expected one instead of refusing it')
+        'listen to /tf_static, where its type is installed, and transform what comes in a frame '
+        'fixed to the expected one')
     # fmt: on
 
 
@@ -86,12 +90,66 @@ class BathymetryNodeConfig(PlacedNodeConfig):
 
 
 @frozen(kw_only=True)
-class ReplayNodeConfig(PlacedNodeConfig):
+class TracksNodeConfig(PlacedNodeConfig):
     """A late message has its window computed again: up to a second, while others go on coming."""
 
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+    also_publish: tuple[str, ...] = parameter((), '',
+        'further types for confirmed tracks', kind='str[]', choices=tuple(TOPICS))
+    targets_to: str = parameter('', '',
+        'address of NMEA 0183 targets, such as 192.168.1.20:10110; empty: none')
+    targets_period: float = parameter(1.0, 's',
+        'time between rounds of targets', range=(0.1, 3600.0))
     # fmt: on
+
+    def check(self) -> list[str]:
+        try:
+            udp_address(self.targets_to or '127.0.0.1:1')
+        except ValueError:
+            return [
+                "parameter 'targets_to' must be the address of a machine in numbers and a port, "
+                f"such as 192.168.1.20:10110, got '{self.targets_to}'"
+            ]
+        return []
+
+
+@frozen(kw_only=True)
+class ObstacleNodeConfig(TracksNodeConfig):
+    """Besides, where the frame of the navigation lies on Earth."""
+
+    # fmt: off
+    targets_as: str = parameter('ttm', '',
+        'sentences of targets: ttm (distance and bearing from the vehicle) or tll (latitude and '
+        'longitude, for which origin_latitude and origin_longitude are needed)',
+        choices=('ttm', 'tll'))
+    origin_latitude: float = parameter(0.0, 'deg',
+        'latitude of the origin of the frame of nav, for targets and messages in latitude and '
+        'longitude; with both latitude and longitude 0: not known', range=(-90.0, 90.0))
+    origin_longitude: float = parameter(0.0, 'deg',
+        'longitude of the origin of the frame of nav, see origin_latitude',
+        range=(-180.0, 180.0))
+    origin_height: float = parameter(0.0, 'm',
+        'height of the origin of the frame of nav above the ellipsoid', range=(-12000.0, 9000.0))
+    # fmt: on
+
+    def origin(self) -> Origin | None:
+        """The origin that is stated, None for none."""
+        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
+            return None
+        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        wanting = {"'targets_as' tll": self.targets_to and self.targets_as == 'tll'}
+        wanting[f"'also_publish' {GEO_POSE}"] = GEO_POSE in self.also_publish
+        if self.origin() is None:
+            problems += [
+                f'parameter {name} needs origin_latitude and origin_longitude'
+                for name, asked in wanting.items()
+                if asked
+            ]
+        return problems
 
 
 @frozen(kw_only=True)
@@ -105,6 +163,19 @@ class DetectorNodeConfig(Config):
     diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
     stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
     # fmt: on
+
+
+def udp_address(text: str) -> tuple[str, int, AddressFamily]:
+    """Host in numbers, port and family of ``host:port``. Raises ValueError.
+
+    A name would have to be looked up, which can take seconds in which the node does nothing else.
+    """
+    host, _, port = text.rpartition(':')
+    host = '127.0.0.1' if host == 'localhost' else host.strip('[]')
+    version = ip_address(host).version
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f'{port!r} is no port')
+    return host, int(port), AF_INET if version == 4 else AF_INET6
 
 
 def node_config_type(system: System) -> type[NodeConfig]:

@@ -40,6 +40,7 @@ from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from std_srvs.srv import SetBool, Trigger
 
+from msg_adapters.displays import displays_of
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
@@ -409,7 +410,7 @@ class TrackerNode(BaseNode):
         self._intake = self._saved_state.load(self._config)
         self.tracker = self._intake.tracker
         self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
-        self._displays = DisplayPublisher(self._name, self.advertise)
+        self._displays = DisplayPublisher(displays_of(self._name), self.advertise)
         self.advertise_more()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)

@@ -38,13 +38,14 @@ from typing import Any
 from msg_adapters.displays.tracks import confirmed_rows
 from msg_adapters.geodetic import write_geo
 
+from ..acoustics.geodesy import Origin
 from ..estimates import Estimate
-from .base import TrackerNode
 from .messages import make
 from .running import run
+from .tracks import TracksNode
 
 
-class DiverNode(TrackerNode):
+class DiverNode(TracksNode):
     """Tracks divers from position fixes or raw arrival times."""
 
     def __init__(self, **options: Any):
@@ -53,9 +54,14 @@ class DiverNode(TrackerNode):
     def advertise_more(self) -> None:
         self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
 
+    def origin(self) -> Origin | None:
+        """That of the parameters, or the first position in latitude and longitude."""
+        known: Origin | None = self.tracker.origin
+        return known
+
     def show(self, estimates: list[Estimate]) -> None:
         super().show(estimates)
-        newest, origin = estimates[-1], self.tracker.origin
+        newest, origin = estimates[-1], self.origin()
         if origin is not None and self._geo.get_subscription_count():
             for row in confirmed_rows(newest):
                 self._geo.publish(write_geo(newest, row, origin, make))

@@ -35,7 +35,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters.displays import displays_of, Drawn
+from msg_adapters.displays import Displays, Drawn
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
@@ -124,11 +124,11 @@ class ProcessedPublisher:
 
 
 class DisplayPublisher:
-    """Publishes what is drawn of the estimates of `system`, to those who listen; `advertise`
-    offers a topic of a type and gives its publisher."""
+    """Publishes what is drawn of estimates, to those who listen; `advertise` offers a topic of a
+    type and gives its publisher."""
 
-    def __init__(self, system: str, advertise: Callable[[str, str], Any]):
-        self._displays = displays_of(system)
+    def __init__(self, displays: Displays, advertise: Callable[[str, str], Any]):
+        self._displays = displays
         self._publishers = {
             name: advertise(type_name, f'~/{name}')
             for name, type_name in self._displays.topics.items()

@@ -93,6 +93,24 @@ OTHERS = {
     'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
         'std_msgs/Header header\ngeographic_msgs/GeoPoseWithCovariance pose\n'
     ),
+    'marine_interfaces/msg/Classification': 'string class_id\nfloat32 probability\n',
+    'marine_interfaces/msg/Kinematics': (
+        'geometry_msgs/PoseWithCovariance pose\nuint8 orientation_availability\n'
+        'geometry_msgs/TwistWithCovariance twist\n'
+    ),
+    'marine_interfaces/msg/Shape': (
+        'uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n'
+    ),
+    'marine_interfaces/msg/Contact': (
+        'std_msgs/Header header\nstring id\nfloat32 existence_probability\n'
+        'marine_interfaces/Classification[] classification\n'
+        'marine_interfaces/Kinematics kinematics\nmarine_interfaces/Shape shape\n'
+        'geographic_msgs/GeoPose geo_pose\nstring source\nuint8 origin_kind\nuint8 status\n'
+        'string note\nstring[] observation_ids\ndiagnostic_msgs/KeyValue[] attributes\n'
+    ),
+    'marine_interfaces/msg/ContactArray': (
+        'std_msgs/Header header\nmarine_interfaces/Contact[] contacts\n'
+    ),
     'seatrac_interfaces/msg/ModemRec': (
         'std_msgs/Header header\nuint8 msg_id\nbool position_flt_error\nuint8 src_id\n'
         'int16 attitude_yaw\nint16 depth_local\nuint16 vos\nbool includes_range\n'

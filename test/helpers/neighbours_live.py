@@ -1,0 +1,177 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Run by a test as a program of its own: real nodes hear and send messages of other packages.
+
+Prints one line of JSON: how many messages each input took and refused, and what came out.
+"""
+
+import json
+
+import numpy as np
+from rclpy.parameter import Parameter
+
+from helpers.node_bench import Bench
+from msg_adapters.neighbours import TOPICS
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.nodes.diver import DiverNode
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.obstacle import ObstacleNode
+from sonar_imm.nodes.qos import lockstep_qos
+
+ORIGIN = Origin(54.3, 10.2)
+STEPS = 20
+
+
+def header(step, frame_id='sensor'):
+    stamp = make('builtin_interfaces/msg/Time', sec=1000 + step)
+    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
+
+
+def place(step):
+    return np.array([20.0 + 0.5 * step, 10.0, -5.0])
+
+
+def geo_point(step):
+    latitude, longitude, altitude = ORIGIN.geodetic(place(step))
+    return make(
+        'geographic_msgs/msg/GeoPoint', latitude=latitude, longitude=longitude, altitude=altitude
+    )
+
+
+def point_stamped(step):
+    return make(
+        'geographic_msgs/msg/GeoPointStamped', header=header(step), position=geo_point(step)
+    )
+
+
+def pose_stamped(step):
+    pose = make('geographic_msgs/msg/GeoPose', position=geo_point(step))
+    return make('geographic_msgs/msg/GeoPoseStamped', header=header(step), pose=pose)
+
+
+def pose_with_covariance(step):
+    pose = make('geographic_msgs/msg/GeoPose', position=geo_point(step))
+    pose = make(
+        'geographic_msgs/msg/GeoPoseWithCovariance', pose=pose, covariance=np.eye(6).ravel()
+    )
+    return make('geographic_msgs/msg/GeoPoseWithCovarianceStamped', header=header(step), pose=pose)
+
+
+def modem(step):
+    east, north, up = place(step)
+    return make(
+        'seatrac_interfaces/msg/ModemRec',
+        header=header(step),
+        src_id=3,
+        includes_position=True,
+        position_easting=round(10.0 * east),
+        position_northing=round(10.0 * north),
+        position_depth=round(-10.0 * up),
+    )
+
+
+def usbl(step):
+    enu = make('geometry_msgs/msg/Vector3', **dict(zip('xyz', place(step))))
+    return make(
+        'acomms_msgs/msg/UsblData', header=header(step), enu=enu, remote_address=3, accuracy=1.0
+    )
+
+
+def beacon(step):
+    at = place(step) * (1.0, -1.0, -1.0)  # forward is east here: starboard is south
+    point = make('geometry_msgs/msg/Point', **dict(zip('xyz', at)))
+    return make(
+        'stonefish_ros2/msg/BeaconInfo', header=header(step), beacon_id=3, relative_position=point
+    )
+
+
+def detections(step):
+    point = make('geometry_msgs/msg/Point', x=30.0, y=2.0, z=1.0)
+    pose = make(
+        'geometry_msgs/msg/PoseWithCovariance', pose=make('geometry_msgs/msg/Pose', position=point)
+    )
+    result = make('vision_msgs/msg/ObjectHypothesisWithPose', pose=pose)
+    seen = make('vision_msgs/msg/Detection3D', header=header(step), results=[result])
+    seen.bbox.center.position = point
+    return make('vision_msgs/msg/Detection3DArray', header=header(step), detections=[seen])
+
+
+GEODETIC = {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
+FIXED = {'vessel': 'fixed'}
+CASES = {
+    'geographic_msgs/msg/GeoPointStamped': (DiverNode, 'fix', point_stamped, GEODETIC),
+    'geographic_msgs/msg/GeoPoseStamped': (DiverNode, 'fix', pose_stamped, GEODETIC),
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
+        *(DiverNode, 'fix', pose_with_covariance),
+        GEODETIC,
+    ),
+    'seatrac_interfaces/msg/ModemRec': (DiverNode, 'relative', modem, FIXED),
+    'acomms_msgs/msg/UsblData': (DiverNode, 'relative', usbl, FIXED),
+    'stonefish_ros2/msg/BeaconInfo': (DiverNode, 'relative', beacon, FIXED),
+    'vision_msgs/msg/Detection3DArray': (ObstacleNode, 'detections', detections, {}),
+}
+
+
+def run(type_name, kind, name, message_of, settings):
+    """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
+    asked = list(TOPICS) if settings is GEODETIC else []
+    settings = {f'{name}_type': type_name, 'also_publish': asked, **settings}
+    bench = Bench()
+    try:
+        overrides = [Parameter(key, value=value) for key, value in settings.items() if value != []]
+        node = bench.add(kind(context=bench.context, parameter_overrides=overrides))
+        own = node.get_name()
+        heard = {
+            type_: bench.listen(message_class(type_), f'/{own}/{TOPICS[type_]}') for type_ in asked
+        }
+        publisher = bench.peer.create_publisher(
+            message_class(type_name), f'/{name}', lockstep_qos()
+        )
+        bench.spin_until(lambda: publisher.get_subscription_count())
+        bench.spin_until(
+            lambda: all(node.count_subscribers(f'/{own}/{TOPICS[type_]}') for type_ in asked)
+        )
+        for step in range(STEPS):
+            publisher.publish(message_of(step))
+            bench.spin_until(lambda step=step: node.answer()['messages'] > step)
+        if asked:
+            bench.spin_until(lambda: all(heard.values()), 20.0)
+        counts = node.answer()
+        seen = {type_: len(found) for type_, found in heard.items()}
+        return {**counts, 'out': seen, **last(heard)}
+    finally:
+        bench.close()
+
+
+def last(heard):
+    """Where the diver is by the last message of two types, metres from where it is."""
+    if not heard:
+        return {}
+    at = heard['geographic_msgs/msg/GeoPoseStamped'][-1].pose.position
+    off = ORIGIN.local(at.latitude, at.longitude, 0.0)[:2] - place(STEPS - 1)[:2]
+    contact = heard['marine_interfaces/msg/Contact'][-1]
+    point = contact.kinematics.pose.pose.position
+    apart = np.array([point.x, point.y]) - place(STEPS - 1)[:2]
+    variance = float(contact.kinematics.pose.covariance[0])
+    return {
+        'off': float(np.hypot(*off)),
+        'apart': float(np.hypot(*apart)),
+        'variance': variance,
+        'id': contact.id,
+    }
+
+
+if __name__ == '__main__':
+    print(json.dumps({name: run(name, *case) for name, case in CASES.items()}))

@@ -1,0 +1,60 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages of other packages between real nodes, with types that colcon builds for this test."""
+
+import json
+import os
+import subprocess
+import sys
+
+from helpers import interfaces
+from helpers.marine import OTHERS
+import pytest
+
+pytest.importorskip('rclpy')
+from sonar_imm_tools.replay.harness import reserved_domain_id  # noqa: E402
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(
+        not interfaces.can_build(),
+        reason='the generators of rosidl are not here: see test/helpers/interfaces.py',
+    ),
+]
+
+
+def test_nodes_hear_and_send_the_types_of_others(tmp_path, request):
+    interfaces.write_sources(tmp_path, OTHERS)
+    environment, root = interfaces.build(tmp_path), request.config.rootpath
+    environment['PYTHONPATH'] += f'{os.pathsep}{root / "test"}'
+    with reserved_domain_id() as domain:
+        done = subprocess.run(
+            [sys.executable, '-m', 'helpers.neighbours_live'],
+            cwd=root,
+            env=environment | {'ROS_DOMAIN_ID': str(domain), 'ROS_PYTHON_CHECK_FIELDS': '1'},
+            capture_output=True,
+            text=True,
+        )
+    assert done.returncode == 0, done.stderr[-4000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    for type_name, result in found.items():
+        assert (result['messages'], result['refused']) == (20, 0), type_name
+        if type_name != 'vision_msgs/msg/Detection3DArray':  # it waits for navigation
+            assert result['estimates'] > 10, type_name
+    for type_name, result in found.items():
+        if type_name.startswith('geographic_msgs/'):
+            assert all(result['out'].values()) and len(result['out']) == 4, type_name
+            assert result['off'] < 4.0 and result['apart'] < 4.0, type_name
+            assert 0.0 < result['variance'] < 100.0 and result['id'].startswith('diver_')
