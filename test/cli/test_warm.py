@@ -63,5 +63,5 @@ def test_the_smallest_recording_of_each_system_is_first(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / 'data').write_bytes(bytes(size))
     todo = [(Path(tmp_path / name), name[0]) for name in sizes]
-    order = _small_ones_first(todo)
-    assert [todo[i][0].name for i in order] == ['a2', 'b1', 'a3', 'a1']
+    order, first = _small_ones_first(todo)
+    assert [todo[i][0].name for i in order] == ['a2', 'b1', 'a3', 'a1'] and first == 2

@@ -45,6 +45,9 @@ PRIOR_SCANS, PRIOR_AREA = 5.0, 4e4
 ENOUGH, EVIDENT = 20.0, 0.5
 """Scans, and false fixes in each, from which `gnn` says that it should not ignore them."""
 
+MOST_SENSORS = 20
+"""Sensors that are remembered, those that showed a scan last."""
+
 MEMORY = 100.0
 """Scans after which what was seen counts for 1/e."""
 
@@ -105,7 +108,13 @@ class Clutter(NamedTuple):
 
 
 Clutters = tuple[tuple[str, Clutter], ...]
-"""What is known of each sensor that showed scans."""
+"""What is known of each sensor that showed scans, the one heard last at the end."""
+
+
+def replaced(known: Clutters, sensor: str, clutter: Clutter) -> Clutters:
+    """With what is known of `sensor` now; the sensor silent for longest makes room for it."""
+    others = [item for item in known if item[0] != sensor]
+    return (*others, (sensor, clutter))[-MOST_SENSORS:]
 
 
 def warnings(known: Clutters, config: DiverConfig) -> list[str]:

@@ -32,7 +32,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from . import families, names
-from .clutter import Clutter
+from .clutter import Clutter, replaced
 from .coverage import Seen
 from .scan import Positions
 from .state import DiverState
@@ -306,10 +306,9 @@ def counted(now: DiverState, fixes: Positions, claimed: FloatArray) -> DiverStat
     (D,)."""
     if fixes.config.clutter_density or fixes.target_id is not None or not fixes.whole:
         return now
-    known = dict(now.clutter)
-    before = known.get(fixes.sensor, Clutter())
-    known[fixes.sensor] = before.after(fixes.z, np.clip(1.0 - claimed, 0.0, 1.0))
-    return now._replace(clutter=tuple(known.items()))
+    before = dict(now.clutter).get(fixes.sensor, Clutter())
+    after = before.after(fixes.z, np.clip(1.0 - claimed, 0.0, 1.0))
+    return now._replace(clutter=replaced(now.clutter, fixes.sensor, after))
 
 
 def without_first_fixes(
@@ -326,5 +325,5 @@ def without_first_fixes(
     new = len(np.setdiff1d(firm, was))
     if not new:
         return now
-    known[sensor] = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
-    return now._replace(clutter=tuple(known.items()))
+    after = known[sensor]._replace(false=max(known[sensor].false - new, 0.0))
+    return now._replace(clutter=replaced(now.clutter, sensor, after))
