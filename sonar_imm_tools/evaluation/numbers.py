@@ -133,12 +133,11 @@ def bounds_remark(summary: Mapping[str, Any]) -> str:
     """What to compare the mean of a `chi2_summary` or `nis_summary` with."""
     if 'low' not in summary:
         return f'{summary["n"]} values'
-    if summary.get('divided_by_dof'):
-        return (
-            f'per degree of freedom: 1 expected, {summary["low"]:.2f} to '
-            f'{summary["high"]:.2f} believable'
-        )
-    return f'{summary["dof"]} expected, {summary["low"]:.2f} to {summary["high"]:.2f} believable'
+    per = summary.get('divided_by_dof')
+    due = 'per degree of freedom: 1 expected' if per else f'{summary["dof"]} expected'
+    within = f'{summary["low"]:.2f} to {summary["high"]:.2f}'
+    outside = summary.get('believable') is False
+    return f'{due}; outside of {within}' if outside else f'{due}, {within} believable'
 
 
 @frozen

@@ -73,7 +73,9 @@ def test_mixed_degrees_of_freedom_share_bounds_around_one():
     summary = nis_summary(np.array([2.0, 4.0]), np.array([2.0, 3.0]))
     assert summary['mean'] == pytest.approx(6.0 / 5.0) and summary['low'] < 1.0 < summary['high']
     assert bounds_remark(summary).startswith('per degree of freedom: 1 expected')
-    assert bounds_remark(nis_summary(np.array([2.0]), np.array([2.0]))).startswith('2 expected')
+    assert bounds_remark(nis_summary(np.array([2.0]), np.array([2.0]))).endswith('believable')
+    far = bounds_remark(nis_summary(np.full(9, 20.0), np.full(9, 2.0)))
+    assert far.startswith('2 expected; outside of ') and 'believable' not in far
 
 
 def test_the_lines_of_each_number_are_labelled_in_words():
