@@ -22,7 +22,7 @@ from helpers.rig import a_fix, FIX, Rig
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
@@ -287,8 +287,9 @@ def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, c
 
 
 def test_accepted_changes_are_said_on_rosout(rig):
-    heard = rig.bench.listen(Log, '/rosout', 10)
-    rig.bench.spin_until(lambda: rig.node.count_subscribers('/rosout'))
+    # Who subscribes late gets what was logged before: a subscriber may be known and not yet matched.
+    lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    heard = rig.bench.listen(Log, '/rosout', lasting)
     rig.node.set_parameters([Parameter('stale_after', value=3.5)])
     rig.bench.spin_until(lambda: any('stale_after is 3.5 now' in one.msg for one in heard))
 
