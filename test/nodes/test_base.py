@@ -287,7 +287,7 @@ def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, c
 
 
 def test_accepted_changes_are_said_on_rosout(rig):
-    # Who subscribes late gets what was logged before: a subscriber may be known and not yet matched.
+    # A late subscriber gets what was logged before: it may be known here and not yet matched.
     lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     heard = rig.bench.listen(Log, '/rosout', lasting)
     rig.node.set_parameters([Parameter('stale_after', value=3.5)])
