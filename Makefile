@@ -10,12 +10,16 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
     $$p -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $$p && break; done)
 # The wheels of ROS 2 are for CPython 3.10 to 3.13 on Linux and x86-64. Elsewhere `.venv` has none: the
 # tests of nodes are skipped, library and offline command are all there.
-ROS = $(shell $(PYTHON) -c 'import platform, sys; print("ros," if sys.version_info < (3, 14) \
+ROS = $(shell $(PYTHON) -c 'import platform, sys; print("[ros]" if sys.version_info < (3, 14) \
     and (sys.platform, platform.machine()) == ("linux", "x86_64") else "")')
 
 BIN := $(abspath $(VENV))/bin
+# What runs, with the nodes; what the tests need besides; what the docs need besides.
 STAMP := $(VENV)/.installed
+TEST_STAMP := $(VENV)/.installed-test
 DOCS_STAMP := $(VENV)/.installed-docs
+# Python compiles a module when it is first imported: most of what is installed never is.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 # Message setters check their types only when asked to before the first import. One thread for each
 # process: the tests run side by side. Logs stay inside the environment.
@@ -56,7 +60,7 @@ unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
-venv: $(STAMP) ## build .venv from PyPI, ROS 2 included (PYTHON=... chooses the interpreter)
+venv: $(TEST_STAMP) ## build .venv from PyPI, ROS 2 included (PYTHON=... chooses the interpreter)
 
 $(STAMP): setup.py pyproject.toml
 	@test -n '$(PYTHON)' || { echo 'sonar_imm needs Python 3.10 or newer and found none: install' \
@@ -67,13 +71,21 @@ $(STAMP): setup.py pyproject.toml
 	    'venv: on Debian and Ubuntu, sudo apt install python3-venv' >&2; exit 1; }
 	@echo 'Building $(VENV) with '"$$($(PYTHON) --version)"'; the first time takes a minute or two.'
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@$(INSTALL) --editable .
 	@# Kernels compile while pip fetches the rest; whoever needs one earlier compiles it too.
 	@nohup nice $(BIN)/sonar-imm warm --jobs 1 >$(VENV)/warm.log 2>&1 &
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(ROS)test,lint,sweep]'
+	@$(INSTALL) --editable '.$(ROS)'
 	@touch $@
 
-demo: venv ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
+$(TEST_STAMP): $(STAMP)
+	@$(INSTALL) --editable '.[test,lint,sweep]'
+	@# Without what it brings along, 1.7 GB of Qt and notebooks. Where there is no wheel, its tests say so.
+	@$(INSTALL) --no-deps --only-binary :all: tqdm \
+	    'themachinethatgoesping>=0.33; python_version >= "3.11"' \
+	    'nanobind-backend>=1.0; python_version >= "3.12"' || true
+	@touch $@
+
+demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
 	$(BIN)/sonar-imm demo --out demo
 
 test: test-core test-system ## run the tests; of the Monte Carlo ones a fourth, in turn
@@ -114,7 +126,7 @@ docs-numbers: venv ## check that the tables of docs/ still hold the numbers of d
 	$(BIN)/python docs/check_numbers.py
 
 dist: venv ## build wheel and sdist into dist/, check them and their size
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	@$(INSTALL) build twine
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/twine check --strict dist/*
@@ -124,7 +136,7 @@ placeholders: ## say what only the owner of a release can fill in (address, repo
 	@$(PYTHON) .ci/placeholders.py
 
 $(DOCS_STAMP): $(STAMP)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 bench: venv ## measure the speed against other libraries

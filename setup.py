@@ -33,7 +33,7 @@ SYSTEMS = sorted(path.parent.name for path in (ROOT / PACKAGE / 'trackers').glob
 
 REQUIRES = [
     'attrs>=23.1',
-    'backports.zstd',
+    'backports.zstd; python_version < "3.14"',  # later ones have it themselves
     'click>=8.1',
     'jinja2>=3.0',
     'lz4>=4.0',
@@ -129,8 +129,7 @@ setup(
         'Intended Audience :: Science/Research',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3',
-        'Programming Language :: Python :: 3.10',
-        'Programming Language :: Python :: 3.14',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in range(10, 15)),
         'Topic :: Scientific/Engineering :: GIS',
         'Topic :: Scientific/Engineering',
     ],

@@ -46,8 +46,8 @@ def main(prefix: Path) -> None:
             f'the shared files of {system} are installed',
         )
     command = prefix / 'lib' / 'sonar_imm' / 'sonar-imm'
-    said = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
-    expect(sonar_imm.__version__ in said.stdout, f'sonar-imm says {said.stdout.strip()!r}')
+    printed = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
+    expect(sonar_imm.__version__ in printed.stdout, f'sonar-imm says {printed.stdout.strip()!r}')
     # It needs marine_acoustic_msgs, which are not on PyPI, so it is not started.
     expect(
         (prefix / 'lib' / 'sonar_imm' / 'fls_detector_node').is_file(),
@@ -69,7 +69,7 @@ class Started:
     kernels first."""
 
     def __init__(self, executable: Path):
-        self._name, self._said = executable.name, ''
+        self._name, self._printed = executable.name, ''
         self._process = subprocess.Popen(
             [executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -88,7 +88,7 @@ class Started:
                     break
                 continue
             print(f'  {line}', end='')
-            self._said += line
+            self._printed += line
             if word in line:
                 return
         raise SystemExit(f"{self._name} never said '{word}'")
@@ -104,8 +104,8 @@ class Started:
             ) from None
         self._reader.join(STOP_LIMIT)
         while not self._lines.empty():
-            self._said += self._lines.get()
-        clean = status == 0 and 'Traceback' not in self._said
+            self._printed += self._lines.get()
+        clean = status == 0 and 'Traceback' not in self._printed
         expect(clean, f'{self._name} stops on SIGINT with {status}')
 
     def kill(self) -> None:

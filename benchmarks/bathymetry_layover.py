@@ -32,11 +32,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.study import Parts, study
-from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.hearing import snr
-from sonar_imm_tools.simulation.bathymetry.objects import facets_of, second_of, surfaces_of
+from sonar_imm_tools.simulation.bathymetry.objects import (
+    Facets,
+    facets_of,
+    second_of,
+    surfaces_of,
+)
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SIZES = {'ledge': (0.8, 3.0), 'box': (1.0, 4.0), 'wall': (2.0, 6.0), 'boulder': (0.6, 2.0)}
@@ -72,15 +76,15 @@ class Bins:
     """Counts over pings."""
 
     def __init__(self) -> None:
-        self.two = self.caught = self.one = self.lost = self.kept = 0
+        self.double = self.caught = self.single = self.lost = self.kept = 0
         self.ignored = self.near_ignored = 0
         self.error_ignored = 0.0
 
 
 def objects(
     kind: str, pings: int, seed: int, changes: Mapping[str, Any]
-) -> Iterator[tuple[Snapshot, FloatArray, FloatArray]]:
-    """Pings, with the power and height (T, 4) of their surfaces."""
+) -> Iterator[tuple[Snapshot, Facets]]:
+    """Pings, and the facets that each of them sees."""
     rng = np.random.default_rng((seed, list(SIZES).index(kind)))
     for _ in range(pings):
         size, distance = rng.uniform(*SIZES[kind]), rng.uniform(16.0, 58.0)
@@ -88,14 +92,14 @@ def objects(
         config = scenario('ledge', {**placed, **changes})
         scene = simulate(config, int(rng.integers(1 << 31)))
         snapshot: Snapshot = scene.measurements[0].measurement
-        seen = facets_of(config, snapshot.range, snr(config, snapshot.range))
-        yield snapshot, *surfaces_of(seen, len(snapshot))
+        yield snapshot, facets_of(config, snapshot.range, snr(config, snapshot.range))
 
 
-def count(bins: Bins, snapshot: Snapshot, power: FloatArray, height: FloatArray) -> None:
+def count(bins: Bins, snapshot: Snapshot, facets: Facets) -> None:
     """Add what both settings make of one ping."""
+    power, height = surfaces_of(facets, len(snapshot))
     number, _, _ = second_of(power, height)
-    two, one = number >= 2, (power > 0.0).sum(axis=1) == 1
+    double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
     estimates = []
     for value in ('gated', 'ignored'):
         config = BathymetryConfig(layover=value, seed=1)
@@ -107,23 +111,23 @@ def count(bins: Bins, snapshot: Snapshot, power: FloatArray, height: FloatArray)
         off = np.abs(height - estimates[0].state[:, :1])
     nearest = np.nanmin(np.where(power > 0.0, off, np.inf), axis=1)
     marked = estimates[0].extras['surfaces'] == 2
-    bins.two, bins.one = bins.two + int(two.sum()), bins.one + int(one.sum())
-    bins.caught += int((marked & two).sum())
-    bins.lost += int((marked & one).sum())
-    bins.kept += int((gated & two).sum())
-    bins.ignored += int((ignored & two).sum())
-    bins.near_ignored += int((nearest < 2.0 * sd)[ignored & two].sum())
-    bins.error_ignored += float(np.square(nearest[ignored & two]).sum())
+    bins.double, bins.single = bins.double + int(double.sum()), bins.single + int(single.sum())
+    bins.caught += int((marked & double).sum())
+    bins.lost += int((marked & single).sum())
+    bins.kept += int((gated & double).sum())
+    bins.ignored += int((ignored & double).sum())
+    bins.near_ignored += int((nearest < 2.0 * sd)[ignored & double].sum())
+    bins.error_ignored += float(np.square(nearest[ignored & double]).sum())
 
 
 def shares(bins: Bins) -> dict[str, float]:
     """The row of a table."""
     return {
-        'bins_two': bins.two,
-        'caught': bins.caught / bins.two,
-        'lost': bins.lost / bins.one,
-        'soundings': bins.kept / bins.two,
-        'soundings_ignored': bins.ignored / bins.two,
+        'bins_two': bins.double,
+        'caught': bins.caught / bins.double,
+        'lost': bins.lost / bins.single,
+        'soundings': bins.kept / bins.double,
+        'soundings_ignored': bins.ignored / bins.double,
         'near_ignored': bins.near_ignored / bins.ignored,
         'rmse_ignored_m': float(np.sqrt(bins.error_ignored / bins.ignored)),
     }

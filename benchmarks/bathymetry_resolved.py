@@ -21,7 +21,9 @@ The pings of `bathymetry_layover`, with objects of other seeds, under ``layover:
 (no sounding); `silent`: without an echo; `false`: share of the bins of one surface that get two.
 Of bins with two heights: `rmse`, both against the nearest surface that answers, `inside` two
 standard deviations, the median `sd`, and `outer`: both the lowest and the highest surface met
-within .6 m. `existence`: how often there are two where the tracker says so, over all objects.
+within .6 m. Surfaces count at their mean height; that of a round face lies between the parts above
+and below its nearest one, where nothing is. `facets`: the same against the nearest facet.
+`existence`: how often there are two where the tracker says so, over all objects.
 `ship`: the same below a ship in a swell, from the soundings and the two strongest surfaces.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
 what the tracker reaches along 60 bins. `cost`: CPU time, see `benchmarks.speed.bathymetry`.
@@ -45,7 +47,7 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm.truth import TrueProfile
-from sonar_imm_tools.simulation.bathymetry.objects import second_of
+from sonar_imm_tools.simulation.bathymetry.objects import Facets, second_of, surfaces_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -65,25 +67,27 @@ class Tally:
     """Bins of some pings; each list holds an array per ping."""
 
     def __init__(self) -> None:
-        self.two = self.one = self.caught = self.doubt = self.silent = self.false = 0
+        self.double = self.single = self.caught = self.doubt = self.silent = self.false = 0
         self.off: list[FloatArray] = []
+        self.off_facets: list[FloatArray] = []
         self.sd: list[FloatArray] = []
         self.outer: list[BoolArray] = []
         self.of_three: list[FloatArray] = []
         self.stated: list[FloatArray] = []
         self.true: list[BoolArray] = []
 
-    def add(self, estimate: Estimate, power: FloatArray, height: FloatArray) -> None:
-        """One ping, and the power and height (T, 4) of its surfaces."""
+    def add(self, estimate: Estimate, facets: Facets) -> None:
+        """One ping, and the facets that it sees."""
+        power, height = surfaces_of(facets, len(estimate))
         number = second_of(power, height)[0]
-        two, one = number >= 2, (power > 0.0).sum(axis=1) == 1
+        double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
         surfaces, valid = estimate.extras['surfaces'], estimate.extras['valid'] > 0
         pair = surfaces == 2
-        self.two, self.one = self.two + int(two.sum()), self.one + int(one.sum())
-        self.caught += int((pair & two).sum())
-        self.doubt += int((~valid & (surfaces == 1) & two).sum())
-        self.silent += int(((surfaces == 0) & two).sum())
-        self.false += int((pair & one).sum())
+        self.double, self.single = self.double + int(double.sum()), self.single + int(single.sum())
+        self.caught += int((pair & double).sum())
+        self.doubt += int((~valid & (surfaces == 1) & double).sum())
+        self.silent += int(((surfaces == 0) & double).sum())
+        self.false += int((pair & single).sum())
         there = np.where(power > 0.0, height, np.nan)
         found = np.column_stack([estimate.state[:, 0], estimate.extras['height_2']])
         lower_sd = np.sqrt(estimate.covariance[:, 0, 0])
@@ -91,32 +95,45 @@ class Tally:
         chosen = pair & (power > 0.0).any(axis=1)
         off = np.nanmin(np.abs(found[chosen, :, None] - there[chosen, None, :]), axis=2)
         self.off.append(off)
+        self.off_facets.append(off_facets(found, chosen, facets))
         self.sd.append(sd[chosen])
         self.of_three.append(off[number[chosen] == 3])
-        both = pair & two
+        both = pair & double
         ends = np.column_stack([np.nanmin(there[both], axis=1), np.nanmax(there[both], axis=1)])
         self.outer.append((np.abs(found[both] - ends) < 0.6).all(axis=1))
-        clear = (two | one) & (surfaces > 0)
+        clear = (double | single) & (surfaces > 0)
         self.stated.append(estimate.extras['existence_2'][clear])
-        self.true.append(two[clear])
+        self.true.append(double[clear])
 
     def row(self) -> dict[str, float]:
         off, sd = np.concatenate(self.off), np.concatenate(self.sd)
+        near = np.concatenate(self.off_facets)
         three = np.concatenate(self.of_three)
         return {
-            'bins_two': self.two,
-            'caught': self.caught / self.two,
-            'doubt': self.doubt / self.two,
-            'silent': self.silent / self.two,
-            'false': self.false / self.one,
+            'bins_two': self.double,
+            'caught': self.caught / self.double,
+            'doubt': self.doubt / self.double,
+            'silent': self.silent / self.double,
+            'false': self.false / self.single,
             'rmse_m': rms(off),
             'median_m': float(np.median(off)),
             'inside': float((off < 2.0 * sd).mean()),
+            'rmse_facets_m': rms(near),
+            'inside_facets': float((near < 2.0 * sd).mean()),
             'sd_m': float(np.median(sd)),
             'outer': float(np.concatenate(self.outer).mean()),
             'bins_three': len(three),
             'rmse_three_m': rms(three) if len(three) else math.nan,
         }
+
+
+def off_facets(found: FloatArray, chosen: BoolArray, facets: Facets) -> FloatArray:
+    """Distance (n, 2) of heights found (T, 2) in the bins `chosen` (T,) to the nearest facet."""
+    off = [
+        np.abs(found[place] - facets.height[facets.bin == place, None]).min(axis=0)
+        for place in np.flatnonzero(chosen)
+    ]
+    return np.array(off).reshape(-1, 2)
 
 
 def tracked(snapshot: Snapshot, layover: str = 'resolved') -> Estimate:
@@ -152,7 +169,7 @@ def below_ship(kind: str, pings: int, seed: int) -> dict[str, float]:
     """Soundings of objects below a ship: of bins with two of them, errors to the nearest of the
     two strongest surfaces."""
     rng = np.random.default_rng((seed, list(SIZES).index(kind)))
-    off, sd, two, caught = [], [], 0, 0
+    off, sd, double, caught = [], [], 0, 0
     for _ in range(max(pings // 4, 1)):
         size, distance = rng.uniform(*SIZES[kind]), rng.uniform(16.0, 58.0)
         placed = {'object': kind, 'object_size': size, 'object_distance': distance, 'pings': 4}
@@ -165,8 +182,8 @@ def below_ship(kind: str, pings: int, seed: int) -> dict[str, float]:
             assert isinstance(true, TrueProfile)
             assert true.surfaces is not None and true.height_2 is not None
             pair = estimate.extras['surfaces'] == 2
-            two, caught = (
-                two + int((true.surfaces > 1).sum()),
+            double, caught = (
+                double + int((true.surfaces > 1).sum()),
                 caught + int((pair & (true.surfaces > 1)).sum()),
             )
             for place, end in (('pz', ''), ('pz_2', '_2')):
@@ -177,8 +194,8 @@ def below_ship(kind: str, pings: int, seed: int) -> dict[str, float]:
                 sd.append(np.sqrt(estimate.extras[f'vertical_uncertainty{end}'][known]))
     errors, stds = np.concatenate(off), np.concatenate(sd)
     return {
-        'bins_two': two,
-        'caught': caught / two,
+        'bins_two': double,
+        'caught': caught / double,
         'rmse_m': rms(errors),
         'median_m': float(np.median(errors)),
         'inside': float((errors < 2.0 * stds).mean()),
@@ -238,8 +255,8 @@ def main(pings: int = 40, seed: int = 4) -> Parts:
     for name, changes in SETTINGS.items():
         for kind in SIZES:
             tally = Tally()
-            for snapshot, power, height in objects(kind, pings, seed, changes):
-                tally.add(tracked(snapshot), power, height)
+            for snapshot, facets in objects(kind, pings, seed, changes):
+                tally.add(tracked(snapshot), facets)
             yield {'objects': {f'{kind}, {name}': tally.row()}}
             stated, true = stated + tally.stated, true + tally.true
     for name, row in calibration(np.concatenate(stated), np.concatenate(true)):

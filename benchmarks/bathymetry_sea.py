@@ -56,7 +56,7 @@ EXACT_NAVIGATION = {
     f'nav_{what}': 0.0
     for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
 }
-TOLD: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
+STATED: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
@@ -72,8 +72,8 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'summer profile, grid': ('moving_profile', APART, GRID),
     'summer profile, particles': ('moving_profile', APART, {}),
     'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
-    'height 10 m, told 15, grid': ('moving', unknown(10.0), {**TOLD, **GRID}),
-    'height 10 m, told 15, particles': ('moving', unknown(10.0), TOLD),
+    'height 10 m, told 15, grid': ('moving', unknown(10.0), {**STATED, **GRID}),
+    'height 10 m, told 15, particles': ('moving', unknown(10.0), STATED),
     'height 10 m, told 10, grid': (
         'moving',
         unknown(10.0),
@@ -82,25 +82,25 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'height 10 m, told 15, grid, exact navigation': (
         'moving',
         {**unknown(10.0), **EXACT_NAVIGATION},
-        {**TOLD, **GRID},
+        {**STATED, **GRID},
     ),
     'height 20 m, told 15, grid, exact navigation': (
         'moving',
         {**unknown(20.0), **EXACT_NAVIGATION},
-        {**TOLD, **GRID},
+        {**STATED, **GRID},
     ),
     'height 15 m, told 10, grid, exact navigation': (
         'moving',
         {**unknown(15.0), **EXACT_NAVIGATION},
-        {**TOLD, **GRID, 'sonar_height': 10.0},
+        {**STATED, **GRID, 'sonar_height': 10.0},
     ),
     'height 15 m, told 15, grid, exact navigation': (
         'moving',
         {**unknown(15.0), **EXACT_NAVIGATION},
-        {**TOLD, **GRID},
+        {**STATED, **GRID},
     ),
-    'height 20 m, told 15, grid': ('moving', unknown(20.0), {**TOLD, **GRID}),
-    'height 20 m, told 15, particles': ('moving', unknown(20.0), TOLD),
+    'height 20 m, told 15, grid': ('moving', unknown(20.0), {**STATED, **GRID}),
+    'height 20 m, told 15, particles': ('moving', unknown(20.0), STATED),
     'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
     'nadir, angles, drift, particles': ('paper', NADIR, ANGLES),
     'nadir, angles, paper, grid': ('paper', NADIR, {**ANGLES, **GRID, 'angle_drift': False}),

@@ -164,7 +164,7 @@ def messages(name: str) -> Iterator[Any]:
 def cost(name: str) -> dict[str, float]:
     """Size, CPU time and growth of the peak memory of this process, for one case."""
     system, topic, _ = CASES[name]
-    settings = {'association': 'jipda'} if name == 'fixes_softly' else {}
+    settings = {'association': 'gnn'} if name == 'fixes' else {}
     tracker = SYSTEMS[system].build(SYSTEMS[system].config_type()(**settings))
     tracker.warm()
     entry = next(entry for entry in inputs_of(system) if entry.name == topic)

@@ -51,11 +51,11 @@ class Case:
 
 CASES = {
     'diver, fixes': Case('diver', ('Fix',)),
-    'diver, fixes in clutter (jipda)': Case('diver', ('Fixes',), {'association': 'jipda'}),
+    'diver, fixes, gnn': Case('diver', ('Fix',), {'association': 'gnn'}),
     'diver, echoes': Case('diver', ('Arrivals',), steps=('echoes',)),
     'diver, a tag': Case('diver', ('Arrivals',), steps=('tags',)),
     'diver, a tag with depth': Case('diver', ('Arrivals',), {'dimensions': 3}, ('tags',)),
-    'diver, everything': Case('diver', (), {'association': 'jipda', 'dimensions': 3}),
+    'diver, everything': Case('diver', (), {'dimensions': 3}),
     'obstacle, defaults': Case('obstacle', ('Detections', 'Navigation')),
     'obstacle, fixed ones only': Case(
         'obstacle', ('Detections', 'Navigation'), {'behaviours': ('fixed',)}

@@ -58,6 +58,7 @@ SINGLES: dict[str, dict[str, Any]] = {
     },
 }
 ALONE: dict[str, Any] = {
+    'association': 'gnn',
     'max_tracks': 1,
     'confirm_hits': 1,
     'delete_misses': 10000,
@@ -375,15 +376,15 @@ def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: A
     error, squared, tracker = followed(path, DiverConfig(**values), factor, name)
     error, squared = error[FIRST:], squared[FIRST:]
     there = np.isfinite(squared)
-    said = ' '.join(tracker.warnings())
+    warnings = ' '.join(tracker.warnings())
     return {
         'rmse_m': rms(np.hypot(*error[there].T)),
         'coverage': float(np.mean(squared[there] <= INSIDE)),
         'nees': float(np.mean(squared[there])),
         'followed': float(np.mean(there)),
         'tracks': float(tracker._stream.state.life.next_id - 1),
-        'warns': float('times as far as they state' in said),
-        'advice': float((re.findall(r'are ([\d.e+]+) times too small', said) or ['nan'])[0]),
+        'warns': float('times as far as they state' in warnings),
+        'advice': float((re.findall(r'are ([\d.e+]+) times too small', warnings) or ['nan'])[0]),
     }
 
 

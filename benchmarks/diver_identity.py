@@ -60,6 +60,13 @@ SCENES = ('buddies', 'crossing', 'harbour')
 ALONE = ('clean', 'usbl', 'usbl, named', 'wild')
 COUNTS = (1, 10, 30)
 HOUR = 3600.0
+LEGS: dict[str, Any] = {
+    'motion': 'legs',
+    'sensor': 'scans',
+    'start': [0.0, 0.0],
+    'detection_probability': 0.9,
+}
+"""Scenes of several targets on straight legs."""
 
 
 def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], float]:
@@ -67,45 +74,41 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
     if name == 'buddies':
         truth = truth_of('buddies', seed)
         items: list[Any] = list(measured('buddies', truth, seed))
-        told = {
+        stated = {
             'detection_probability': P_DETECTION,
             'clutter_density': FALSE / (2.0 * HALF) ** 2,
         }
-        return items, Scene((), truth), told, 10.0
+        return items, Scene((), truth), stated, 10.0
     if name == 'harbour':
-        values: dict[str, Any] = {
-            'motion': 'legs',
-            'sensor': 'scans',
+        values = LEGS | {
             'divers': 8,
             'speed': 3.0,
-            'start': [0.0, 0.0],
             'turn_deg': 180.0,
             'leg_min': 10.0,
             'leg_max': 30.0,
             'duration': 300.0,
             'step': 2.0,
             'spacing': 30.0,
-            'detection_probability': 0.9,
             'fix_std': 2.0,
             'clutter': 20.0,
             'clutter_range': 200.0,
         }
         scene = simulate(scenario('table1', values), seed)
-        told = {'speed_mean': 3.0, 'speed_std': 1.0, 'velocity_std': 2.5}
+        stated = {'speed_mean': 3.0, 'speed_std': 1.0, 'velocity_std': 2.5}
         cutoff = 20.0
     else:
         values = {'detection_probability': 0.7, 'clutter': 10.0}
         scene = simulate(scenario('crossing', values), seed)
-        told, cutoff = {}, 10.0
+        stated, cutoff = {}, 10.0
     half = values.get('clutter_range', 80.0)
-    told |= {
+    stated |= {
         'detection_probability': values['detection_probability'],
         'clutter_density': values['clutter'] / (2.0 * half) ** 2,
     }
-    return [item.measurement for item in scene.measurements], scene, told, cutoff
+    return [item.measurement for item in scene.measurements], scene, stated, cutoff
 
 
-def case(name: str, runs: int, untold: bool = False, **settings: Any) -> dict[str, Any]:
+def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) -> dict[str, Any]:
     """The scores of a way to pair, over all runs of a scene."""
     learnt: list[float] = []
     scored: list[dict[str, Any]] = []
@@ -113,9 +116,11 @@ def case(name: str, runs: int, untold: bool = False, **settings: Any) -> dict[st
     named: list[float] = []
     seconds, scans, rows, span = 0.0, 0, 0, 0.0
     for seed in range(runs):
-        items, scene, told, cutoff = scene_of(name, seed)
-        density = told['clutter_density']
-        tracker = DiverTracker(DiverConfig.from_mapping(({} if untold else told) | settings))
+        items, scene, stated, cutoff = scene_of(name, seed)
+        density = stated['clutter_density']
+        tracker = DiverTracker(
+            DiverConfig.from_mapping(({} if nothing_stated else stated) | settings)
+        )
         if not seed:
             tracker.warm()
             tracker.reset()
@@ -179,17 +184,13 @@ def recorded(sensor: str, association: str) -> dict[str, float]:
 
 def cost(association: str, minutes: int = 10, **settings: Any) -> dict[str, float]:
     """What an hour of four divers in clutter costs, from the first minutes of it."""
-    values: dict[str, Any] = {
-        'motion': 'legs',
-        'sensor': 'scans',
+    values = LEGS | {
         'divers': 4,
         'speed': 0.75,
-        'start': [0.0, 0.0],
         'turn_deg': 60.0,
         'duration': 60.0 * minutes,
         'step': 1.0,
         'spacing': 10.0,
-        'detection_probability': 0.9,
         'fix_std': 0.7,
         'clutter': 2.0,
         'clutter_range': 80.0,
@@ -208,23 +209,23 @@ def cost(association: str, minutes: int = 10, **settings: Any) -> dict[str, floa
 
 def main(
     runs: int = 3,
-    untold: int = 10,
+    nothing_stated: int = 10,
     scenes: tuple[str, ...] = SCENES,
     associations: tuple[str, ...] = ASSOCIATIONS,
     counts: tuple[int, ...] = COUNTS,
 ) -> Parts:
-    yield {'runs': runs, 'untold_runs': untold}
+    yield {'runs': runs, 'untold_runs': nothing_stated}
     for name in scenes:
         for association in associations:
             found = case(name, runs, association=association)
             yield {'table': {f'{name}, {association}': found}}
     for name in scenes:
         for association in associations:
-            count = runs if name == 'harbour' else untold
-            found = case(name, count, untold=True, association=association)
+            count = runs if name == 'harbour' else nothing_stated
+            found = case(name, count, nothing_stated=True, association=association)
             yield {'untold': {f'{name}, {association}': {'runs': count, **found}}}
     for scene in ALONE:
-        for association in ('gnn', 'kbest'):
+        for association in associations:
             yield {'single': {f'{scene}, {association}': single(scene, association, runs)}}
     if (DATA / 'autoferry').is_dir():
         for sensor, association in product(('radar', 'lidar'), associations):

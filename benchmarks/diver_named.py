@@ -45,7 +45,7 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SCENES = ('apart', 'buddies')
 HALF, FALSE, SCAN_STD, NAMED_STD, P_DETECTION = 60.0, 2.0, 0.5, 2.0, 0.9
-HEARD_FROM, EVERY = 20, 4
+NAMED_FROM, EVERY = 20, 4
 
 
 def truth_of(scene: str, seed: int) -> tuple[TrueTrack, ...]:
@@ -83,8 +83,8 @@ def measured(scene: str, truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | 
                 frame_id='map',
             )
         )
-        speaks = (k - HEARD_FROM) % EVERY // 2
-        if k < HEARD_FROM or (k - HEARD_FROM) % 2 or (scene == 'buddies' and speaks):
+        speaks = (k - NAMED_FROM) % EVERY // 2
+        if k < NAMED_FROM or (k - NAMED_FROM) % 2 or (scene == 'buddies' and speaks):
             continue
         place = truth[speaks].position[k, :2] + rng.normal(scale=NAMED_STD, size=2)
         measurements.append(

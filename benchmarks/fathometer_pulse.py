@@ -27,14 +27,16 @@ five records are not scored.
 noise: the matrices are the exact ones, the layers are fitted with either pulse and taken off, and
 the largest peaks further than 0.4 m from any layer are listed, each with the nearest place
 z_i + z_j - z_k. MVDR is no linear function of the matrices, so that echoes that interfere beat.
-Then the exact echo of one layer (what changes with the sign of its amplitude) beside the pulses of
-processor and band, by distance, and how much of it there is in each octave, against W, as it is
-('all noise') and with the share of the surface only ('processor').
+Then, with the strongest layer alone, what its echo leaves by distance, its phase left in and taken
+off. Then the exact echo of one layer (what changes with the sign of its amplitude) beside the
+pulses of processor and band, by distance, and how much of it there is in each octave, against W,
+as it is ('all noise') and with the share of the surface only ('processor').
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 from attrs import evolve
 import numpy as np
@@ -47,9 +49,10 @@ from sonar_imm.acoustics.fathometer import (
     steering,
     surface_share,
 )
+from sonar_imm.acoustics.pulse import band_pulse, Pulse
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
@@ -101,8 +104,10 @@ def layers(
     return config, Drift(depth, amplitude, amplitude != 0.0, array, stated), rng
 
 
-def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[str, float]]:
-    """Scores of each pulse and polarity."""
+def run(
+    name: str, seed: int, records: int, particles: int, pulses: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Scores of each of `pulses` and polarity."""
     if name == 'drift':
         config, floor, rng = drift(seed, records)
     else:
@@ -116,7 +121,7 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
         f'{name}, {pulse}, {polarity}': FathometerTracker(
             FathometerConfig(**settings, pulse=pulse, polarity=polarity)
         )
-        for pulse in ('band', 'processor')
+        for pulse in pulses
         for polarity in ('positive', 'both')
     }
     scores: dict[str, list[list[float]]] = {label: [] for label in trackers}
@@ -138,47 +143,98 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
     }
 
 
-def peaks_beside() -> dict[str, list[dict[str, float]]]:
-    """The largest peaks beside the layers of ``strong``, by pulse."""
+class Exact(NamedTuple):
+    """Exact cross-spectra of some of the layers of ``strong``, seen by the tracker: depth (n,) of
+    the layers, z (m,), and responses (m,) in units of one record's noise with the phase of echoes
+    left in and taken off; the pulse of the processor."""
+
+    depth: np.ndarray
+    z: np.ndarray
+    plain: np.ndarray
+    turned: np.ndarray
+    pulse: Pulse
+
+    def left(self, seen: np.ndarray, pulse: Pulse) -> np.ndarray:
+        """`seen` (m,) without the layers, fitted with `pulse` at the nearest cells."""
+        at = np.abs(self.z[:, None] - self.depth).argmin(axis=0)
+        a = np.linalg.solve(pulse(self.z[at][:, None] - self.z[at]), seen[at])
+        return np.asarray(seen - pulse(self.z[:, None] - self.z[at]) @ a)
+
+
+def seen_exactly(count: int, **changes: Any) -> Exact:
+    """The first `count` layers, with these parameters changed."""
     config, floor, rng = layers(0, 1, SIGNS['strong'])
     floor = evolve(floor, depth=DEPTHS[None], array_depth=np.array([config.array_depth]))
+    there = Drift(
+        floor.depth[:, :count],
+        floor.amplitude[:, :count],
+        floor.present[:, :count],
+        floor.array_depth,
+        floor.array_depth_stated,
+    )
     first = np.ceil(config.frequency_min * config.snapshot_seconds)
     last = np.floor(config.frequency_max * config.snapshot_seconds)
     frequency = np.arange(first, last + 1.0) / config.snapshot_seconds
     exact = CrossSpectra(
-        stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, floor, 0, frequency)
+        stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, there, 0, frequency)
     )
     settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
-    tracked = FathometerConfig(
-        **{**settings, 'depth_min': config.depth_min, 'depth_max': config.depth_max},
-        pulse='processor',
-        noise_depth_min=0.0,
-        noise_depth_max=0.0,
-    )
+    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
+    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0, **changes}
+    tracked = FathometerConfig(**settings, pulse='processor')
     lattice = lattice_of_array(config.array_depth, tracked)
     response = array_response(exact, lattice, tracked, config.array_depth)
+    plain = array_response(exact, lattice, evolve(tracked, pulse='band'), config.array_depth)
     drawn = cross_spectra(config, floor, 0, config.array_depth, rng)
     sigma = float(array_response(drawn, lattice, tracked, config.array_depth).sigma[0])
-    z, b = response.depth, response.amplitude / sigma
-    at = np.abs(z[:, None] - DEPTHS).argmin(axis=0)
-    triples = (DEPTHS[:, None, None] + DEPTHS[:, None] - DEPTHS).ravel()
-    found = {}
     assert response.pulse is not None
-    for name, pulse in (('band', pulse_of(tracked)), ('processor', response.pulse)):
-        a = np.linalg.solve(pulse(z[at][:, None] - z[at]), b[at])
-        left = b - pulse(z[:, None] - z[at]) @ a
-        left[np.abs(z[:, None] - DEPTHS).min(axis=1) <= 0.4] = 0.0
+    return Exact(
+        there.depth[0],
+        response.depth,
+        plain.amplitude / sigma,
+        response.amplitude / sigma,
+        response.pulse,
+    )
+
+
+def peaks_beside() -> dict[str, list[dict[str, float]]]:
+    """The largest peaks beside the layers of ``strong``, by pulse."""
+    exact, config = seen_exactly(len(DEPTHS)), scenario('pressure')
+    triples = (DEPTHS[:, None, None] + DEPTHS[:, None] - DEPTHS).ravel()
+    band = band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
+    found = {}
+    for name, pulse, seen in (
+        ('band', band, exact.plain),
+        ('processor', exact.pulse, exact.turned),
+    ):
+        left = exact.left(seen, pulse)
+        left[np.abs(exact.z[:, None] - DEPTHS).min(axis=1) <= 0.4] = 0.0
         size = np.abs(left)
         peaks = 1 + np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:]))
         largest = peaks[np.argsort(-size[peaks])][:8]
         found[name] = [
             {
-                'depth': float(z[k]),
+                'depth': float(exact.z[k]),
                 'sigmas': float(left[k]),
-                'nearest z_i + z_j - z_k': float(triples[np.abs(triples - z[k]).argmin()]),
+                'nearest z_i + z_j - z_k': float(triples[np.abs(triples - exact.z[k]).argmin()]),
             }
             for k in largest
         ]
+    return found
+
+
+def tails() -> dict[str, dict[str, float]]:
+    """What the echo of the strongest layer alone leaves, largest within .1 m of each distance,
+    with its phase left in and taken off, in units of one record's noise."""
+    # The layer stands on a cell.
+    exact = seen_exactly(1, depth_step=0.05)
+    found: dict[str, dict[str, float]] = {}
+    for name, seen in (('phase left in', exact.plain), ('phase off', exact.turned)):
+        left = exact.left(seen, exact.pulse)
+        row = found[name] = {}
+        for away in (-0.9, -0.7, -0.5, -0.3, 0.3, 0.5, 0.7, 0.9):
+            near = left[np.abs(exact.z - exact.depth[0] - away) <= 0.1]
+            row[f'{away:g} m'] = float(near[np.abs(near).argmax()])
     return found
 
 
@@ -252,17 +308,18 @@ def main(
     records: int = 300,
     particles: int = 5000,
     scenes: Sequence[str] = ('strong', 'signed', 'drift'),
+    pulses: Sequence[str] = ('band', 'processor'),
     ghosts: bool = False,
 ) -> Parts:
     if ghosts:
-        yield {'ghosts': peaks_beside(), 'echoes': echoes()}
+        yield {'ghosts': peaks_beside(), 'tails': tails(), 'echoes': echoes()}
         return
     yield {'records': records}
     for name in scenes:
         length = records if name == 'drift' else max(10, records // 10)
         # What costs little is repeated more often.
         seeds = range(runs if name == 'drift' else 5 * runs)
-        found = [run(name, seed, length, particles) for seed in seeds]
+        found = [run(name, seed, length, particles, pulses) for seed in seeds]
         for label in found[0]:
             each = [scores[label] for scores in found]
             error = {'P, s.e.': standard_error([row['P'] for row in each])}

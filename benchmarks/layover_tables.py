@@ -70,15 +70,15 @@ def circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
 
 def levels(y: ComplexArray) -> FloatArray:
     """L (bins,) at noise of unit variance."""
-    _, one, two = layover.residuals(y, 0.5)
-    return np.asarray(2.0 * (np.sqrt(one) - np.sqrt(two)))
+    _, single, double = layover.residuals(y, 0.5)
+    return np.asarray(2.0 * (np.sqrt(single) - np.sqrt(double)))
 
 
-def pooled(two: FloatArray, one: FloatArray) -> FloatArray:
+def pooled(double: FloatArray, single: FloatArray) -> FloatArray:
     """Log ratio (K,) of the shares of two and one surfaces (K,) in classes, increasing: neighbours
     that decrease are pooled, which keeps the mean of the ratio under `one` at 1."""
     blocks: list[list[float]] = []
-    for a, b in zip(two, one):
+    for a, b in zip(double, single):
         blocks.append([a, b, 1])
         while len(blocks) > 1 and blocks[-2][0] * blocks[-1][1] >= blocks[-1][0] * blocks[-2][1]:
             last = blocks.pop()
@@ -104,11 +104,13 @@ def main(
         rows = []
         for row, decibels in enumerate(DECIBELS):
             rng = np.random.default_rng((seed, count, row))
-            one, two = (levels(snapshots(bins, count, float(decibels), k, rng)) for k in (1, 2))
-            shares = [np.histogram(found, EDGES)[0] / bins for found in (two, one)]
+            single, double = (
+                levels(snapshots(bins, count, float(decibels), k, rng)) for k in (1, 2)
+            )
+            shares = [np.histogram(found, EDGES)[0] / bins for found in (double, single)]
             rows.append(pooled(*shares))
-            level = float(np.quantile(one, 0.999))
-            found = {'level': level, 'caught': float((two > level).mean())}
+            level = float(np.quantile(single, 0.999))
+            found = {'level': level, 'caught': float((double > level).mean())}
             yield {'levels': {f'{count} staves, {decibels:g} dB': found}}
         made[f'value_{count}'] = np.array(rows).astype(np.float32)
     if table is not None:

@@ -127,8 +127,8 @@ TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
     'plain CV Kalman': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
     'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
     'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
-    'families (default), gnn': (ours(model_set='families'), (0.0,)),
-    'families (default), jipda': (ours(model_set='families', association='jipda'), (0.0,)),
+    'families, gnn': (ours(model_set='families', association='gnn'), (0.0,)),
+    'families (default), jipda': (ours(model_set='families'), (0.0,)),
     'heading_speed, gnn': (ours(**HEADINGS, **BOATS), (0.03, 0.1, 0.3)),
     'heading_speed, jipda': (ours(**HEADINGS, **BOATS, association='jipda'), (0.03, 0.1, 0.3)),
 }

@@ -74,7 +74,7 @@ OF_BOATS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
     'families (default)': {},
-    'families, jipda': {'association': 'jipda'},
+    'families, gnn': {'association': 'gnn'},
     'heading_speed': {**HEADINGS, **BOATS},
     'heading_speed, jipda': {**HEADINGS, **BOATS, 'association': 'jipda'},
 }

@@ -115,8 +115,8 @@ SOAK: dict[str, Callable[[Row], str]] = {
     'not counted': _plain('uncounted', '.0f'),
 }
 MESSAGES = {
-    'fixes': '`fixes`: 10,000 of one scan, at random',
-    'fixes_softly': 'the same, `association: jipda`',
+    'fixes': '`fixes`: 10,000 of one scan, at random, `association: gnn`',
+    'fixes_softly': 'the same by default',
     'arrivals_wild_tag': '`arrivals`: a tag, 1000 receivers, times that fit nothing',
     'arrivals_many_divers': '`arrivals`: echoes of 50 divers at 20 receivers',
     'detections': '`detections`: 10,000 echoes all over the beam',

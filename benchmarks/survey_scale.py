@@ -81,12 +81,12 @@ def write_lines(place: Path, lines: int, length: float) -> int:
 def surveyed(runs: Path, out: Path, jobs: int, soundings: int) -> dict[str, object]:
     """Costs of a survey of the lines below `runs`."""
     watch = Watch()
-    heard = Progress(begin=watch.begin, say=lambda text: None, warn=lambda text: None)
+    progress = Progress(begin=watch.begin, say=lambda text: None, warn=lambda text: None)
     options = Options(adjusted=True)
     sources = sources_of(runs)
     begun = time.perf_counter()
     with folder_of(out, options), watch, workers(jobs) as run:
-        survey = make(sources, out, options, run, heard)
+        survey = make(sources, out, options, run, progress)
         watch.begin('products', 0)
         write(survey, out)
         watch.begin('', 0)

@@ -21,10 +21,15 @@ A table with measured numbers has a comment above it, which the site shows below
 
     <!-- numbers: read 2026-11-20 1f; COMMAND -->     what COMMAND printed on that day; 1f is the
                                                       digest of all numbers of the table
-    <!-- numbers: none -->                            nothing in it was measured
+    <!-- numbers: none; REASON -->                    nothing in it was measured
     <!-- numbers: sea.json; made by MODULE -->        what `page_of` of that module makes of it
-    <!-- numbers: sea.json; CELLS; rows: KEYS -->     each cell is bound to values of that file
+    <!-- numbers: sea.json; CELLS; rows: KEYS; rest: 1f -->
+                                                      each cell is bound to values of that file; 1f
+                                                      is the digest of the numbers that are not:
+                                                      in heads, in names of rows, those of others
 
+A digest that is missing or wrong is told with the right one: copy it when the numbers are right.
+Figures in code or in a word (`table1`) are parts of names, and not checked.
 `docs/results/sources.json` says by which command a file of `docs/results` was made, and when.
 
 CELLS are paths into the file, one for each of the last columns, divided by `|`; a single one with
@@ -69,7 +74,15 @@ import sys
 from typing import Any
 
 from attrs import frozen
-from result_ages import age_in, history, module_file, paths_of, script_of
+from result_ages import (
+    age_since,
+    commit_of_reading,
+    commit_of_result,
+    history,
+    module_file,
+    paths_of,
+    script_of,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -78,6 +91,8 @@ SOURCES = RESULTS / 'sources.json'
 
 MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r'(?<![\w.])[-+]?(?:\d+(?:,\d{3})*(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?(?![\w.]*\w)')
+ALONE = re.compile(rf'^(?:{NUMBER.pattern}\s*[^\W\d]*\W*)+$')
+"""A cell of numbers, with units at most."""
 MADE = {'parameters'}
 """Folders of docs/ whose pages hold no measurement: they are generated."""
 
@@ -95,15 +110,27 @@ class Table:
     def place(self) -> str:
         return f'{self.page}:{self.line}'
 
-    def digest(self) -> str:
-        """Of all its numbers: what was read by hand has to stay as it was read."""
-        numbers = [number for row in self.rows for cell in row for number in numbers_in(cell)]
-        return hashlib.sha256(' '.join(numbers).encode()).hexdigest()[:6]
+    def numbers(self) -> list[str]:
+        return [number for row in self.rows for cell in row for number in numbers_in(cell)]
 
     def measured(self) -> bool:
-        """Whether it looks like measurements: a decimal number or a share somewhere."""
-        cells = (cell for row in self.rows[2:] for cell in row[1:])
-        return any('.' in n or n.endswith('%') for cell in cells for n in numbers_in(cell))
+        """Whether it looks like measurements: a decimal number, a share, or a cell of numbers."""
+        cells = [cell for row in self.rows[2:] for cell in row[1:]]
+        return any(ALONE.match(cell) for cell in cells) or any(
+            '.' in n or n.endswith('%') for cell in cells for n in numbers_in(cell)
+        )
+
+    def exempt(self) -> str:
+        """Why its numbers are not checked, '' where they are, or where there are none."""
+        kind, _, reason = self.mark.partition(';')
+        if kind not in {'', 'none'} or not self.numbers():
+            return ''
+        return reason.strip() or 'in words, none of them measured'
+
+
+def digest(numbers: list[str]) -> str:
+    """Of numbers that were read by hand: they have to stay as they were read."""
+    return hashlib.sha256(' '.join(numbers).encode()).hexdigest()[:6]
 
 
 def pages() -> list[Path]:
@@ -144,11 +171,16 @@ def on_one_line(text: str) -> str:
 
 def numbers_in(cell: str) -> list[str]:
     """Its numbers but those in code, each with `%` where it is a share."""
-    bare = re.sub(r'`[^`]*`', ' ', cell)
+    bare = without_code(cell)
     return [
         found.group() + '%' * bare[found.end() :].lstrip().startswith('%')
         for found in NUMBER.finditer(bare)
     ]
+
+
+def without_code(cell: str) -> str:
+    """A cell with blanks for its code, as long as it was."""
+    return re.sub(r'`[^`]*`', lambda found: ' ' * len(found.group()), cell)
 
 
 def agrees(number: str, value: float) -> bool:
@@ -157,6 +189,10 @@ def agrees(number: str, value: float) -> bool:
     mantissa, _, exponent = text.partition('e')
     unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition('.')[2]))
     return abs((100.0 if number.endswith('%') else 1.0) * value - float(text)) <= 0.5001 * unit
+
+
+INNER = re.compile(r'\([^)]*\)')
+FIELD = re.compile(r'\{(row|col|n|\d+(?:\.\d+)?)\}')
 
 
 @frozen
@@ -169,10 +205,13 @@ class Binding:
     table: Table
     paths: tuple[str, ...]
     keys: tuple[str, ...]
+    rest: str
+    """The digest of the numbers that are not compared."""
 
     @classmethod
     def of(cls, table: Table) -> Binding:
-        file, cells, *rest = (part.strip() for part in table.mark.split(';'))
+        file, cells, *parts = (part.strip() for part in table.mark.split(';'))
+        named = dict(part.split(':', 1) for part in parts if ':' in part)
         head, _, *body = table.rows
         base, _, columns = cells.rpartition('>>')
         paths = [path.strip() for path in columns.split('|')]
@@ -181,7 +220,7 @@ class Binding:
         if len(paths) >= len(head):
             raise ValueError(f'{len(paths)} paths for {len(head)} columns')
         labels = [label(row[0]) for row in body]
-        given = rest[0].removeprefix('rows:').split('|') if rest else ['='] * len(body)
+        given = named['rows'].split('|') if 'rows' in named else ['='] * len(body)
         if len(given) != len(body):
             raise ValueError(f'{len(given)} keys for {len(body)} rows')
         keys: list[str] = []
@@ -189,30 +228,54 @@ class Binding:
             keys.append((row if key == '=' else key) or keys[-1])
         unbound = ['-'] * (len(head) - len(paths))
         full = [path if path == '-' else with_base(base.strip(), path) for path in paths]
-        return cls(contents(file), table, (*unbound, *full), tuple(keys))
+        rest = named.get('rest', '').strip()
+        return cls(contents(file), table, (*unbound, *full), tuple(keys), rest)
+
+    def compares(self, row: int, column: int) -> bool:
+        return self.paths[column] != '-' and self.keys[row] != '-'
 
     def wrong(self, row: int, column: int, cell: str) -> list[str]:
         """What is wrong with a cell, were it `cell`: row of the body, column of the table."""
-        if self.paths[column] == '-' or self.keys[row] == '-' or cell == '-':
+        if not self.compares(row, column) or cell == '-':
             return []
         mine, _, others = self.filled(row, column).partition('~')
-        outer = re.sub(r'\([^)]*\)', ' ', cell)
-        found = self.compared(outer, mine)
+        found = self.compared(INNER.sub(' ', cell), mine)
         if others:
-            found += self.compared(' '.join(re.findall(r'\([^)]*\)', cell)), others)
+            found += self.compared(' '.join(INNER.findall(cell)), others)
         return found
+
+    def not_compared(self) -> list[str]:
+        """Numbers of heads, of names of rows, of cells without a path, and those of others."""
+        head, _, *body = self.table.rows
+        left = list(head)
+        for row, cells in enumerate(body):
+            for column, cell in enumerate(cells):
+                if not self.compares(row, column):
+                    left.append(cell)
+                elif '~' not in self.filled(row, column):
+                    left += INNER.findall(cell)
+        return [number for cell in left for number in numbers_in(cell)]
 
     def filled(self, row: int, column: int) -> str:
         cells = self.table.rows[row + 2]
-        head = label(self.table.rows[0][column])
-        words = {'row': self.keys[row], 'col': head, 'n': str(column - 1)}
-        for place, cell in enumerate(map(label, cells), start=1):
-            words[f'{place}'] = cell
-            for part, text in enumerate(cell.split(', '), start=1):
-                words[f'{place}.{part}'] = text
+
+        def word(found: re.Match[str]) -> str:
+            name = found[1]
+            if name == 'row':
+                return self.keys[row]
+            if name == 'col':
+                return label(self.table.rows[0][column])
+            if name == 'n':
+                return str(column - 1)
+            place, _, part = name.partition('.')
+            parts = [label(cell) for cell in cells[int(place) - 1 : int(place)]]
+            if part and parts:
+                parts = parts[0].split(', ')[int(part) - 1 :]
+            return parts[0] if parts else found[0]
+
         path = self.paths[column]
         for _ in range(2):  # the key of a row may name its column
-            path = re.sub(r'\{([\w.]+)\}', lambda found: words.get(found[1], found[0]), path)
+            path = FIELD.sub(word, path)
         return path
 
     def compared(self, cell: str, paths: str) -> list[str]:
@@ -227,15 +290,20 @@ class Binding:
             if not agrees(number, value)
         ]
 
-    def cells(self) -> Iterator[tuple[int, int, str]]:
-        """Row of the body, column and text of each cell that is compared."""
-        for row, cells in enumerate(self.table.rows[2:]):
-            for column, cell in enumerate(cells):
-                if self.paths[column] != '-' and self.keys[row] != '-':
-                    yield row, column, cell
-
     def doubts(self) -> list[str]:
-        return [wrong for cell in self.cells() for wrong in self.wrong(*cell)]
+        body = enumerate(self.table.rows[2:])
+        cells = ((row, column, cell) for row, line in body for column, cell in enumerate(line))
+        found = [wrong for cell in cells for wrong in self.wrong(*cell)]
+        left = self.not_compared()
+        right = digest(left) if left else ''
+        if self.rest == right:
+            return found
+        end = f'`; rest: {right}`' if right else 'no `rest`'
+        return [
+            *found,
+            f'{len(left)} numbers have no value in the file (heads, names of rows, numbers of '
+            f'others): are they as they should be? Then the mark ends with {end}',
+        ]
 
 
 def with_base(base: str, path: str) -> str:
@@ -302,16 +370,21 @@ def doubts(table: Table, sources: dict[str, dict[str, str]]) -> list[str]:
     """What is wrong with the numbers of a table, in sentences."""
     kind, _, rest = table.mark.partition(';')
     if not table.mark:
-        return [f'{table.place}: numbers without a source'] if table.measured() else []
+        without = (
+            f'{table.place}: numbers without a source: write above it '
+            f'`<!-- numbers: read {date.today()} {digest(table.numbers())}; COMMAND -->` with the '
+            'command that prints them, or `<!-- numbers: none; REASON -->` if none was measured'
+        )
+        return [without] if table.measured() else []
     if kind == 'none':
-        return []
+        return [] if rest else [f'{table.place}: `none` needs a reason: `none; REASON`']
     if kind.startswith('read '):
-        day, _, digest = kind.removeprefix('read ').strip().partition(' ')
+        day, _, given = kind.removeprefix('read ').strip().partition(' ')
         found = dated(table.place, day, rest.strip())
-        if digest != table.digest():
+        if given != (right := digest(table.numbers())):
             found.append(
-                f'{table.place}: not the numbers that were read; those have the digest '
-                f'{table.digest()}'
+                f'{table.place}: not the numbers that were read on {day}. If `{rest.strip()}` '
+                f'prints them now, the mark begins with `read {date.today()} {right};`'
             )
         return found
     if kind not in sources or not (RESULTS / kind).is_file():
@@ -376,16 +449,23 @@ def all_doubts() -> list[str]:
     return found
 
 
-def age(result: str) -> int | None:
-    """Commits to what a result depends on since it was made, None where that is not known."""
-    return age_in(
-        history(), f'docs/results/{result}', paths_of(result, known_sources()[result]['command'])
+def aged(result: str) -> str:
+    """How many commits to what a result depends on there were since it was made."""
+    made = commit_of_result(history(), f'docs/results/{result}')
+    return since(made, paths_of(result, known_sources()[result]['command']))
+
+
+def aged_reading(mark: str) -> str:
+    """The same for a mark of numbers that were read by hand."""
+    kind, _, command = mark.partition(';')
+    return since(
+        commit_of_reading(kind.split()[1], command.strip()), paths_of('', command.strip())
     )
 
 
-def aged(result: str) -> str:
-    commits = age(result)
-    return 'unknown' if commits is None else f'{commits} commits to its code since'
+def since(made: str, paths: frozenset[str]) -> str:
+    commits = age_since(history(), made, paths)
+    return 'age unknown' if commits is None else f'{commits} commits to its code since'
 
 
 def run(name: str) -> int:
@@ -414,10 +494,15 @@ def main() -> int:
         return status
     for name, source in known_sources().items():
         print(f'{source["date"]}  {name}: {aged(name)}; {source["command"]}')
-    marks = [table.mark for page in pages() for table in tables(page)]
-    bound = sum('.json' in mark.partition(';')[0] for mark in marks)
-    read = sum(mark.startswith('read ') for mark in marks)
-    print(f'{bound} tables bound to results, {read} read by hand')
+    every = [table for page in pages() for table in tables(page)]
+    read = [table for table in every if table.mark.startswith('read ')]
+    for table in read:
+        print(f'{table.place}: {table.mark}; {aged_reading(table.mark)}')
+    for table in every:
+        if reason := table.exempt():
+            print(f'{table.place}: {len(table.numbers())} numbers are not checked: {reason}')
+    bound = sum('.json' in table.mark.partition(';')[0] for table in every)
+    print(f'{bound} tables bound to results, {len(read)} read by hand')
     found = all_doubts()
     for doubt in found:
         print(doubt, file=sys.stderr)

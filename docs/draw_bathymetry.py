@@ -265,8 +265,8 @@ def draw_labels() -> None:
     axes[3].plot([0, 1], [0, 1], color='0.8', linewidth=0.8)
     for name, colour in colours.items():
         rows = result['calibration'][name].values()
-        said, right = [row['said'] for row in rows], [row['right'] for row in rows]
-        axes[3].plot(said, right, 'o-', color=colour, markersize=3, linewidth=1.0, label=name)
+        stated, right = [row['said'] for row in rows], [row['right'] for row in rows]
+        axes[3].plot(stated, right, 'o-', color=colour, markersize=3, linewidth=1.0, label=name)
     axes[3].set(title='detectable bins', xlabel='probability of rough floor', ylabel='share rough')
     axes[3].legend(fontsize=7, loc='upper left')
     save(figure, 'bathymetry_labels.png', tight=False)
@@ -313,8 +313,10 @@ def draw_ledge() -> None:
         surfaces = np.where(power >= 1.0, height, np.nan)
         axis.plot(ping.range, surfaces, color=INK, linewidth=0.8, label='truth')
         valid, two = table['valid'] > 0, table['surfaces'] == 2
-        one = valid & ~two
-        axis.plot(ping.range[one], table['height'][one], '.', color=BLUE, label='one surface')
+        single = valid & ~two
+        axis.plot(
+            ping.range[single], table['height'][single], '.', color=BLUE, label='one surface'
+        )
         if layover == 'gated':
             axis.plot(ping.range[two], table['height'][two], 'x', color=RED, label='no sounding')
         else:

@@ -50,7 +50,8 @@ MARKDOWN = """\
 Written by `make docs` from the configuration classes; `ros2 param describe` shows the same.
 `config/{name}.yaml` holds the defaults, ready to copy.
 
-A parameter that may change while running keeps the tracks; every other one is read at start.
+A *live* parameter may change while the node runs, and the tracks are kept; every other one is
+read at start.
 A wrong value is refused with one sentence that names it, a misspelt name is warned about.
 
 ## The ten that matter
@@ -77,7 +78,7 @@ MATTER = {
         'covariance_scale': 'a warning says that fixes scatter more, or less, than they state',
         'target': 'not a diver: `rov`, `fish`, `boat` or `ship`',
         'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
-        'association': 'several divers who meet in clutter: `kbest`',
+        'association': 'divers who stay side by side, or carry transponders: `kbest`',
         'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
         'clutter_density': 'false fixes per square metre and scan, when you know them',
         'coverage_sector': 'the sensor sees a sector only: who leaves it is not deleted',

@@ -16,14 +16,15 @@
 
 A result depends on the script of its command and on all modules of ours that this imports. It is
 as old as the number of commits that changed one of these files, and are no forebears of the commit
-that changed the result last. Files that were only renamed do not count.
+that changed the result last; for numbers that were read by hand, of the commit that first named
+their day and command. Files that were only renamed do not count.
 """
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 import re
 import subprocess
@@ -32,6 +33,11 @@ from attrs import frozen
 
 ROOT = Path(__file__).resolve().parents[1]
 SYSTEMS = ('bathymetry', 'diver', 'fathometer', 'obstacle')
+LOADED = {
+    'scenes': 'sonar_imm_tools.simulation',
+    'judge': 'sonar_imm_tools.evaluation',
+}
+"""The packages that properties of `System` lead to; its trackers are loaded with `SYSTEMS`."""
 MOVED = 90
 """Per cent: a file that was renamed and is alike by as much was only moved."""
 
@@ -48,40 +54,62 @@ def module_file(module: str) -> Path | None:
     return next(found, None)
 
 
-def imported(module: str, path: Path) -> Iterator[str]:
-    """The modules that a module imports, anywhere in it, as far as they may be ours."""
+@cache
+def imported(module: str, path: Path) -> frozenset[str]:
+    """Those of our modules that a module imports, anywhere in it.
+
+    One that it loads by the name of a system ends in `{system}`."""
+    found = set(_imported(module, path))
+    return frozenset(name for name in found if '{' in name or module_file(name))
+
+
+def _imported(module: str, path: Path) -> Iterator[str]:
     package = module.split('.')[: None if path.name == '__init__.py' else -1]
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding='utf-8'))]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING':
+            continue
+        waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             above = package[: len(package) + 1 - node.level] if node.level else []
             origin = '.'.join([*above, *filter(None, [node.module])])
             yield from (origin, *(f'{origin}.{alias.name}' for alias in node.names))
+        elif isinstance(node, ast.Attribute) and node.attr in LOADED:
+            if ast.unparse(node).startswith('SYSTEMS['):
+                yield LOADED[node.attr] + '.{system}'
 
 
-@lru_cache
+@cache
 def paths_of(result: str, command: str) -> frozenset[str]:
     """Files that a result depends on: its script, and all of ours that this imports.
 
-    Trackers are loaded by name, so those of the result's system count too, or of all systems when
-    its name has none. All of the packages for a command that is no benchmark."""
+    Of what is loaded by the name of a system, that of the result's system, or of all systems when
+    its name, or that of the script, has none. All of the packages for a command that is no
+    benchmark."""
     script = script_of(command)
     if not script:
         ours = (path.parent for path in ROOT.glob('*/__init__.py'))
         return frozenset(name_of(path) for folder in ours for path in folder.rglob('*.py'))
+    title = result or script.rpartition('.')[2]
+    systems = [name for name in SYSTEMS if title.startswith(name)] or SYSTEMS
     found: dict[str, Path] = {}
     waiting = [script]
     while waiting:
         module = waiting.pop()
-        if module not in found and (path := module_file(module)):
+        if module == 'sonar_imm.trackers':
+            waiting += [f'{module}.{system}.*' for system in systems]
+        if '{system}' in module:
+            waiting += [module.format(system=system) for system in systems]
+        elif module.endswith('.*'):
+            folder = ROOT.joinpath(*module.split('.')[:-1])
+            waiting += [f'{module[:-2]}.{path.stem}' for path in folder.glob('[a-z]*.py')]
+        elif module not in found and (path := module_file(module)):
             found[module] = path
             waiting += imported(module, path)
-    files = set(found.values())
-    if 'sonar_imm.trackers' in found:
-        for system in [name for name in SYSTEMS if result.startswith(name)] or SYSTEMS:
-            files |= set((ROOT / 'sonar_imm' / 'trackers' / system).rglob('*.py'))
-    return frozenset(map(name_of, files))
+    return frozenset(map(name_of, found.values()))
 
 
 def name_of(path: Path) -> str:
@@ -98,16 +126,17 @@ class Commit:
     """Name before, name after, per cent alike."""
 
 
-@lru_cache
+def git(*words: str) -> str:
+    try:
+        done = subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True)
+    except OSError:
+        return ''
+    return done.stdout if done.returncode == 0 else ''
+
+
+@cache
 def history() -> tuple[Commit, ...]:
     """All commits, newest first; none without git, or where the clone is shallow."""
-
-    def git(*words: str) -> str:
-        try:
-            done = subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True)
-        except OSError:
-            return ''
-        return done.stdout if done.returncode == 0 else ''
 
     if git('rev-parse', '--is-shallow-repository').strip() != 'false':
         return ()
@@ -124,13 +153,36 @@ def commit_of(text: str) -> Commit:
     return Commit(name, tuple(parents), changes)
 
 
-def age_in(commits: tuple[Commit, ...], result: str, paths: frozenset[str]) -> int | None:
+@cache
+def readings() -> tuple[tuple[str, str, str], ...]:
+    """Numbers read by hand that a commit brought, newest first: commit, day, begin of command."""
+    log = git('log', '--topo-order', '-p', '-U0', '-G^<!-- numbers: read', '--format=%x00%H')
+    line = re.compile(r'^\+<!-- numbers: read (\S+?)(?: \w+)?; *(.*?)(?: *-->)?$', re.MULTILINE)
+    return tuple(
+        (commit.partition('\n')[0], day, command)
+        for commit in log.split('\0')[1:]
+        for day, command in line.findall(commit)
+    )
+
+
+def commit_of_result(commits: tuple[Commit, ...], result: str) -> str:
+    """The commit that changed a file last, '' for none."""
+    found = (c.name for c in commits if any(result == new for _, new, _ in c.changes))
+    return next(found, '')
+
+
+def commit_of_reading(day: str, command: str) -> str:
+    """The first commit with numbers that a command printed on that day, '' for none."""
+    found = [c for c, that, begin in readings() if that == day and command.startswith(begin)]
+    return found[-1] if found else ''
+
+
+def age_since(commits: tuple[Commit, ...], made: str, paths: frozenset[str]) -> int | None:
     """Of all `commits`, newest first, those that changed `paths` and are no forebears of the one
-    that changed `result` last."""
-    made = next((c for c in commits if any(result == new for _, new, _ in c.changes)), None)
-    if made is None:
+    named `made`; None where that is not known."""
+    if not any(commit.name == made for commit in commits):
         return None
-    names, old, count = set(paths), {made.name}, 0
+    names, old, count = set(paths), {made}, 0
     for commit in commits:
         if commit.name in old:
             old |= set(commit.parents)

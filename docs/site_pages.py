@@ -82,13 +82,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 def caption(mark: str, up: str) -> str:
     """What is shown below a table for its mark; `up` leads from the page to docs/."""
-    from check_numbers import aged, known_sources
+    from check_numbers import aged, aged_reading, known_sources
 
     kind, _, rest = mark.partition(';')
     if kind == 'none':
         return ''
     if kind.startswith('read '):
-        return f'*Read on {kind.split()[1]}:* `{rest.strip()}`'
+        return f'*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`'
     source = known_sources()[kind]
     return (
         f'*Values of {source["date"]} ({aged(kind)}), [{kind}]({up}results/{kind}):* '

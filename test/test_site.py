@@ -136,7 +136,8 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
 def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
     text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
     assert made.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
+        '| a |\n|---|\n| 1.5 |\n\n'
+        '*Read on 2026-11-20 (age unknown):* `sonar-imm bench`\n\nAfter.\n'
     )
     text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
     shown = made.captioned(text, '../')

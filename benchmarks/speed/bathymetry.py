@@ -44,7 +44,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.ping import Look, look
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm.trackers.bathymetry.two_surfaces import stretches
+from sonar_imm.trackers.bathymetry.two_surfaces import possible_bins, stretches
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 PEER_BINS = 400
@@ -284,7 +284,8 @@ def bench_layover(rounds: int = 7) -> dict[str, Any]:
                 timed, seen = under_way(scene, changes, values)
                 methods[f'{scene}, {engine}, {layover}'] = timed
                 if scene == 'ledge' and seen.layover is not None:
-                    parts = stretches(seen.layover.existence)
+                    possible = possible_bins(seen.ping.snapshot.iq, seen.layover)
+                    parts = stretches(possible)
                     share = sum(end - first for first, end in parts) / timed[1]
     speed = rates(methods, rounds, clock=time.process_time)
     slow, fast = (speed[f'ledge, particles, {name}'] for name in ('resolved', 'gated'))

@@ -269,7 +269,7 @@ def _damped_step(
     a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
     trace = information[:, 0, 0] + information[:, 1, 1]
     smallest = 0.5 * (a + d) - np.hypot(0.5 * (a - d), b)
-    shift = damping * trace + np.maximum(-2.0 * smallest, 0.0) + 1e-300
+    shift = damping * trace + np.maximum(-2.0 * smallest, 0.0)
     a, d = a + shift, d + shift
     x, y = gradient.T
     step = np.stack([d * x - b * y, a * y - b * x], axis=-1)

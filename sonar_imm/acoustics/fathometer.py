@@ -233,6 +233,43 @@ def sampled_share(csdm: ComplexArray, loading: float, snapshots: float) -> Float
     return np.maximum(share, 1.0 / snapshots)
 
 
+def echo_phase(
+    csdm: ComplexArray,
+    frequency: ArrayLike,
+    heights: NDArray[np.floating],
+    below: ArrayLike,
+    sound_speed: float,
+    loading: float,
+) -> FloatArray:
+    """Phase (K, F), rad, of what MVDR makes of the echo of a layer, against exp(-i 2 k H): of
+    layers ``H = below`` (K,), m below hydrophone 0, by the cross-spectra of this record.
+
+    Noise comes down under all angles, and what comes nearly from above the array cannot tell from
+    the vertical: its echo has the phase u 2 k H, u the sine of its angle, which is less than that
+    from above. So there is a tail above the layer, the more so the nearer the layer and the wider
+    the beam (.16 rad at 100 Hz, 22 m below 4 m of hydrophones). Cross-spectra of the echo are
+    those of `noise_integral` between the array and its image; R_l^-1 of this record says what
+    MVDR leaves of them. From every 16th row."""
+    f = np.asarray(frequency, np.float64)
+    rows = np.arange(0, len(f), 16)
+    k, R = 2.0 * np.pi * f[rows] / sound_speed, csdm[rows].astype(np.complex128)
+    w, M = steering(f[rows], heights, sound_speed), len(heights)
+    ridge = loading * np.einsum('fmm->f', R).real / M
+    solved = np.linalg.solve(
+        R + ridge[:, None, None] * np.eye(M), np.stack([w.conj(), w], axis=-1)
+    )
+    # Pairs whose image is equally far count together.
+    apart, group = np.unique(np.round(heights[:, None] + heights, 6), return_inverse=True)
+    pairs = solved[:, :, None, 0].conj() * solved[:, None, :, 1]
+    pairs = pairs.reshape(len(rows), -1) @ np.eye(len(apart))[group.ravel()]
+    found = []
+    for H in np.asarray(below, np.float64):
+        image = noise_integral(-k[:, None] * (apart + 2.0 * H))
+        echo = -1j * (pairs * image).sum(axis=1) * np.exp(2j * k * H)
+        found.append(np.interp(np.arange(len(f)), rows, np.unwrap(np.angle(echo))))
+    return np.array(found)
+
+
 def _running_mean(values: FloatArray) -> FloatArray:
     half = min(_RUNNING // 2, len(values) - 1)
     padded = np.pad(values, half, 'reflect')

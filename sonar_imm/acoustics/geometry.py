@@ -110,6 +110,24 @@ def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """x, y, z, w of `rotation`.
+
+    >>> import numpy as np
+    >>> [round(part, 3) for part in quaternion(0.0, 0.0, np.pi / 2)]
+    [0.0, 0.0, 0.707, 0.707]
+    """
+    (sr, cr), (sp, cp), (sy, cy) = (
+        (np.sin(0.5 * angle), np.cos(0.5 * angle)) for angle in (roll, pitch, yaw)
+    )
+    return (
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+        float(cr * cp * cy + sr * sp * sy),
+    )
+
+
 def euler_angles(R: FloatArray) -> FloatArray:
     """Roll, pitch and yaw (..., 3) of a rotation (..., 3, 3); pitch in [-pi/2, pi/2]."""
     return np.stack(

@@ -143,7 +143,7 @@ def uncertainties(
     share = budget.sound_speed / sound_speed
     with np.errstate(divide='ignore', invalid='ignore'):
         over = np.where(D > 0.0, Y / D, np.inf)
-        steepness = np.where(Y > 0.0, np.minimum(D / Y, STEEPEST), STEEPEST)
+        steepness = np.fmin(D / Y, STEEPEST)
     bent = np.where(Y > 0.0, 0.5 * share * Y * over, 0.0)
     bent_aside = np.where(Y > 0.0, 0.5 * share * Y * np.minimum(1.0, STEEPEST * over), 0.0)
     vertical = variance + np.square(budget.attitude * Y) + budget.heave**2

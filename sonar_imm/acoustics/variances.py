@@ -135,10 +135,10 @@ def decorrelation(iq: NDArray, chosen: BoolArray, half_width: int = 5) -> float:
     near, far = (part.reshape(len(y), -1) for part in (y[..., :-1], y[..., 1:]))
     across = np.abs(np.einsum('kn,kn->k', far, near.conj()))
     powers = [np.einsum('kn,kn->k', part, part.conj()).real for part in (near, far)]
-    heard = (powers[0] > 0.0) & (powers[1] > 0.0)
-    if not heard.any():
+    powered = (powers[0] > 0.0) & (powers[1] > 0.0)
+    if not powered.any():
         return float('nan')
-    return float(1.0 - np.median(across[heard] / np.sqrt(powers[0] * powers[1])[heard]))
+    return float(1.0 - np.median(across[powered] / np.sqrt(powers[0] * powers[1])[powered]))
 
 
 def signal_variance(

@@ -32,6 +32,9 @@ LLVM never sees a damaged one.
 No cache is a condition. What cannot be loaded is compiled, and what cannot be kept (a full disk, a
 folder of another user) is compiled anew by each process; a warning says so once.
 
+Whoever compiles has some 70 MB more for as long as it lives: numba and LLVM give little back.
+`Elsewhere` is another process that compiles for one that runs long.
+
 numba has no public way to do this. The private parts in use are
 
 * ``numba.core.caching.FunctionCache(function)``, which finds the folder and turns compiled code
@@ -54,11 +57,15 @@ from functools import cache
 import gc
 import hashlib
 import inspect
+import json
 import os
 from pathlib import Path
 import pickle
 import re
+import signal
+import subprocess
 import sys
+import threading
 import time
 from types import CodeType, ModuleType
 from typing import Any, cast, TypeVar
@@ -75,7 +82,8 @@ KEPT_SECONDS = 7 * 86400.0
 """How long code is kept that was compiled of sources as they no longer are."""
 
 kernels: Counter[str] = Counter()
-"""How many kernels this process has 'loaded' and 'compiled', one for each signature."""
+"""How many kernels this process has 'loaded' and 'compiled', one for each signature; what was
+compiled for it `Elsewhere` counts as well."""
 
 listeners: list[Callable[[], object]] = []
 """Called after each kernel that was compiled."""
@@ -135,6 +143,8 @@ def _or_none(
     def guarded(*args: Any) -> Any:
         try:
             found = use_cache(*args)
+            if found is None and getattr(_thread, 'only_kept', False):
+                raise _NotKept(function.__qualname__)
             if found is not None or counted_as == 'compiled':
                 kernels[counted_as] += 1
                 present.update(with_callees(function))
@@ -200,6 +210,115 @@ def expect(needed: tuple[int, int]) -> None:
     """Begin a new `progress`."""
     global progress
     progress = Progress(needed)
+
+
+class _NotKept(BaseException):
+    """A kernel has to be compiled. No `Exception`, which a tracker may take for bad data."""
+
+
+_thread = threading.local()
+
+
+def kept(step: Callable[[], object]) -> bool:
+    """Run `step` as long as it has nothing to compile that could be kept; whether it ran to its
+    end. For other threads nothing changes."""
+    _thread.only_kept = True
+    try:
+        step()
+    except _NotKept:
+        return False
+    finally:
+        _thread.only_kept = False
+    return True
+
+
+Steps = Callable[[], list[tuple[str, Callable[[], object]]]]
+"""Makes steps that compile, each with a name. It is pickled."""
+
+
+class Elsewhere:
+    """Another process, which compiles what this one loads from disk afterwards."""
+
+    one_at_a_time = threading.Lock()
+    """For the threads of this process: they need much the same kernels."""
+    _PROGRAM = (
+        'import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); '
+        f'from {__name__} import _compile_for_another; _compile_for_another()'
+    )
+
+    @classmethod
+    def begin(cls, steps: Steps) -> Elsewhere | None:
+        """None where the steps cannot be pickled, or no process can be started."""
+        try:
+            return cls(steps)
+        except (OSError, pickle.PicklingError, AttributeError, TypeError):
+            return None
+
+    def __init__(self, steps: Steps):
+        request = pickle.dumps([entry or os.getcwd() for entry in sys.path]) + pickle.dumps(steps)
+        pipe = subprocess.PIPE
+        program = [sys.executable, '-c', self._PROGRAM]
+        self._process = subprocess.Popen(
+            program, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL
+        )
+        self._say(request)
+
+    def compile(self, name: str) -> None:
+        """Compile the step `name` there, and count here what it has compiled. Returns early when
+        it cannot, or was stopped: what is not on disk then is compiled by whoever needs it."""
+        if not self._say(f'{json.dumps(name)}\n'.encode()):
+            return
+        assert self._process.stdout
+        for line in self._process.stdout:
+            if not line.endswith(b'\n') or not (made := json.loads(line)):
+                return
+            present.update(made)
+            kernels['compiled'] += 1
+
+    def stop(self) -> None:
+        """End it now."""
+        self._process.terminate()
+
+    def close(self) -> None:
+        """End it, and wait."""
+        self.stop()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close() if pipe else None
+
+    def _say(self, request: bytes) -> bool:
+        assert self._process.stdin
+        try:
+            self._process.stdin.write(request)
+            self._process.stdin.flush()
+        except OSError:  # it has ended
+            return False
+        return True
+
+
+def _compile_for_another() -> None:
+    """What the process of `Elsewhere` does: for each name it reads one line for each kernel it has
+    compiled, with all that are new since the last line, and an empty one at the end."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(os, 'nice'):  # on Windows there is none; the node answers first
+        os.nice(5)
+    answers = os.fdopen(os.dup(1), 'w')
+    os.dup2(2, 1)  # whatever else is printed
+    # Where nothing can be kept the other process compiles; numba's own cache it does not know.
+    warnings.simplefilter('error', RuntimeWarning)
+    steps = dict(pickle.load(sys.stdin.buffer)())
+    said = dict[str, int]()
+
+    def compiled() -> None:
+        new = {name: lines for name, lines in present.items() if name not in said}
+        said.update(new)
+        print(json.dumps(new or said), file=answers, flush=True)
+
+    listeners.append(compiled)
+    for line in sys.stdin.buffer:
+        steps[json.loads(line)]()
+        print('{}', file=answers, flush=True)
 
 
 class _RareCollections(event.Listener):

@@ -116,7 +116,9 @@ class BaseNode(ManagedNode):
             self._offer()
         finally:
             self._made = self._entities() - before
-        self._warming = Warming(self.warm_steps, self._connected, self.kernels_of)
+        self._warming = Warming(
+            self.warm_steps, self._connected, self.kernels_of, self.steps_elsewhere()
+        )
         self._until_warm = self.create_timer(LOOK, self.look, clock=self._steady)
 
     def look(self) -> None:
@@ -231,6 +233,10 @@ class BaseNode(ManagedNode):
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """What compiles or loads the kernels that these measurements need, None: all."""
         raise NotImplementedError
+
+    def steps_elsewhere(self) -> Callable[[], list[WarmStep]] | None:
+        """What makes all steps of `warm_steps` again in another process; it is pickled."""
+        return None
 
     def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
         """About how many kernels these steps of `warm_steps` need, and how many lines of source
@@ -482,6 +488,10 @@ class TrackerNode(BaseNode):
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """Those of the tracker."""
         return self.tracker.warm_steps(inputs)
+
+    def steps_elsewhere(self) -> Callable[[], list[WarmStep]]:
+        """Those of a tracker with the same parameters."""
+        return functools.partial(SYSTEMS[self._name].warm_steps, self._config)
 
     def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
         """Those of the system."""

@@ -31,6 +31,7 @@ if __name__ == '__main__':
     one_blas_thread()  # before numpy is imported
 
 from collections.abc import Callable, Collection
+import functools
 import sys
 from typing import Any
 
@@ -47,6 +48,11 @@ from .qos import output_qos
 from .running import run
 
 NAME = 'fls_detector'
+
+
+def warm_steps(config: DetectorConfig) -> list[WarmStep]:
+    """Those of the detector."""
+    return [('images', ImageDetector(config).warm)]
 
 
 class FlsDetectorNode(BaseNode):
@@ -84,7 +90,11 @@ class FlsDetectorNode(BaseNode):
 
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """The detector has one."""
-        return [('images', ImageDetector(self._settings[DetectorConfig]).warm)]
+        return warm_steps(self._settings[DetectorConfig])
+
+    def steps_elsewhere(self) -> Callable[[], list[WarmStep]]:
+        """The same."""
+        return functools.partial(warm_steps, self._settings[DetectorConfig])
 
     def work_report(self) -> dict[str, Any]:
         """How many messages of detections there were."""

@@ -55,7 +55,9 @@ class Warming:
     """Compiles or loads kernels in a thread of its own, step by step.
 
     What the connected publishers call for comes first; when nobody publishes yet, that is
-    everything. The rest is compiled after `ready`, beside the first messages.
+    everything. The rest is compiled after `ready`, beside the first messages. A process of its own
+    compiles, so that the node does not keep the memory which that takes; it ends with the last
+    step. Where that cannot keep what it compiles, the thread compiles.
     """
 
     PATIENCE, PERIOD = 3.0, 10.0
@@ -68,13 +70,17 @@ class Warming:
         steps: Callable[[Collection[type] | None], list[WarmStep]],
         connected: Callable[[], Collection[type] | None],
         kernels_of: Callable[[Collection[str]], tuple[int, int]],
+        elsewhere: Callable[[], list[WarmStep]] | None = None,
     ):
         """steps: what there is to do for measurements of these classes, None for all. connected:
         the classes that somebody publishes now, None for nobody. kernels_of: what steps need, see
-        `trackers.System.kernels_of`."""
+        `trackers.System.kernels_of`. elsewhere: makes the same steps in a process that compiles,
+        see `jit.Elsewhere`; None: the thread does."""
         from ..estimation import jit  # and numba, which the tracker has loaded by now
 
         self._steps, self._connected, self._kernels_of = steps, connected, kernels_of
+        self._elsewhere = elsewhere
+        self._process: jit.Elsewhere | None = None
         self._jit, self._progress = jit, jit.Progress()
         self._start = time.monotonic()
         self._said = -self.PERIOD
@@ -98,8 +104,10 @@ class Warming:
         return not self._thread.is_alive()
 
     def stop(self, *, wait: bool) -> None:
-        """Begin no further step."""
+        """Begin no further step, and no further kernel in the other process."""
         self._stopped.set()
+        if process := self._process:
+            process.stop()
         if wait:
             self._thread.join()
 
@@ -123,6 +131,9 @@ class Warming:
             self._work()
         except Exception as error:
             self._error = error
+        finally:
+            if self._process:
+                self._process.close()
         self._ready = True
 
     def _work(self) -> None:
@@ -137,8 +148,24 @@ class Warming:
             self._ready = self._ready or not wanted
             self._progress.needed = self._kernels_of([*done, *(wanted or left)])
             self._doing = (wanted or [*left])[0]
-            left.pop(self._doing)()
+            self._do(self._doing, left.pop(self._doing))
             done.append(self._doing)
+
+    def _do(self, name: str, step: Callable[[], object]) -> None:
+        from ..estimation import jit
+
+        if self._elsewhere is not None:
+            if jit.kept(step):
+                return
+            with jit.Elsewhere.one_at_a_time:
+                # Another node of this process may have had it compiled meanwhile.
+                if jit.kept(step) or self._stopped.is_set():
+                    return
+                self._process = self._process or jit.Elsewhere.begin(self._elsewhere)
+                if self._process and not self._stopped.is_set():
+                    self._process.compile(name)
+        if not self._stopped.is_set():
+            step()
 
 
 class ManagedNode(LifecycleNodeMixin, Node):

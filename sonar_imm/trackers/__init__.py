@@ -134,6 +134,10 @@ class System:
         jit.expect(self.kernels_of([name for name, _ in tracker.warm_steps(inputs)]))
         tracker.warm(inputs)
 
+    def warm_steps(self, config: Config) -> list[WarmStep]:
+        """Those of a tracker of its own, for another process: this can be pickled."""
+        return self.build(config).warm_steps()
+
     def _own(self, dotted: str) -> Any:
         module, _, name = dotted.rpartition('.')
         return getattr(import_module(f'{__name__}.{self.name}.{module}'), name)

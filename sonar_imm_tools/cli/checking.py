@@ -141,7 +141,7 @@ def play_recording(
     params: Path | None = None,
     limit: float | None = None,
     topics: Mapping[str, str] | None = None,
-    quiet: bool = False,
+    quiet: bool,
     live: bool = True,
 ) -> PlayedRecording:
     """Track `bag` offline and, if `live`, by the node too into `folder`, and compare.

@@ -119,12 +119,12 @@ def command(
                 stack.close()
                 return stack.enter_context(progress(what, total, quiet=as_json))
 
-            heard = Progress(
+            hooks = Progress(
                 begin=begin,
                 say=lambda text: say(text, quiet=as_json),
                 warn=lambda text: click.echo(text, err=True),
             )
-            survey = make(sources, out, options, run, heard)
+            survey = make(sources, out, options, run, hooks)
         content = write(survey, out)
     failed = [line for line in content['lines'] if line['failure']]
     if as_json:

@@ -189,13 +189,13 @@ class Plan:
         from ..offline.batch import Job
         from ..offline.tracking import InputOptions
         from ..recordings.reader import BagReader
-        from ..recordings.topics import instruments, said_of_topics
+        from ..recordings.topics import instruments, remarks_on_topics
 
         wanted = inputs_by_topic(self.topics)
         with BagReader(bag, strict=self.strict) as reader:
             system = choose_system(reader, self.system, wanted)
             found = instruments(reader, system.name, wanted)
-            for sentence in said_of_topics(reader, system.name, found):
+            for sentence in remarks_on_topics(reader, system.name, found):
                 note(sentence)
         params = self.parameters_of(bag)
         config, node = load_config(system, params, self.overrides)

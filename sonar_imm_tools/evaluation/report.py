@@ -103,6 +103,11 @@ class Part:
         return ', '.join([*checked, self.verdict or 'uncertainty not scored'])
 
     @property
+    def was_played(self) -> bool:
+        """Whether the node heard the recording: there are other checks than that of the error."""
+        return any(not check.name.endswith(' against truth') for check in self.checks)
+
+    @property
     def check_rows(self) -> list[tuple[str, str, str, str]]:
         """The checks as a table."""
         return [(c.name, c.result, c.wanted, 'yes' if c.good else 'NO') for c in self.checks]

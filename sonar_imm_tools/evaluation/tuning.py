@@ -59,7 +59,7 @@ from ..recordings.reader import BagReader
 
 FEWEST = 20
 """Measurements below which nothing is fitted."""
-TOLD = 0.35
+DETERMINED = 0.35
 """Standard error, of a logarithm or logit, up to which a parameter is told."""
 STEP = 0.15
 """Of central differences."""
@@ -130,8 +130,8 @@ class Recording:
         options = evolve(job.options, order='stamp', smooth=False)
         with BagReader(job.bag) as reader:
             run = OfflineRun(reader, SYSTEMS[job.system], job.config, options)
-            heard = [item.measurement for item in run.read()]
-        found = tuple(item for item in heard if not isinstance(item, Rejection))
+            taken = [item.measurement for item in run.read()]
+        found = tuple(item for item in taken if not isinstance(item, Rejection))
         config = _predictive(job.system).for_tuning(run.tracker.config)
         return cls(job.system, config, options.frame_id, found)
 
@@ -401,23 +401,27 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         part = evolve(fitting, tunables=tuple(tunables[k] for k in free))
         se[free] = errors(part, best[free], evaluate)
         used += 1 + 2 * len(free) ** 2
-    told = (se <= TOLD) & ~at_bound
+    determined = (se <= DETERMINED) & ~at_bound
 
     before, _ = fitting.scores(None)
     after, gain, values = before, 0.0, {}
     final = best
-    if told.any():
-        again = evolve(fitting, tunables=tuple(t for t, yes in zip(tunables, told) if yes))
-        begin = [(again, start[told], FIRST), (again, start[told], SECOND)]
-        if not told.all():
-            begin.append((again, best[told], WHOLE))
+    if determined.any():
+        again = evolve(fitting, tunables=tuple(t for t, yes in zip(tunables, determined) if yes))
+        begin = [(again, start[determined], FIRST), (again, start[determined], SECOND)]
+        if not determined.all():
+            begin.append((again, best[determined], WHOLE))
         fits = together(maximise, begin)
         used += sum(found[2] for found in fits)
         final = best.copy()
-        if not told.all():
-            final[told] = fits[2][0]
+        if not determined.all():
+            final[determined] = fits[2][0]
         chosen = np.array(
-            [t.coordinate(rounded(t.value(u))) for t, u, yes in zip(tunables, final, told) if yes]
+            [
+                t.coordinate(rounded(t.value(u)))
+                for t, u, yes in zip(tunables, final, determined)
+                if yes
+            ]
         )
         halves = together(
             _score,
@@ -444,9 +448,9 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         reason = ''
         if at_bound[k]:
             reason = f'the likelihood goes on rising beyond {tunable.value(best[k]):.4g}'
-        elif not told[k]:
+        elif not determined[k]:
             reason = 'cannot be told from this recording'
-        value = rounded(tunable.value(place)) if told[k] else tunable.start
+        value = rounded(tunable.value(place)) if determined[k] else tunable.start
         rows.append(
             Row(
                 name=tunable.label,
@@ -454,7 +458,7 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
                 after=value,
                 low=low,
                 high=high,
-                verdict='told' if told[k] else 'flat',
+                verdict='told' if determined[k] else 'flat',
                 reason=reason,
             )
         )

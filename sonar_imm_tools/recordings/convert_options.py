@@ -451,12 +451,11 @@ class XtfOptions:
 
 @frozen(kw_only=True)
 class Ek80Options:
-    """Raw file of a Simrad EK80 with complex samples to /snapshot and /nav. Needs
-    themachinethatgoesping.
+    """Raw file of a Simrad EK80 to /snapshot and /nav. Needs themachinethatgoesping.
 
     The sectors of a split beam are summed to its starboard and its port half; --staves says other
-    sums. Chirps are left out: they are not compressed. Of several channels the first is taken, or
-    the one that --channel names.
+    sums. Power and angles make the same two halves. Chirps are compressed. Of several channels the
+    first is taken, or the one that --channel names.
     """
 
     EXAMPLES: ClassVar = ('D20221108.raw line.bag', 'D20221108.raw line.bag --channel ES70')
@@ -473,7 +472,8 @@ class KongsbergOptions:
     """Soundings of a KMALL or .all file of a Kongsberg multibeam to /ground, and /nav. Needs
     themachinethatgoesping.
 
-    They are a reference, or the ground of the obstacle tracker: no tracker takes them alone.
+    They are a reference, or the ground of the obstacle tracker: no tracker takes them alone. The
+    last profile of sound speed is kept in parameters.yaml beside the bag.
     """
 
     EXAMPLES: ClassVar = ('0077.kmall reference.bag', '0077.all reference.bag')

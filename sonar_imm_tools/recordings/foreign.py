@@ -17,9 +17,9 @@ A damaged file may make a library fail, hang, or ask for memory without end. So 
 child process that may take `MEMORY` bytes and be silent for `SILENCE` seconds. What it gave until
 then is kept.
 
-The child gives records, dicts with the key ``kind``: ``ping`` (see the readers), ``floor`` for
-soundings, ``profile`` for speeds of sound, and ``problem``, whose ``text`` says why there is no
-more. This module imports nothing of the package, so that the child starts fast.
+The child gives records, dicts with the key ``kind``: ``ping`` (see the readers), ``profile`` (see
+`_profile`) and ``problem``, whose ``text`` says why there is no more. This module imports nothing
+of the package, so that the child starts fast.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ import math
 import os
 from pathlib import Path
 import pickle
-import resource
 import subprocess
 import sys
 import threading
@@ -159,24 +158,56 @@ def _hertz(stated: float) -> float:
 
 
 def _simrad(path: str) -> Iterator[Record]:
-    """Pings of EK80: stamp_ns, channel, iq (bins, staves), sample_interval s, frequency Hz,
-    sound_speed, chirp, and the place as in `_placed`."""
+    """Pings of EK80: stamp_ns, channel, sample_interval s, sound_speed m/s and the place as in
+    `_placed`;
+
+    iq (bins, sectors), or power in dB (bins,) and angle (bins,), the phase in rad of the starboard
+    half against the port half; None where the file has none;
+    frequency Hz, of a chirp its middle; spacing of the halves in m, as the transducer's
+    sensitivity has it;
+    chirp: None, or band Hz, duration s, slope, rate Hz and filters (coefficients, decimation).
+    """
     from themachinethatgoesping.echosounders import simradraw
 
+    kinds = simradraw.t_SimradRawDatagramIdentifier
     handler = simradraw.SimradRawFileHandler(path, show_progress=False)
+    filters: dict[tuple[str, int], tuple[np.ndarray, int]] = {}
+    for stage in handler.datagram_interface.datagrams(kinds.FIL1):
+        key = stage.get_channel_id_stripped(), stage.get_stage()
+        filters[key] = np.array(stage.get_coefficients()), stage.get_decimation_factor()
     for ping in handler.get_pings():
-        (data,) = ping.file_data.datagrams(simradraw.t_SimradRawDatagramIdentifier.RAW3)
+        (data,) = ping.file_data.datagrams(kinds.RAW3)
         samples = data.get_sample_data()
-        signal = ping.file_data.get_parameter()
+        signal, channel = ping.file_data.get_parameter(), ping.get_channel_id()
+        built = ping.file_data.transceiver_information
+        transducer = built.get_transducer()
         pairs = getattr(samples, 'complex_samples', None)
+        angle = getattr(samples, 'angle', None)
+        speed = ping.file_data.get_environment().SoundSpeed
+        frequency, chirp = signal.Frequency, None
+        if math.isfinite(signal.FrequencyStart):
+            frequency = 0.5 * (signal.FrequencyStart + signal.FrequencyEnd)
+            chirp = {
+                'band': (signal.FrequencyStart, signal.FrequencyEnd),
+                'duration': signal.PulseDuration,
+                'slope': signal.Slope,
+                'rate': built.get_transceiver().RxSampleFrequency,
+                'filters': [filters[key] for key in sorted(filters) if key[0] == channel],
+            }
         yield {
             'kind': 'ping',
-            'channel': ping.get_channel_id(),
+            'channel': channel,
             'iq': None if pairs is None else np.asarray(pairs)[..., 0] + 1j * pairs[..., 1],
+            'power': samples.get_power(True) if samples.has_power() else None,
+            # As they lie in the file: athwartships, then alongships; 128 are half a turn.
+            'angle': None if angle is None else np.asarray(angle)[:, 0] * (math.pi / 128.0),
             'sample_interval': signal.SampleInterval,
-            'frequency': signal.Frequency,
-            'chirp': math.isfinite(signal.FrequencyStart),
-            'sound_speed': ping.watercolumn.get_sound_speed_at_transducer(),
+            'frequency': frequency,
+            'spacing': transducer.AngleSensitivityAthwartship
+            * speed
+            / (2.0 * math.pi * (transducer.Frequency or math.nan)),
+            'chirp': chirp,
+            'sound_speed': speed,
             **_placed(ping),
         }
         ping.release()
@@ -185,13 +216,26 @@ def _simrad(path: str) -> Iterator[Record]:
 def _kmall(path: str) -> Iterator[Record]:
     from themachinethatgoesping.echosounders import kmall
 
-    yield from _kongsberg(kmall.KMALLFileHandler(path, show_progress=False))
+    kind = kmall.t_KMALLDatagramIdentifier.S_SOUND_VELOCITY_PROFILE
+    handler = kmall.KMALLFileHandler(path, show_progress=False)
+    for cast in handler.datagram_interface.datagrams(kind):
+        yield _profile(cast.get_svp_depths(), cast.get_svp_sound_velocities())
+    yield from _kongsberg(handler)
 
 
 def _all(path: str) -> Iterator[Record]:
     from themachinethatgoesping.echosounders import kongsbergall
 
-    yield from _kongsberg(kongsbergall.KongsbergAllFileHandler(path, show_progress=False))
+    kind = kongsbergall.t_KongsbergAllDatagramIdentifier.SoundSpeedProfileDatagram
+    handler = kongsbergall.KongsbergAllFileHandler(path, show_progress=False)
+    for cast in handler.datagram_interface.datagrams(kind):
+        yield _profile(cast.get_depths_in_meters(), cast.get_sound_speeds_in_meters_per_second())
+    yield from _kongsberg(handler)
+
+
+def _profile(depths: Any, speeds: Any) -> Record:
+    """A cast of sound speed: depths m and speeds m/s in turn."""
+    return {'kind': 'profile', 'values': np.column_stack([depths, speeds]).ravel().tolist()}
 
 
 def _kongsberg(handler: Any) -> Iterator[Record]:
@@ -233,7 +277,11 @@ LIBRARIES = {'xtf': 'pyxtf', **dict.fromkeys(('ek80', 'kmall', 'all'), 'themachi
 
 
 def _bound_memory() -> None:
-    """Bound what this process may take from now on."""
+    """Bound what this process may take from now on, where the system can (not on Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return
     taken = 0
     with suppress(OSError):
         text = Path('/proc/self/status').read_text(encoding='ascii')

@@ -25,10 +25,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 import struct
+import sys
 from typing import BinaryIO, NamedTuple
 
-from backports import zstd
 import lz4.frame
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x08

@@ -37,7 +37,6 @@ import struct
 from typing import NamedTuple
 from zlib import crc32
 
-from backports import zstd
 import numpy as np
 
 from .mcap_records import (
@@ -58,6 +57,7 @@ from .mcap_records import (
     TOO_LARGE,
     TooLargeError,
     unpack,
+    zstd,
 )
 from .mcap_sums import summary_is_right
 

@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from attrs import frozen
-from backports.zstd import ZstdError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -34,7 +33,7 @@ from rosbags.typesys.store import Typestore
 from sonar_imm.parameters import ConfigError, yaml_tree
 from sonar_imm.texts import in_one_line
 
-from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
+from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack, zstd
 from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
@@ -373,7 +372,7 @@ def _unpacked(raw: bytes) -> bytes:
         return bytes(raw)
     try:
         return unpack(raw, 'zstd')
-    except (TooLargeError, ZstdError):
+    except (TooLargeError, zstd.ZstdError):
         return bytes(raw)
 
 

@@ -95,7 +95,7 @@ def _free_name(place: str, own: Mapping[str, InputTopic], used: Collection[str])
     return name if name not in used else next(free for free in further if free not in used)
 
 
-def said_of_topics(
+def remarks_on_topics(
     bag: BagReader, system: str, found: Mapping[str, Mapping[str, InputTopic]]
 ) -> list[str]:
     """A sentence for each topic that feeds the tracker, and for each that could and does not.

@@ -146,11 +146,11 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
         'rms_after': survey.adjustment.rms[-1] if survey.adjustment else None,
     }
     names = [unit.name for unit in survey.units]
-    told: dict[str, Any] = {'parameters': [], 'not_told': []}
+    adjustment: dict[str, Any] = {'parameters': [], 'not_told': []}
     if survey.adjustment is not None:
-        told = described(survey.adjustment, names)
-    write_json(out / ADJUSTMENT, {**told, 'crossings': crossings})
-    write_report(out, survey, chart, told)
+        adjustment = described(survey.adjustment, names)
+    write_json(out / ADJUSTMENT, {**adjustment, 'crossings': crossings})
+    write_report(out, survey, chart, adjustment)
     options = survey.options
     content = {
         'version': __version__,

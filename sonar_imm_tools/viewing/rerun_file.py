@@ -55,7 +55,7 @@ def write_rerun(run: Path, file: Path) -> int:
             _log(stream, system, estimate, lasting)
         for true in read_truth(facts) or []:
             stream.set_time('stamp', timestamp=np.datetime64(true.stamp_ns, 'ns'))
-            stream.log('truth', rerun.Points3D(_places(true), colors=(255, 255, 255)))
+            stream.log('truth', rerun.Points3D(true.xyz, colors=(255, 255, 255)))
     return len(estimates)
 
 
@@ -77,7 +77,7 @@ def _first_picture(system: str, lasting: Counter[int]) -> blueprint.Blueprint:
     scene = blueprint.Spatial3DView(origin='/', name=system)
     if not lasting:
         return blueprint.Blueprint(scene)
-    (track, _), *_ = lasting.most_common(1)
+    track = max(lasting, key=lasting.__getitem__)
     curves = [
         blueprint.TimeSeriesView(origin=f'/{system}/track_{track}/{kind}', name=f'{track}: {kind}')
         for kind in ('probability', 'state', 'std')
@@ -92,15 +92,14 @@ def _log(
 ) -> None:
     """Log one estimate at its stamp; curves of the tracks in `lasting`."""
     stream.set_time('stamp', timestamp=np.datetime64(estimate.stamp_ns, 'ns'))
-    places = _places(estimate)
     ids = estimate.extras.get('track_id')
     classes = None if ids is None else ids.astype(np.uint16)
-    stream.log(f'{system}/points', rerun.Points3D(places, class_ids=classes))
+    stream.log(f'{system}/points', rerun.Points3D(estimate.xyz, class_ids=classes))
     covariances = _place_covariances(estimate)
     if covariances is not None:
         half_sizes, turns = _ellipsoids(covariances)
         drawn = rerun.Ellipsoids3D(
-            centers=places, half_sizes=half_sizes, quaternions=turns, class_ids=classes
+            centers=estimate.xyz, half_sizes=half_sizes, quaternions=turns, class_ids=classes
         )
         stream.log(f'{system}/covariance', drawn)
     if ids is None:
@@ -119,10 +118,6 @@ def _log(
                 if np.isfinite(value):
                     path = f'{system}/track_{track}/{kind}/{name}'
                     stream.log(path, rerun.Scalars(value))
-
-
-def _places(estimate: Estimate) -> np.ndarray:
-    return np.asarray(estimate.xyz, float).reshape(-1, 3)
 
 
 def _place_covariances(estimate: Estimate) -> np.ndarray | None:

@@ -33,6 +33,7 @@ from sonar_imm.acoustics.fathometer import (
     coherence_and_power,
     conventional,
     depth_response,
+    echo_phase,
     echo_spectrum,
     mvdr,
     noise_sigma,
@@ -284,6 +285,27 @@ def test_the_share_of_the_surface_is_that_of_the_powers():
     alive = np.array([0, 1, 2, 4, 7, 8, 9, 12, 13, 15])
     some = surface_share(R[:, alive[:, None], alive], frequency, heights[alive], 1500.0)
     assert some == pytest.approx(share, rel=0.05)
+
+
+def test_the_phase_of_an_echo_is_that_of_the_array_and_its_distance():
+    """Against what the response changes by with the amplitude of a layer, 22 m and 40 m below."""
+    frequency, heights = np.arange(100.0, 2800.0, 4.0), 0.25 * np.arange(16)
+    w = steering(frequency, heights, C)
+    for H in (22.0, 40.0):
+        with_layer, without = (
+            surface_noise_csdm(frequency, 16, 0.25, [H], [a], C) + 0.01 * np.eye(16)
+            for a in (0.1, -0.1)
+        )
+        changed = coherence(with_layer, w, 'mvdr') - coherence(without, w, 'mvdr')
+        exact = np.angle(changed * np.exp(4j * np.pi * frequency * H / C))
+        phase = echo_phase(with_layer, frequency, heights, [H], C, 1e-2)[0]
+        assert phase == pytest.approx(exact, abs=0.02)
+        assert exact[:50].mean() < -0.15 * 22.0 / H * 0.8
+        # Some hydrophones are dead, and the record has an end.
+        alive = np.array([0, 1, 2, 4, 5, 7, 8, 9, 10, 12, 13, 15])
+        R = sample_csdm(with_layer, 100, np.random.default_rng(0))[:, alive[:, None], alive]
+        some = echo_phase(R, frequency, heights[alive], [H], C, 1e-2)[0]
+        assert some == pytest.approx(exact, abs=0.05)
 
 
 def test_the_power_of_few_snapshots_is_less_by_what_is_fitted():

@@ -65,6 +65,14 @@ def test_a_burst_is_none_of_the_floor_and_an_edge_is_no_burst():
     assert not loudness.loud_bins(power, 5.0, bins=5, usable=usable)[350]
 
 
+def test_a_burst_is_one_beside_the_twenty_bins_before_it_and_after_it():
+    power = np.full(200, 1e4)
+    power[80:121], power[100] = 1.0, 1e3
+    assert np.flatnonzero(loudness.bursts(power)).tolist() == [100]
+    power[86:97] = 1e4  # most of those before it
+    assert not loudness.bursts(power).any()
+
+
 def test_a_loud_stretch_that_is_not_coherent_is_a_diffuse_floor_and_a_spike_is_not():
     rng = np.random.default_rng(3)
     ratio, usable = 1e4 * noise_power(rng, 600, 8), np.ones(600, bool)

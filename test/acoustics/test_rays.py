@@ -129,7 +129,8 @@ def test_the_launch_table_undoes_the_rays():
 def test_the_launch_table_of_straight_rays_is_the_depth():
     table = launch_table(profile_of([0.0, 1500.0]), 5.0, 77.0, 1500.0)
     depth = np.linspace(-11.0, 29.0, 50)  # also beyond straight down, where it says r sin > r
-    assert table_at(table, 12.5, depth) == pytest.approx(depth, abs=1e-9)
+    for r in (0.3 * table.range_step, 12.5):
+        assert table_at(table, r, depth) == pytest.approx(depth, abs=1e-9)
 
 
 def test_between_cells_of_the_launch_table_there_is_a_bilinear_function():

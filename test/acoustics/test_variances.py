@@ -125,3 +125,14 @@ def test_a_water_column_of_fading_noise_is_kept_whole(staves):
             noise = rng.normal(size=(bins, staves, 2)).view(np.complex128)[..., 0]
             noise *= np.sqrt(rng.exponential(size=(bins, 1)))
             assert variances.quiet_stretches(noise, np.ones(bins, bool)).all()
+
+
+@pytest.mark.parametrize('apart, differ', [(5, True), (6, False)])
+def test_a_bin_is_compared_with_the_five_on_either_side_of_it(apart, differ):
+    """One bin by itself agrees with itself, whatever its staves say; two of other directions do
+    not agree."""
+    chosen = np.zeros(30, bool)
+    chosen[[10, 10 + apart]] = True
+    iq = np.ones((30, 4), complex)
+    iq[10] = np.exp(2.0j * np.arange(4))
+    assert (variances.decorrelation(iq, chosen) > 0.1) == differ

@@ -19,7 +19,7 @@ import itertools
 from pathlib import Path
 
 from helpers.dive_scenes import legs
-from helpers.sonar_files import ek80, side_scan
+from helpers.sonar_files import ek80, kmall, side_scan
 import numpy as np
 import pytest
 
@@ -158,7 +158,7 @@ def split_beam(path):
 SONARS = {
     'line.xtf': (xtf, [], 'obstacle'),
     'frames': (pictures, ['--far-range', '40', '--fov', '60'], 'obstacle'),
-    'd.raw': (split_beam, ['--element-spacing', '0.0106'], 'bathymetry'),
+    'd.raw': (split_beam, [], 'bathymetry'),
 }
 
 
@@ -177,6 +177,22 @@ def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
     assert f'{system} <- ' in said and 'no track' not in said
     assert main(['evaluate', str(run), '--report', str(report)]) == 0
     assert '<html' in report.read_text().lower()
+
+
+def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alone(
+    tmp_path, capsys
+):
+    pytest.importorskip('themachinethatgoesping')
+    kmall(tmp_path / 'line.kmall')
+    bag, run = tmp_path / 'bag', tmp_path / 'run'
+    assert main(['convert', str(tmp_path / 'line.kmall'), str(bag)]) == 0
+    assert 'to track it' not in capsys.readouterr().out
+    assert main(['info', str(bag)]) == 1
+    printed = capsys.readouterr().out
+    assert 'fits obstacle ground' in printed and 'no tracker can use it' in printed
+    assert main(['track', str(bag), str(run), '--system', 'obstacle']) == 0
+    assert 'obstacle <- /ground as ground (5 messages)' in (said := capsys.readouterr().out)
+    assert 'no track was made' in said
 
 
 def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):

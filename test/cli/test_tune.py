@@ -18,18 +18,24 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 import yaml
 
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Detections, Fix, Navigation
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation import tuning
 from sonar_imm_tools.evaluation.bathymetry import predictive as swaths
 from sonar_imm_tools.evaluation.diver.predictive import Scored
-from sonar_imm_tools.evaluation.tuning import Tunable, values_of
+from sonar_imm_tools.evaluation.obstacle import predictive as obstacles
+from sonar_imm_tools.evaluation.tuning import errors, maximise, Tunable, values_of
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'regret_free'
 QUICK = ['--system', 'diver', '--set', 'model_set=cv', '--parameters', 'covariance_scale']
@@ -96,6 +102,95 @@ def test_an_element_that_is_fitted_leaves_the_others_of_its_list() -> None:
     assert not config.sigmas and not first.usual and second.label == 'sigmas[1]'
     changed = values_of([second], np.log([0.3]))
     assert changed == {'sigmas': (config.sigmas_used[0], pytest.approx(0.3))}
+
+
+def fitting_of(peak: list[float], H: np.ndarray) -> Any:
+    """A posterior that is a parabola: its peak in coordinates, and its curvature -H."""
+    names = ('speed_std', 'speed_noise')
+    tunables = tuple(Tunable(name=name, start=1.0) for name in names[: len(peak)])
+
+    def posterior(u: np.ndarray, part: str = '') -> float:
+        return float(7.0 - 0.5 * (u - peak) @ H @ (u - peak))
+
+    return SimpleNamespace(jobs=(None,), tunables=tunables, posterior=posterior)
+
+
+CORRELATED = np.array([[4.0, 3.0], [3.0, 9.0]])
+
+
+def test_standard_errors_are_those_of_the_inverse_of_the_curvature() -> None:
+    fitting = fitting_of([0.3, -0.2], CORRELATED)
+
+    def evaluate(points: list[np.ndarray]) -> list[float]:
+        return [fitting.posterior(u) for u in points]
+
+    exact = np.sqrt(np.diag(np.linalg.inv(CORRELATED)))
+    assert errors(fitting, np.array([0.3, -0.2]), evaluate) == pytest.approx(exact)
+    saddle = fitting_of([0.0, 0.0], np.array([[1.0, 3.0], [3.0, 1.0]]))
+    found = errors(saddle, np.zeros(2), lambda points: [saddle.posterior(u) for u in points])
+    assert np.isinf(found).all()
+
+
+@pytest.mark.parametrize('peak', [[0.3, -0.2], [-40.0, 40.0]])
+def test_a_fit_ends_at_the_peak_or_at_the_bounds_before_it(
+    peak: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tuning, '_recording', lambda job: SimpleNamespace(config=DiverConfig()))
+    fitting = fitting_of(peak, np.diag([4.0, 9.0]))
+    low, high = np.transpose([t.bounds(DiverConfig()) for t in fitting.tunables])
+    asked: list[int] = []
+    best, value, used = maximise(fitting, np.zeros(2), 'whole', asked.append)
+    assert best == pytest.approx(np.clip(peak, low, high), abs=0.05)
+    assert value == pytest.approx(fitting.posterior(best)) and used == sum(asked) <= 80
+
+
+class Halves:
+    """Forty numbers with a standard deviation of 3 in the first half and 2 in the second; that
+    of the model is the parameter speed_std."""
+
+    config = DiverConfig()
+    z = np.tile([1.0, -1.0], 20) * np.repeat([3.0, 2.0], 20)
+
+    def scores(self, values: dict[str, float], until: float = math.inf) -> tuning.Scores:
+        terms = norm.logpdf(self.z, scale=values.get('speed_std', 1.0))
+        return {k: (float(term), 1) for k, term in enumerate(terms) if k <= until}
+
+
+def test_what_is_gained_is_of_each_half_by_what_the_other_one_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tuning, '_recording', lambda job: Halves())
+    job: Any = SimpleNamespace(system='diver')
+    fitting = tuning.Fitting(
+        jobs=(job,),
+        tunables=(Tunable(name='speed_std', start=1.0, std=3.0),),
+        split=(19,),
+    )
+    tuned = tuning.tune(fitting, 40)
+    first, second = Halves.z[:20], Halves.z[20:]
+    gained = [
+        norm.logpdf(half, scale=scale).sum() - norm.logpdf(half).sum()
+        for half, scale in ((second, 3.0), (first, 2.0))
+    ]
+    assert tuned.held_out_gain == pytest.approx(sum(gained) / 40, abs=0.02)
+    assert tuned.values['speed_std'] == pytest.approx(math.sqrt(6.5), abs=0.1)
+    assert tuned.log_likelihood_before == pytest.approx(norm.logpdf(Halves.z).sum())
+    (row,) = tuned.parameters
+    assert row.verdict == 'told' and row.low is not None and row.high is not None
+    # Of forty numbers a logarithm of their spread is known to the root of one eightieth.
+    assert math.log(row.high / row.low) == pytest.approx(4.0 / math.sqrt(80.0), rel=0.05)
+
+
+def test_the_score_of_a_sea_without_obstacles_is_that_of_its_clutter() -> None:
+    """Clutter is a Poisson process: m detections in an area A have m log(density) - density A."""
+    config = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)
+    tracker = obstacles.Scored(config)
+    place, level = np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    tracker.process(Navigation(stamp_ns=1, position=place, orientation=level))
+    distance, bearing = np.array([10.0, 20.0, 30.0]), np.array([0.0, 0.2, -0.3])
+    tracker.process(Detections(stamp_ns=1, range=distance, bearing=bearing))
+    area = 50.0 * 0.5 * math.pi
+    assert tracker.scores == {1: (pytest.approx(3.0 * math.log(0.02) - 0.02 * area), 0)}
 
 
 def kalman(z: np.ndarray, R: float, noise: float) -> float:

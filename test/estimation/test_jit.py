@@ -21,8 +21,10 @@ import os
 from pathlib import Path
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 
 import numba
 from numba.core import caching
@@ -507,3 +509,89 @@ def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkey
     with pytest.warns(RuntimeWarning):
         tripled = jit.kernel(lambda x: 3.0 * x)
     assert tripled(2.0) == 6.0 and tripled.stats.cache_path is None
+
+
+STRANGER = """
+import time
+
+from sonar_imm.estimation import jit
+
+@jit.kernel
+def halved(x):
+    return 0.5 * x
+
+def work():
+    assert halved(4.0) == 2.0
+
+def steps():
+    return [('work', work), ('sleep', lambda: time.sleep(600.0))]
+"""
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """A module with a kernel that nobody has compiled, and a folder of its own for it."""
+    (tmp_path / 'stranger.py').write_text(STRANGER)
+    cache = tmp_path / 'kernels'
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(cache))
+    monkeypatch.setattr(numba.config, 'CACHE_DIR', str(cache))
+    monkeypatch.syspath_prepend(tmp_path)
+    jit._warn_of_no_cache.cache_clear()
+    yield importlib.import_module('stranger')
+    del sys.modules['stranger']
+
+
+@pytest.fixture
+def elsewhere(stranger):
+    process = jit.Elsewhere.begin(stranger.steps)
+    yield process
+    process.close()
+
+
+def test_another_process_compiles_and_this_one_loads(stranger, elsewhere):
+    before = jit.kernels.copy()
+    assert not jit.kept(stranger.work) and jit.kernels == before
+    elsewhere.compile('work')
+    assert jit.kernels - before == {'compiled': 1} and jit.present['stranger.halved'] == 3
+    assert jit.kept(stranger.work) and jit.kernels - before == {'compiled': 1, 'loaded': 1}
+    elsewhere.compile('work')  # nothing is left
+    assert jit.kernels - before == {'compiled': 1, 'loaded': 1}
+
+
+def test_what_cannot_be_kept_elsewhere_is_compiled_here(stranger):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a full disk
+    process = jit.Elsewhere.begin(stranger.steps)
+    try:
+        process.compile('work')
+        process.compile('work')  # it has ended
+        assert not jit.kept(stranger.work)
+        with pytest.warns(RuntimeWarning, match='compiled in memory'):
+            stranger.work()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        process.close()
+    assert jit.kept(stranger.work)
+
+
+def test_what_compiles_elsewhere_can_be_stopped(elsewhere):
+    threading.Timer(1.0, elsewhere.stop).start()
+    elsewhere.compile('sleep')
+    assert elsewhere._process.wait(10.0) == -signal.SIGTERM
+
+
+def test_what_cannot_be_pickled_or_started_is_compiled_here(stranger, monkeypatch):
+    assert jit.Elsewhere.begin(lambda: []) is None
+    monkeypatch.setattr(sys, 'executable', '/nowhere/python')
+    assert jit.Elsewhere.begin(stranger.steps) is None
+
+
+def test_one_thread_does_without_compiling_and_others_compile(stranger):
+    """A message may need a kernel while others are loaded."""
+    thread = threading.Thread(target=stranger.work)
+
+    def step():
+        thread.start()
+        thread.join()
+
+    assert jit.kept(step) and stranger.halved.signatures

@@ -63,6 +63,11 @@ def test_a_metric_is_shown_where_its_first_number_is_known():
     assert cards(shown, {'n': 1, 'a': {'kept': 0.25}}) == ()
 
 
+def test_without_values_there_is_no_verdict():
+    none = chi2_summary(np.empty(0), 2)
+    assert (none['n'], none['dof'], none['believable']) == (0, 2, None)
+
+
 def test_nees_leaves_out_what_says_nothing():
     error = np.array([[3.0, 4.0], [1.0, 1.0], [np.nan, 0.0]])
     covariance = np.array([np.diag([1.0, 4.0]), np.diag([1.0, 0.0]), np.eye(2)])

@@ -207,6 +207,9 @@ def test_a_run_with_an_origin_is_drawn_in_degrees():
     bar = degrees.data[-1]
     ends = [origin.local(y, x)[0] for x, y in zip(bar.x, bar.y)]
     assert bar.name == f'{ends[1] - ends[0]:.0f} m'
+    for place, axis in ((bar.x, degrees.layout.xaxis), (bar.y, degrees.layout.yaxis)):
+        low, high = axis.range
+        assert 0.01 < (place[0] - low) / (high - low) < 0.1  # in the lower left corner
     assert [figures.scale_length(x) for x in (0.7, 1.0, 4.9, 72.0)] == [0.5, 1.0, 2.0, 50.0]
 
 
@@ -220,6 +223,8 @@ def test_checks_against_the_live_node_come_first():
     checks = [Check('bytes', 'equal', 'equal', True)]
     page = Page(html(part(checks=checks)))
     assert page.headings[1] == 'Live node against offline tracker'
+    checks = [Check('position RMSE against truth', '1 m', 'at most 2 m', True)]
+    assert Page(html(part(checks=checks))).headings[1] == 'Error and its limit'
 
 
 def test_a_part_of_another_system_makes_a_page():

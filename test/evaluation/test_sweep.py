@@ -205,6 +205,7 @@ def test_nested_metrics_become_flat_numbers():
     assert type(told['a.ok']) is int  # not True in a table
 
 
+@pytest.mark.filterwarnings('error')  # one run has no spread, and says nothing on the terminal
 def test_the_sums_are_those_of_the_runs_that_gave_the_metric():
     outcomes = [
         Outcome(2, {'a': 4.0, 'b': 7}),

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Files of sonars, made by the writers of the libraries that read them."""
 
+from contextlib import suppress
 from datetime import datetime, timedelta, timezone
 import struct
 
@@ -100,31 +101,49 @@ def ek80_datagram(kind, seconds, content):
     return struct.pack('<i', len(body)) + body + struct.pack('<i', len(body))
 
 
-def ek80(path, samples, chirp=False, channel='WBT 1-15 ES70', place=PLACE):
-    """A raw file with one channel; samples: (pings, bins, sectors), complex, 5 pings per second.
-    The datagrams with samples are written by the library."""
+RATE = 1.5e6
+"""Samples per second of the made-up receiver of `ek80` before its filters."""
+BAND, PULSE, SLOPE = (55e3, 90e3), 512e-6, 0.1
+"""Band in Hz, duration in s and slope of the edges of its chirps."""
+FILTERS = [
+    (np.hanning(49) * np.exp(2j * np.pi * 72.5e3 / RATE * np.arange(49)), 6),
+    (np.array([1.0 + 0.0j]), 3),
+]
+"""Coefficients and decimation of its filters."""
+
+
+def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 1-15 ES70'):
+    """A raw file with one channel, 5 pings per second; samples: (pings, bins, sectors), complex,
+    or where there are angles, (pings, bins, 2) of -128 to 127, athwartships and alongships, whole
+    numbers of power, 3.0103/256 dB each. The datagrams with samples and filters are written by the
+    library."""
     from themachinethatgoesping.echosounders import simradraw
 
     def xml(seconds, text):
         return ek80_datagram('XML0', seconds, text.encode())
 
-    pulse = 'FrequencyStart="55000" FrequencyEnd="90000"' if chirp else 'Frequency="70000"'
+    chirp_text = f'FrequencyStart="{BAND[0]}" FrequencyEnd="{BAND[1]}"'
+    pulse, duration, interval = 'Frequency="70000"', 0.000256, 4e-5
+    if chirp:
+        pulse, duration = chirp_text, PULSE
+        interval = np.prod([step for _, step in FILTERS]) / RATE
     parts = [
         xml(
             0.0,
             '<?xml version="1.0" encoding="utf-8"?><Configuration><Header ApplicationName="EK80" '
             'Version="2.0.1.0" FileFormatVersion="1.23" TimeBias="0"/><Transceivers>'
             '<Transceiver TransceiverName="WBT 1" SerialNumber="1" Impedance="5400" '
-            'RxSampleFrequency="1500000" TransceiverNumber="1" TransceiverType="WBT"><Channels>'
-            f'<Channel ChannelID="{channel}" ChannelIdShort="ES70" MaxTxPowerTransceiver="750" '
-            'PulseDuration="0.000256" PulseDurationFM="0.000512"><Transducer '
-            'TransducerName="ES70" SerialNumber="1" Frequency="70000" FrequencyMinimum="45000" '
-            'FrequencyMaximum="90000" Gain="27" SaCorrection="0" EquivalentBeamAngle="-20.7" '
-            'AngleSensitivityAlongship="23" AngleSensitivityAthwartship="23" '
-            'BeamWidthAlongship="7" BeamWidthAthwartship="7" BeamType="1"/></Channel></Channels>'
-            '</Transceiver></Transceivers><Transducers><Transducer TransducerName="ES70" '
-            'TransducerMounting="HullMounted" TransducerOffsetX="0" TransducerOffsetY="0" '
-            'TransducerOffsetZ="0"/></Transducers></Configuration>',
+            f'RxSampleFrequency="{RATE:.0f}" TransceiverNumber="1" TransceiverType="WBT">'
+            f'<Channels><Channel ChannelID="{channel}" ChannelIdShort="ES70" '
+            'MaxTxPowerTransceiver="750" PulseDuration="0.000256" PulseDurationFM="0.000512">'
+            '<Transducer TransducerName="ES70" SerialNumber="1" Frequency="70000" '
+            'FrequencyMinimum="45000" FrequencyMaximum="90000" Gain="27" SaCorrection="0" '
+            'EquivalentBeamAngle="-20.7" AngleSensitivityAlongship="23" '
+            'AngleSensitivityAthwartship="23" BeamWidthAlongship="7" BeamWidthAthwartship="7" '
+            'BeamType="1"/></Channel></Channels></Transceiver></Transceivers><Transducers>'
+            '<Transducer TransducerName="ES70" TransducerMounting="HullMounted" '
+            'TransducerOffsetX="0" TransducerOffsetY="0" TransducerOffsetZ="0"/></Transducers>'
+            '</Configuration>',
         ),
         xml(
             0.0,
@@ -133,9 +152,17 @@ def ek80(path, samples, chirp=False, channel='WBT 1-15 ES70', place=PLACE):
             'WaterLevelDraft="1"/>',
         ),
     ]
-    for k, iq in enumerate(samples):
+    for stage, (coefficients, step) in enumerate(filters if chirp else [], start=1):
+        content = simradraw.datagrams.FIL1()
+        content.set_channel_id(channel.ljust(128, '\0'))
+        content.set_stage(stage)
+        content.set_decimation_factor(step)
+        content.set_no_of_coefficients(len(coefficients))
+        content.set_coefficients(coefficients.astype(np.complex64))
+        parts.append(ek80_datagram('FIL1', 0.0, content.to_binary()[16:-4]))
+    for k, rows in enumerate(samples):
         seconds = 0.2 * k
-        latitude, longitude = place
+        latitude, longitude = PLACE
         moment = BEGIN + timedelta(seconds=seconds)
         fix = (
             f'GPGGA,{moment:%H%M%S}.{moment.microsecond // 10_000:02d},'
@@ -147,25 +174,100 @@ def ek80(path, samples, chirp=False, channel='WBT 1-15 ES70', place=PLACE):
             for letter in text:
                 total ^= ord(letter)
             parts.append(ek80_datagram('NME0', seconds, f'${text}*{total:02X}'.encode()))
-        mode = 1 if chirp else 0
         parts.append(
             xml(
                 seconds,
                 '<?xml version="1.0" encoding="utf-8"?><Parameter><Channel '
-                f'ChannelID="{channel}" ChannelMode="0" PulseForm="{mode}" {pulse} '
-                'PulseDuration="0.000256" SampleInterval="4e-05" TransmitPower="750" '
-                'Slope="0.1" SoundVelocity="1490"/></Parameter>',
+                f'ChannelID="{channel}" ChannelMode="0" PulseForm="{int(chirp)}" {pulse} '
+                f'PulseDuration="{duration}" SampleInterval="{interval}" TransmitPower="750" '
+                f'Slope="{SLOPE}" SoundVelocity="1490"/></Parameter>',
             )
         )
         data, kinds = simradraw.datagrams.RAW3(), simradraw.datagrams.raw3datatypes
-        pairs = np.stack([iq.real, iq.imag], axis=-1).astype(np.float32)
         data.set_channel_id(channel.ljust(128, '\0'))
         data.set_timestamp(BEGIN.timestamp() + seconds)
-        data.set_data_type(kinds.t_RAW3DataType.ComplexFloat32)
-        data.set_number_of_complex_samples(iq.shape[1])
-        data.set_count(len(iq))
+        data.set_count(len(rows))
         data.set_offset(0)
-        data.set_sample_data(kinds.RAW3DataComplexFloat32(np.ascontiguousarray(pairs)))
+        if angles is None:
+            pairs = np.stack([rows.real, rows.imag], axis=-1).astype(np.float32)
+            data.set_data_type(kinds.t_RAW3DataType.ComplexFloat32)
+            data.set_number_of_complex_samples(rows.shape[1])
+            data.set_sample_data(kinds.RAW3DataComplexFloat32(np.ascontiguousarray(pairs)))
+        else:
+            turns = angles[k].astype(np.int8).view(np.uint8)
+            data.set_data_type(kinds.t_RAW3DataType.PowerAndAngle)
+            data.set_sample_data(kinds.RAW3DataPowerAndAngle(rows.astype(np.int16), turns))
         parts.append(ek80_datagram('RAW3', seconds, data.to_binary()[16:-4]))
+    path.write_bytes(b''.join(parts))
+    return path
+
+
+INSTALLATION = (
+    'OSCV:Empty,EMXV:EM2042,PU_0,SN=25002,IP=157.237.20.40:0xffff0000,UDP=1997,TYPE=CON_TECH,'
+    'VERSIONS:,CPU:6.3.0,VXW:7,FILTER:1,CBMF:1,TX:1.02,RX:3.3.0,VERSIONS-END,SERIALno:,TX:1,RX:2,'
+    'SERIALno-END,DCL:2.0.3,KMALL:Rev J,SYSTEM:EM 2042 - Single Tx single Rx,TRAI_TX1:N=1;X=0;Y=0;'
+    'Z=0;R=0;P=0;H=0;S=0.7,TRAI_RX1:N=2;X=0;Y=0;Z=0;R=0;P=0;H=0;G=0,POSI_1:X=0;Y=0;Z=0;D=0;'
+    'G=WGS84;T=Datagram;C=On;F=GGA;Q=Off;I=Net port 1;U=ACTIVE,POSI_2:U=NOT_SET,POSI_3:U=NOT_SET,'
+    'ATTI_1:X=0;Y=0;Z=0;R=0;P=0;H=0;D=0;M=Rotation;F=KM Binary;I=Net port 2;U=ACTIVE,ATTI_2:U='
+    'NOT_SET,EMXI:SWLZ=0,'
+)
+
+
+def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
+    """A KMALL file, written by the library: an EM 2042 that goes east, 5 pings per second; across,
+    down: m from the reference point, of the soundings."""
+    from themachinethatgoesping.echosounders.kmall import datagrams as made
+
+    def zero(part, **values):
+        """A part of a datagram: what the library leaves undefined is 0."""
+        for name in dir(part):
+            if name.startswith('set_'):
+                with suppress(TypeError):  # texts and lists
+                    getattr(part, name)(0)
+        for name, value in values.items():
+            getattr(part, f'set_{name}')(value)
+        return part
+
+    def packed(datagram, seconds):
+        nanoseconds = round((BEGIN.timestamp() + seconds) * 1e9)
+        datagram.set_time_sec(nanoseconds // 10**9)
+        datagram.set_time_nanosec(nanoseconds % 10**9)
+        size = len(datagram.to_binary())
+        datagram.set_bytes_datagram(size)
+        if hasattr(datagram, 'set_bytes_datagram_check'):
+            datagram.set_bytes_datagram_check(size)
+        return datagram.to_binary()
+
+    installation, runtime = made.IInstallationParam(), made.IOpRuntime()
+    installation.set_install_txt(INSTALLATION)
+    runtime.set_runtime_txt('Sector coverage\nMax angle Port:      60.0\n')
+    parts = [packed(installation, 0.0), packed(runtime, 0.0)]
+    for k in range(pings):
+        place = made.SPosition()
+        latitude, longitude = place_of(0.4 * k, 0.0)
+        place.set_corrected_lat_deg(latitude)
+        place.set_corrected_lon_deg(longitude)
+        place.set_course_over_ground_deg(90.0)
+        place.set_pos_data_from_sensor('$GPGGA')
+        parts.append(packed(place, 0.2 * k))
+        soundings = []
+        for number, y in enumerate(across):
+            where = {'x_re_ref_point_m': 0.5, 'y_re_ref_point_m': y, 'z_re_ref_point_m': down}
+            soundings.append(zero(made.MRZSoundings(), sounding_index=number, **where))
+        ping, holder = made.MRangeAndDepth(), made.MRZSoundingsContainer()
+        holder.soundings = made.MRZSoundingsVector(soundings)
+        ping.soundings = holder
+        ping.set_ping_count(k)
+        for name in ('number_of_datagrams', 'datagram_number', 'swaths_per_ping'):
+            getattr(ping, f'set_{name}')(1)
+        ping.set_rx_fans_per_ping(1)
+        ping.ping_info = zero(made.MRZPingInfo())
+        ping.rx_info = zero(
+            made.MRZRxInfo(),
+            number_of_soundings_max_main=len(across),
+            number_of_soundings_valid_main=len(across),
+            number_of_bytes_per_sounding=120,
+        )
+        parts.append(packed(ping, 0.2 * k))
     path.write_bytes(b''.join(parts))
     return path

@@ -14,6 +14,8 @@
 
 """A node while its kernels are compiled."""
 
+from functools import partial
+import pickle
 import time
 
 import pytest
@@ -28,8 +30,11 @@ from rcl_interfaces.srv import GetParameters  # noqa: E402
 from sonar_imm.estimation import jit  # noqa: E402
 from sonar_imm.measurements import Arrivals, Fix  # noqa: E402
 from sonar_imm.nodes.base import TrackerNode  # noqa: E402
+from sonar_imm.nodes.fls_detector import warm_steps as image_steps  # noqa: E402
 from sonar_imm.nodes.managed import Warming  # noqa: E402
 from sonar_imm.nodes.qos import output_qos  # noqa: E402
+from sonar_imm.trackers import SYSTEMS  # noqa: E402
+from sonar_imm.trackers.obstacle.detector import DetectorConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures('walker')
 
@@ -104,6 +109,39 @@ def test_what_goes_wrong_is_raised_where_somebody_asks():
         time.sleep(0.01)
     with pytest.raises(ZeroDivisionError):
         warming.trouble()
+
+
+@pytest.mark.parametrize('system', [*SYSTEMS.values(), None])
+def test_the_other_process_finds_the_steps_of_this_one(system):
+    """As they are pickled for it; None: of images."""
+    if system:
+        config = system.config_type()()
+        steps, own = partial(system.warm_steps, config), system.build(config).warm_steps()
+    else:
+        steps, own = partial(image_steps, DetectorConfig()), image_steps(DetectorConfig())
+    assert [name for name, _ in pickle.loads(pickle.dumps(steps))()] == [name for name, _ in own]
+
+
+@pytest.mark.parametrize('kept', [True, False])
+def test_a_process_of_its_own_compiles_and_ends(kept, monkeypatch):
+    """Where it keeps nothing the thread compiles."""
+    there, done = [], []
+
+    class Elsewhere:
+        one_at_a_time = jit.Elsewhere.one_at_a_time
+        begin = classmethod(lambda cls, steps: cls())
+        compile = there.append
+        stop = close = lambda self: there.append('ended')
+
+    monkeypatch.setattr(jit, 'Elsewhere', Elsewhere)
+    monkeypatch.setattr(jit, 'kept', lambda step: kept and bool(there))
+    steps = [(name, lambda name=name: done.append(name)) for name in ('fixes', 'echoes')]
+    warming = Warming(lambda inputs: steps, lambda: None, kernels_of, lambda: [])
+    warming._thread.join(30.0)
+    assert warming.ready() and warming.sentence() == ''
+    warming.trouble()
+    assert there == (['fixes', 'ended'] if kept else ['fixes', 'echoes', 'ended'])
+    assert done == (['fixes'] if kept else ['fixes', 'echoes'])
 
 
 def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):

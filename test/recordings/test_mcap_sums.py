@@ -14,6 +14,8 @@
 
 """Checksums of MCAP files: no bit of a file that we wrote turns without being said."""
 
+import contextlib
+import shutil
 import struct
 import zlib
 
@@ -183,3 +185,15 @@ def test_a_bit_costs_one_chunk_of_a_short_recording(tmp_path, compressed, size, 
         (_, found), problems = content(tmp_path / 'one.mcap')
         assert problems and 0 < len(whole) - len(found) <= 40 // chunks + 1
         assert set(found) < set(whole)
+
+
+def test_past_damage_is_read_where_the_recording_is_a_single_file(long, tmp_path):
+    """The messages of several files are merged: which of them have been given is not known."""
+    folder = shutil.copytree(long.parent, tmp_path / 'bag')
+    for files, read_on in ((1, True), (2, False)):
+        with contextlib.closing(RosbagsSource(folder)) as source:
+            rest = source.rescue()
+            assert (rest is not None) == read_on, files
+            if rest:
+                rest.close()
+        shutil.copy(long, folder / 'bag_1.mcap')

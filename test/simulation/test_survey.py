@@ -52,6 +52,14 @@ def test_without_errors_soundings_lie_on_the_floor():
     assert east < 0.05  # it yaws by .8 deg
 
 
+def test_lines_lie_side_by_side_and_cross_lines_evenly_along_them():
+    changes = {'lines': 3, 'spacing': 20.0, 'cross_lines': 2, 'terrain': 'flat'}
+    scene = simulate(scenario('survey', {**EXACT, **changes}), 1)
+    middle = [(points['x'].mean(), points['y'].mean()) for points in scene.points]
+    lines = [(30.0, 0.0), (30.0, 20.0), (30.0, 40.0)]
+    np.testing.assert_allclose(middle, [*lines, (20.0, 20.0), (40.0, 20.0)], atol=1.5)
+
+
 @pytest.mark.parametrize(
     'name, value, sign, left',
     [

@@ -15,6 +15,7 @@
 """A real node that compiles its kernels, with the defaults, is there for others meanwhile."""
 
 import contextlib
+from pathlib import Path
 import re
 import time
 
@@ -63,3 +64,15 @@ def test_a_node_answers_and_reports_while_it_compiles(system, tmp_path, monkeypa
             del reports[:]
             wait_for(compiles)
         assert 'ready, hears' not in node.log()
+
+
+def test_a_node_that_had_to_compile_has_the_memory_of_one_that_had_not(tmp_path, monkeypatch):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    memory = []
+    with local_discovery(), reserved_domain_id() as domain, Link('asks', domain_id=domain) as link:
+        for _ in range(2):
+            with NodeProcess('fathometer', domain_id=domain) as node:
+                assert link.wait_for(lambda node=node: 'ready, hears' in node.log(), 5 * LIMIT)
+                status = Path(f'/proc/{node.process.pid}/status').read_text()
+                memory.append(int(re.search(r'VmHWM:\s+(\d+) kB', status)[1]))
+    assert memory[0] < 1.1 * memory[1]

@@ -18,6 +18,7 @@ import contextlib
 import json
 import threading
 import time
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
@@ -110,8 +111,8 @@ def test_it_plays_by_itself_for_who_stays_and_where_that_was_wanted(autostart, l
         viewer = stack.enter_context(Viewer(stack.enter_context(server).url))
         server.advertise(material.channels.values())
         viewer.wait(lambda: len(viewer.channels) == len(material.channels))
-        viewer.subscribe('/nav')
-        viewer.wait(lambda: server.watched('/nav'))
+        viewer.subscribe('/nav', '/detections')  # a viewer asks for one after another
+        viewer.wait(lambda: server.watched('/nav') and server.watched('/detections'))
         if leaves:
             stack.close()
         time.sleep(1.5 * SETTLE)
@@ -130,6 +131,12 @@ def test_live_channels_come_and_go():
         viewer.wait(lambda: server.watched('/talk'))
         server.withdraw('/talk')
         viewer.wait(lambda: '/talk' not in viewer.channels)
+
+
+def test_a_browser_is_sent_to_this_server():
+    with ViewServer('test', '127.0.0.1', 0) as server:
+        asked = parse_qs(urlsplit(server.app_url).query)
+        assert asked['ds.url'] == [server.url]
 
 
 def test_a_taken_port_is_one_sentence():

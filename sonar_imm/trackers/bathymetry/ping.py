@@ -74,8 +74,8 @@ SURE = 0.9
 DETECTABLE = 1.5
 """Roughness is seen where its standard deviation is that of so many single snapshots."""
 
-LOUD = 10.0
-"""So many times the noise is much power."""
+LOUD = 4.0
+"""So many times the noise is much power, in a bin of which two waves leave only noise."""
 FEWEST_BINS = 100
 """Of fewer bins `residual_ratio` says nothing."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.

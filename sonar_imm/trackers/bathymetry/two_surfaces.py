@@ -40,9 +40,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from ...acoustics.layover import BIRTH, END, Layover
 from ...acoustics.likelihood_kernels import horner
+from ...acoustics.variances import HALF_WIDTH, mean_power, moving_mean
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import exponentials, phasors
 from ...estimation.jit import kernel
@@ -50,6 +52,9 @@ from .kernels import Geometry, PingLikelihood, sines_of
 
 POSSIBLE, MARGIN = 0.05, 10
 """A stretch is where the chain says more than this, and so many bins around it."""
+BRIGHTER, AROUND = 3.0, 60
+"""It is also where the power, a mean of 21 bins, is so many times the median of so many bins to
+either side: what faces the sonar is bright, also where two waves are too faint for the chain."""
 EXISTS = 0.5
 """From this probability on both surfaces are soundings."""
 FEWEST_STAVES = 4
@@ -94,9 +99,18 @@ class Moves(NamedTuple):
     gap: int
 
 
-def stretches(existence: FloatArray) -> list[tuple[int, int]]:
-    """First bin and end of each stretch in which a second surface is possible."""
-    near = np.convolve(existence > POSSIBLE, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0.5
+def possible_bins(iq: np.ndarray, second: Layover) -> BoolArray:
+    """Bins (T,) of iq (T, P) in which a second surface is possible: the chain says so, or they are
+    `BRIGHTER` than those around them."""
+    power = np.nan_to_num(moving_mean(mean_power(iq), HALF_WIDTH, second.usable))
+    usual = median_filter(power, 2 * AROUND + 1, mode='nearest')
+    bright = second.usable & (power > BRIGHTER * usual)
+    return np.asarray((second.existence > POSSIBLE) | bright)
+
+
+def stretches(possible: BoolArray) -> list[tuple[int, int]]:
+    """First bin and end of each stretch around bins (T,) in which a second surface is possible."""
+    near = np.convolve(possible, np.ones(2 * MARGIN + 1))[MARGIN:-MARGIN] > 0.5
     edges = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]]).astype(np.int8)))
     return [
         (low, min(low + LONGEST, end))
@@ -122,7 +136,7 @@ def resolve(
         _taps(WALK_OF_TWO).astype(np.float32),
         round(APART / STEP),
     )
-    for first, end in stretches(existence):
+    for first, end in stretches(possible_bins(iq, second)):
         here = slice(first, end)
         cells = _cells(floor, first, end)
         start = np.exp(-0.5 * np.square((cells - floor[first]) / START_STD)) + LEAST_START

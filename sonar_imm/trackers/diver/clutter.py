@@ -21,8 +21,8 @@ the false ones did, `12 sqrt(det C)` of their covariance C (a disc has `4 pi sqr
 it needs not be stated, and a sensor that moves takes it along.
 
 Before anything was seen there are `PRIOR_SCANS` scans of `PRIOR_AREA` with the density
-`CLUTTER`. That is also the least that is believed: a sensor without a false fix so far may show
-some.
+`CLUTTER`. A tenth of that is the least that is believed: a sensor without a false fix so far may
+show some.
 """
 
 from __future__ import annotations
@@ -38,6 +38,9 @@ from .config import CLUTTER, DiverConfig
 MOST = 1e-2
 """The greatest that is believed, per square metre: one within the usual gate of a fix good to a
 metre in every other scan. Whoever has more has to state it."""
+
+LEAST = 0.1 * CLUTTER
+"""The least that is believed."""
 
 PRIOR_SCANS, PRIOR_AREA = 5.0, 4e4
 """Scans, and m^2, that what is known at first is worth."""
@@ -77,7 +80,7 @@ class Clutter(NamedTuple):
         """Of false fixes, per square metre and scan."""
         number = CLUTTER * PRIOR_SCANS * PRIOR_AREA + max(self.false, 0.0)
         found = number / ((PRIOR_SCANS + self.scans) * self.area)
-        return min(max(found, CLUTTER), MOST)
+        return min(max(found, LEAST), MOST)
 
     def after(self, z: FloatArray, false: FloatArray) -> Clutter:
         """With a scan of fixes z (D, 2), each false with a probability (D,)."""
@@ -119,7 +122,7 @@ def replaced(known: Clutters, sensor: str, clutter: Clutter) -> Clutters:
 
 def warnings(known: Clutters, config: DiverConfig) -> list[str]:
     """Sentences on false fixes that the association does not expect."""
-    if config.association != 'gnn':
+    if config.pairing != 'gnn':
         return []
     found = [clutter for _, clutter in known if clutter.evident]
     return [

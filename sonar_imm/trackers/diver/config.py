@@ -272,12 +272,18 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         range=(0.0, 1e4),
         description='number of false fixes expected in a scan, per square metre; 0: jipda and '
         'kbest learn it from the fixes that are no track of theirs, else 1e-6')
-    association: str = parameter('gnn', '',
+    association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
-        'jipda (all pairings weighed, tracks confirmed by their probability of existence, for '
-        'divers that cross in clutter) or kbest (the most probable histories of pairings kept, '
-        'until later scans and names tell which was right, for divers side by side)',
-        choices=ASSOCIATIONS)
+        'jipda (all pairings weighed, tracks confirmed by their probability of existence), kbest '
+        '(the most probable histories of pairings kept, until later scans and names tell which '
+        'was right, for divers side by side) or auto (jipda with model_set families, else gnn)',
+        choices=('auto', *ASSOCIATIONS))
+    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
+        description='number of hits within confirm_window that confirm a track, with association '
+        'gnn and of raw arrivals')
+    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5,
+        description='number of consecutive scans without a hit that cover a confirmed target and '
+        'so end its track, with association gnn and of raw arrivals')
     hypotheses: int = parameter(30, '',
         'kbest: largest number of histories of pairings that are kept of divers near each other',
         range=(1, 1000))
@@ -479,6 +485,14 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         if sectors := self.sensor_coverage_sector:
             own['coverage_sector'] = sectors[SECTOR * place : SECTOR * (place + 1)]
         return evolve(self, **own)
+
+    @property
+    def pairing(self) -> str:
+        """One of `ASSOCIATIONS`. Weighing asks for the density of a fix, also where a diver does
+        what is rare: `families` have that, of the other sets a sharp turn looks like clutter."""
+        if self.association != 'auto':
+            return self.association
+        return 'jipda' if self.model_set == 'families' else 'gnn'
 
     @property
     def usual_clutter(self) -> float:

@@ -432,7 +432,9 @@ def _may_be_lost(now: DiverState, track: int, fixes: Positions) -> bool:
     if fixes.target_id is not None or not fixes.whole:
         return True
     missed = 1.0 - fixes.config.detection_probability
-    return bool(missed ** (now.life.misses[track] + 1) <= LOST)
+    # Who lives by his existence has no count of misses, but refused a fix before.
+    before = max(int(now.life.misses[track]), 1)
+    return bool(missed ** (before + 1) <= LOST)
 
 
 def _reaches(now: DiverState, track: int, z: FloatArray, fixes: Positions) -> bool:

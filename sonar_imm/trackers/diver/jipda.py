@@ -144,7 +144,7 @@ def joint_weights(
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
     looked = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
-    ratio, detected = mixture / (fixes.clutter + config.birth_density), np.ones(1)
+    ratio, detected = mixture / (fixes.clutter + fixes.births), np.ones(1)
     detected = detected * config.detection_probability
     if seen is not None:
         detected = np.maximum(seen.tracks, LEAST_DETECTED)
@@ -216,9 +216,7 @@ def known_existence(existence: FloatArray, status: StatusArray) -> FloatArray:
 def birth_existence(fixes: Positions, claimed: FloatArray) -> FloatArray:
     """Existence (D,) of tracks that begin at fixes which belong, with the probability `claimed`
     (D,), to others."""
-    density = fixes.config.birth_density
-    new = density / (density + fixes.clutter)
-    return np.asarray(new * (1.0 - claimed))
+    return np.asarray(fixes.births / (fixes.births + fixes.clutter) * (1.0 - claimed))
 
 
 class Judged(NamedTuple):

@@ -109,7 +109,7 @@ def branched(
     if seen is not None:
         p = np.maximum(seen.tracks, jipda.LEAST_DETECTED)
         ratio = ratio - seen.log_ratio + np.log(seen.fixes)[None] - np.log(p)[:, None]
-    ratio = ratio - math.log(fixes.clutter + config.birth_density)
+    ratio = ratio - math.log(fixes.clutter + fixes.births)
     ratio[excluded] = -np.inf
     reserved = np.zeros(ratio.shape, bool)
     if fixes.target_id is not None:

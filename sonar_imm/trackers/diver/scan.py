@@ -94,6 +94,10 @@ class Heights(NamedTuple):
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
 
 
+MOST_BIRTHS = 1.5
+"""New divers for each false fix, at most, where the density of false fixes is learnt."""
+
+
 @frozen(eq=False)
 class Positions:
     """D fixes of one stamp and sensor, of which each diver causes at most one: z (D, 2), R
@@ -120,6 +124,13 @@ class Positions:
     def clutter(self) -> float:
         """The density of false fixes, 1/m^2."""
         return self.config.clutter_density or self.learnt
+
+    @property
+    def births(self) -> float:
+        """The density of new divers, 1/m^2: where that of false fixes is learnt, not many more.
+        Else a sensor that gives none has its fixes doubted for divers that may yet come."""
+        stated = self.config.birth_density
+        return stated if self.config.clutter_density else min(stated, MOST_BIRTHS * self.learnt)
 
 
 @frozen(eq=False)
@@ -150,7 +161,7 @@ class Scan:
         """The scan of `items`; factor: on the covariances of fixes and of arrival times; clutter:
         of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config, factor[0]), []
-        known = dict(clutter) if config.association != 'gnn' else {}
+        known = dict(clutter) if config.pairing != 'gnn' else {}
         for at, group in enumerate(fixes):
             if group.target_id is None and group.sensor in known:
                 fixes[at] = evolve(group, learnt=known[group.sensor].density)

@@ -42,7 +42,7 @@ from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
-from ...estimation.arrays import FloatArray, IndexArray, IntArray
+from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, TENTATIVE, Tracks
 from ...estimation.consistency import ENOUGH, excess
 from ...intake import KnownFrames
@@ -89,7 +89,7 @@ class DiverTracker:
     def _settle(self, config: DiverConfig) -> None:
         """What follows from the parameters, once and not in every scan."""
         self.config = config
-        self._keeps_hypotheses = config.association == 'kbest'
+        self._keeps_hypotheses = config.pairing == 'kbest'
         self.rules = track_rules(config)
         layouts = partial(Instruments.layout, config=config, models=self.models)
         self._layout = lru_cache(maxsize=16)(layouts)
@@ -309,7 +309,7 @@ class DiverTracker:
             excluded = np.zeros(len(excluded), bool)
         where = now, config, fixes.z, fixes.R
         seen = coverage.detectable(self._covered, fixes.sensor, *where)
-        if config.association == 'jipda':
+        if config.pairing == 'jipda':
             weights = jipda.joint_weights(now, fixes, expected, H, excluded, densities, seen)
             claimed = weights.beta.sum(axis=0)
             existence = jipda.birth_existence(fixes, claimed)
@@ -356,8 +356,7 @@ class DiverTracker:
         """The tracks, those that were lost where two fixes say that they are, and whether there
         was one."""
         seen, weights = association.seen, association.weights
-        sure = weights is not None and seen is None
-        if association.densities is None or not len(now.x) or sure:
+        if association.densities is None or not len(now.x):
             return now, False
         hit, left = np.zeros(len(now.x), bool), np.ones(len(fixes.z), bool)
         hit[association.tracks] = True
@@ -365,7 +364,6 @@ class DiverTracker:
         if weights is None:
             left[association.detection[firm[association.tracks]]] = False
         else:
-            # Whom the sensor sees is not lost: his existence tells.
             left = weights.beta[firm].sum(axis=0) < 0.5
             hit = hit if seen is None else hit | ~seen.unseen
         layout, whole = self._layout(now.instruments), association.densities.whole
@@ -393,9 +391,10 @@ class DiverTracker:
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask
-            return jipda.update_jointly(
+            now = jipda.update_jointly(
                 now, fixes, weights, tracks, h, layout, considered, association.densities
             )
+            return self._with_scale(now, fixes, association)
         if not len(tracks):
             return now
         if association.densities is not None:
@@ -410,12 +409,7 @@ class DiverTracker:
         now = now._replace(
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
         )
-        if self.config.estimate_covariance_scale:
-            if association.counted is not None:
-                counts = association.counted[tracks]
-                tracks, detection = tracks[counts], detection[counts]
-            now = self._with_scale(now, fixes, tracks, detection)
-        return now
+        return self._with_scale(now, fixes, association)
 
     def _update_heights(self, now: DiverState, fixes: Positions, found: Association) -> DiverState:
         """The tracks after what the fixes that are theirs state of z."""
@@ -423,9 +417,15 @@ class DiverTracker:
         return heights.update(now, fixes, found, layout, place, self.config)
 
     def _with_scale(
-        self, now: DiverState, fixes: Positions, tracks: IndexArray, detection: IntArray
+        self, now: DiverState, fixes: Positions, association: Association
     ) -> DiverState:
-        """With the scale of the stated covariances learnt from the fixes of `tracks`."""
+        """With the scale of the stated covariances learnt from the pairs of an association."""
+        tracks, detection = association.tracks, association.detection
+        if association.counted is not None:
+            counts = association.counted[tracks]
+            tracks, detection = tracks[counts], detection[counts]
+        if not self.config.estimate_covariance_scale or not len(tracks):
+            return now
         E = self._layout(now.instruments).H[0]
         mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], now.mu[tracks], E)
         residual, stated = fixes.z[detection] - mean, fixes.R[detection] / fixes.factor

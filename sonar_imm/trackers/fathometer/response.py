@@ -64,6 +64,8 @@ _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more 
 DECAYS = (2.0, 4.0, 8.0, 16.0)
 """Depths, m, over which the scatter of an envelope may fall to 1/e: silt with gas to sand."""
 MAX_SCATTER_CELLS = 10_000
+_PHASES = 4
+"""At how many depths the phase of an echo is found."""
 
 
 @frozen
@@ -265,7 +267,8 @@ def array_response(
     """Look up and down with the array and correlate. mirrored: noise is measured in the mirror
     window even where depths are configured for it. Raises `Rejection` ('bad_band',
     'bad_frequency', 'singular', 'no_noise')."""
-    coherence = array_coherence(record, config)
+    below = lattice.depth - reference_depth
+    coherence = array_coherence(record, config, below)
     gamma, first, spacing, aperture = coherence[:4]
     seconds = config.snapshot_seconds or 1.0 / spacing
     pulse = None
@@ -273,9 +276,16 @@ def array_response(
         heard = coherence._replace(weight=coherence.weight * coherence.share)
         pulse = processor_pulse(heard, lattice, config.sound_speed)
 
-    def at(low: float, step: float, count: int, *, envelope: bool = False) -> FloatArray:
+    def at(
+        low: float,
+        step: float,
+        count: int,
+        *,
+        envelope: bool = False,
+        turn: float | NDArray[np.complexfloating] = 1.0,
+    ) -> FloatArray:
         return fathometer.depth_response(
-            gamma,
+            turn * gamma,
             first,
             spacing,
             (low, step, count),
@@ -289,7 +299,12 @@ def array_response(
         return noise_taper(config.window, config.overlap, way / seconds)
 
     # The noise of an envelope is that of the response: its own scatter is less.
-    b = at(lattice.first, lattice.step, lattice.cells, envelope=config.envelope)
+    depths, b = (lattice.first, lattice.step, lattice.cells), np.zeros(lattice.cells)
+    # The phase of an echo goes with 1 / depth: in between, responses are interpolated in that.
+    inverse = 1.0 / np.maximum(below, aperture or 1.0)
+    for turn, unit in zip(coherence.turns, np.eye(len(coherence.turns))):
+        share = np.interp(inverse, coherence.inverse, unit)
+        b += share * at(*depths, envelope=config.envelope, turn=turn)
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
@@ -354,7 +369,8 @@ class ArrayCoherence(NamedTuple):
     """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
     spacing in Hz; aperture: length of the array, m; weight (F,): the spectrum of an echo, NaN as
     gamma, if all noise were the surface's and the matrices exact; share (F,): by what it is less
-    than that."""
+    than that; turns (K, F): what takes the phase of `fathometer.echo_phase` off echoes from 1 /
+    inverse (K,) m below the array; one, and one row of ones, where it is left."""
 
     gamma: NDArray[np.complexfloating]
     first: float
@@ -362,10 +378,15 @@ class ArrayCoherence(NamedTuple):
     aperture: float
     weight: FloatArray
     share: FloatArray
+    turns: NDArray[np.complexfloating]
+    inverse: FloatArray
 
 
-def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCoherence:
-    """What the array hears from above and below at once. Raises `Rejection`."""
+def array_coherence(
+    record: CrossSpectra, config: FathometerConfig, below: FloatArray | None = None
+) -> ArrayCoherence:
+    """What the array hears from above and below at once; below (n,): where echoes are looked for,
+    m below hydrophone 0, rising. Raises `Rejection`."""
     rows = np.flatnonzero(
         (record.frequency >= config.frequency_min - 1e-6)
         & (record.frequency <= config.frequency_max + 1e-6)
@@ -407,8 +428,22 @@ def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCohe
     share[index[use][there]] = _echo_share(
         csdm[there], frequency[there], heights, record.snapshots, config
     )
+    turns, inverse = np.ones((1, len(gamma)), np.complex128), np.ones(1)
+    if _sees_processor(config, heights) and below is not None and config.output != 'printed':
+        far, near = (1.0 / max(float(below[k]), aperture) for k in (-1, 0))
+        inverse = np.linspace(far, near, _PHASES)
+        sound = config.sound_speed, config.loading
+        phase = fathometer.echo_phase(
+            csdm[there], frequency[there], heights, 1.0 / inverse, *sound
+        )
+        turns = np.ones((_PHASES, len(gamma)), np.complex128)
+        turns[:, index[use][there]] = np.exp(-1j * phase)
     first = float(record.frequency[rows[0]])
-    return ArrayCoherence(gamma, first, spacing, aperture, weight, share)
+    return ArrayCoherence(gamma, first, spacing, aperture, weight, share, turns, inverse)
+
+
+def _sees_processor(config: FathometerConfig, heights: NDArray[np.floating[Any]]) -> bool:
+    return config.pulse == 'processor' and config.processor == 'mvdr' and len(heights) > 1
 
 
 def _echo_share(
@@ -418,7 +453,7 @@ def _echo_share(
     snapshots: float,
     config: FathometerConfig,
 ) -> FloatArray:
-    if config.pulse != 'processor' or config.processor != 'mvdr' or len(heights) < 2:
+    if not _sees_processor(config, heights):
         return np.ones(len(csdm))
     share = fathometer.surface_share(csdm, frequency, heights, config.sound_speed)
     if snapshots > 0.0:

@@ -154,7 +154,7 @@ def profile_figure(profile: Profile) -> go.Figure:
             place, height_2 = profile.range[second], profile.truth.height_2[second]
             add_points(figure, place, height_2, 'truth, second surface', INK, size=2)
     add_line(figure, ranges, height, 'estimate', COLOURS[0], 1.4)
-    marks = [('no echo', ~profile.heard, 3)]
+    marks = [('no echo', ~profile.echoes, 3)]
     if profile.upper is not None:
         _add_upper(figure, profile)
     elif profile.two is not None:

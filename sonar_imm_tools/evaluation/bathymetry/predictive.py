@@ -86,8 +86,8 @@ class Scored(BathymetryTracker):
             return []
         made = super().process(measurement)
         for estimate in made:
-            said = np.asarray(estimate.extras['log_likelihood'], float)
-            bins = said[np.asarray(estimate.extras['valid'], bool)]
+            logs = np.asarray(estimate.extras['log_likelihood'], float)
+            bins = logs[np.asarray(estimate.extras['valid'], bool)]
             score, count = self.scores.get(estimate.stamp_ns, (0.0, 0))
             score += float(np.maximum(bins, UNEXPLAINED).sum())
             self.scores[estimate.stamp_ns] = score, count + len(bins)

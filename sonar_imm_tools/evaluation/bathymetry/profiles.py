@@ -85,10 +85,10 @@ class Profile:
     unsure: BoolArray | None = None
 
     @property
-    def heard(self) -> BoolArray:
+    def echoes(self) -> BoolArray:
         """Bins (n,) with an echo."""
-        heard = self.valid if self.two is None else self.valid | self.two
-        return heard if self.unsure is None else heard | self.unsure
+        echoes = self.valid if self.two is None else self.valid | self.two
+        return echoes if self.unsure is None else echoes | self.unsure
 
 
 @frozen(eq=False)

@@ -55,7 +55,7 @@ def score(swath: Swath) -> dict[str, Any]:
         'pings': len(profiles),
         'span_s': (max(stamps) - min(stamps)) / SECOND if stamps else 0.0,
         'bins': sum(len(profile.range) for profile in profiles),
-        'heard_share': _mean([profile.heard for profile in profiles]),
+        'heard_share': _mean([profile.echoes for profile in profiles]),
         'rough_share': _mean([swath.roughness(profile) > 0.5 for profile in profiles]),
         'height_std_median_m': _median([profile.height_std for profile in profiles]),
     }
@@ -101,8 +101,8 @@ def height_error(profile: Profile, truth: TrueFloor) -> FloatArray:
 
 def _gate(known: Known) -> dict[str, Any]:
     """How well the gate tells shadow from echo."""
-    shadow = [profile.heard[_PLACES['shadow'](truth)] for profile, truth in known]
-    echo = [profile.heard[truth.echo] for profile, truth in known]
+    shadow = [profile.echoes[_PLACES['shadow'](truth)] for profile, truth in known]
+    echo = [profile.echoes[truth.echo] for profile, truth in known]
     return {
         'shadow_bins': sum(map(len, shadow)),
         'shadow_passed_over': 1.0 - _mean(shadow),
@@ -114,12 +114,12 @@ def _layover(known: Known) -> dict[str, Any]:
     """How many bins with two surfaces were found, become soundings all the same, how many with one
     were lost, and how far the heights of two lie from the nearest true one; empty where the truth
     or the estimate does not say it."""
-    two, one, kept, off, held = [], [], [], [], []
+    two, single, kept, off, held = [], [], [], [], []
     for profile, truth in known:
         if truth.surfaces is not None and profile.two is not None:
             two.append(profile.two[truth.surfaces > 1])
             kept.append(profile.valid[truth.surfaces > 1])
-            one.append(profile.two[truth.surfaces == 1])
+            single.append(profile.two[truth.surfaces == 1])
         if profile.two is not None and profile.upper is not None:
             for height, std in ((profile.height, profile.height_std), profile.upper):
                 error = truth.to_nearest(height)[profile.two & truth.echo]
@@ -128,7 +128,7 @@ def _layover(known: Known) -> dict[str, Any]:
     if not two:
         return {}
     counts = {'bins': sum(map(len, two)), 'found': _mean(two), 'soundings': _mean(kept)}
-    scores: dict[str, Any] = {**counts, 'lost': _mean(one)}
+    scores: dict[str, Any] = {**counts, 'lost': _mean(single)}
     if off:
         scores['heights'] = {**error_summary(_finite(off)), 'inside_band': _mean(held)}
     return {'layover': scores}

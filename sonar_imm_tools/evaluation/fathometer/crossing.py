@@ -106,7 +106,7 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
                 'longitude': _between(lines[0].longitude, i, s),
                 'latitude': _between(lines[0].latitude, i, s),
                 'angle_deg': angle,
-                **_compared(found[0], found[1], limit, directions, position_std),
+                **compared(found[0], found[1], limit, directions, position_std),
             }
         )
     matched = [pair for crossing in crossings for pair in crossing['horizons']]
@@ -275,7 +275,7 @@ def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float
     passed, and the angle between them in degrees."""
     found = []
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
-    for i in np.flatnonzero(np.hypot(*u.T) > 0.0):
+    for i in range(len(u)):
         apart = b[:-1] - a[i]
         across = u[i, 0] * v[:, 1] - u[i, 1] * v[:, 0]
         with np.errstate(divide='ignore', invalid='ignore'):
@@ -284,7 +284,7 @@ def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float
         # Half-open, so that a crossing at a position counts once.
         for j in np.flatnonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)):
             angle = np.degrees(np.arctan2(abs(across[j]), abs(float(u[i] @ v[j]))))
-            found.append((int(i), int(j), float(s[j]), float(t[j]), float(angle)))
+            found.append((i, int(j), float(s[j]), float(t[j]), float(angle)))
     return found
 
 
@@ -336,14 +336,15 @@ def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> 
     return sorted(horizons, key=lambda horizon: horizon.depth)
 
 
-def _compared(
+def compared(
     a: Sequence[Horizon],
     b: Sequence[Horizon],
     limit: float,
     directions: FloatArray,
     position_std: float,
 ) -> dict[str, Any]:
-    """directions (2, 2): unit vectors along both lines."""
+    """The horizons of two lines where they cross, those in pairs that are less than `limit` m
+    apart; directions (2, 2): unit vectors along both lines."""
     from scipy.optimize import linear_sum_assignment
 
     depth_a, depth_b = np.array([h.depth for h in a]), np.array([h.depth for h in b])

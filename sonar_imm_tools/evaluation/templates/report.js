@@ -14,8 +14,11 @@ function plotly() {
     const inside = document.getElementById('plotlyjs');
     script.onload = good;
     script.onerror = () => bad(new Error(`${PLOTLYJS} is not in the folder of this page`));
-    if (inside === null) script.src = PLOTLYJS;
-    if (inside === null) { document.head.append(script); return; }
+    if (inside === null) {
+      script.src = PLOTLYJS;
+      document.head.append(script);
+      return;
+    }
     unpacked(inside.textContent).then((text) => {
       script.textContent = text;
       document.head.append(script);
@@ -35,8 +38,11 @@ async function draw(plot) {
     const [text] = await Promise.all([unpacked(packed), plotly()]);
     const figure = JSON.parse(text);
     const small = matchMedia('(max-width: 640px)').matches;  // there a finger scrolls the page
-    if (small) figure.layout = {...figure.layout, dragmode: false, font: {...figure.layout.font, size: 11}};
-    if (small) figure.layout.margin = {...figure.layout.margin, l: 46, r: 8};
+    if (small) {
+      const {font, margin} = figure.layout;
+      Object.assign(figure.layout,
+        {dragmode: false, font: {...font, size: 11}, margin: {...margin, l: 46, r: 8}});
+    }
     await Plotly.newPlot(plot, figure.data, figure.layout, {...CONFIG, displayModeBar: small ? false : 'hover'});
   } catch (error) {
     plot.textContent = `No plot: ${error.message}.`;

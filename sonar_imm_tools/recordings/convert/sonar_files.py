@@ -36,6 +36,8 @@ from msg_adapters.navigation import write_navigation, write_range
 from msg_adapters.snapshots import write_snapshot
 from msg_adapters.soundings import write_ground
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geometry import quaternion
+from sonar_imm.acoustics.rays import profile_problem
 from sonar_imm.measurements import (
     Altitude,
     Ground,
@@ -54,6 +56,7 @@ from ..foreign import read_apart, Record
 from ..messages import ros_message
 from ..sources import BagError
 from ..writer import BagWriter
+from .images import SYSTEM
 
 JUMP = 3600 * SECOND
 """A clock that goes further than this from one ping to the next is off, or was set."""
@@ -104,7 +107,7 @@ def convert_xtf(path: str | Path, out: str | Path, **values: Any) -> ConversionR
                 phases = True
                 yield Message(f'/{side}/snapshot', write_snapshot(snapshot, ros_message))
 
-    _write(Path(path), 'xtf', report, how, messages, {'obstacle': mount})
+    _write(Path(path), 'xtf', report, how, messages, {SYSTEM: mount})
     other = next(side for side in LOOKS if side != how.side)
     report.notes['side'] = f'echoes of {how.side}; those of the other by --side {other}'
     report.notes['samples'] = (
@@ -114,11 +117,18 @@ def convert_xtf(path: str | Path, out: str | Path, **values: Any) -> ConversionR
 
 
 def convert_ek80(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
-    """Convert the complex samples of a split-beam echo sounder to ``/snapshot``.
+    """Convert the complex samples, or the power and angles, of a split-beam echo sounder to
+    ``/snapshot``.
 
     values: as in `Ek80Options`. Needs themachinethatgoesping. Raises `BagError`.
     """
     how = Ek80Options(**values)
+    if _start(path)[4:8] == b'CON0':
+        raise BagError(
+            f'{path} is of an EK60 or ES60, which the reader of the EK80 does not know; '
+            'docs/reference/formats.md shows how echopype makes an archive of it for '
+            'sonar-imm convert snapshots'
+        )
     report = ConversionReport(Path(out))
     others: set[str] = set()
     chosen = ''
@@ -128,10 +138,8 @@ def convert_ek80(path: str | Path, out: str | Path, **values: Any) -> Conversion
         if how.channel not in ping['channel'] or chosen not in ('', ping['channel']):
             others.add(ping['channel'])
             return
-        if ping['iq'] is None:
-            raise Rejection('power_only', 'it holds power, not complex samples')
-        if ping['chirp']:
-            raise Rejection('chirp', 'it is a chirp, which is not compressed here')
+        if ping['iq'] is None and (ping['power'] is None or ping['angle'] is None):
+            raise Rejection('power_only', 'it holds power alone, which says no direction')
         chosen = ping['channel']
         snapshot = _split_beam(ping, how)
         yield Message('/snapshot', write_snapshot(snapshot, ros_message))
@@ -155,7 +163,11 @@ def convert_kongsberg(path: str | Path, out: str | Path, **values: Any) -> Conve
         nav = ping['nav']
         if ping['soundings'] is None or nav is None:
             raise Rejection('no_soundings', 'it has no soundings, or no position')
-        found = ping['soundings'][np.isfinite(ping['soundings']).all(axis=1)]
+        # Of a file that is cut off, the library makes soundings at the ship itself.
+        found = ping['soundings']
+        found = found[np.isfinite(found).all(axis=1) & found.any(axis=1)]
+        if not len(found):
+            raise Rejection('no_soundings', 'none of its soundings is valid')
         # Soundings are level: they turn with the heading alone.
         heading = math.radians(ping['heading'])
         s, c = math.sin(heading), math.cos(heading)
@@ -170,10 +182,22 @@ def convert_kongsberg(path: str | Path, out: str | Path, **values: Any) -> Conve
         )
         yield Message('/ground', write_ground(ground, ros_message))
 
-    with Path(path).open('rb') as file:
-        start = file.read(8)
-    _write(Path(path), 'kmall' if start[4:5] == b'#' else 'all', report, how, messages)
+    reader = 'kmall' if _start(path)[4:5] == b'#' else 'all'
+    profiles: dict[str, dict[str, Any]] = {'bathymetry': {}}
+    _write(Path(path), reader, report, how, messages, profiles)
+    if 'sound_speed_profile' in profiles['bathymetry']:
+        report.notes['sound speed'] = (
+            'the last profile is in parameters.yaml beside the bag, for --params of other bags'
+        )
     return report
+
+
+def _start(path: str | Path) -> bytes:
+    try:
+        with Path(path).open('rb') as file:
+            return file.read(8)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
 
 
 def convert_pictures(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
@@ -238,17 +262,10 @@ class _Frame:
         return {'origin': f'latitude {place.latitude!r}, longitude {place.longitude!r}'}
 
 
-def _orientation(heading: float, pitch: float, roll: float) -> list[float]:
+def _orientation(heading: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
     """Quaternion x, y, z, w, ENU from FLU, of degrees: from north to the east, bow up, starboard
     down."""
-    halves = (math.radians(0.5 * angle) for angle in (90.0 - heading, -pitch, roll))
-    (cy, sy), (cp, sp), (cr, sr) = ((math.cos(half), math.sin(half)) for half in halves)
-    return [
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ]
+    return quaternion(math.radians(roll), math.radians(-pitch), math.radians(90.0 - heading))
 
 
 def _write(
@@ -261,7 +278,7 @@ def _write(
 ) -> None:
     """Write what a reader of binary files gives."""
     try:
-        records = _named(read_apart(reader, path), path, report)
+        records = _named(read_apart(reader, path), path, report, parameters)
         _write_all(path, records, report, how, messages, parameters)
     except ImportError:
         extra = EXTRAS[reader]
@@ -270,14 +287,25 @@ def _write(
         ) from None
 
 
-def _named(records: Iterable[Record], path: Path, report: ConversionReport) -> Iterator[Record]:
-    """Pings with the word for their place; what is wrong with the file goes to the report."""
-    for number, record in enumerate(records, start=1):
+def _named(
+    records: Iterable[Record],
+    path: Path,
+    report: ConversionReport,
+    parameters: dict[str, dict[str, Any]] | None,
+) -> Iterator[Record]:
+    """Pings with the word for their place; what is wrong with the file goes to the report, a
+    profile of sound speed to the parameters of the bathymetry tracker."""
+    for record in records:
         if record['kind'] == 'problem':
             report.problems.append(f'{path.name}: {record["text"]}; what came before it is kept')
+        elif record['kind'] == 'profile':
+            if problem := profile_problem(record['values']):
+                report.problems.append(f'{path.name}: a profile of sound speed {problem}')
+            elif parameters is not None:
+                parameters['bathymetry']['sound_speed_profile'] = record['values']
         else:
             report.rows += 1
-            yield {**record, 'where': f'ping {number}'}
+            yield {**record, 'where': f'ping {report.rows}'}
 
 
 def _write_all(
@@ -446,24 +474,68 @@ def _turns(samples: np.ndarray, radians_per_count: float | None) -> np.ndarray:
 
 def _split_beam(ping: Record, how: Ek80Options) -> Snapshot:
     """The halves, or the chosen sums, of the sectors of a split beam."""
-    iq, speed = ping['iq'][1:], _speed(ping)  # the first sample lies at range 0
-    sectors = iq.shape[1]
-    staves = HALVES.get(sectors, ()) if how.staves is None else how.staves
-    if len(staves) < 2 or any(not 0 <= k < sectors for stave in staves for k in stave):
-        raise Rejection('bad_staves', f'it has {sectors} sectors; --staves says which to take')
-    interval = float(ping['sample_interval'])
+    interval, spacing = float(ping['sample_interval']), how.element_spacing
     if not (math.isfinite(interval) and interval > 0.0):
         raise Rejection('out_of_range', f'its samples are {interval:g} s apart')
+    if ping['iq'] is None:
+        iq = _of_angles(ping, how)
+    else:
+        sectors = ping['iq'].shape[1]
+        staves = HALVES.get(sectors, ()) if how.staves is None else how.staves
+        if len(staves) < 2 or any(not 0 <= k < sectors for stave in staves for k in stave):
+            raise Rejection('bad_staves', f'it has {sectors} sectors; --staves says which to take')
+        iq = np.stack([ping['iq'][:, list(stave)].sum(axis=1) for stave in staves], axis=1)
+        if ping['chirp'] is not None:
+            iq = _compressed(iq, ping['chirp'], interval)
+    if spacing is None and how.staves is None and 0.0 < ping['spacing'] < 10.0:
+        spacing = float(ping['spacing'])
+    iq, speed = iq[1:], _speed(ping)  # the first sample lies at range 0
     return Snapshot(
         stamp_ns=ping['stamp_ns'],
         frame_id=how.frame_id,
         range=np.arange(1, 1 + len(iq)) * 0.5 * speed * interval,
-        iq=np.stack([iq[:, list(stave)].sum(axis=1) for stave in staves], axis=1),
+        iq=iq,
         sound_speed=speed,
         frequency=float(ping['frequency']),
-        element_spacing=how.element_spacing,
+        element_spacing=spacing,
         sample_rate=1.0 / interval,
     )
+
+
+def _of_angles(ping: Record, how: Ek80Options) -> np.ndarray:
+    """(R, 2) of power and the phase of the starboard half against the port half."""
+    if how.staves is not None:
+        raise Rejection('bad_staves', 'it holds power and angles: there are no sectors to choose')
+    if len(ping['power']) != len(ping['angle']):
+        raise Rejection('bad_shape', 'its powers and angles are not equally many')
+    turn = np.exp(0.5j * ping['angle'])
+    size = 10.0 ** (np.asarray(ping['power'], np.float64) / 20.0)
+    return np.column_stack([size * turn, size * turn.conj()])
+
+
+def _compressed(iq: np.ndarray, chirp: Record, interval: float) -> np.ndarray:
+    """Samples (R, N) of a chirp after the matched filter: a linear sweep with Hann edges, sent
+    through the filters of the receiver (Andersen et al., 2024, Methods Ecol. Evol. 15)."""
+    (low, high), duration, rate = chirp['band'], chirp['duration'], chirp['rate']
+    known = all(map(math.isfinite, (low, high, duration, chirp['slope'], rate)))
+    if not (known and 2.0 <= duration * rate <= 1e6 and 0.0 <= chirp['slope'] <= 0.5):
+        raise Rejection('chirp', 'it is a chirp of which the file does not say how it was made')
+    if (
+        not abs(math.prod(step for _, step in chirp['filters']) / rate - interval)
+        < 1e-3 * interval
+    ):
+        raise Rejection('chirp', 'it is a chirp whose filters the file does not hold')
+    time = np.arange(int(duration * rate)) / rate
+    replica = np.cos(2.0 * math.pi * (low + 0.5 * (high - low) / duration * time) * time)
+    edges = np.hanning(round(2.0 * chirp['slope'] * duration * rate))
+    rise, fall = edges[: len(edges) // 2], edges[len(edges) // 2 :]
+    replica[: len(rise)] *= rise
+    replica[len(replica) - len(fall) :] *= fall
+    for coefficients, step in chirp['filters']:
+        replica = np.convolve(replica, coefficients)[::step]
+    replica /= np.sum(np.abs(replica) ** 2)
+    lags = [np.correlate(stave, replica, mode='full')[len(replica) - 1 :] for stave in iq.T]
+    return np.column_stack(lags)
 
 
 def _table_of(folder: Path, named: Path | str | None) -> Path:

@@ -92,7 +92,7 @@ def sense_from_vessel(
         VesselPose(
             stamp_ns=pose_ns,
             position=place + POSITION_STD * rng.normal(size=3),
-            orientation=_quaternion(*wrong),
+            orientation=geometry.quaternion(*wrong),
             pose_covariance=np.diag([*[POSITION_STD**2] * 3, *std**2]),
             frame_id='map',
         )
@@ -134,16 +134,3 @@ def sense_geodetic(
             )
         )
     return fixes
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """x, y, z, w of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
-    (sr, cr), (sp, cp), (sy, cy) = (
-        (np.sin(0.5 * angle), np.cos(0.5 * angle)) for angle in (roll, pitch, yaw)
-    )
-    return (
-        float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy),
-        float(cr * cp * cy + sr * sp * sy),
-    )

@@ -18,11 +18,16 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm_tools.evaluation.bathymetry.figures import profile_figure, verdict_figure
+from sonar_imm_tools.evaluation.bathymetry.figures import (
+    chart_figure,
+    profile_figure,
+    verdict_figure,
+)
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
 from sonar_imm_tools.evaluation.bathymetry.summary import METRICS, summary_sentence
-from sonar_imm_tools.evaluation.numbers import lines
+from sonar_imm_tools.evaluation.numbers import cards, lines
+from sonar_imm_tools.survey.chart import Chart
 
 N = 20
 PATCH = slice(8, 14)
@@ -65,6 +70,17 @@ def test_the_picture_of_a_ping_shades_the_patch_and_the_band_of_two_deviations()
     assert (edges.min(), edges.max()) == pytest.approx((0.1 - 0.12, 0.1 + 0.12))
 
 
+def test_the_chart_puts_the_middle_of_each_cell_in_its_place_north_up():
+    depth = np.array([[5.0, 6.0, 7.0], [8.0, 9.0, np.nan]])
+    bands = dict.fromkeys(('depth', 'uncertainty', 'label', 'count'), depth)
+    track = np.array([[101.0, 46.0], [106.0, 50.0]])
+    cells, ship = chart_figure(Chart(100.0, 50.0, 2.0, bands), track).data
+    assert list(cells.x) == [101.0, 103.0, 105.0] and list(cells.y) == [49.0, 47.0]
+    np.testing.assert_array_equal(cells.z, -depth)
+    assert list(ship.x) == [101.0, 106.0] and list(ship.y) == [46.0, 50.0]
+    assert cells.customdata.shape == (2, 3, 3)
+
+
 def test_errors_by_place_and_the_share_inside_the_band():
     one = profile()
     one.height[PATCH] = 0.3
@@ -77,6 +93,17 @@ def test_errors_by_place_and_the_share_inside_the_band():
     assert metrics['inside_band'] == pytest.approx(
         {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}, nan_ok=True
     )
+
+
+@pytest.mark.parametrize('patch, both', [(PATCH, True), (slice(0, N), False), (slice(0), False)])
+def test_smooth_floor_and_patches_are_told_apart_where_there_are_both(patch, both):
+    drawn = profile()
+    drawn.truth.patch[:] = False
+    drawn.truth.patch[patch] = True
+    metrics = score(swath(drawn))
+    shown = {card.title for card in cards(METRICS, metrics)}
+    assert ({'On smooth floor, RMS', 'In rough patches, RMS'} <= shown) == both
+    assert ('where it is smooth' in summary_sentence(metrics)) == both
 
 
 def test_overlap_and_delay_of_the_segmentation():

@@ -220,6 +220,19 @@ def test_without_truth_only_what_needs_none_is_scored():
     assert sum(metrics['models']['mean_probability'].values()) == pytest.approx(1.0)
 
 
+def test_models_are_counted_by_how_probable_they_are_and_how_often_they_lead():
+    """Of 17 estimates in four seconds east leads the first four."""
+    series = series_of(single_run(count=17)[0])
+    east = np.where(np.arange(17) < 4, 0.8, 0.4)
+    series = evolve(
+        series, model_names=('east', 'north'), probabilities=np.column_stack([east, 1.0 - east])
+    )
+    models = score(series)['models']
+    assert models['leads'] == {'east': 4 / 17, 'north': 13 / 17}
+    assert models['mean_probability']['east'] == pytest.approx((4 * 0.8 + 13 * 0.4) / 17)
+    assert models['leader_changes_per_minute'] == pytest.approx(15.0)
+
+
 @pytest.mark.parametrize('truth', [[], single_run(count=5)[1]])
 def test_an_empty_run_gives_numbers_json_can_hold(truth):
     metrics = scored([], truth, fixes=fix_series([]))

@@ -25,8 +25,10 @@ from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer.crossing import (
     common_shift,
+    compared,
     crossing_lines,
     crossing_metrics,
+    Horizon,
     mistie_figure,
     summary,
 )
@@ -165,6 +167,17 @@ def test_what_was_not_seen_at_the_crossing_is_not_compared(lines):
     assert [h['bottom'] for h in one['horizons']] == [True]
     # Where places may be wrong by so much it is.
     assert len(crossed(lines, 'we', 'late', 10.0)['crossings'][0]['horizons']) == 2
+
+
+@pytest.mark.parametrize('first, second, bottom', [(0.6, 0.9, True), (0.9, 0.5, False)])
+def test_a_pair_is_the_floor_where_both_lines_rather_take_it_for_it(first, second, bottom):
+    one, other = (
+        Horizon(1, 20.0, 0.1, 0.0, is_bottom=share, multiple=0.0, cut=False)
+        for share in (first, second)
+    )
+    for pair in ([one], [other]), ([other], [one]):
+        [horizon] = compared(*pair, 1.0, np.eye(2), 0.0)['horizons']
+        assert horizon['bottom'] == bottom
 
 
 def test_shift_and_spread_of_differences_that_are_known():

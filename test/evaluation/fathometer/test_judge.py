@@ -22,7 +22,13 @@ import pytest
 from sonar_imm.measurements import Trace
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer import LIMIT
-from sonar_imm_tools.evaluation.fathometer.figures import response_image
+from sonar_imm_tools.evaluation.fathometer.figures import (
+    Image,
+    MOST_DEPTHS,
+    MOST_RECORDS,
+    response_figure,
+    response_image,
+)
 from sonar_imm_tools.evaluation.fathometer.records import Record, records_of, Reflections
 from sonar_imm_tools.evaluation.fathometer.scoring import pair, score
 from sonar_imm_tools.evaluation.judging import judge
@@ -166,6 +172,19 @@ def test_the_image_is_what_the_tracker_saw(run):
     expected = traces[5].amplitude / traces[5].sigma
     assert np.allclose(image.value[:, 5], expected, rtol=1e-4, atol=1e-4)
     assert image.stamp_ns[5] == traces[5].stamp_ns
+
+
+def test_a_thin_reflector_does_not_vanish_from_a_long_recording():
+    """Of an image with more depths and records than are drawn, the largest of a few is."""
+    value = np.zeros((2 * MOST_DEPTHS, 3 * MOST_RECORDS))
+    value[301, 604] = 9.0
+    depth, stamp_ns = 0.1 * np.arange(len(value)), 10**9 * np.arange(value.shape[1])
+    (drawn,) = response_figure(Image(value, depth, stamp_ns), [], 0).data
+    assert drawn.z.shape == (MOST_DEPTHS, MOST_RECORDS)
+    [[row, column]] = np.argwhere(drawn.z)
+    assert drawn.z[row, column] == 9.0
+    assert drawn.y[row] == pytest.approx(30.1, abs=0.1)
+    assert drawn.x[column] == pytest.approx(604.0, abs=3.0)
 
 
 def test_without_truth_there_is_a_page_and_no_verdict(run):

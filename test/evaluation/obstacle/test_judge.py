@@ -16,6 +16,7 @@
 
 import json
 
+from attrs import evolve
 from helpers.obstacle_bags import tracked
 import numpy as np
 import pytest
@@ -115,11 +116,16 @@ def test_scores_are_those_done_by_hand():
         ),
     ]
     metrics, found = score(series_of(estimates), (straight(1, 3.0),), cutoff=5.0, gap=60.0)
+    assert (metrics['pings'], metrics['span_s']) == (2, 1.0)
     assert metrics['vertical_offset']['rmse_m'] == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
     assert metrics['range']['rmse_m'] == pytest.approx(0.3 / np.sqrt(2.0))
     assert metrics['bearing']['rmse_deg'] == pytest.approx(np.degrees(0.01) / np.sqrt(2.0))
     assert metrics['vertical_offset_near']['n'] == 2
     assert metrics['consistency']['nees_offset']['mean'] == pytest.approx(2.5)
+    assert [metrics['consistency'][name]['dof'] for name in ('nees_offset', 'nees_state')] == [
+        1,
+        3,
+    ]
     assert metrics['consistency']['band_coverage'] == 0.5
     assert metrics['above']['brier'] == pytest.approx((0.01 + 0.04) / 2.0)
     assert metrics['above']['bins']['0.1 to 0.3'] == {
@@ -172,6 +178,21 @@ def test_an_obstacle_is_asked_for_from_its_sixth_ping_until_it_is_passed():
     assert not passed.there(path.stamp_ns, 60.0).any()
     blind = TruePath(1, path.stamp_ns, path.seen, np.zeros(20, bool))
     assert not blind.there(path.stamp_ns, 60.0).any()
+
+
+def test_truth_is_one_path_per_obstacle_and_says_when_it_is_in_the_beam():
+    tables = []
+    for second in range(1, 9):
+        rows = [[k, 1, 60.0 - 2.0 * second, 0.0, 3.0, 1.0, 2.0, 4.0, 0.1] for k in (1, 2)]
+        table = estimate(second, rows)
+        in_beam = np.array([second > 1, second > 3], np.uint8)
+        tables.append(evolve(table, extras={**table.extras, 'in_beam': in_beam}))
+    first, second = truth_of(tables, lag=0.5)
+    assert (first.track_id, second.track_id) == (1, 2)
+    assert first.stamp_ns[0] == SECOND // 2 and first.seen[0].tolist() == [58.0, 0.0, 3.0]
+    assert (first.in_beam.sum(), second.in_beam.sum()) == (7, 5)
+    # Only the first one was in the beam for six pings.
+    assert [path.there(path.stamp_ns, 60.0).sum() for path in (first, second)] == [2, 0]
 
 
 def test_truth_between_its_stamps_is_interpolated_but_not_across_gaps():
@@ -251,6 +272,9 @@ def test_online_and_deferred_estimates_hold_at_the_first_echo_of_a_vehicle_that_
     assert found.echoes == 20 and found.plain.best == pytest.approx(8.0, abs=0.3)
     assert (found.online, *found.band) == pytest.approx((8.0, 7.0, 10.0))
     assert np.isnan(found.as_dict()['tether_m'])
+    known = found.as_dict() | evolve(found, truth=7.5).as_dict()
+    for name in ('rmsd', 'rmsd_both_sides', 'refit', 'online'):
+        assert known[f'{name}_error_m'] == pytest.approx(known[f'{name}_m'] - 7.5)
     received.append(Altitude(stamp_ns=SECOND, altitude=20.0))
     config = ObstacleConfig(sonar_lever=(0.0, 0.0, -0.5), altitude_std=0.3)
     found = deferred_estimates(series_of(estimates), received, config, {}, 60.0)

@@ -14,12 +14,29 @@
 
 """Files of sonars and folders of pictures as bags: what is taken, and what is said of bad ones."""
 
+import importlib.util
 import os
 import pickle
+import platform
+import sys
 
-from helpers.sonar_files import ek80, side_scan, xtf_head, xtf_ping
+from helpers.sonar_files import (
+    BAND,
+    ek80,
+    ek80_datagram,
+    FILTERS,
+    kmall,
+    PULSE,
+    RATE,
+    side_scan,
+    SLOPE,
+    xtf_head,
+    xtf_ping,
+)
 import numpy as np
 import pytest
+from scipy import signal
+import yaml
 
 from msg_adapters.soundings import read_ground
 from sonar_imm.measurements import Detections, Navigation, Snapshot
@@ -179,6 +196,17 @@ class TestXtf:
         assert 'needs more than 1024 MB' in report.problems[0]
 
 
+def test_the_reader_of_echo_sounders_is_here_wherever_it_has_a_wheel():
+    """So that the tests below are left out nowhere else; `make venv` installs it."""
+    libc, version = platform.libc_ver()
+    new = tuple(map(int, version.split('.')[:2])) >= (2, 34) if libc == 'glibc' else False
+    if sys.version_info < (3, 11) or platform.machine() != 'x86_64' or not new:
+        pytest.skip('themachinethatgoesping has no wheel for this Python and system')
+    assert importlib.util.find_spec('themachinethatgoesping'), (
+        "pip install --no-deps themachinethatgoesping tqdm 'nanobind-backend>=1.0'"
+    )
+
+
 def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
     for name in ('pyxtf', 'themachinethatgoesping'):
         (tmp_path / f'{name}.py').write_text('raise ImportError("not here")')
@@ -218,16 +246,91 @@ class TestEk80:
         convert_ek80(path, tmp_path / 'bag', staves=[[0], [1], [2], [3]])
         assert read(tmp_path / 'bag', 'bathymetry', Snapshot)[0].staves == 4
 
-    def test_chirps_and_other_channels_are_said(self, tmp_path, samples):
-        with pytest.raises(BagError, match='it is a chirp'):
-            convert_ek80(ek80(tmp_path / 'a.raw', samples, chirp=True), tmp_path / 'bag')
+    def test_the_spacing_of_the_halves_follows_from_the_sensitivity(self, tmp_path, samples):
+        """23 rad of phase per rad, so 23 / (2 pi) wavelengths; an option is worth more."""
+        path = ek80(tmp_path / 'a.raw', samples)
+        for options, wanted in (({}, 23 * 1490 / 70e3 / (2 * np.pi)), ({'element_spacing': 1}, 1)):
+            convert_ek80(path, tmp_path / f'bag{len(options)}', **options)
+            found = read(tmp_path / f'bag{len(options)}', 'bathymetry', Snapshot)[0]
+            assert found.element_spacing == pytest.approx(wanted, rel=1e-6)
+
+    def test_power_and_angles_are_two_halves(self, tmp_path):
+        rng = np.random.default_rng(2)
+        angles, power = rng.integers(-128, 128, (3, 200, 2)), rng.integers(-9000, -3000, (3, 200))
+        path = ek80(tmp_path / 'a.raw', power, angles=angles)
+        assert convert_ek80(path, tmp_path / 'bag').messages['/snapshot'] == 3
+        for ping, snapshot in enumerate(read(tmp_path / 'bag', 'bathymetry', Snapshot)):
+            starboard, port = snapshot.iq.T
+            decibels = 10 * np.log10(np.abs(starboard) ** 2)
+            assert decibels == pytest.approx(power[ping, 1:] * 10 * np.log10(2) / 256, abs=1e-3)
+            assert np.abs(port) == pytest.approx(np.abs(starboard))
+            wanted = np.exp(1j * np.pi / 128 * angles[ping, 1:, 0])  # athwartships comes first
+            turn = starboard * port.conj() / np.abs(port) ** 2
+            assert turn == pytest.approx(wanted, abs=1e-5)
+        with pytest.raises(BagError, match='no sectors to choose'):
+            convert_ek80(path, tmp_path / 'none', staves=[[0], [1]])
+
+    def test_a_chirp_is_compressed(self, tmp_path):
+        """An echo 40 samples deep, of a chirp that scipy made, has its range and its phase."""
+        count, step = round(PULSE * RATE), int(np.prod([each for _, each in FILTERS]))
+        sent = signal.chirp(np.arange(count) / RATE, BAND[0], PULSE, BAND[1])
+        heard = np.zeros(200 * step)
+        heard[40 * step : 40 * step + count] = sent * signal.windows.tukey(count, 2 * SLOPE)
+        for coefficients, every in FILTERS:
+            heard = np.convolve(heard, coefficients)[::every]
+        turn = np.exp(0.4j)
+        sectors = np.array([turn, turn.conj(), turn.conj(), turn])
+        path = ek80(tmp_path / 'a.raw', (heard[:, None] * sectors)[None], chirp=True)
+        convert_ek80(path, tmp_path / 'bag')
+        (snapshot,) = read(tmp_path / 'bag', 'bathymetry', Snapshot)
+        size = np.abs(snapshot.iq[:, 0])
+        loudest = int(size.argmax())
+        assert snapshot.range[loudest] == pytest.approx(40 * step / RATE * 745.0, abs=1e-3)
+        # 35 kHz wide: a quarter of the pulse further off there is next to nothing.
+        far = np.abs(np.arange(len(size)) - loudest) > 10
+        assert size[far].max() < 0.05 * size[loudest] and size[loudest] == pytest.approx(
+            2, rel=0.05
+        )
+        angle = np.angle(snapshot.iq[loudest, 0] * snapshot.iq[loudest, 1].conj())
+        assert angle == pytest.approx(0.8, abs=1e-3) and snapshot.frequency == 72.5e3
+
+    def test_what_cannot_be_used_is_said(self, tmp_path, samples):
+        with pytest.raises(BagError, match='whose filters the file does not hold'):
+            convert_ek80(ek80(tmp_path / 'a.raw', samples, chirp=True, filters=[]), tmp_path / 'o')
         with pytest.raises(BagError, match='no ping that could be converted'):
             convert_ek80(ek80(tmp_path / 'b.raw', samples), tmp_path / 'bag', channel='ES38')
+        (tmp_path / 'c.raw').write_bytes(ek80_datagram('CON0', 0.0, bytes(600)))
+        with pytest.raises(BagError, match='of an EK60 or ES60.*echopype'):
+            convert_ek80(tmp_path / 'c.raw', tmp_path / 'bag')
 
     def test_what_came_before_the_cut_is_kept(self, tmp_path, samples):
         path = ek80(tmp_path / 'a.raw', samples)
         path.write_bytes(path.read_bytes()[:-500])
         assert convert_ek80(path, tmp_path / 'bag').messages['/snapshot'] == 2
+
+
+class TestKongsberg:
+    @pytest.fixture(autouse=True)
+    def _library(self):
+        pytest.importorskip('themachinethatgoesping')
+
+    def test_soundings_and_navigation(self, tmp_path):
+        report = convert_kongsberg(kmall(tmp_path / 'a.kmall'), tmp_path / 'bag')
+        assert report.messages == {'/ground': 5, '/nav': 5} and not report.problems
+        with BagReader(tmp_path / 'bag') as bag:
+            grounds = [read_ground(item.message) for item in bag.messages(['/ground'])]
+        for k, ground in enumerate(grounds):  # without a compass the bow is north
+            wanted = [[0.4 * k + y, 0.5, -20.0] for y in (-10.0, 0.0, 10.0)]
+            assert ground.position == pytest.approx(np.array(wanted), abs=0.02)
+            assert ground.stamp_ns == pytest.approx((1_717_149_600 + 0.2 * k) * 1e9, abs=1e4)
+
+    def test_a_cut_file_is_refused(self, tmp_path):
+        """The library loses every ping of it: what it makes up must not become a sea floor."""
+        path = kmall(tmp_path / 'a.kmall')
+        path.write_bytes(path.read_bytes()[:-300])
+        with pytest.raises(BagError, match='none of its soundings is valid'):
+            convert_kongsberg(path, tmp_path / 'bag')
+        assert not (tmp_path / 'bag').exists()
 
 
 @pytest.fixture
@@ -286,7 +389,10 @@ def test_soundings_of_a_multibeam_lie_beside_the_ship(tmp_path, monkeypatch):
         'soundings': np.array([[2.0, 10.0, 20.0], [np.nan, 0.0, 0.0]]),
     }
     lost = {'soundings': None, 'place': (10.0, 54.0)}
+    cast = {'kind': 'profile', 'values': [0.0, 1480.0, 30.0, 1490.0]}
     records = [
+        cast,
+        {**cast, 'values': [0.0, 1480.0, 0.0, 1490.0]},
         {**ping, 'stamp_ns': 1_717_149_600 * 10**9, 'place': (10.0, 54.0)},
         {**ping, 'stamp_ns': 1_717_149_601 * 10**9, 'place': (0.0, 0.0)},
         {**ping, 'stamp_ns': 1_717_149_602 * 10**9, **lost},
@@ -294,6 +400,9 @@ def test_soundings_of_a_multibeam_lie_beside_the_ship(tmp_path, monkeypatch):
     monkeypatch.setattr(sonar_files, 'read_apart', lambda reader, path: iter(records))
     report = convert_kongsberg(tmp_path / 'a.kmall', tmp_path / 'bag')
     assert report.messages == {'/nav': 1, '/ground': 1} and report.bad_rows == 2
+    own = yaml.safe_load((tmp_path / 'bag' / 'parameters.yaml').read_text())
+    assert own['bathymetry']['ros__parameters'] == {'sound_speed_profile': cast['values']}
+    assert any('needs increasing depths' in problem for problem in report.problems)
     with BagReader(tmp_path / 'bag') as bag:
         (found,) = [read_ground(item.message) for item in bag.messages(['/ground'])]
     assert found.position == pytest.approx(np.array([[2.0, -10.0, -21.0]]), abs=1e-6)

@@ -82,6 +82,16 @@ def test_an_object_has_a_shadow(kind):
     assert (power[ranges > end + 0.1, 3] > 0.0).all()
 
 
+@pytest.mark.parametrize('side, sign', [('port', 1.0), ('starboard', -1.0)])
+def test_the_truth_of_an_object_has_its_range_height_and_side(side, sign):
+    config = scenario('ledge', {'object': 'wall', 'object_size': 4.0, 'pings': 1, 'side': side})
+    true = simulate(config, 1).truth[0]
+    x, y, z = true.xyz[true.valid].T
+    assert (x == 0.0).all() and (sign * y > 0.0).all() and true.height[true.valid].max() > 3.0
+    np.testing.assert_allclose(np.hypot(y, z), true.range[true.valid])
+    np.testing.assert_allclose(z, true.height[true.valid] - config.sonar_height)
+
+
 def test_a_wall_is_gated_and_scored():
     """The range of heights is no limit: walls of 4 m."""
     config = scenario(

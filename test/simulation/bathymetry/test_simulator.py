@@ -199,3 +199,11 @@ def test_other_laws_of_echoes_and_of_rough_floor():
     assert rough.std() == pytest.approx(0.5, rel=0.1)
     after = (rough[:, :-20] * rough[:, 20:]).mean() / rough.var()
     assert after == pytest.approx(np.exp(-1.0), abs=0.1)
+
+
+@pytest.mark.parametrize('law', ['gaussian', 'laplace', 'exponential'])
+def test_roughness_without_a_correlation_length_is_white(law):
+    changes = {'roughness_law': law, 'correlation_length': 0.0, 'pings': 30}
+    rough = np.stack([true.height[true.patch] for _, true in run(**changes)])
+    assert rough.std() == pytest.approx(0.5, rel=0.05)
+    assert abs((rough[:, :-1] * rough[:, 1:]).mean() / rough.var()) < 0.05

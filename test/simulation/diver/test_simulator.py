@@ -317,3 +317,59 @@ def test_divers_rise_and_sink_with_the_swell_by_its_height_and_period():
     assert np.ptp(height) == pytest.approx(1.0, abs=0.05)
     assert height.mean() == pytest.approx(-4.0, abs=1e-9)
     np.testing.assert_allclose(height[16:], height[:-16], atol=1e-9)
+
+
+def test_positions_have_the_errors_they_state_and_a_height_where_it_is_measured():
+    """White errors of half a metre, and nothing else, in 500 fixes."""
+    scene = {'sensor': 'positions', 'fix_std': 0.5, 'duration': 499.0, 'depth': (-8.0, -8.0)}
+    for height_std in (0.0, 0.2):
+        simulated = simulate(scenario('table1', {**scene, 'fix_height_std': height_std}), 3)
+        fixes = [each.measurement for each in simulated.measurements]
+        stated = [0.25, 0.25, 0.04][: 3 if height_std else 2]
+        for fix in fixes:
+            known = np.isfinite(np.diag(fix.covariance))  # NaN: not measured
+            np.testing.assert_allclose(np.diag(fix.covariance)[known], stated)
+        error = [fix.position for fix in fixes] - simulated.truth[0].position
+        measured = error[:, : len(stated)]
+        np.testing.assert_allclose(np.cov(measured.T), np.diag(stated), atol=0.05)
+
+
+def test_a_scan_holds_the_divers_that_are_seen_and_clutter_in_no_order():
+    """Nearly exact fixes of a crossing: those at a diver are of divers, the others fill a square
+    of 160 m."""
+    config = scenario('crossing', {'fix_std': 1e-3, 'clutter': 6.0})
+    simulated = simulate(config, 4)
+    truth = np.array([track.position for track in simulated.truth])
+    seen, first, false = 0, 0, []
+    for each, places in zip(simulated.measurements, truth.swapaxes(0, 1)):
+        fixes = each.measurement.position
+        assert (fixes[:, 2] == 0.0).all()
+        off = np.linalg.norm(fixes[:, None, :2] - places[None, :, :2], axis=2).min(axis=1)
+        seen, first = seen + (off < 0.01).sum(), first + (off[0] < 0.01)
+        false.append(fixes[off >= 0.01, :2])
+    scans = len(simulated.measurements)
+    assert seen / scans == pytest.approx(4 * 0.9, abs=0.2)
+    assert len(np.concatenate(false)) / scans == pytest.approx(6.0, abs=0.6)
+    assert np.abs(np.concatenate(false)).max() == pytest.approx(80.0, abs=1.0)
+    assert 0.2 < first / scans < 0.6  # a diver is not always the first
+
+
+def test_of_scans_is_known_how_often_divers_are_seen_and_how_dense_the_clutter_is():
+    assert scenario('crossing').instruments() == {
+        'clutter_density': 10.0 / 160.0**2,
+        'detection_probability': 0.9,
+    }
+    assert 'clutter_density' not in scenario('table1').instruments()
+
+
+@pytest.mark.parametrize('divers, std, stated', [(1, 0.2, True), (1, 0.0, False), (2, 0.2, False)])
+def test_a_depth_is_stated_where_it_is_measured_and_there_is_one_it_can_be_of(divers, std, stated):
+    scene = simulate(
+        scenario('at_depth', {'divers': divers, 'depth_std': std, 'duration': 5.0}), 3
+    )
+    for each in scene.measurements:
+        assert np.isfinite(each.measurement.depth).all() == stated
+        if stated:
+            index = np.searchsorted(scene.truth[0].stamp_ns, each.measurement.stamp_ns)
+            true = -scene.truth[0].position[index, 2]
+            assert each.measurement.depth == pytest.approx(true, abs=0.8)

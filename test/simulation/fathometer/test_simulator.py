@@ -77,6 +77,7 @@ def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
         ({'frequency_min': 5000.0}, 'frequency_max'),
         ({'ship_pass': (3,)}, 'ship_pass'),
         ({'level': 'pressure'}, '600 s'),
+        ({'level': 'pressure', 'frequency_max': 6001.0, 'sample_rate': 12000.0}, 'half the'),
         ({'layers': 1}, 'no layer'),
         ({'level': 'csdm'}, '13.6 GB'),
         ({'records': 0}, 'records'),

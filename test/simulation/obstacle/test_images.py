@@ -99,6 +99,14 @@ def test_a_point_is_as_strong_wide_and_long_as_told():
     assert -24.0 < 10.0 * np.log10(sidelobes / peak) < -17.0
 
 
+@pytest.mark.parametrize('sound', [0.96, 1.04])
+def test_an_error_of_the_sound_speed_stretches_all_ranges(sound):
+    one = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
+    d = one.range[300]
+    image = one.image(LEVEL, [LEVEL.position + np.array([d, 0.0, 0.0])], sound)
+    assert one.range[image.max(axis=1).argmax()] == pytest.approx(sound * d, abs=0.1)
+
+
 def test_what_lies_above_or_below_the_axis_is_fainter():
     assert vertical_pattern(np.array([0.0]), 0.26) == 1.0
     assert vertical_pattern(np.array([0.13]), 0.26) == pytest.approx(0.25, rel=0.01)

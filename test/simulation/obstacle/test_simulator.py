@@ -399,6 +399,22 @@ def test_errors_of_the_navigation_grow_as_their_kind_does(errors, along, across)
         assert found == pytest.approx(expected, rel=0.28, abs=0.05)
 
 
+def turned(pairs):
+    """By what angles (n, 3), in degrees, the first pose of each pair is off the second."""
+    angles = [
+        [Rotation.from_quat(pose.orientation).as_euler('xyz', degrees=True) for pose in pair]
+        for pair in pairs
+    ]
+    return np.subtract(*np.swapaxes(angles, 0, 1))
+
+
+def test_white_errors_of_the_attitude_are_normal_and_as_large_as_told():
+    noisy, ideal = run(**{**SILENT, 'attitude_std_deg': 0.3}), run(ideal_navigation=True)
+    off = turned(list(zip(of(noisy, Navigation), of(ideal, Navigation)))) / 0.3
+    assert off.mean(axis=0) == pytest.approx(0.0, abs=0.15)
+    assert off.std(axis=0) == pytest.approx(1.0, rel=0.1) and np.abs(off).max() < 4.5
+
+
 @pytest.mark.statistics
 def test_attitudes_and_depths_have_the_errors_told():
     angles, depths = [], []
@@ -406,11 +422,7 @@ def test_attitudes_and_depths_have_the_errors_told():
         told = {**SILENT, 'attitude_bias_deg': 0.5, 'yaw_bias_deg': 0.8, 'depth_std': 0.1}
         noisy, ideal = run(seed=seed, **told), run(seed=seed, ideal_navigation=True)
         pairs = list(zip(of(noisy, Navigation), of(ideal, Navigation)))
-        turned = [
-            [Rotation.from_quat(one.orientation).as_euler('xyz', degrees=True) for one in pair]
-            for pair in pairs[::20]
-        ]
-        off = np.array([a - b for a, b in turned])
+        off = turned(pairs[::20])
         assert np.ptp(off, axis=0).max() < 1e-6  # a bias stays
         angles.append(off[0])
         depths += [one.position[2] - other.position[2] for one, other in pairs]

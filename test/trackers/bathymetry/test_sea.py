@@ -243,6 +243,15 @@ def test_without_navigation_nothing_changes_and_with_it_the_columns_say_more():
     ]
 
 
+@pytest.mark.parametrize('seconds, used', [(3600, 2), (3601, 1)])
+def test_a_pose_from_more_than_an_hour_ahead_is_not_believed(seconds, used):
+    tracker = BathymetryTracker(sea_config(CASE, navigation='required', particles_per_model=20))
+    pose = next(iter(navigation(CASE)))
+    tracker.process(pose)
+    tracker.process(evolve(pose, stamp_ns=pose.stamp_ns + seconds * 10**9))
+    assert tracker.counts['poses'] == used
+
+
 def test_a_clock_set_back_forgets_the_poses():
     tracker = BathymetryTracker(sea_config(CASE, navigation='required', particles_per_model=20))
     poses = navigation(CASE)

@@ -118,7 +118,9 @@ def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
             assert variance[t, side] == pytest.approx(share @ (place - mean) ** 2, abs=1e-4)
 
 
-def test_existence_and_heights_of_the_prototype():
+def test_existence_and_heights_of_the_prototype(monkeypatch):
+    # Its stretches begin where the chain says so, and nowhere else.
+    monkeypatch.setattr(two, 'BRIGHTER', 1e9)
     with np.load(VECTORS / 'pings.npz') as archive:
         known = dict(archive)
     parts = known['iq'].astype(np.float32)
@@ -240,14 +242,35 @@ def test_stretches_have_a_margin_and_are_cut_where_they_are_long():
     existence = np.zeros(10_000)
     existence[[100, 115, 400]] = 1.0
     existence[2000:9000] = 0.06
-    assert two.stretches(existence) == [
+    assert two.stretches(existence > two.POSSIBLE) == [
         (90, 126),
         (390, 411),
         (1990, 5990),
         (5990, 9010),
     ]
-    assert two.stretches(np.zeros(50)) == []
-    assert two.stretches(np.ones(5)) == [(0, 5)]
+    assert two.stretches(np.zeros(50, bool)) == []
+    assert two.stretches(np.ones(5, bool)) == [(0, 5)]
+
+
+def test_a_bright_face_begins_a_stretch_where_the_chain_says_nothing(monkeypatch):
+    snapshot, face = floor(0.0, seed=1, snr_db=8.0), floor(3.0, seed=2, snr_db=16.0)
+    at, iq = slice(150, 162), snapshot.iq.copy()
+    iq[at] += face.iq[at]
+    config = BathymetryConfig(layover='resolved')
+    seen = look(Ping(config, evolve(snapshot, iq=iq), None))
+    silent = seen.layover._replace(existence=np.zeros(len(iq)))
+    arguments = iq, seen.likelihood, seen.swath.geometry, silent, np.zeros(len(iq))
+    double = two.resolve(*arguments).existence >= two.EXISTS
+    assert double[at].mean() > 0.7
+    assert not double[:145].any() and not double[167:].any()
+    monkeypatch.setattr(two, 'BRIGHTER', 1e9)
+    assert not two.resolve(*arguments).existence.any()
+
+
+def test_an_even_floor_has_no_bright_bins():
+    seen = look(Ping(BathymetryConfig(layover='resolved'), floor(0.0), None))
+    quiet = seen.layover._replace(existence=np.zeros(len(seen.likelihood.echo)))
+    assert two.possible_bins(seen.ping.snapshot.iq, quiet).mean() < 0.02
 
 
 def test_the_grid_holds_both_ends_of_a_stretch():

@@ -105,7 +105,7 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
 
 def test_a_run_is_that_of_the_prototype():
     """Its transitions are taken at a step rounded to a microsecond, and are not learnt."""
-    tracker = DiverTracker(config(adaptation='fixed', confirm_hits=1))
+    tracker = DiverTracker(config(association='gnn', adaptation='fixed', confirm_hits=1))
     exact = tracker.models.chain.transition
     tracker._chain.transition = lambda learnt, dt: np.array(exact(round(dt, 6))[None])
     with np.load(VECTORS / 'run.npz') as run:
@@ -208,7 +208,7 @@ def test_a_name_does_not_make_a_fix_good():
         plain[k], named[k] = moved(plain[k], *far), moved(named[k], *far)
     error = []
     for items in (plain, named):
-        estimates = run(DiverTracker(config(max_tracks=20)), items)
+        estimates = run(DiverTracker(config(association='gnn', max_tracks=20)), items)
         rows = [np.flatnonzero(e.extras['track_id'] == 1)[0] for e in estimates]
         at = np.array([e.state[row, :2] for e, row in zip(estimates, rows)])
         error.append(at - np.column_stack([0.7 * np.arange(200), np.zeros(200)]))

@@ -31,7 +31,13 @@ from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
-CV = {'model_set': 'cv', 'max_tracks': 1, 'dimensions': 3, 'gate_probability': 0.999999}
+CV = {
+    'model_set': 'cv',
+    'association': 'gnn',
+    'max_tracks': 1,
+    'dimensions': 3,
+    'gate_probability': 0.999999,
+}
 Z, W = 2, 5
 """Of z and its rate in the published state."""
 

@@ -336,7 +336,7 @@ def test_arrivals_are_judged_where_no_fix_says_the_same():
 
 
 def test_the_score_of_a_track_is_that_of_its_last_scans():
-    tracker, scores = DiverTracker(DiverConfig(history=0.0)), []
+    tracker, scores = DiverTracker(DiverConfig(association='gnn', history=0.0)), []
     for second in range(1, 101):
         tracker.process(scan(second, (0.0, 0.0)))
         scores.append(tracker._stream.state.score[0])
@@ -470,10 +470,14 @@ def missed(made, divers=3):
 
 @pytest.mark.parametrize('seed', range(2))
 def test_fixes_of_a_sensor_that_polls_are_gathered_to_scans(seed):
-    alone, _ = missed(run(DiverTracker(DiverConfig()), polled(seed)))
+    """Hits and misses starve where each fix is a scan, existence hardly."""
+    hits, alone = (
+        missed(run(DiverTracker(DiverConfig(association=name)), polled(seed)))[0]
+        for name in ('gnn', 'jipda')
+    )
     made = run(DiverTracker(DiverConfig(scan_period=1.0)), polled(seed))
     gathered, ids = missed(made)
-    assert alone > 0.3 and gathered < 0.01 and len(ids) == 3
+    assert hits > 0.3 > 0.1 > alone and gathered < 0.01 and len(ids) == 3
     assert {item.stamp_ns % SECOND for item in made} == {SECOND // 2}
 
 

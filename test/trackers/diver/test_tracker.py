@@ -85,7 +85,7 @@ def test_the_estimate_is_the_contract():
         *('family_steady', 'family_brisk', 'family_lively', 'family_quiet'),
         *('hover', 'covariance_scale'),
     ]
-    assert np.isnan(columns['existence']).all() and columns['target_id'].tolist() == [-1]
+    assert columns['existence'] > 0.5 and columns['target_id'].tolist() == [-1]
     assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
     assert columns['track_id'].dtype == np.uint32 and columns['track_state'].dtype == np.uint8
     assert estimate.stamp_ns == SECOND and estimate.frame_id == 'map'

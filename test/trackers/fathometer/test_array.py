@@ -19,6 +19,7 @@ from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.ambient import surface_noise_csdm
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.trackers.fathometer import pressure
 from sonar_imm.trackers.fathometer.pressure import CompanionDepths
@@ -266,3 +267,22 @@ def test_the_nearest_depth_counts_before_or_after(monkeypatch):
     depths.add(ArrayDepth(stamp_ns=40 * second, depth=74.0))
     assert depths.nearest(20 * second, config) is None
     assert depths.nearest(30 * second, config) == 73.0
+
+
+def test_an_echo_of_the_processor_is_even_about_its_layer():
+    """A tail above a strong layer, and its opposite below it, were taken for reflectors."""
+    frequency, layer = np.arange(100.0, 2800.0, 4.0), 52.0
+    R = surface_noise_csdm(frequency, 16, 0.25, [layer - 30.0], [0.35], 1500.0) + 0.01 * np.eye(16)
+    record = CrossSpectra(stamp_ns=1, frequency=frequency, csdm=R)
+    settings = {'phones': 16, 'element_spacing': 0.25, 'depth_min': 47.0, 'depth_max': 57.0}
+    band = {'frequency_min': 100.0, 'frequency_max': 2800.0, 'noise_sigma': 1.0}
+    odd = {}
+    for pulse in ('processor', 'band'):
+        config = FathometerConfig(**settings, **band, pulse=pulse, depth_step=0.05)
+        response = array_response(record, lattice_of_array(30.0, config), config, 30.0)
+        b, middle = response.amplitude, len(response.amplitude) // 2
+        assert response.depth[middle] == pytest.approx(layer)
+        near = np.arange(4, 25)
+        odd[pulse] = np.abs(b[middle + near] - b[middle - near]).max() / b[middle]
+    # The band leaves the phase in: its response is the same as ever.
+    assert odd['processor'] < 0.02 < 0.04 < odd['band']
