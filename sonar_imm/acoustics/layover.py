@@ -99,15 +99,15 @@ def layover(
     staves of such bins do not agree, which one wave would demand; the chain leaves them out.
     """
     staves = iq.shape[1]
-    _, one, two = residuals(iq, spacing)
+    _, rest_1, rest_2 = residuals(iq, spacing)
     snr = signal / noise
-    error = array_error(one / noise, snr, staves, usable)
+    error = array_error(rest_1 / noise, snr, staves, usable)
     larger = 1.0 + error * snr
-    level = 2.0 * (np.sqrt(one) - np.sqrt(two)) / np.sqrt(noise * larger)
+    level = 2.0 * (np.sqrt(rest_1) - np.sqrt(rest_2)) / np.sqrt(noise * larger)
     evidence = np.where(usable, log_ratio(level, snr / larger, staves), 0.0)
     if loud is not None and staves > 2:
         most = float(gammaincinv(staves - 2.0, LEFT))
-        usable = usable | loud & (two < most * noise * larger)
+        usable = usable | loud & (rest_2 < most * noise * larger)
     return Layover(existence(evidence), error, usable)
 
 
@@ -133,23 +133,23 @@ def residuals(iq: ArrayLike, spacing: float) -> tuple[FloatArray, FloatArray, Fl
         found,
     )
     power = np.square(np.abs(y)).sum(axis=1)
-    one = np.maximum(power - found[:, 0], 0.0)
-    two = np.minimum(np.maximum(power - found[:, 1], 0.0), one)
-    return power, one, two if staves > 2 else np.zeros(n)
+    rest_1 = np.maximum(power - found[:, 0], 0.0)
+    rest_2 = np.minimum(np.maximum(power - found[:, 1], 0.0), rest_1)
+    return power, rest_1, rest_2 if staves > 2 else np.zeros(n)
 
 
-def array_error(one: FloatArray, snr: FloatArray, staves: int, usable: BoolArray) -> float:
+def array_error(rest_1: FloatArray, snr: FloatArray, staves: int, usable: BoolArray) -> float:
     """Power that is no plane wave as a share eps of the echo: noise is (1 + eps SNR) as large.
 
     Three times the median over bins above 20 dB of (R1 / m - 1) / SNR, m the median of R1 without
     any error, the gamma distribution of P - 3/2 degrees; at least `LEAST_ERROR`, also where there
-    are too few bins to measure it. one (n,): R1.
+    are too few bins to measure it. rest_1 (n,): R1.
     """
     chosen = usable & (snr > VERY_LOUD)
     if np.count_nonzero(chosen) < FEWEST_BINS:
         return LEAST_ERROR
     usual = float(gammaincinv(staves - 1.5, 0.5))
-    excess = float(np.median((one[chosen] / usual - 1.0) / snr[chosen]))
+    excess = float(np.median((rest_1[chosen] / usual - 1.0) / snr[chosen]))
     return max(LEAST_ERROR, ERROR_MARGIN * excess)
 
 
@@ -234,8 +234,8 @@ def _fit_waves(
                 top, place = power, i
         if place < 0:
             continue
-        one, c, _ = _climb(y[t], phase[place], 0.0, widest)
-        found[t, 0] = one
+        single, c, _ = _climb(y[t], phase[place], 0.0, widest)
+        found[t, 0] = single
         if P == 2:
             continue
         # The wave that was found, at the middle of the array: its beam is b.
@@ -255,10 +255,10 @@ def _fit_waves(
             if power > top:
                 top, place = power, i
         middle = 0.5 * (phase[place] + c)
-        two = _climb(y[t], middle, abs(phase[place] - middle), widest)[0]
+        pair = _climb(y[t], middle, abs(phase[place] - middle), widest)[0]
         for side in (-beside, beside):
-            two = max(two, _climb(y[t], c + side, beside, widest)[0])
-        found[t, 1] = two
+            pair = max(pair, _climb(y[t], c + side, beside, widest)[0])
+        found[t, 1] = pair
 
 
 @kernel

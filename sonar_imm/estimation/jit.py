@@ -308,12 +308,12 @@ def _compile_for_another() -> None:
     # Where nothing can be kept the other process compiles; numba's own cache it does not know.
     warnings.simplefilter('error', RuntimeWarning)
     steps = dict(pickle.load(sys.stdin.buffer)())
-    said = dict[str, int]()
+    reported = dict[str, int]()
 
     def compiled() -> None:
-        new = {name: lines for name, lines in present.items() if name not in said}
-        said.update(new)
-        print(json.dumps(new or said), file=answers, flush=True)
+        new = {name: lines for name, lines in present.items() if name not in reported}
+        reported.update(new)
+        print(json.dumps(new or reported), file=answers, flush=True)
 
     listeners.append(compiled)
     for line in sys.stdin.buffer:

@@ -102,8 +102,8 @@ def repeated_walk(walk: FloatArray, times: int, *, reach: float = 4.0) -> FloatA
     deviations of it."""
     radius = len(walk) // 2
     size = 1 << (2 * radius * times).bit_length()
-    one = np.roll(np.append(walk, np.zeros(size - len(walk))), -radius)
-    total = np.maximum(np.fft.irfft(np.fft.rfft(one) ** times, size), 0.0)
+    padded = np.roll(np.append(walk, np.zeros(size - len(walk))), -radius)
+    total = np.maximum(np.fft.irfft(np.fft.rfft(padded) ** times, size), 0.0)
     std = math.sqrt(times * float(walk @ np.square(np.arange(-radius, radius + 1.0))))
     cut = int(min(walk_reach(std, reach=reach), radius * times))
     K = total[np.arange(-cut, cut + 1)]

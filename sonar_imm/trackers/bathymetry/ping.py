@@ -174,8 +174,8 @@ def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | 
     if _resolves(ping):
         loud = snapshot.usable & ~echo & np.logical_or.accumulate(echo)
         loud &= variances.mean_power(snapshot.iq) > LOUD * likelihood.noise
-    heard = echo if loud is None else echo | loud
-    iq = np.where(heard[:, None], snapshot.iq, 0.0)
+    has_echo = echo if loud is None else echo | loud
+    iq = np.where(has_echo[:, None], snapshot.iq, 0.0)
     spacing = swath.geometry.spacing
     return layover(iq, likelihood.signal, likelihood.noise, echo, spacing, loud)
 
@@ -385,15 +385,15 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     if seen.layover is not None:
         surfaces = _resolved(seen, track)
         found = seen.layover.existence if surfaces is None else surfaces.existence
-        heard = ping.echo
+        has_echo = ping.echo
         if surfaces is not None:
-            heard = heard | seen.layover.usable & (found >= EXISTS)
-        existence = np.where(heard, found, 0.0)
+            has_echo = has_echo | seen.layover.usable & (found >= EXISTS)
+        existence = np.where(has_echo, found, 0.0)
         two = existence > GATE if surfaces is None else existence >= EXISTS
-        doubt = ~heard | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
+        doubt = ~has_echo | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
         second = {
             'existence_2': existence.astype(np.float32),
-            'surfaces': np.where(heard, 1 + two, 0).astype(np.uint8),
+            'surfaces': np.where(has_echo, 1 + two, 0).astype(np.uint8),
         }
         if surfaces is not None:
             second |= _upper(seen, surfaces, two)

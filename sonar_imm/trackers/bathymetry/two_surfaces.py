@@ -186,10 +186,10 @@ def pair_likelihoods(
     gap: int,
     work: FloatArray,
     price: FloatArray,
-    one: FloatArray,
+    lone: FloatArray,
     two: FloatArray,
 ) -> bool:
-    """Likelihoods of one height, into one (G,), and of pairs i, j >= i + gap, into two (G, G), up
+    """Likelihoods of one height, into lone (G,), and of pairs i, j >= i + gap, into two (G, G), up
     to a common factor, of a bin y (P,) in units of the noise; sines (G,) of the heights, NaN
     where no echo can come from. False if that is everywhere. work (8, G or more) and price (G, G)
     are scratch."""
@@ -209,8 +209,8 @@ def pair_likelihoods(
     phasors(sines, 0.5 * P * spacing, C, S)
     top = 0.0
     for i in range(G):
-        one[i] = power[i] / d
-        top = one[i] if one[i] > top else top
+        lone[i] = power[i] / d
+        top = lone[i] if lone[i] > top else top
     for i in range(G):
         near = min(i + gap, G)
         row, cost = two[i, near:], price[i, near:]
@@ -228,12 +228,12 @@ def pair_likelihoods(
             top = row[j] if row[j] > top else top
     single, double = 1.0 / (1.0 + v * P), 1.0 / (v * v)
     for i in range(G):
-        c[i] = one[i] - top
-    exponentials(c, s, one)
+        c[i] = lone[i] - top
+    exponentials(c, s, lone)
     reached = False
     for i in range(G):
         reached = reached or sines[i] == sines[i]
-        one[i] = one[i] * single if sines[i] == sines[i] else 0.0
+        lone[i] = lone[i] * single if sines[i] == sines[i] else 0.0
     for i in range(G - gap):
         row, cost = two[i, i + gap :], price[i, i + gap :]
         n = row.shape[0]
@@ -293,22 +293,22 @@ def walk_of_single(p: FloatArray, taps: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def step_orders(
-    one: FloatArray,
+    lone: FloatArray,
     two: FloatArray,
     moves: Moves,
     backward: bool,
     sums: FloatArray,
     half: FloatArray,
 ) -> None:
-    """From one bin to the next, in place: one (G,), two (G + 2K, G + 2K) as `walk_of_two` takes
+    """From one bin to the next, in place: lone (G,), two (G + 2K, G + 2K) as `walk_of_two` takes
     it. backward: the transpose, of what later bins say. sums (3, G) and half are scratch."""
-    G, K, gap = one.shape[0], moves.walk_of_two.shape[0] - 1, moves.gap
+    G, K, gap = lone.shape[0], moves.walk_of_two.shape[0] - 1, moves.gap
     any_height = 1.0 / G
     rows, columns, moved = sums[0], sums[1], sums[2]
     total = 0.0
     for i in range(G):
         columns[i] = 0.0
-        total += one[i]
+        total += lone[i]
     for i in range(G):
         near, here = min(i + gap, G), 0.0
         row, column = two[K + i, K + near : K + G], columns[near:]
@@ -316,7 +316,7 @@ def step_orders(
             here += row[j]
             column[j] += row[j]
         rows[i] = here
-    walk_of_single(one, moves.walk, moved)
+    walk_of_single(lone, moves.walk, moved)
     # What changes order: forward by birth and end, backward the other way round.
     birth, end = moves.birth * any_height, 0.5 * moves.end
     up, down = (end, birth) if backward else (birth, end)
@@ -324,7 +324,7 @@ def step_orders(
     for i in range(G):
         held = rows[i] + columns[i]
         moved[i] = (1.0 - moves.birth) * (stay * moved[i] + leap * total) + down * held
-        rows[i] = up * one[i] + (1.0 - moves.end) * 0.5 * leap * held
+        rows[i] = up * lone[i] + (1.0 - moves.end) * 0.5 * leap * held
     walk_of_two(two, moves.walk_of_two, gap, half)
     kept = (1.0 - moves.end) * stay
     for i in range(G):
@@ -333,7 +333,7 @@ def step_orders(
         for j in range(row.shape[0]):
             row[j] = kept * row[j] + more + other[j]
     for i in range(G):
-        one[i] = moved[i]
+        lone[i] = moved[i]
 
 
 @kernel
@@ -361,39 +361,39 @@ def smooth_stretch(
     K, gap = moves.walk_of_two.shape[0] - 1, moves.gap
     pairs = (G - gap) * (G - gap + 1) // 2
     # Of each bin: what it says itself, and what it and those before say; pairs row after row.
-    said_one, said_two = np.ones((n, G)), np.ones((n, pairs), np.float32)
-    kept_one, kept_two = np.empty((n, G)), np.empty((n, pairs), np.float32)
-    one, two = np.empty(G), np.zeros((G + 2 * K, G + 2 * K), np.float32)
+    likely_lone, likely_two = np.ones((n, G)), np.ones((n, pairs), np.float32)
+    kept_lone, kept_two = np.empty((n, G)), np.empty((n, pairs), np.float32)
+    lone, two = np.empty(G), np.zeros((G + 2 * K, G + 2 * K), np.float32)
     half = np.zeros((G + 2 * K, G + 2 * K), np.float32)
     alone, sines, work, sums = np.empty(G), np.empty(G), np.empty((8, G)), np.empty((3, G))
     likelihood, price = np.empty((G, G)), np.empty((G, G))
     for i in range(G):
-        one[i] = start[i]
+        lone[i] = start[i]
     for t in range(n):
         if t > 0:
-            step_orders(one, two, moves, False, sums, half)
+            step_orders(lone, two, moves, False, sums, half)
         if usable[t]:
             sines_of(cells, first + t, geometry, work, sines)
             reached = pair_likelihoods(
                 y[t], ratio[t], sines, geometry.spacing, gap, work, price, alone, likelihood
             )
             if reached:
-                said_one[t] = alone
-                pack(likelihood, 0, gap, said_two[t])
-        weigh_orders(one, two, said_one[t], said_two[t], K, gap)
+                likely_lone[t] = alone
+                pack(likelihood, 0, gap, likely_two[t])
+        weigh_orders(lone, two, likely_lone[t], likely_two[t], K, gap)
         for i in range(G):
-            kept_one[t, i] = one[i]
+            kept_lone[t, i] = lone[i]
         pack(two, K, gap, kept_two[t])
     # From here on what later bins say of each height and pair.
     for i in range(G):
-        one[i] = 1.0
+        lone[i] = 1.0
         for j in range(i + gap, G):
             two[K + i, K + j] = 1.0
     for t in range(n - 1, -1, -1):
         single, double, k = 0.0, 0.0, 0
         low = low_square = high = high_square = 0.0
         for i in range(G):
-            single += kept_one[t, i] * one[i]
+            single += kept_lone[t, i] * lone[i]
         for i in range(G - gap):
             row, here, here_square = 0.0, 0.0, 0.0
             for j in range(i + gap, G):
@@ -415,8 +415,8 @@ def smooth_stretch(
             variance[t, 0] = max(low_square / double - low * low, 0.0)
             variance[t, 1] = max(high_square / double - high * high, 0.0)
         if t > 0:
-            weigh_orders(one, two, said_one[t], said_two[t], K, gap)
-            step_orders(one, two, moves, True, sums, half)
+            weigh_orders(lone, two, likely_lone[t], likely_two[t], K, gap)
+            step_orders(lone, two, moves, True, sums, half)
 
 
 @kernel
@@ -432,28 +432,28 @@ def pack(two: FloatArray, border: int, gap: int, out: FloatArray) -> None:
 
 @kernel
 def weigh_orders(
-    one: FloatArray,
+    lone: FloatArray,
     two: FloatArray,
-    said_one: FloatArray,
-    said_two: FloatArray,
+    likely_lone: FloatArray,
+    likely_two: FloatArray,
     border: int,
     gap: int,
 ) -> None:
     """Multiply heights (G,) and pairs by what a bin says, packed; all together sum to one."""
-    G, k, total = one.shape[0], 0, 0.0
+    G, k, total = lone.shape[0], 0, 0.0
     for i in range(G):
-        one[i] *= said_one[i]
-        total += one[i]
+        lone[i] *= likely_lone[i]
+        total += lone[i]
     for i in range(G - gap):
         row = two[border + i]
         for j in range(border + i + gap, border + G):
-            row[j] *= said_two[k]
+            row[j] *= likely_two[k]
             total += row[j]
             k += 1
     share = 1.0 / total
     factor = np.float32(share)
     for i in range(G):
-        one[i] *= share
+        lone[i] *= share
         row = two[border + i]
         for j in range(border + i + gap, border + G):
             row[j] *= factor

@@ -273,8 +273,8 @@ def array_response(
     seconds = config.snapshot_seconds or 1.0 / spacing
     pulse = None
     if config.pulse == 'processor' and config.processor == 'mvdr':
-        heard = coherence._replace(weight=coherence.weight * coherence.share)
-        pulse = processor_pulse(heard, lattice, config.sound_speed)
+        coherent = coherence._replace(weight=coherence.weight * coherence.share)
+        pulse = processor_pulse(coherent, lattice, config.sound_speed)
 
     def at(
         low: float,
