@@ -330,7 +330,7 @@ def note(name: str, folder: Path, seconds: float) -> None:
     words = ['git', '-C', str(ROOT), 'describe', '--always', '--dirty']
     done = subprocess.run(words, capture_output=True, text=True)
     runs[name] = {
-        'seconds': before['seconds'] + round(seconds, 1),
+        'seconds': before['seconds'] + round(seconds, 3),
         'date': f'{date.today():%Y-%m-%d}',
         'share': SHARE,
         'processors': os.cpu_count(),

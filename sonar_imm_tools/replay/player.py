@@ -27,6 +27,7 @@ import time
 from typing import Any
 
 from attrs import Attribute, field, frozen
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -42,6 +43,8 @@ from .lockstep import Chain, LockStep, only_node
 
 NAME = 'sonar_imm_player'
 _FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
+_LAST_MESSAGES = 2.0
+"""Seconds that listeners have in all to take what was sent last."""
 _DEPTH = 100
 _NANO = 10**9
 
@@ -153,7 +156,11 @@ class Player:
             before = self._published
             self._play_once(stepped, progress)
             if not self._options.loop or self._published == before:
-                return
+                break
+        end = time.monotonic() + _LAST_MESSAGES
+        for publisher in self._publishers.values():
+            # With the end of its publisher a message that is still on its way is lost.
+            publisher.wait_for_all_acked(Duration(seconds=max(end - time.monotonic(), 0.0)))
 
     def result(self) -> PlayResult:
         """Sum up."""

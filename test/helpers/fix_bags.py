@@ -52,7 +52,9 @@ class Ear:
 
     def __init__(self, link, message_type, topic):
         self.link, self.heard = link, []
-        link.node.create_subscription(message_type, topic, self.heard.append, lockstep_qos())
+        self.subscription = link.node.create_subscription(
+            message_type, topic, self.heard.append, lockstep_qos()
+        )
 
     def positions(self, count):
         assert self.link.wait_for(lambda: len(self.heard) >= count, 10.0)

@@ -73,12 +73,16 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
     )
     with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
         player = Player(reader, peer, options)
-        (profile,) = (one.qos_profile for one in player._publishers.values())
+        (publisher,) = player._publishers.values()
+        profile = publisher.qos_profile
         assert profile.durability.name == 'TRANSIENT_LOCAL' and profile.depth == 7
+        # Both sides have to know of each other, which on a busy machine takes seconds.
+        assert peer.wait_for(publisher.get_subscription_count, 60.0)
+        assert link.wait_for(ear.subscription.get_publisher_count, 60.0)
         player.run()
         assert player.result().published == 11
     link.wait_for(lambda: len(ear.heard) == 11, 5.0)
-    assert [round(one.pose.pose.position.x) for one in ear.heard] == list(range(5, 16))
+    assert [round(message.pose.pose.position.x) for message in ear.heard] == list(range(5, 16))
 
 
 def test_the_pace_follows_the_log_times(bag, link, domain):
