@@ -85,6 +85,12 @@ def test_a_loud_stretch_that_is_not_coherent_is_a_diffuse_floor_and_a_spike_is_n
     assert not found[:200].any() and found[215:385].mean() > 0.9 and not found[415:].any()
 
 
+def test_noise_is_never_very_loud_20_db_are():
+    incoherent, usable = np.ones(200, bool), np.ones(200, bool)
+    assert not loudness.diffuse_bins(np.full(200, 90.0), incoherent, usable).any()
+    assert loudness.diffuse_bins(np.full(200, 110.0), incoherent, usable).all()
+
+
 def diffuse(rng, bins, staves, share, *, snr=1e4):
     def circular(*shape):
         return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2.0)

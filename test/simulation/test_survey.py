@@ -52,6 +52,14 @@ def test_without_errors_soundings_lie_on_the_floor():
     assert east < 0.05  # it yaws by .8 deg
 
 
+@pytest.mark.parametrize('depth', [20.0, 40.0])
+def test_the_floor_of_a_survey_has_hills_of_some_of_its_depth(depth):
+    settings = {**EXACT, 'terrain': 'survey', 'slope': 0.0, 'length': 200.0, 'depth': depth}
+    scene = simulate(scenario('survey', settings), 1)
+    below = -line_of(scene.points[0], budget()).z / depth
+    assert 0.6 < below.min() < 0.9 and 1.1 < below.max() < 1.4  # 12 to 28 of 20 m
+
+
 def test_lines_lie_side_by_side_and_cross_lines_evenly_along_them():
     changes = {'lines': 3, 'spacing': 20.0, 'cross_lines': 2, 'terrain': 'flat'}
     scene = simulate(scenario('survey', {**EXACT, **changes}), 1)
