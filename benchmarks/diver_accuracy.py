@@ -245,8 +245,8 @@ def smoothing(runs: int) -> dict[str, dict[str, float]]:
 
 
 def whole_tracker(runs: int, **values: str) -> dict[str, dict[str, float]]:
-    """Gating, track logic and all, with the defaults but for `values`: RMSE of the confirmed track,
-    scans without one, identities."""
+    """Gating, track logic and all, defaults but for `values`: RMSE of the confirmed track, scans
+    without one, identities."""
     table = {}
     for name in ('table1', 'irregular', 'multistatic', 'multistatic_fixes'):
         squared, absent, names, total = [], 0, [], 0

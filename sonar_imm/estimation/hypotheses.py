@@ -338,7 +338,7 @@ def _missed(now: Hypotheses, which: BoolArray, none: FloatArray, D: int) -> _Bra
     """The hypotheses of clusters near which there is no detection."""
     member, cluster = now.member[which], now.cluster[which]
     log_weight = now.log_weight[which] + member @ none
-    total = np.full(int(cluster.max()) + 1, -np.inf)
+    total = np.full(int(cluster.max(initial=-1)) + 1, -np.inf)
     np.logaddexp.at(total, cluster, log_weight)
     code = np.full((len(member), int(member.sum(axis=1).max(initial=0))), -1, np.int64)
     at, row = np.nonzero(member)

@@ -160,6 +160,7 @@ def associate(
         after[t] = missed[t]
         for d in range(D):
             after[t] += beta[t, d]
+        after[t] = min(after[t], 1.0)  # what is rounded adds up to a little more
     return beta, missed, after
 
 

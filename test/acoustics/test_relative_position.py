@@ -144,7 +144,13 @@ def test_place_and_lever_add_what_they_are_uncertain_by():
     nothing = np.zeros((3, 3))
     loose = Mounting(MOUNT.lever, MOUNT.R, 0.3)
     placed = place(
-        VESSEL, Uncertainty(POSITION, nothing), loose, OFFSET, nothing, range_std=1.0, angle_std=1.0
+        VESSEL,
+        Uncertainty(POSITION, nothing),
+        loose,
+        OFFSET,
+        nothing,
+        range_std=1.0,
+        angle_std=1.0,
     )
     assert placed.covariance == pytest.approx(POSITION + 0.09 * np.eye(3))
 

@@ -231,6 +231,15 @@ def test_hypotheses_of_joined_clusters_are_the_products():
     assert found.hypotheses.weight[found.hypotheses.shown] == pytest.approx([0.54])
 
 
+def test_a_number_that_no_cluster_has_is_no_cluster():
+    before, ids = two_tracks()
+    gap = before._replace(cluster=2 * before.cluster)  # 0 and 2
+    ratio = [[3.0, 1.0], [1.0, 2.0]]  # each detection is near to both
+    found, expected = pair(gap, ids, ratio), pair(before, ids, ratio)
+    weights = [sorted(rows_of(item).values()) for item in (found, expected)]
+    assert weights[0] == pytest.approx(weights[1], abs=1e-15)
+
+
 def test_nothing_at_all():
     found = pair(Hypotheses.none(), np.empty(0, np.int64), np.empty((0, 3)))
     assert len(found.source) == 0 and found.claimed.tolist() == [0.0, 0.0, 0.0]

@@ -50,6 +50,24 @@ def test_no_message_breaks_a_tracker(system):
     assert tally.read > 0.5 * tally.cases and len(tally.refused) >= 5 and tally.counted
 
 
+@pytest.mark.parametrize(
+    'bad',
+    [
+        {3: 1048575, 15: 11047, 19: 257408},
+        {2: 297, 3: 20451, 7: 1633},
+        {40: 11177, 44: 476},
+    ],
+    ids=['existence above 1', 'existence of one above 1', 'no hypothesis of a cluster'],
+)
+def test_messages_that_once_broke_hypotheses_of_divers(bad):
+    numbers = [bad.get(k, 0) for k in range(50)]
+    run('diver', (3, [Bad.of('diver', number) for number in numbers]))
+
+
+def test_where_the_last_diver_has_gone_existence_is_a_number_still():
+    assert run_extreme('diver', 41)
+
+
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_no_parameter_breaks_a_tracker(system):
     with warnings.catch_warnings():

@@ -37,7 +37,7 @@ import numpy as np
 
 from ...estimation import hypotheses
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import TENTATIVE, TrackRules
 from ...estimation.hypotheses import Hypotheses
 from ...measurements import NOBODY
@@ -243,7 +243,12 @@ def one_past(scans: Sequence[DiverState]) -> list[DiverState]:
 def _of_tracks(now: DiverState, value: FloatArray) -> FloatArray:
     """The expected `value` (T,) of the track of each row, 0 where it is not there."""
     _, which = np.unique(now.life.track_id, return_inverse=True)
-    return np.asarray(np.bincount(which, now.hypotheses.marginal() * value)[which])
+    return _summed(which, now.hypotheses.marginal() * value)
+
+
+def _summed(which: IntArray, share: FloatArray) -> FloatArray:
+    """The sum (T,) of the shares (T,) of each kind; bincount of nothing gives integers."""
+    return np.asarray(np.bincount(which, share)[which], float)
 
 
 def presence(now: DiverState) -> FloatArray:
@@ -252,10 +257,11 @@ def presence(now: DiverState) -> FloatArray:
     open long after it is sure that there is one."""
     share = now.hypotheses.marginal() * now.existence
     _, last = np.unique(now.history[:, -1:], return_inverse=True)
-    there = np.bincount(last.ravel(), share)[last.ravel()]
+    there = _summed(last.ravel(), share)
     known = now.history[:, -1:].any(axis=1)
     own = _of_tracks(now, now.existence)
-    return np.asarray(np.where(known, np.fmax(there, own), own))
+    # Weights that are rounded add up to a little more than 1.
+    return np.asarray(np.minimum(np.where(known, np.fmax(there, own), own), 1.0))
 
 
 def most_tracks(config: DiverConfig) -> int:

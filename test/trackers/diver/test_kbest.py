@@ -333,6 +333,11 @@ def test_a_knot_of_fixes_costs_bounded_memory():
         assert len(set(made[-1].extras['track_id'].tolist())) == len(made[-1])
 
 
+def test_nobody_is_there_with_a_probability_of_no_rows():
+    nobody = DiverTracker(CROSSING)._stream.state
+    assert kbest.presence(nobody).shape == (0,) and kbest.presence(nobody).dtype == float
+
+
 def test_every_row_is_in_a_hypothesis_and_weights_sum_to_one():
     tracker = DiverTracker(CROSSING)
     for item in crossing():

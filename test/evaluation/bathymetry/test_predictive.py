@@ -1,0 +1,29 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What tuning runs the bathymetry tracker with."""
+
+import pytest
+
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig, MODEL_SETS
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+def test_tuning_is_without_monte_carlo_noise_where_the_models_have_a_grid(model_set):
+    config = for_tuning(BathymetryConfig(model_set=model_set))
+    assert (config.engine == 'grid') == (model_set != 'height_rw_ncs')  # which has two states
+    assert config.smoothing == 'none'
+    BathymetryTracker(config)  # it can be run
