@@ -30,7 +30,6 @@ from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import jobs, making
-from sonar_imm_tools.survey.looks import joined
 from sonar_imm_tools.survey.making import plan_tiles
 
 rasterio = pytest.importorskip('rasterio')
@@ -401,11 +400,11 @@ def test_cells_follow_depth():
 
     from sonar_imm_tools.survey.looks import looks_of
 
-    looks = joined([looks_of(line, 2.0) for line in vectors.lines(vectors.scene())])
+    looks = [looks_of(line, 2.0) for line in vectors.lines(vectors.scene())]
     assert {tile.cell for tile in plan_tiles(looks, 0.0)} <= {0.5, 1.0, 2.0}
     from attrs import evolve
 
-    deep = evolve(looks, z=10.0 * looks.z)
+    deep = [evolve(each, z=10.0 * each.z) for each in looks]
     assert min(tile.cell for tile in plan_tiles(deep, 0.0)) >= 4.0
     covered = {(tile.cell, tile.i, tile.j) for tile in plan_tiles(looks, 0.0)}
     assert len(covered) == len(plan_tiles(looks, 0.0))

@@ -204,9 +204,9 @@ def test_lines_that_do_not_overlap():
 
 
 def test_misties_are_differences_of_lines():
-    pairs = {(a, b): d for a, b, d in misties(joined(small()))}
-    assert set(pairs) == {(0, 1), (0, 2), (1, 2)}
-    assert np.median(pairs[0, 2]) == pytest.approx(-0.4, abs=0.2)
+    pairs, cells = misties(small())
+    assert set(pairs) == {(0, 1), (0, 2), (1, 2)} and cells == 60
+    assert pairs[0, 2].median == pytest.approx(-0.4, abs=0.2) and pairs[0, 2].cells == 60
     assert robust_rms(np.array([-1.0, 1.0, 1.0])) == pytest.approx(1.4826)
 
 
