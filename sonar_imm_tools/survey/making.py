@@ -274,7 +274,6 @@ def make(
     none = np.zeros((len(units), 6))
     looks = statistics(none)
     before, cells = misties(looks)
-    rms = Crossing.of(looks).rms() if cells else 0.0
     found: Adjustment | None = None
     after: dict[tuple[int, int], Mistie] = {}
     if options.adjusted:
@@ -292,6 +291,9 @@ def make(
         warnings += _warnings_of(found)
         looks = statistics(found.corrections)
         after, _ = misties(looks)
+        rms = found.rms[0]
+    else:
+        rms = Crossing.of(looks).rms() if cells else 0.0
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)
     corrections = none if found is None else found.corrections
