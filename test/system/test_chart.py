@@ -87,9 +87,9 @@ def test_a_chart_grows_with_the_lines(monkeypatch):
         )
         statuses = []
         link.node.create_subscription(DiagnosticArray, '/diagnostics', statuses.append, 10)
-        it = started(domain, '--period', '0.3', '--timeout', '90')
+        it = started(domain, '--period', '0.3', '--timeout', '180')
         try:
-            assert link.wait_for(publisher.get_subscription_count, 60.0)
+            assert link.wait_for(publisher.get_subscription_count, 120.0)
             assert link.wait_for(
                 lambda: link.node.count_subscribers('/sonar_imm_chart/ground'),
                 90.0,
