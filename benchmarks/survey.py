@@ -30,6 +30,7 @@ wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections, as the grid is and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import contextlib
 
 from attrs import evolve
@@ -39,7 +40,7 @@ from benchmarks.study import mean_of, Parts, rms, study
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm_tools.recordings.export.points import Points
-from sonar_imm_tools.simulation.survey import budget, Floor, scenario, simulate, SurveyScene
+from sonar_imm_tools.simulation.survey import budget, Floor, scenario, simulate
 from sonar_imm_tools.survey import grid as grid_module
 from sonar_imm_tools.survey import looks as looks_module
 from sonar_imm_tools.survey.adjustment import adjust
@@ -64,7 +65,7 @@ WRECK: dict[str, float] = {
     'ghost': False,
     'fish': False,
 }
-"""Six lines; the wreck lies at .55 of the length and .35 of the width of the parallel ones."""
+"""The wreck lies at .55 of the length and .35 of the width of the parallel lines."""
 WALLS: dict[str, dict[str, float]] = {
     'as it is': {},
     'gradients cut at .5': {'STEEPEST': 0.5},
@@ -75,26 +76,31 @@ WALLS: dict[str, dict[str, float]] = {
 }
 
 
-def main(runs: int = 6, first: int = 10, surveys: int = 6, interval: float = 1.0) -> Parts:
+def main(
+    runs: int = 6,
+    first: int = 10,
+    interval: float = 1.0,
+    parts: Sequence[str] = ('one_run', 'walls', 'survey'),
+) -> Parts:
+    seeds = range(first, first + runs)
     yield {'runs': runs, 'first_seed': first, 'ping_interval': interval}
-    for name, (terrain, slope, cell) in FLOORS.items():
-        rows = [one_run(terrain, slope, cell, seed) for seed in range(first, first + runs)]
+    for name, (terrain, slope, cell) in FLOORS.items() if 'one_run' in parts else ():
+        rows = [one_run(terrain, slope, cell, seed) for seed in seeds]
         worst = {
             f'worst_{way}': min(row[f'inside_{way}'] for row in rows) for way in ('mean', 'looks')
         }
         yield {'one_run': {name: {**mean_of(rows), **worst}}}
-    scenes = [walls_scene(seed) for seed in (first, first + 1)]
-    for name, change in WALLS.items():
-        yield {'walls': {name: mean_of([walls(*scene, **change) for scene in scenes])}}
+    for name, choices in WALLS.items() if 'walls' in parts else ():
+        yield {'walls': {name: mean_of([walls(seed, **choices) for seed in seeds[:2]])}}
     adjusted: list[dict[str, float]] = []
     charts: dict[str, list[dict[str, float]]] = {}
-    for seed in range(first, first + surveys):
+    for seed in seeds if 'survey' in parts else ():
         corrections, made = survey(seed, interval)
         adjusted.append(corrections)
         for name, row in made.items():
             charts.setdefault(name, []).append(row)
         errors = {name: {'rms': rms([row[name] for row in adjusted])} for name in corrections}
-        # What is known after each survey, of which all but the last are replaced.
+        # What is known after each survey; the last one's stays.
         yield {
             'surveys': len(adjusted),
             'adjustment': errors,
@@ -189,17 +195,9 @@ def about_level(
     }
 
 
-def walls_scene(seed: int) -> tuple[int, SurveyScene]:
-    """Lines along and across a wreck."""
-    return seed, simulate(scenario('survey', WRECK), seed)
-
-
-def walls(
-    seed: int, scene: SurveyScene, nav_errors: float = 1.0, **choices: float
-) -> dict[str, float]:
-    """Errors about their median on the sides of the wreck and on all other nodes."""
-    if nav_errors != 1.0:
-        scene = simulate(scenario('survey', {**WRECK, 'nav_errors': nav_errors}), seed)
+def walls(seed: int, nav_errors: float = 1.0, **choices: float) -> dict[str, float]:
+    """Errors about their median on the sides of the wreck and on all nodes beside it."""
+    scene = simulate(scenario('survey', {**WRECK, 'nav_errors': nav_errors}), seed)
     parts = [
         line_of(points, budget()).corrected(c)
         for points, c in zip(scene.points, scene.corrections)
@@ -212,7 +210,7 @@ def walls(
             stack.callback(setattr, where, name, getattr(where, name))
             setattr(where, name, value)
         nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
-    x, y = nodes.ix + 0.5, nodes.iy + 0.5
+    x, y = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64).T
     error = nodes.z - scene.floor.at(x, y)
     off = np.abs(error - np.median(error))
     along, across = x - 0.55 * WRECK['length'], y - 0.35 * 120.0
@@ -273,4 +271,4 @@ def scores(floor: Floor, place: FloatArray, z: FloatArray, sd: FloatArray) -> di
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, parts={'choices': ['one_run', 'walls', 'survey']})

@@ -92,6 +92,24 @@ def test_the_chart_lies_on_the_true_floor(lines, made):
     assert np.nanmax(bands['hypotheses']) >= 2 and np.nanmax(bands['lines']) == 4
 
 
+def test_export_of_one_run_is_the_same_grid(lines, tmp_path):
+    """Node by node, also across the seams of tiles; a survey keeps what it reads in float32."""
+    runs = tmp_path / 'runs'
+    shutil.copytree(lines / 'line_001', runs / 'line_001')
+    record = {'system': 'bathymetry', 'bag': 'a.bag', 'topics': {}, 'parameters': {}}
+    (runs / 'line_001' / 'run.json').write_text(json.dumps(record))
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 1) == 0
+    assert run('export', runs / 'line_001', tmp_path / 'one.tif', '--cell', 1) == 0
+    survey, there, _ = read(tmp_path / 'out' / 'survey.tif')
+    one, here, _ = read(tmp_path / 'one.tif')
+    top, left = round(there.f - here.f), round(here.c - there.c)
+    rows, columns = one['depth'].shape
+    for name in ('depth', 'uncertainty', 'count', 'hypotheses', 'competing_depth'):
+        whole = survey[name][top : top + rows, left : left + columns]
+        assert np.isfinite(one[name]).sum() > 30, name
+        assert one[name] == pytest.approx(whole, abs=1e-4, nan_ok=True), name
+
+
 def test_tiles_are_the_chart(made):
     whole, transform, _ = read(made / 'survey.tif')
     survey = json.loads((made / 'survey.json').read_text())
