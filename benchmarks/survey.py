@@ -24,10 +24,14 @@ is that by one over the variance; its uncertainty is that of soundings whose pin
 `adjustment`: the scene `survey`, twelve lines and three across with biases, tides, an error of the
 sound speed, fish and false echoes: errors of the corrections, and as multiples of their stated
 standard deviations. `grid`: the charts of it in 1 m cells over the middle, about the median of
-their errors, since no crossing tells the level; `inside` with the level.
+their errors, since no crossing tells the level; `inside` with the level. `walls`: the sides of the
+wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections, as the grid is and with other choices.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
 
 from attrs import evolve
 import numpy as np
@@ -37,6 +41,8 @@ from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm_tools.recordings.export.points import Points
 from sonar_imm_tools.simulation.survey import budget, Floor, scenario, simulate
+from sonar_imm_tools.survey import grid as grid_module
+from sonar_imm_tools.survey import looks as looks_module
 from sonar_imm_tools.survey.adjustment import adjust
 from sonar_imm_tools.survey.chart import chart_of
 from sonar_imm_tools.survey.grid import grid_of_looks, Soundings
@@ -51,28 +57,55 @@ FLOORS = {
     'slope .1, 1 m': ('slope', 0.1, 1.0),
     'slope .1, 5 m': ('slope', 0.1, 5.0),
 }
+WRECK: dict[str, float] = {
+    'lines': 4,
+    'cross_lines': 2,
+    'length': 160.0,
+    'ping_interval': 0.5,
+    'ghost': False,
+    'fish': False,
+}
+"""The wreck lies at .55 of the length and .35 of the width of the parallel lines."""
+WALLS: dict[str, dict[str, float]] = {
+    'as it is': {},
+    'gradients cut at .5': {'STEEPEST': 0.5},
+    'gradients cut at 4': {'STEEPEST': 4.0},
+    'reach of half a cell': {'REACH': 0.5},
+    'cut at gaps of .5 m': {'LEAST_GAP': 0.5},
+    'no errors of navigation': {'nav_errors': 0.0},
+}
 
 
-def main(runs: int = 6, interval: float = 1.0) -> Parts:
-    yield {'runs': runs, 'ping_interval': interval}
-    for name, (terrain, slope, cell) in FLOORS.items():
-        rows = [one_run(terrain, slope, cell, seed) for seed in range(runs)]
+def main(
+    runs: int = 6,
+    first: int = 10,
+    interval: float = 1.0,
+    parts: Sequence[str] = ('one_run', 'walls', 'survey'),
+) -> Parts:
+    seeds = range(first, first + runs)
+    yield {'runs': runs, 'first_seed': first, 'ping_interval': interval}
+    for name, (terrain, slope, cell) in FLOORS.items() if 'one_run' in parts else ():
+        rows = [one_run(terrain, slope, cell, seed) for seed in seeds]
         worst = {
             f'worst_{way}': min(row[f'inside_{way}'] for row in rows) for way in ('mean', 'looks')
         }
         yield {'one_run': {name: {**mean_of(rows), **worst}}}
+    for name, choices in WALLS.items() if 'walls' in parts else ():
+        yield {'walls': {name: mean_of([walls(seed, **choices) for seed in seeds[:2]])}}
     adjusted: list[dict[str, float]] = []
     charts: dict[str, list[dict[str, float]]] = {}
-    for seed in range(runs):
+    for seed in seeds if 'survey' in parts else ():
         corrections, made = survey(seed, interval)
         adjusted.append(corrections)
         for name, row in made.items():
             charts.setdefault(name, []).append(row)
-    yield {
-        'adjustment': {name: {'rms': rms([row[name] for row in adjusted])} for name in adjusted[0]}
-    }
-    for name, rows in charts.items():
-        yield {'grid': {name: mean_of(rows)}}
+        errors = {name: {'rms': rms([row[name] for row in adjusted])} for name in corrections}
+        # What is known after each survey; the last one's stays.
+        yield {
+            'surveys': len(adjusted),
+            'adjustment': errors,
+            'grid': {name: mean_of(rows) for name, rows in charts.items()},
+        }
 
 
 def survey(seed: int, interval: float) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
@@ -162,6 +195,35 @@ def about_level(
     }
 
 
+def walls(seed: int, nav_errors: float = 1.0, **choices: float) -> dict[str, float]:
+    """Errors about their median on the sides of the wreck and on all nodes beside it."""
+    scene = simulate(scenario('survey', {**WRECK, 'nav_errors': nav_errors}), seed)
+    parts = [
+        line_of(points, budget()).corrected(c)
+        for points, c in zip(scene.points, scene.corrections)
+    ]
+    number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
+    own = evolve(budget(), sound_speed=0.0)
+    where = looks_module if 'STEEPEST' in choices else grid_module
+    with contextlib.ExitStack() as stack:
+        for name, value in choices.items():
+            stack.callback(setattr, where, name, getattr(where, name))
+            setattr(where, name, value)
+        nodes = grid_of_looks(Soundings(joined_lines(parts), number), 1.0, (20, 0, 120, 120), own)
+    x, y = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64).T
+    error = nodes.z - scene.floor.at(x, y)
+    off = np.abs(error - np.median(error))
+    along, across = x - 0.55 * WRECK['length'], y - 0.35 * 120.0
+    out = np.hypot(along / 20.0, across / 4.0)
+    side = (out > 0.8) & (np.abs(along) < 22.0) & (np.abs(across) < 6.0)
+    return {
+        'rms': rms(off[side]),
+        'p95': float(np.quantile(off[side], 0.95)),
+        'inside': float(np.mean(off[side] < 2.0 * nodes.sd[side])),
+        'others_rms': rms(off[~side & (out > 0.8)]),
+    }
+
+
 def one_run(terrain: str, slope: float, cell: float, seed: int) -> dict[str, float]:
     """RMSE and share inside two sigma of the plain mean and of the grid of looks."""
     line = {'length': 200.0, 'ping_interval': 0.2}
@@ -209,4 +271,4 @@ def scores(floor: Floor, place: FloatArray, z: FloatArray, sd: FloatArray) -> di
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, parts={'choices': ['one_run', 'walls', 'survey']})

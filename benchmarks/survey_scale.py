@@ -20,7 +20,8 @@ Groups of fifty lines beside each other on a slope, each group the same sounding
 that lines overlap their neighbours throughout; then `sonar-imm survey --adjust` as the command
 does it. `stages`: seconds of CPU of all processes, and per million soundings. `memory`: of a
 worker, MB (the part that is its own and not of a file), after the first tenth of the lines and the
-most until the end; of the process that holds the survey, the most.
+most until the end; of the process that holds the survey, the most; and of both the peak resident
+set size, as the system counts it, with what they share with each other.
 """
 
 from __future__ import annotations
@@ -99,8 +100,12 @@ def surveyed(runs: Path, out: Path, jobs: int, soundings: int) -> dict[str, obje
         'wall_s': time.perf_counter() - begun,
         'tiles': len(survey.tiles),
         'memory': {
-            'worker': {'first_tenth': watch.early, 'most': watch.most},
-            'command': {'most': watch.own},
+            'worker': {
+                'first_tenth': watch.early,
+                'most': watch.most,
+                'peak_rss': watch.peak,
+            },
+            'command': {'most': watch.own, 'peak_rss': _memory_mb(os.getpid(), 'VmHWM')},
         },
     }
 
@@ -113,6 +118,7 @@ class Watch:
     early: float = 0.0
     most: float = 0.0
     own: float = 0.0
+    peak: float = 0.0
     _stage: str = ''
     _spent: float = 0.0
     _is_early: bool = True
@@ -148,11 +154,12 @@ class Watch:
     def _look(self) -> None:
         while not self._ended.wait(0.2):
             for child in _children():
-                used = _private_mb(child)
+                used = _memory_mb(child, 'RssAnon')
+                self.peak = max(self.peak, _memory_mb(child, 'VmHWM'))
                 self.most = max(self.most, used)
                 if self._is_early:
                     self.early = max(self.early, used)
-            self.own = max(self.own, _private_mb(os.getpid()))
+            self.own = max(self.own, _memory_mb(os.getpid(), 'RssAnon'))
 
 
 def _children() -> Iterator[int]:
@@ -175,13 +182,13 @@ def _cpu_seconds() -> float:
     return total
 
 
-def _private_mb(process: int) -> float:
-    """Memory of a process that no file holds, MB."""
+def _memory_mb(process: int, kind: str) -> float:
+    """What the system says of the memory of a process, MB; RssAnon: what no file holds."""
     try:
         lines = Path(f'/proc/{process}/status').read_text().splitlines()
     except OSError:
         return 0.0
-    return sum(int(line.split()[1]) for line in lines if line.startswith('RssAnon')) / 1024
+    return sum(int(line.split()[1]) for line in lines if line.startswith(kind)) / 1024
 
 
 if __name__ == '__main__':

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import contextlib
 from pathlib import Path
 import time
@@ -75,9 +76,9 @@ def command(
     Without TOPIC every topic that ends in /soundings is heard. Published, latched, in the frame of
     the navigation: /sonar_imm_chart/grid (nav_msgs/OccupancyGrid for RViz: 100 the shoalest, 0 the
     deepest, -1 unknown) and /sonar_imm_chart/nodes (PointCloud2: depths with uncertainty, count,
-    lines and what competes). Nothing is adjusted; `survey` does that afterwards. Ctrl-C ends it.
+    lines and what competes). What changed goes to /sonar_imm_chart/ground, for the input `ground`
+    of obstacle_node. Nothing is adjusted; `survey` does that afterwards. Ctrl-C ends it.
     """
-    from sonar_imm.nodes.qos import latched_qos
 
     from ..replay.link import Link, LinkError
     from ..replay.listening import TableListener
@@ -87,9 +88,10 @@ def command(
     settings: Any = config
     chart = LiveChart(cell, settings.budget(), settings.sound_speed)
     with Link(NAME) as link, contextlib.suppress(KeyboardInterrupt):
-        outputs = Outputs(link, latched_qos())
+        outputs = Outputs(link)
         listener = TableListener(link, topics, 'soundings')
-        frame, newest, due, changed = '', 0, time.monotonic() + period, False
+        frame, newest, due = '', 0, time.monotonic() + period
+        changed: set[tuple[int, int]] = set()
         for table in listener.tables(timeout):
             if table is not None:
                 if 'vertical_uncertainty' not in (table.columns or {}):
@@ -104,34 +106,39 @@ def command(
             begun = time.monotonic()
             if begun < due:
                 continue
-            for _ in chart.remade():
-                changed = True
+            for tile in chart.remade():
+                changed.add(tile)
                 if time.monotonic() - begun > MAKING:
                     break
             else:
                 if changed:
-                    outputs.publish(chart, newest, frame)
-                due, changed = time.monotonic() + period, False
+                    outputs.publish(chart, sorted(changed), newest, frame)
+                due, changed = time.monotonic() + period, set()
 
 
 class Outputs:
-    """The two topics of the chart."""
+    """The topics of the chart."""
 
-    def __init__(self, link: Any, qos: Any):
+    def __init__(self, link: Any):
         from sonar_imm.nodes.messages import message_class
+        from sonar_imm.nodes.qos import latched_qos, output_qos
 
         self._grid = link.node.create_publisher(
-            message_class('nav_msgs/msg/OccupancyGrid'), f'/{NAME}/grid', qos
+            message_class('nav_msgs/msg/OccupancyGrid'), f'/{NAME}/grid', latched_qos()
         )
-        self._nodes = link.node.create_publisher(
-            message_class('sensor_msgs/msg/PointCloud2'), f'/{NAME}/nodes', qos
-        )
+        cloud = message_class('sensor_msgs/msg/PointCloud2')
+        self._nodes = link.node.create_publisher(cloud, f'/{NAME}/nodes', latched_qos())
+        self._ground = link.node.create_publisher(cloud, f'/{NAME}/ground', output_qos())
         self._lines = 0
 
-    def publish(self, chart: LiveChart, stamp_ns: int, frame_id: str) -> None:
-        """Publish all that is known."""
+    def publish(
+        self, chart: LiveChart, changed: Sequence[tuple[int, int]], stamp_ns: int, frame_id: str
+    ) -> None:
+        """Publish all that is known, and of the tiles that changed the floor."""
         from msg_adapters.headers import make_header
+        from msg_adapters.soundings import write_ground
         from msg_adapters.table import encode_table
+        from sonar_imm.measurements import Ground
         from sonar_imm.nodes.messages import make
 
         table = chart.table()
@@ -154,6 +161,9 @@ class Outputs:
             make('nav_msgs/msg/OccupancyGrid', header=header, info=info, data=cells.ravel())
         )
         self._nodes.publish(encode_table(table, stamp_ns=stamp_ns, frame_id=frame_id, make=make))
+        position, variance = chart.floor(changed)
+        ground = Ground(stamp_ns=stamp_ns, position=position, variance=variance, frame_id=frame_id)
+        self._ground.publish(write_ground(ground, make))
         if chart.lines != self._lines:
             self._lines = chart.lines
             say(f'line {chart.lines}: {len(table["x"])} nodes')

@@ -46,10 +46,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from sonar_imm.acoustics.sounding import ErrorBudget
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 
 from .line import PARAMETERS, partials
-from .looks import gradients, joined, Looks, MAD, runs_of
+from .looks import gradients, Looks, MAD, runs_of, strips
 
 NU, REWEIGHTINGS = 4.0, 8
 ROUNDS = 3
@@ -62,6 +62,8 @@ lie at a depth, not at a share of it."""
 SECOND_ORDER = 0.04
 """Share of a correction of sound speed that its partial misses, where the water has layers."""
 MOST_UNKNOWNS = 20_000
+MOST_LOOKS = 1_000_000
+"""Above it the equations are those of a part of the cells."""
 ROWS_AT_ONCE = 200_000
 MOST_PARAMETERS = 1000
 """Above it the covariance with states is not worked out: the consider covariance stands alone."""
@@ -91,8 +93,8 @@ class Adjustment:
 
     owner (P,): number of the line, -1 the survey; kind (P,): index into `PARAMETERS`; value, std,
     prior_std (P,); covariance (P, P); information (P, P) of the data alone; corrections (L, 6):
-    total of each line; cells: how many have two lines; rms: of looks about their cells, robust,
-    before the first round and after each.
+    total of each line; rms: of looks about their cells, robust, before the first round and after
+    each.
     """
 
     owner: IntArray
@@ -103,7 +105,6 @@ class Adjustment:
     covariance: FloatArray
     information: FloatArray
     corrections: FloatArray
-    cells: int
     rms: tuple[float, ...]
     groups: int
 
@@ -148,19 +149,17 @@ def adjust(
     unknowns = _Unknowns.of(count, priors or Priors(), fixed)
     corrections = np.zeros((count, len(PARAMETERS)))
     history: list[float] = []
+    value = np.zeros(len(unknowns.owner))
     for number in range(ROUNDS + 1):
-        looks, g, cell, cells = crossing(joined(statistics(corrections)))
-        if not cells:
-            raise ValueError('no two lines overlap')
-        equations = _Equations(looks, g, cell, cells, unknowns, corrections, budget, sound_speed)
-        history.append(equations.rms())
-        if number == ROUNDS:
-            break
+        found = Crossing.of(statistics(corrections), sound_speed)
+        equations = _Equations(found, unknowns, corrections, budget)
+        history.append(found.rms())
         if number:
             note(number, history[-1])
-        value = equations.solve(states)
-        corrections = unknowns.totals(value)
-    note(ROUNDS, history[-1])
+        if number < ROUNDS:
+            value = equations.solve(states)
+            corrections = unknowns.totals(value)
+            del found, equations  # before the next ones are made
     # The last step moved no place by much: the equations of the last statistics are those of it.
     equations.reweight(value)
     covariance, information = equations.covariance(states)
@@ -176,58 +175,143 @@ def adjust(
         covariance=covariance,
         information=information,
         corrections=corrections,
-        cells=cells,
         rms=tuple(history),
-        groups=groups_of(looks, cell, count),
+        groups=groups_of(found, count),
     )
 
 
-def crossing(looks: Looks) -> tuple[Looks, FloatArray, IntArray, int]:
-    """The looks in cells that two lines or more see, with gradients (m, 2), the number of the cell
-    of each, and how many cells there are."""
-    if not len(looks):
-        return looks, np.zeros((0, 2)), np.zeros(0, np.int64), 0
-    starts, counts, group = runs_of(looks.ix, looks.iy)
+@frozen(eq=False)
+class Crossing:
+    """Looks (m,) in cells that two lines or more see, sorted by cell and line.
+
+    cell: number of the cell, from 0; line: number; time s; z: height at the centre, m; variance of
+    it, m^2; g (m, 2): gradient of the floor; partials (m, 6) of the height; depth below the array,
+    m. cells: how many there are.
+    """
+
+    cell: IntArray
+    line: IntArray
+    time: FloatArray
+    z: FloatArray
+    variance: FloatArray
+    g: FloatArray
+    partials: FloatArray
+    depth: FloatArray
+    cells: int
+
+    @classmethod
+    def of(cls, lines: Sequence[Looks], sound_speed: float = 1500.0) -> Crossing:
+        """Of the looks of lines; where they are more than `MOST_LOOKS`, of every second cell, of
+        every fourth, and so on: what lasts for seconds limits the corrections, not noise.
+
+        Raises ValueError where no two lines see the same cell.
+        """
+        parts: list[Crossing] = []
+        every = 1
+        for part in crossings(lines, sound_speed):
+            parts.append(part.thinned(every))
+            while sum(len(each.z) for each in parts) > MOST_LOOKS:
+                every *= 2
+                parts = [each.thinned(2) for each in parts]
+        firsts = np.cumsum([0, *(part.cells for part in parts)])
+        if not firsts[-1]:
+            raise ValueError('no two lines overlap')
+        whole = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _OF_LOOKS}
+        cell = np.concatenate([part.cell + first for part, first in zip(parts, firsts.tolist())])
+        return cls(cell=cell, cells=int(firsts[-1]), **whole)
+
+    def thinned(self, every: int) -> Crossing:
+        """Each cell whose number `every` divides."""
+        if every == 1:
+            return self
+        rows = self.cell % every == 0
+        chosen = {name: getattr(self, name)[rows] for name in _OF_LOOKS}
+        return Crossing(cell=self.cell[rows] // every, cells=-(-self.cells // every), **chosen)
+
+    def rms(self) -> float:
+        """Of looks about the weighted means of their cells, robust."""
+        weight = 1.0 / self.variance
+        total = np.bincount(self.cell, weight * self.z, self.cells)
+        mean = total / np.bincount(self.cell, weight, self.cells)
+        return robust_rms(self.z - mean[self.cell])
+
+
+_OF_LOOKS = ('line', 'time', 'z', 'variance', 'g', 'partials', 'depth')
+
+
+def crossings(lines: Sequence[Looks], sound_speed: float = 1500.0) -> Iterator[Crossing]:
+    """What lines have in common, by parts of the floor."""
+    for looks, inside in strips(lines):
+        yield _crossing(looks, inside, sound_speed)
+
+
+def _crossing(looks: Looks, inside: BoolArray, sound_speed: float) -> Crossing:
+    """In the cells of those looks that are inside."""
+    starts, _, group = runs_of(looks.ix, looks.iy)
     least = np.minimum.reduceat(looks.line, starts)
     most = np.maximum.reduceat(looks.line, starts)
-    shared = least < most
+    shared = (least < most) & inside[starts]
     rows = shared[group]
-    if not rows.any():
-        return looks.chosen(rows), np.zeros((0, 2)), np.zeros(0, np.int64), 0
     g = gradients(looks, looks.ix[starts][shared], looks.iy[starts][shared])
     cell = (np.cumsum(shared) - 1)[group[rows]]
-    return looks.chosen(rows), g[cell], cell, int(shared.sum())
+    chosen, g = looks.chosen(rows), g[cell]
+    return Crossing(
+        cell=cell,
+        line=chosen.line,
+        time=chosen.time,
+        z=chosen.heights(g),
+        variance=chosen.variances(g),
+        g=g,
+        partials=partials(chosen.basis, g, sound_speed),
+        depth=2.0 * chosen.basis[:, 8] - sound_speed * chosen.basis[:, 1],
+        cells=int(shared.sum()),
+    )
 
 
-def groups_of(looks: Looks, cell: IntArray, count: int) -> int:
+def groups_of(found: Crossing, count: int) -> int:
     """How many groups of lines there are that do not overlap each other."""
-    see = csr_array((np.ones(len(cell)), (cell, looks.line)), shape=(cell.max() + 1, count))
+    shape = found.cells, count
+    see = csr_array((np.ones(len(found.cell)), (found.cell, found.line)), shape=shape)
     return int(connected_components(see.T @ see, directed=False)[0])
 
 
-def misties(looks: Looks) -> Iterator[tuple[int, int, FloatArray]]:
-    """Of each pair of lines that share cells: their numbers and the differences of their heights,
-    first less second."""
-    looks, g, cell, cells = crossing(looks)
+@frozen
+class Mistie:
+    """Difference of two lines: cells that both see; median and robust rms, m."""
+
+    cells: int
+    median: float
+    rms: float
+
+
+def misties(lines: Sequence[Looks]) -> tuple[dict[tuple[int, int], Mistie], int]:
+    """By the numbers of each pair of lines that share cells, first less second; and how many cells
+    two lines or more see."""
+    keys, apart = [], []
+    cells = 0
+    for found in crossings(lines):
+        cells += found.cells
+        if not found.cells:
+            continue
+        starts, _, _ = runs_of(found.cell, found.line)
+        weight = 1.0 / found.variance
+        z = np.add.reduceat(weight * found.z, starts) / np.add.reduceat(weight, starts)
+        cell, line = found.cell[starts], found.line[starts]
+        for step in range(1, int(np.bincount(cell).max())):
+            here = np.flatnonzero(cell[step:] == cell[:-step])
+            keys.append((line[here] << 32) + line[here + step])
+            apart.append(z[here] - z[here + step])
     if not cells:
-        return
-    starts, _, group = runs_of(cell, looks.line)
-    weight = 1.0 / looks.variances(g)
-    total = np.add.reduceat(weight, starts)
-    z = np.add.reduceat(weight * looks.heights(g), starts) / total
-    cell, line = cell[starts], looks.line[starts]
-    first, second, apart = [], [], []
-    for step in range(1, int(np.bincount(cell).max())):
-        pairs = np.flatnonzero(cell[step:] == cell[:-step])
-        first.append(line[pairs])
-        second.append(line[pairs + step])
-        apart.append(z[pairs] - z[pairs + step])
-    a, b, d = np.concatenate(first), np.concatenate(second), np.concatenate(apart)
-    order = np.lexsort((b, a))
-    a, b, d = a[order], b[order], d[order]
-    starts, counts, _ = runs_of(a, b)
-    for start, n in zip(starts.tolist(), counts.tolist()):
-        yield int(a[start]), int(b[start]), d[start : start + n]
+        return {}, 0
+    key, d = np.concatenate(keys), np.concatenate(apart)
+    order = np.argsort(key, kind='stable')
+    starts, _, _ = runs_of(key[order])
+    pairs = [divmod(pair, 1 << 32) for pair in key[order[starts]].tolist()]
+    each = np.split(d[order], starts[1:])
+    return {
+        pair: Mistie(len(own), float(np.median(own)), robust_rms(own))
+        for pair, own in zip(pairs, each)
+    }, cells
 
 
 def robust_rms(values: FloatArray) -> float:
@@ -276,31 +360,20 @@ class _Equations:
     """Heights of looks as equations of the unknowns, at one round's places."""
 
     def __init__(
-        self,
-        looks: Looks,
-        g: FloatArray,
-        cell: IntArray,
-        cells: int,
-        unknowns: _Unknowns,
-        corrections: FloatArray,
-        budget: ErrorBudget,
-        sound_speed: float,
+        self, found: Crossing, unknowns: _Unknowns, corrections: FloatArray, budget: ErrorBudget
     ):
-        self.looks, self.g, self.unknowns, self.budget = looks, g, unknowns, budget
-        self.sound_speed = sound_speed
-        self.a = partials(looks.basis, g, sound_speed)
+        self.found, self.unknowns, self.budget = found, unknowns, budget
+        self.a, self.v, self.cell = found.partials, found.variance, found.cell
         self.J = self._jacobian()
-        rows = np.arange(len(looks))
-        self.in_cell = csr_array((np.ones(len(looks)), (cell, rows)), shape=(cells, len(looks)))
-        self.cell = cell
+        m = len(found.z)
+        shape = found.cells, m
+        self.in_cell = csr_array((np.ones(m), (self.cell, np.arange(m))), shape=shape)
         # As the sounding was reported: the prior holds the total, not what this round adds.
-        self.y = looks.heights(g) - (self.a * corrections[looks.line]).sum(axis=1)
-        self.now = looks.heights(g)
-        self.v = looks.variances(g)
+        self.y = found.z - (self.a * corrections[found.line]).sum(axis=1)
         self.w = 1.0 / self.v
 
     def _jacobian(self) -> csr_array:
-        known, line = self.unknowns, self.looks.line
+        known, line = self.unknowns, self.found.line
         survey = np.flatnonzero(known.owner < 0)
         m, k = len(line), len(survey)
         values = np.column_stack([self.a[:, known.kind[survey]], self.a[:, [3, 4, 0]]])
@@ -309,10 +382,6 @@ class _Equations:
         columns[:, k:] = k + 3 * line[:, None] + np.arange(3)
         pointers = np.arange(0, m * (k + 3) + 1, k + 3)
         return csr_array((values.ravel(), columns.ravel(), pointers), shape=(m, len(known.owner)))
-
-    def rms(self) -> float:
-        """Of looks about the weighted means of their cells, robust."""
-        return robust_rms(self._off_cell(self.now))
 
     def _off_cell(self, z: FloatArray) -> FloatArray:
         mean = (self.in_cell @ (self.w * z)) / (self.in_cell @ self.w)
@@ -336,8 +405,7 @@ class _Equations:
     def states(self, seconds: float) -> tuple[csr_array, FloatArray]:
         """Columns (m, S) of the speed of sound by depth, and of roll and heave in blocks of each
         line (0: without), and the prior information."""
-        depth = 2.0 * self.looks.basis[:, 8] - self.sound_speed * self.looks.basis[:, 1]
-        deeper = depth / np.median(depth) - 1.0
+        deeper = self.found.depth / np.median(self.found.depth) - 1.0
         columns = [csr_array((self.a[:, 4] * deeper)[:, None])]
         count = 0
         if seconds:
@@ -349,7 +417,7 @@ class _Equations:
         return hstack(columns).tocsr(), 1.0 / np.square(np.maximum(deviations, 1e-9))
 
     def _blocks(self, seconds: float) -> tuple[IntArray, int]:
-        key = self.looks.line * (1 << 40) + np.floor(self.looks.time / seconds).astype(np.int64)
+        key = self.found.line * (1 << 40) + np.floor(self.found.time / seconds).astype(np.int64)
         found, block = np.unique(key, return_inverse=True)
         return block, len(found)
 
@@ -419,8 +487,8 @@ class _Equations:
             (self.a[:, 1], b.attitude, short),
             (self.a[:, 3], b.heave, short),
             (self.a[:, 2], b.heading, long),
-            (self.g[:, 0], b.position, long),
-            (self.g[:, 1], b.position, long),
+            (self.found.g[:, 0], b.position, long),
+            (self.found.g[:, 1], b.position, long),
         ]
         total = np.zeros((size, size))
         sums = [csr_array((size, count)) for _, _, (_, count) in lasting]

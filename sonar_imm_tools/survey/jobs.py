@@ -155,7 +155,8 @@ def line_statistics(unit: Unit, corrections: FloatArray, cell: float, place: Pat
     if kept(place.with_suffix('.json')) == signature:
         return
     looks = looks_of(_load(unit.file).corrected(corrections), cell).numbered(unit.number)
-    _save(place, {k: v for k, v in asdict(looks, recurse=False).items() if k != 'cell'})
+    columns = asdict(looks, recurse=False, filter=lambda field, _: field.name != 'cell')
+    _save_table(place, columns)
     write_json(place.with_suffix('.json'), signature)
 
 
@@ -177,8 +178,7 @@ def tile_line(
         of_tile = np.minimum(of_tile, numbers[inverse.ravel()])
     order = np.argsort(of_tile, kind='stable')
     line, of_tile = line.chosen(order), of_tile[order]
-    with whole(place) as unfinished, unfinished.open('wb') as file:
-        np.save(file, _table(line))
+    _save_table(place, _columns(line))
     rows = {}
     for k in np.unique(of_tile[of_tile < len(tiles)]).tolist():
         rows[tiles[k].name] = tuple(np.searchsorted(of_tile, [k, k + 1]).tolist())
@@ -234,14 +234,24 @@ def make_tile(job: TileJob) -> None:
 # -- files below .work ---------------------------------------------------------------------------
 
 
-def _table(line: Line) -> np.ndarray:
-    """A line as a structured array."""
-    fields: list[Any] = [('stamp_ns', 'i8'), ('xy', 'f8', (2,)), ('z', 'f8')]
-    fields += [(k, kind, (2,)) if k == 'port' else (k, kind) for k, kind in _STORED.items()]
-    table = np.empty(len(line), fields)
-    for name, *_ in fields:
-        table[name] = getattr(line, name)
+def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Columns (n, ...) as one array of rows."""
+    fields: list[Any] = [(k, v.dtype, v.shape[1:]) for k, v in columns.items()]
+    table = np.empty(len(next(iter(columns.values()))), fields)
+    for name, values in columns.items():
+        table[name] = values
     return table
+
+
+def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    with whole(path) as unfinished, unfinished.open('wb') as file:
+        np.save(file, _table(columns))
+
+
+def _columns(line: Line) -> dict[str, np.ndarray]:
+    """The columns of a line as they are kept."""
+    columns = {name: getattr(line, name) for name in ('stamp_ns', 'xy', 'z')}
+    return columns | {k: getattr(line, k).astype(kind) for k, kind in _STORED.items()}
 
 
 def _line(table: np.ndarray, sound_speed: float) -> Line:
@@ -255,7 +265,7 @@ def _line(table: np.ndarray, sound_speed: float) -> Line:
 
 
 def _store(path: Path, line: Line) -> None:
-    _save(path, {'table': _table(line), 'sound_speed': line.sound_speed})
+    _save(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
 
 
 def _stat(path: Path) -> tuple[int, int]:
@@ -275,9 +285,19 @@ def _load(path: Path) -> Line:
         return _line(kept['table'], float(kept['sound_speed']))
 
 
-def kept_looks(path: Path, cell: float) -> Looks:
-    with np.load(path) as kept:
-        return Looks(cell, **{name: kept[name] for name in kept.files})
+class KeptLooks(Sequence[Looks]):
+    """The looks of lines, each read from its file when it is asked for."""
+
+    def __init__(self, places: Sequence[Path], cell: float):
+        self._places, self._cell = places, cell
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, k: Any) -> Any:
+        table = np.load(self._places[k])
+        columns = {name: np.ascontiguousarray(table[name]) for name in table.dtype.names}
+        return Looks(self._cell, **columns)
 
 
 def signed(*parts: Any) -> str:

@@ -21,7 +21,7 @@ common with itself is in the uncertainty, what lines differ by makes competing d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import math
 
 from attrs import define, Factory
@@ -148,16 +148,18 @@ class LiveChart:
 
     def table(self) -> dict[str, np.ndarray]:
         """All nodes by `COLUMNS`, sorted by tile, column and row."""
-        tiles = [self._nodes[key] for key in sorted(self._nodes)]
-
-        def whole(name: str) -> FloatArray:
-            return np.concatenate([getattr(nodes, name) for nodes in tiles] or [np.zeros(0)])
-
+        whole = _of([self._nodes[key] for key in sorted(self._nodes)])
         x, y = self.cell * (whole('ix') + 0.5), self.cell * (whole('iy') + 0.5)
         values = {'x': x, 'y': y, 'z': whole('z'), 'uncertainty': whole('sd'), 'px': x, 'py': y}
         for name in ('count', 'lines', 'hypotheses', 'competing_z', 'label'):
             values[name] = whole(name)
         return {name: values[name].astype(kind) for name, kind in COLUMNS.items()}
+
+    def floor(self, tiles: Iterable[tuple[int, int]]) -> tuple[FloatArray, FloatArray]:
+        """Places (n, 3) and variances (n,) of the nodes of some tiles, m and m^2."""
+        whole = _of([self._nodes[tile] for tile in tiles])
+        level = self.cell * (np.column_stack([whole('ix'), whole('iy')]) + 0.5)
+        return np.column_stack([level, whole('z')]), np.square(whole('sd'))
 
     def picture(self) -> tuple[int, int, IntArray]:
         """First column and row, and the cells (rows, columns) from 0, the deepest of them, to 100,
@@ -171,3 +173,8 @@ class LiveChart:
         span = max(float(np.ptp(z)), 1e-6)
         cells[iy - iy.min(), ix - ix.min()] = np.rint(100.0 * (z - z.min()) / span)
         return int(ix.min()), int(iy.min()), cells
+
+
+def _of(tiles: Sequence[Nodes]) -> Callable[[str], FloatArray]:
+    """What gives a field of all nodes of tiles."""
+    return lambda name: np.concatenate([getattr(nodes, name) for nodes in tiles] or [np.zeros(0)])

@@ -20,7 +20,8 @@ Statistics of looks are all that the adjustment needs of a line, some hundred by
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+import math
 
 from attrs import evolve, fields, frozen
 import numpy as np
@@ -39,6 +40,8 @@ SLOPE_STD = 0.5
 STEEPEST = 1.0
 FURTHEST = 3
 """Cells between which a look's heights are compared: pings may be further apart than cells."""
+LOOKS_AT_ONCE = 400_000
+"""About so many looks are in memory at once, whatever the survey."""
 
 
 @frozen(eq=False)
@@ -150,13 +153,52 @@ def joined(parts: Sequence[Looks]) -> Looks:
     return Looks(parts[0].cell, **{name: values[order] for name, values in whole.items()})
 
 
+def strips(lines: Sequence[Looks]) -> Iterator[tuple[Looks, BoolArray]]:
+    """The floor strip by strip along its longer side: the looks of all lines there, and which of
+    them are in the strip and not only near enough for the gradients in it. Each line is taken from
+    `lines` for each strip that it meets, so that a sequence may read them from files."""
+    ends = np.zeros((len(lines), 2, 2), np.int64)
+    sizes = np.zeros(len(lines), np.int64)
+    for k, looks in enumerate(lines):
+        sizes[k] = len(looks)
+        if len(looks):
+            ends[k] = [(each.min(), each.max() + 1) for each in (looks.ix, looks.iy)]
+    seen = np.flatnonzero(sizes)
+    if not len(seen):
+        return
+    low, high = ends[seen, :, 0].min(axis=0), ends[seen, :, 1].max(axis=0)
+    axis = int(np.argmax(high - low))
+    count = math.ceil(int(sizes.sum()) / LOOKS_AT_ONCE)
+    # Edges at equal shares of all looks, as if those of a line were evenly along it.
+    places = np.arange(low[axis], high[axis] + 1)
+    first, last = ends[seen, axis].T
+    per_cell = np.zeros(len(places))
+    density = sizes[seen] / (last - first)
+    np.add.at(per_cell, first - low[axis], density)
+    np.subtract.at(per_cell, last - low[axis], density)
+    total = np.concatenate([[0.0], np.cumsum(np.cumsum(per_cell))[:-1]])
+    inner = np.searchsorted(total, total[-1] * np.arange(1, count) / count)
+    edges = np.unique([low[axis], *places[inner].tolist(), high[axis]])
+    halo = FURTHEST + 1
+    for start, end in zip(edges[:-1].tolist(), edges[1:].tolist()):
+        near = seen[(first < end + halo) & (last > start - halo)]
+        parts = []
+        for k in near.tolist():
+            looks = lines[k]
+            where = (looks.ix, looks.iy)[axis]
+            parts.append(looks.chosen((where >= start - halo) & (where < end + halo)))
+        together = joined(parts)
+        where = (together.ix, together.iy)[axis]
+        yield together, (where >= start) & (where < end)
+
+
 def gradients(looks: Looks, ix: IntArray, iy: IntArray) -> FloatArray:
     """Gradients (k, 2) of the floor at cells ix, iy (k,), by least squares over 3 x 3 cells.
 
     Heights are compared within looks, and between a cell and the next one of one line's side only:
     an offset between lines makes no slope. Where little is known the gradient is near zero.
     """
-    if not len(looks):
+    if not len(looks) or not len(ix):
         return np.zeros((len(ix), 2))
     low = min(looks.ix.min(), ix.min()) - 1, min(looks.iy.min(), iy.min()) - 1
     rows = max(looks.iy.max(), iy.max()) - low[1] + 2

@@ -33,20 +33,20 @@ import numpy as np
 
 from sonar_imm import __version__
 from sonar_imm.acoustics.sounding import ErrorBudget
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..offline.jobs import Run
 from ..offline.run_folder import PARQUET, RUN, SOUNDINGS
 from ..recordings.export.points import TOPIC, topics_of_soundings
 from ..recordings.reader import BagReader
 from ..recordings.sources import BagError, is_recording
-from .adjustment import adjust, Adjustment, crossing, misties, robust_rms
+from .adjustment import adjust, Adjustment, Crossing, Mistie, misties
 from .chart import MOST_CELLS
 from .grid import HALO, Nodes
 from .jobs import (
     import_line,
     kept,
-    kept_looks,
+    KeptLooks,
     line_statistics,
     make_tile,
     Options,
@@ -59,7 +59,7 @@ from .jobs import (
     Unit,
 )
 from .line import budget_of
-from .looks import joined, Looks
+from .looks import Looks
 
 WORK, SURVEY = '.work', 'survey.json'
 _STATED = ('soundings', 'size', 'mtime_ns', 'sha256', 'bounds')
@@ -140,33 +140,62 @@ def epsg_of(sources: Sequence[Source], given: int) -> int:
 # -- which tiles there are ----------------------------------------------------------------------
 
 
-def plan_tiles(looks: Looks, resolution: float) -> list[Tile]:
+@frozen(eq=False)
+class _Depths:
+    """What cells of the statistics (m,) say of tiles: number of the cell, depth m, soundings."""
+
+    index: IntArray
+    depth: FloatArray
+    count: FloatArray
+
+    def chosen(self, rows: np.ndarray) -> _Depths:
+        return _Depths(self.index[rows], self.depth[rows], self.count[rows])
+
+    def wanted_cell(self, side: float) -> float:
+        """The cell that depths and soundings ask for, m; side: of the cells of the statistics."""
+        shoal = max(float(np.quantile(self.depth, 0.1)), 1e-6)
+        by_depth = 2.0 ** math.floor(math.log2(0.05 * shoal))
+        _, cell = np.unique(self.index, axis=0, return_inverse=True)
+        density = float(np.median(np.bincount(cell.ravel(), self.count))) / side**2
+        wanted = 0.5 * math.log2(LEAST_SOUNDINGS / (density * math.pi * 0.75**2))
+        by_count = 2.0 ** math.ceil(wanted)
+        return min(max(by_depth, by_count, FINEST), COARSEST)
+
+
+def plan_tiles(lines: Sequence[Looks], resolution: float) -> list[Tile]:
     """The tiles that hold soundings, sorted by cell, column and row; resolution 0: cells by depth.
 
     A tile, from 16 m cells on, is divided in four while the shoalest tenth of its depths asks for
     finer cells, a twentieth of the depth, and half of them would still hold five soundings.
     """
-    centre = looks.cell * (np.column_stack([looks.ix, looks.iy]) + 0.5)
+    indices, depths, counts = [], [], []
+    for looks in lines:
+        side = looks.cell
+        indices.append(np.column_stack([looks.ix, looks.iy]).astype(np.int32))
+        depths.append(-looks.z)
+        counts.append(looks.count)
+    every = _Depths(np.concatenate(indices), np.concatenate(depths), np.concatenate(counts))
     if resolution > 0.0:
         # A cell of the statistics may lie in several tiles; those without soundings fall away.
-        corners = 0.5 * looks.cell * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        places = (centre[:, None] + corners * (1.0 - 1e-9)).reshape(-1, 2)
+        corners = 0.5 + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.5 * (1.0 - 1e-9)
+        cells = np.unique(every.index, axis=0)
+        places = side * (cells[:, None] + corners).reshape(-1, 2)
         found = np.unique(np.floor(places / (resolution * TILE)).astype(np.int64), axis=0)
         return [Tile(cell=resolution, i=i, j=j) for i, j in found.tolist()]
     tiles: list[Tile] = []
 
-    def divide(rows: np.ndarray, cell: float) -> None:
-        index = np.floor(centre[rows] / (cell * TILE)).astype(np.int64)
+    def divide(part: _Depths, cell: float) -> None:
+        index = np.floor(side * (part.index + 0.5) / (cell * TILE)).astype(np.int64)
         found, inverse = np.unique(index, axis=0, return_inverse=True)
         for k, (i, j) in enumerate(found.tolist()):
-            inside = rows[inverse.ravel() == k]
-            finer = cell > FINEST and 0.5 * cell * TILE >= looks.cell
-            if finer and _wanted_cell(looks.chosen(inside)) < cell:
+            inside = part.chosen(inverse.ravel() == k)
+            finer = cell > FINEST and 0.5 * cell * TILE >= side
+            if finer and inside.wanted_cell(side) < cell:
                 divide(inside, 0.5 * cell)
             else:
                 tiles.append(Tile(cell=cell, i=i, j=j))
 
-    divide(np.arange(len(looks)), COARSEST)
+    divide(every, COARSEST)
     return sorted(tiles, key=lambda tile: (tile.cell, tile.i, tile.j))
 
 
@@ -184,16 +213,6 @@ def extent_of(tiles: Sequence[Tile]) -> tuple[float, float, float, int, int]:
             '--resolution'
         )
     return low[0], high[1], cell, rows, columns
-
-
-def _wanted_cell(looks: Looks) -> float:
-    """The cell that depths and soundings of some looks ask for, m."""
-    shoal = max(float(np.quantile(-looks.z, 0.1)), 1e-6)
-    by_depth = 2.0 ** math.floor(math.log2(0.05 * shoal))
-    _, cell = np.unique(np.column_stack([looks.ix, looks.iy]), axis=0, return_inverse=True)
-    density = float(np.median(np.bincount(cell.ravel(), looks.count))) / looks.cell**2
-    by_count = 2.0 ** math.ceil(0.5 * math.log2(LEAST_SOUNDINGS / (density * math.pi * 0.75**2)))
-    return min(max(by_depth, by_count, FINEST), COARSEST)
 
 
 # -- the survey ----------------------------------------------------------------------------------
@@ -220,8 +239,8 @@ class Survey:
     tiles: Mapping[Tile, Path]
     adjustment: Adjustment | None
     rms_before: float
-    before: Mapping[tuple[int, int], FloatArray]
-    after: Mapping[tuple[int, int], FloatArray]
+    before: Mapping[tuple[int, int], Mistie]
+    after: Mapping[tuple[int, int], Mistie]
     crossing_cells: int
     warnings: Sequence[str]
 
@@ -245,21 +264,18 @@ def make(
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
 
-    def statistics(corrections: FloatArray) -> list[Looks]:
-        places = [work / 'looks' / f'{unit.file.stem}.npz' for unit in units]
+    places = [work / 'looks' / f'{unit.file.stem}.npy' for unit in units]
+
+    def statistics(corrections: FloatArray) -> Sequence[Looks]:
         calls = [(unit, corrections[unit.number], cell, p) for unit, p in zip(units, places)]
         _all(run, line_statistics, calls, progress, 'statistics', units)
-        return [kept_looks(place, cell) for place in places]
+        return KeptLooks(places, cell)
 
     none = np.zeros((len(units), 6))
-    looks = joined(statistics(none))
-    before = {(a, b): d for a, b, d in misties(looks)}
-    shared, g, of_cell, cells = crossing(looks)
-    heights = shared.heights(g)
-    weight = 1.0 / shared.variances(g)
-    mean = np.bincount(of_cell, weight * heights, cells) / np.bincount(of_cell, weight, cells)
-    rms = robust_rms(heights - mean[of_cell]) if cells else 0.0
-    found, after = None, {}
+    looks = statistics(none)
+    before, cells = misties(looks)
+    found: Adjustment | None = None
+    after: dict[tuple[int, int], Mistie] = {}
     if options.adjusted:
         fixed = [unit.number for unit in units if unit.line in options.fixed]
         try:
@@ -273,8 +289,11 @@ def make(
         except ValueError as error:
             raise BagError(f'the lines cannot be adjusted: {error}') from None
         warnings += _warnings_of(found)
-        looks = joined(statistics(found.corrections))
-        after = {(a, b): d for a, b, d in misties(looks)}
+        looks = statistics(found.corrections)
+        after, _ = misties(looks)
+        rms = found.rms[0]
+    else:
+        rms = Crossing.of(looks).rms() if cells else 0.0
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)
     corrections = none if found is None else found.corrections
@@ -365,18 +384,21 @@ def _tiled(
     places = [work / 'soundings' / f'{unit.file.stem}.npy' for unit in units]
     calls = [(unit, corrections[unit.number], tiles, place) for unit, place in zip(units, places)]
     rows = _all(run, tile_line, calls, progress, 'sorting', units)
-    seen = set().union(*rows)
+    holders: dict[str, list[int]] = {}
+    for k, ranges in enumerate(rows):
+        for name in ranges:
+            holders.setdefault(name, []).append(k)
     near = _neighbours(tiles)
-    tiles = [tile for tile in tiles if tile.name in seen]
+    tiles = [tile for tile in tiles if tile.name in holders]
     # What is not known of the mean speed of a line is among the corrections then.
     own = budget if found is None else evolve(budget, sound_speed=0.0)
     jobs = []
     for tile in tiles:
-        parts = []
-        for unit, place, ranges in zip(units, places, rows):
-            if mine := [ranges[name] for name in near[tile.name] if name in ranges]:
-                parts.append((unit.number, place, mine))
-        numbers = [part[0] for part in parts]
+        names = near[tile.name]
+        numbers = sorted({k for name in names for k in holders.get(name, ())})
+        parts = [
+            (k, places[k], [rows[k][name] for name in names if name in rows[k]]) for k in numbers
+        ]
         covariance = None if found is None else found.of_lines(numbers)
         jobs.append(
             TileJob(

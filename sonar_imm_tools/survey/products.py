@@ -40,7 +40,7 @@ from sonar_imm.parameters import ConfigError
 from ..evaluation.plotting import add_points, COLOURS, styled
 from ..offline.run_folder import REPORT
 from ..recordings.sources import BagError
-from .adjustment import described, robust_rms
+from .adjustment import described, Mistie
 from .chart import BANDS, Chart, values_of, write_geotiff
 from .grid import Nodes
 from .jobs import Options, TILE, Tile, write_json
@@ -111,16 +111,16 @@ def _remove(out: Path) -> None:
 def write(survey: Survey, out: Path) -> dict[str, Any]:
     """Write all files; gives the content of survey.json, which is the last of them. Raises
     `BagError`."""
-    found = list(survey.nodes())
-    west, north, cell, rows, columns = extent_of([tile for tile, _ in found])
+    counts = {tile: len(nodes.z) for tile, nodes in survey.nodes()}
+    west, north, cell, rows, columns = extent_of(list(counts))
     bands = {name: np.full((rows, columns), np.nan, np.float32) for name in OF_A_SURVEY}
     auto = survey.options.resolution == 0.0
-    names_of_tiles = {f'{tile.name}.tif' for tile, _ in found}
+    names_of_tiles = {f'{tile.name}.tif' for tile in counts}
     for stale in sorted((out / TILES).glob('*.tif')):
         if stale.name not in names_of_tiles:
             stale.unlink()
     epsg = survey.epsg or None
-    for tile, nodes in found:
+    for tile, nodes in survey.nodes():
         own = _bands(tile, nodes)
         if auto:
             place = out / TILES / f'{tile.name}.tif'
@@ -137,7 +137,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
     chart = Chart(west, north, cell, bands)
     with whole(out / CHART) as unfinished:
         write_geotiff(unfinished, chart, epsg, OF_A_SURVEY)
-    _write_provenance(out / PROVENANCE, survey, found)
+    _write_provenance(out / PROVENANCE, survey)
     write_json(out / COVERAGE, _coverage(chart, survey.epsg))
     _write_crossings(out / CROSSINGS, survey)
     crossings = {
@@ -163,8 +163,8 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
         'crs': {'epsg': epsg},
         'lines': survey.lines,
         'tiles': [
-            {'name': tile.name, 'cell': tile.cell, 'i': tile.i, 'j': tile.j, 'nodes': len(nodes.z)}
-            for tile, nodes in found
+            {'name': tile.name, 'cell': tile.cell, 'i': tile.i, 'j': tile.j, 'nodes': count}
+            for tile, count in counts.items()
         ],
         'warnings': list(survey.warnings),
     }
@@ -183,7 +183,7 @@ def _bands(tile: Tile, nodes: Nodes) -> dict[str, FloatArray]:
     return bands
 
 
-def _write_provenance(path: Path, survey: Survey, found: list[tuple[Tile, Nodes]]) -> None:
+def _write_provenance(path: Path, survey: Survey) -> None:
     """One row for each line that a depth was made of."""
     import pyarrow
     import pyarrow.parquet
@@ -203,7 +203,7 @@ def _write_provenance(path: Path, survey: Survey, found: list[tuple[Tile, Nodes]
         whole(path) as unfinished,
         pyarrow.parquet.ParquetWriter(str(unfinished), schema) as writer,
     ):
-        for tile, nodes in found:
+        for tile, nodes in survey.nodes():
             node = nodes.seen_node
             columns = [
                 (nodes.ix[node] + 0.5) * tile.cell,
@@ -240,19 +240,18 @@ def _write_crossings(path: Path, survey: Survey) -> None:
     """One row for each pair of lines that share cells, first less second, in m."""
     names = [unit.name for unit in survey.units]
 
-    def summary(found: Mapping[tuple[int, int], FloatArray], pair: tuple[int, int]) -> list[str]:
-        if pair not in found:
-            return ['', '']
-        return [f'{float(np.median(found[pair])):.4f}', f'{robust_rms(found[pair]):.4f}']
+    def summary(of_pair: Mistie | None) -> list[str]:
+        return [f'{of_pair.median:.4f}', f'{of_pair.rms:.4f}'] if of_pair else ['', '']
 
     with whole(path) as unfinished, unfinished.open('w', encoding='utf-8', newline='') as file:
         writer = csv.writer(file, lineterminator='\n')
         kinds = ('median_before', 'rms_before', 'median_after', 'rms_after')
         writer.writerow(['line_a', 'line_b', 'cells', *kinds])
         for pair in sorted({*survey.before, *survey.after}):
-            apart = survey.after.get(pair, survey.before.get(pair, np.zeros(0)))
-            row = [*summary(survey.before, pair), *summary(survey.after, pair)]
-            writer.writerow([names[pair[0]], names[pair[1]], len(apart), *row])
+            before, after = survey.before.get(pair), survey.after.get(pair)
+            cells = (after or before or Mistie(0, math.nan, math.nan)).cells
+            row = [*summary(before), *summary(after)]
+            writer.writerow([names[pair[0]], names[pair[1]], cells, *row])
 
 
 # -- the page of a survey: chart, uncertainty, what competes, misties, what could not be told -----
@@ -348,7 +347,7 @@ def misties_figure(survey: Survey) -> go.Figure:
         ('after', survey.after, COLOURS[0]),
     ):
         there = [k for k, pair in enumerate(pairs) if pair in found]
-        values = [robust_rms(found[pairs[k]]) for k in there]
+        values = [found[pairs[k]].rms for k in there]
         if there:
             add_points(figure, there, values, name, colour, 6)
     return styled(

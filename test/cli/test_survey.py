@@ -30,7 +30,6 @@ from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.survey import jobs, making
-from sonar_imm_tools.survey.looks import joined
 from sonar_imm_tools.survey.making import plan_tiles
 
 rasterio = pytest.importorskip('rasterio')
@@ -91,6 +90,24 @@ def test_the_chart_lies_on_the_true_floor(lines, made):
     assert np.mean(np.abs(error) < 2.0 * bands['uncertainty'][rows, columns]) > 0.93
     # Fish stay visible as what competes.
     assert np.nanmax(bands['hypotheses']) >= 2 and np.nanmax(bands['lines']) == 4
+
+
+def test_export_of_one_run_is_the_same_grid(lines, tmp_path):
+    """Node by node, also across the seams of tiles; a survey keeps what it reads in float32."""
+    runs = tmp_path / 'runs'
+    shutil.copytree(lines / 'line_001', runs / 'line_001')
+    record = {'system': 'bathymetry', 'bag': 'a.bag', 'topics': {}, 'parameters': {}}
+    (runs / 'line_001' / 'run.json').write_text(json.dumps(record))
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 1) == 0
+    assert run('export', runs / 'line_001', tmp_path / 'one.tif', '--cell', 1) == 0
+    survey, there, _ = read(tmp_path / 'out' / 'survey.tif')
+    one, here, _ = read(tmp_path / 'one.tif')
+    top, left = round(there.f - here.f), round(here.c - there.c)
+    rows, columns = one['depth'].shape
+    for name in ('depth', 'uncertainty', 'count', 'hypotheses', 'competing_depth'):
+        whole = survey[name][top : top + rows, left : left + columns]
+        assert np.isfinite(one[name]).sum() > 30, name
+        assert one[name] == pytest.approx(whole, abs=1e-4, nan_ok=True), name
 
 
 def test_tiles_are_the_chart(made):
@@ -401,11 +418,11 @@ def test_cells_follow_depth():
 
     from sonar_imm_tools.survey.looks import looks_of
 
-    looks = joined([looks_of(line, 2.0) for line in vectors.lines(vectors.scene())])
+    looks = [looks_of(line, 2.0) for line in vectors.lines(vectors.scene())]
     assert {tile.cell for tile in plan_tiles(looks, 0.0)} <= {0.5, 1.0, 2.0}
     from attrs import evolve
 
-    deep = evolve(looks, z=10.0 * looks.z)
+    deep = [evolve(each, z=10.0 * each.z) for each in looks]
     assert min(tile.cell for tile in plan_tiles(deep, 0.0)) >= 4.0
     covered = {(tile.cell, tile.i, tile.j) for tile in plan_tiles(looks, 0.0)}
     assert len(covered) == len(plan_tiles(looks, 0.0))

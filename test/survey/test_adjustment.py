@@ -21,9 +21,17 @@ import pytest
 
 from sonar_imm_tools.simulation.survey import budget
 from sonar_imm_tools.survey import adjustment as module
-from sonar_imm_tools.survey.adjustment import adjust, described, misties, Priors, robust_rms
+from sonar_imm_tools.survey import looks as looks_module
+from sonar_imm_tools.survey.adjustment import (
+    adjust,
+    Crossing,
+    described,
+    misties,
+    Priors,
+    robust_rms,
+)
 from sonar_imm_tools.survey.line import BASIS
-from sonar_imm_tools.survey.looks import joined, Looks, looks_of
+from sonar_imm_tools.survey.looks import joined, Looks, looks_of, strips
 
 BUDGET = budget()
 
@@ -204,10 +212,42 @@ def test_lines_that_do_not_overlap():
 
 
 def test_misties_are_differences_of_lines():
-    pairs = {(a, b): d for a, b, d in misties(joined(small()))}
-    assert set(pairs) == {(0, 1), (0, 2), (1, 2)}
-    assert np.median(pairs[0, 2]) == pytest.approx(-0.4, abs=0.2)
+    pairs, cells = misties(small())
+    assert set(pairs) == {(0, 1), (0, 2), (1, 2)} and cells == 60
+    assert pairs[0, 2].median == pytest.approx(-0.4, abs=0.2) and pairs[0, 2].cells == 60
     assert robust_rms(np.array([-1.0, 1.0, 1.0])) == pytest.approx(1.4826)
+
+
+@pytest.fixture(scope='module')
+def of_the_vectors():
+    lines = vectors.lines(vectors.scene())
+    return [looks_of(line, 2.0).numbered(k) for k, line in enumerate(lines)]
+
+
+def test_strips_of_the_floor_are_the_floor(of_the_vectors, monkeypatch):
+    """What a survey needs at once does not grow with it, and no bit on where strips end."""
+    whole, pairs = Crossing.of(of_the_vectors), misties(of_the_vectors)
+    monkeypatch.setattr(looks_module, 'LOOKS_AT_ONCE', 6000)
+    most = [len(looks) for looks, _ in strips(of_the_vectors)]
+    assert len(most) == 4 and max(most) < 10_000
+    parts = Crossing.of(of_the_vectors)
+    assert parts.cells == whole.cells and misties(of_the_vectors) == pairs
+    for name in ('z', 'variance', 'g', 'partials', 'depth'):
+        here, there = (
+            getattr(each, name)[np.lexsort((each.z, each.time, each.line))]
+            for each in (parts, whole)
+        )
+        assert np.array_equal(here, there), name
+
+
+def test_a_part_of_the_cells_tells_the_same(of_the_vectors, monkeypatch):
+    """Equations of more looks than are wanted are those of every fourth cell."""
+    whole = Crossing.of(of_the_vectors)
+    monkeypatch.setattr(module, 'MOST_LOOKS', len(whole.z) // 3)
+    part = Crossing.of(of_the_vectors)
+    assert len(part.z) < 0.3 * len(whole.z) and part.cells == -(-whole.cells // 4)
+    assert np.array_equal(np.unique(part.cell), np.arange(part.cells))
+    assert part.rms() == pytest.approx(whole.rms(), rel=0.05)
 
 
 @pytest.mark.parametrize('states', [True, False])

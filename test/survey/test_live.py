@@ -17,7 +17,11 @@
 import numpy as np
 import pytest
 
+from msg_adapters.soundings import read_ground, write_ground
+from sonar_imm.measurements import Ground
+from sonar_imm.trackers.obstacle.ground import GroundMap
 from sonar_imm_tools.recordings.export.points import Points
+from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.simulation.survey import budget, scenario, simulate
 from sonar_imm_tools.survey.grid import grid_of_looks, Soundings
 from sonar_imm_tools.survey.line import joined_lines, line_of
@@ -105,6 +109,32 @@ def test_a_turn_or_a_silence_begins_another_line(scene, turned, silent, lines):
     chart = LiveChart(2.0, BUDGET)
     fed(chart, [first, Points(first.stamp_ns + later, columns)])
     assert chart.lines == lines
+
+
+def test_what_changed_is_the_ground_of_the_obstacle_node(scene):
+    """All that was published by and by is the newest chart, exact, with its variances."""
+    chart = LiveChart(1.0, BUDGET)
+    newest = {}
+    for points in scene.points:
+        for stamp, columns in pings(points):
+            chart.add(stamp, columns)
+        position, variance = chart.floor(sorted(set(chart.remade())))
+        stamp = int(points.stamp_ns.max())
+        ground = Ground(stamp_ns=stamp, position=position, variance=variance)
+        read = read_ground(write_ground(ground, ros_message))
+        assert np.array_equal(read.position, ground.position)
+        newest |= {
+            (x, y): (z, v) for (x, y, z), v in zip(read.position.tolist(), read.variance.tolist())
+        }
+    table = chart.table()
+    assert set(newest) == set(zip(table['px'].tolist(), table['py'].tolist()))
+    z, variance = np.array([newest[place] for place in zip(table['px'], table['py'])]).T
+    assert z == pytest.approx(table['z'], abs=1e-5)
+    assert variance == pytest.approx(np.square(table['uncertainty']), rel=1e-4)
+    floor = GroundMap().added(ground)
+    off = [floor.floor(x, y, 1.0)[0] - z for x, y, z in ground.position[::50].tolist()]
+    assert np.median(np.abs(off)) < 0.1
+    assert len(chart.floor([])[0]) == 0
 
 
 def test_nothing_is_an_empty_chart():

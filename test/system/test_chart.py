@@ -25,6 +25,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from nav_msgs.msg import OccupancyGrid  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 
@@ -33,7 +34,7 @@ from msg_adapters.table import decode_table  # noqa: E402
 from sonar_imm.nodes.messages import make  # noqa: E402
 from sonar_imm.nodes.qos import latched_qos, output_qos  # noqa: E402
 from sonar_imm.soundings import COLUMNS, Soundings  # noqa: E402
-from sonar_imm_tools.replay.harness import reserved_domain_id  # noqa: E402
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id  # noqa: E402
 from sonar_imm_tools.replay.link import Link  # noqa: E402
 from sonar_imm_tools.simulation.survey import scenario, simulate  # noqa: E402
 
@@ -59,19 +60,41 @@ def started(domain, *arguments):
     )
 
 
+def grounds(statuses):
+    """How many messages the obstacle node has taken as ground, by its newest diagnostics; 0 where
+    it refused one."""
+    values = {pair.key: pair.value for each in statuses[-1:] for pair in each.status[0].values}
+    refused = any(key.startswith(('refused', 'incompatible')) for key in values)
+    return 0 if refused else int(values.get('ground received', 0))
+
+
 def test_a_chart_grows_with_the_lines(monkeypatch):
+    """Lines of a node go to the chart, and what changed of it to the obstacle node."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     small = {'lines': 2, 'cross_lines': 0, 'length': 40.0, 'spacing': 30.0, 'ghost': False}
     scene = simulate(scenario('survey', small), 1)
     grids, clouds = [], []
-    with reserved_domain_id() as domain, Link('sea', domain_id=domain) as link:
+    with (
+        reserved_domain_id() as domain,
+        Link('sea', domain_id=domain) as link,
+        NodeProcess(
+            'obstacle', domain_id=domain, arguments=('-r', 'ground:=/sonar_imm_chart/ground')
+        ) as obstacle,
+    ):
         publisher = link.node.create_publisher(PointCloud2, '/bathymetry/soundings', output_qos())
         link.node.create_subscription(
             OccupancyGrid, '/sonar_imm_chart/grid', grids.append, latched_qos()
         )
-        it = started(domain, '--period', '0.3', '--timeout', '90')
+        statuses = []
+        link.node.create_subscription(DiagnosticArray, '/diagnostics', statuses.append, 10)
+        it = started(domain, '--period', '0.3', '--timeout', '180')
         try:
-            assert link.wait_for(publisher.get_subscription_count, 60.0)
+            assert link.wait_for(publisher.get_subscription_count, 120.0)
+            assert link.wait_for(
+                lambda: link.node.count_subscribers('/sonar_imm_chart/ground'),
+                90.0,
+                obstacle.trouble,
+            )
             for points, least in zip(scene.points, (1, 2)):
                 for message in messages(points):
                     publisher.publish(message)
@@ -79,6 +102,7 @@ def test_a_chart_grows_with_the_lines(monkeypatch):
                 before = len(grids)
                 assert link.wait_for(lambda: len(grids) > before, 60.0), least  # noqa: B023
             link.wait_for(lambda: False, 2.0)  # what is under way
+            assert link.wait_for(lambda: grounds(statuses) > 0, 60.0, obstacle.trouble)
             # Who comes later gets the newest chart.
             link.node.create_subscription(
                 PointCloud2, '/sonar_imm_chart/nodes', clouds.append, latched_qos()
