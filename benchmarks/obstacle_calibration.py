@@ -16,8 +16,8 @@
 
     python -m benchmarks.obstacle_calibration --out docs/results/obstacle_calibration.json
 
-All runs are of the whole tracker, with `misses: ignored` and with `misses: evidence`, and else
-with its defaults, of which `--tracker name=value` replaces some.
+All runs are of the whole tracker, with its defaults, of which `--tracker name=value` replaces
+some. `misses` changes what is published and not the filter (`looks`), so one run shows both.
 
 `forecasts` compares stated probabilities of a collision with what happened, when the range first
 falls to 60, 45, 30, 20 and 10 m, by five bins: `runs` of a fixed, a swaying and a moving obstacle
@@ -39,12 +39,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
-from benchmarks.obstacle_accuracy import config_of, LEVER, nearest, parsed, track
+from benchmarks.obstacle_accuracy import config_of, LEVER, nearest, parsed
 from benchmarks.obstacle_sea import first_at
 from benchmarks.study import Parts, rms, study, truths
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, MISSES, ObstacleConfig
+from sonar_imm.trackers.obstacle.state import PingState
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools import SECOND
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 ALTITUDES = (6.0, 25.0)
@@ -64,6 +70,33 @@ DEEPEST = 0.2
 """m above the sea floor: no obstacle lies lower."""
 
 
+Found = dict[str, dict[int, Estimate]]
+"""The last estimate of every ping, by stamp, for each way to take misses."""
+
+
+class _Both(ObstacleTracker):
+    """Publishes what each way to take misses would."""
+
+    def __init__(self, config: ObstacleConfig):
+        super().__init__(evolve(config, misses='evidence'))
+        self.ignoring = ObstacleTracker(evolve(config, misses='ignored'))
+        self.found: Found = {misses: {} for misses in MISSES}
+
+    def _estimate(self, ping: PingState) -> Estimate:
+        evidence = super()._estimate(ping)
+        self.found['ignored'][ping.stamp_ns] = self.ignoring._estimate(ping)
+        self.found['evidence'][ping.stamp_ns] = evidence
+        return evidence
+
+
+def track(scene: Scene, config: ObstacleConfig, until_ns: int) -> Found:
+    tracker = _Both(config)
+    for item in scene.measurements:
+        if item.received_ns <= until_ns:
+            tracker.process(item.measurement)
+    return tracker.found
+
+
 def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
     """Whether the obstacle is ever within the radius and the half height at once from a ping on;
     what the scene does not reach has passed."""
@@ -76,7 +109,7 @@ def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[
     """Tables of a case of `DRAWN`: what was stated and what happened, and Brier scores."""
     reach, altitudes = DRAWN[name]
     config = ObstacleConfig(**values)
-    found: list[tuple[float, float, float]] = []
+    found: dict[str, list[tuple[float, float, float]]] = {misses: [] for misses in MISSES}
     asked, block = 0, 0
     for kind in KINDS:
         for altitude in altitudes:
@@ -92,13 +125,23 @@ def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[
                 if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
                     continue
                 done += 1
-                final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
-                for at in AT:
-                    asked += 1
-                    seen = first_at(truth, final, at)
-                    if seen is not None and np.isfinite(seen[1]['collision_probability']):
+                asked += len(AT)
+                # Ten pings after the last of the forecasts nothing is looked at any more.
+                last = [*np.flatnonzero(truth.range <= min(AT))[:1], len(truth.range)][0]
+                until_ns = int(truth.stamp_ns[min(last + 10, len(truth.range) - 1)])
+                every = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values), until_ns)
+                for misses, final in every.items():
+                    for at in AT:
+                        seen = first_at(truth, final, at)
+                        if seen is None or not np.isfinite(seen[1]['collision_probability']):
+                            continue
                         ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                        found.append((at, seen[1]['collision_probability'], float(ends)))
+                        found[misses].append((at, seen[1]['collision_probability'], float(ends)))
+    return {misses: {name: _calibration(rows, asked)} for misses, rows in found.items()}
+
+
+def _calibration(found: list[tuple[float, float, float]], asked: int) -> dict[str, Any]:
+    """Of forecasts: at which range, stated probability, and whether it happened."""
     ranges, p, hit = (np.array(column) for column in zip(*found))
     reliability: dict[str, dict[str, float]] = {}
     for low, high in zip(BINS, BINS[1:]):
@@ -125,14 +168,26 @@ def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[
 
 def band(
     offset: float, altitude: float, approaches: int, first: int, values: dict[str, Any]
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """How much of the last 35 m the 90 % band holds, of obstacles at one offset."""
     setting = scenario('approach', {**LEVER, 'vertical_offset': offset, 'altitude': altitude})
-    held, widths, errors, followed, pings = [], [], [], 0, 0
+    runs: dict[str, list[tuple[TrueObstacle, dict[int, Estimate]]]] = {m: [] for m in MISSES}
     for seed in range(first, first + approaches):
         scene = simulate(setting, seed)
         truth = truths(scene, TrueObstacle)[0]
-        final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+        config = config_of(setting, behaviours=BEHAVIOURS, **values)
+        for misses, final in track(scene, config, int(truth.stamp_ns[-1]) + SECOND).items():
+            runs[misses].append((truth, final))
+    where = f'{altitude:g} m', f'{offset:g} m'
+    return {
+        misses: {'band': {where[0]: {where[1]: _held(tracked)}}}
+        for misses, tracked in runs.items()
+    }
+
+
+def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, float]:
+    held, widths, errors, followed, pings = [], [], [], 0, 0
+    for truth, final in runs:
         inside = []
         for ping in np.flatnonzero(truth.range <= LAST).tolist():
             pings += 1
@@ -165,17 +220,15 @@ def main(
     tracker: Sequence[str] = (),
 ) -> Parts:
     yield {'runs': runs, 'approaches': approaches, 'first': first}
-    for misses in MISSES:
-        values = {**dict(map(parsed, tracker)), 'misses': misses}
-        for name in cases:
-            if name != 'band':
-                yield {misses: {name: forecasts(name, runs, first, values)}}
-                continue
-            for altitude in ALTITUDES:
-                for offset in OFFSETS:
-                    if offset <= altitude - 0.3 - DEEPEST:
-                        row = band(offset, altitude, approaches, first, values)
-                        yield {misses: {'band': {f'{altitude:g} m': {f'{offset:g} m': row}}}}
+    values = dict(map(parsed, tracker))
+    for name in cases:
+        if name != 'band':
+            yield forecasts(name, runs, first, values)
+            continue
+        for altitude in ALTITUDES:
+            for offset in OFFSETS:
+                if offset <= altitude - 0.3 - DEEPEST:
+                    yield band(offset, altitude, approaches, first, values)
 
 
 if __name__ == '__main__':

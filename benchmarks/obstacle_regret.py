@@ -94,9 +94,9 @@ def case(
 def main(
     runs: int = 40,
     first: int = 9000,
-    sways: Sequence[float] = (0.5, 0.7),
+    sways: Sequence[float] = (0.5,),
     cases: Sequence[str] = tuple(CASES),
-    jobs: int = 2,
+    jobs: int = 1,
 ) -> Parts:
     yield {'runs': runs, 'first': first}
     numbers = partial(case, runs=runs, first=first, sways=sways)

@@ -29,8 +29,9 @@ Z weighs the component, and its derivatives give mean and covariance of what is 
 
 Used is the last echo and the misses since: where it was seen then, and is not now. The next echo
 shows that it was in the beam all the time, and only faint; so the filter goes on without all this,
-and what is published is a copy. A beam that is higher than stated therefore harms no track. Nor does the life of a track depend on it: misses that put an obstacle
-out of the beam would excuse themselves.
+and what is published is a copy. A beam that is higher than stated therefore harms no track. Nor
+does the life of a track depend on it: misses that put an obstacle out of the beam would excuse
+themselves.
 
 p is learned when an echo comes, from how many misses it ends. So misses of what always gave an
 echo say a lot, and those of what flickers little. Where exactly a beam ends is not known: its
