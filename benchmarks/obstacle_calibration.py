@@ -19,19 +19,20 @@
 All runs are of the whole tracker, with its defaults, of which `--tracker name=value` replaces
 some. `misses` changes what is published and not the filter (`looks`), so one run shows both.
 
+Each scene has `OBSTACLES` one behind the other, for as many runs from a third of the time.
+
 `forecasts` compares stated probabilities of a collision with what happened, when the range first
-falls to 60, 45, 30, 20 and 10 m, by five bins: `runs` of a fixed, a swaying and a moving obstacle
+falls to 60, 45, 30, 20 and 10 m, by five bins: fixed, swaying and moving obstacles in `scenes`
 each, per altitude of the vehicle. `within 8 m` draws the vertical offset evenly over 8 m to both
-sides, at altitudes of 6 and 25 m (what would lie in the sea floor is drawn again, by the next
-seed); `over the beam` over what the beam shows at the first ping, and `near the sonar` within 5 m,
-both at 15 m. `error` is the binomial standard error of what happened; forecasts of a run are not
-independent, so that it is rather larger. `lost` is the share of the ranges at which the obstacle
-is not followed: no forecast. `guess` is the Brier score of who knows nothing but how often it
-happens.
+sides, at altitudes of 6 and 25 m (what would lie in the sea floor does not count); `over the beam`
+over what the beam shows 90 m ahead, and `near the sonar` within 5 m, both at 15 m. `error` is the
+binomial standard error of what happened; forecasts of an obstacle are not independent, so that it
+is rather larger. `lost` is the share of the ranges at which the obstacle is not followed: no
+forecast. `guess` is the Brier score of who knows nothing but how often it happens.
 
 `band` is the share of the pings of the last 35 m of range in which the 90 % band of the vertical
-offset holds the truth, over `approaches` fixed obstacles per offset; `worst` that of the tenth of
-the approaches in which it holds least, `width` its mean width.
+offset holds the truth, over the fixed obstacles of `approaches` scenes per offset; `worst` that of
+the tenth of the obstacles of which it holds least, `width` its mean width.
 """
 
 from __future__ import annotations
@@ -50,7 +51,6 @@ from sonar_imm.trackers.obstacle.config import BEHAVIOURS, MISSES, ObstacleConfi
 from sonar_imm.trackers.obstacle.state import PingState
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
-from sonar_imm_tools import SECOND
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 ALTITUDES = (6.0, 25.0)
@@ -64,6 +64,8 @@ AT = (60.0, 45.0, 30.0, 20.0, 10.0)
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 KINDS = ('approach', 'swaying', 'mover')
 OFFSETS = (-8.0, -6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0, 8.0)
+OBSTACLES, SPACING = 4, 12.0
+"""In a scene, and m from one to the next."""
 LAST = 35.0
 """m of range over which the band is judged."""
 DEEPEST = 0.2
@@ -89,12 +91,17 @@ class _Both(ObstacleTracker):
         return evidence
 
 
-def track(scene: Scene, config: ObstacleConfig, until_ns: int) -> Found:
+def track(scene: Scene, config: ObstacleConfig) -> Found:
     tracker = _Both(config)
     for item in scene.measurements:
-        if item.received_ns <= until_ns:
-            tracker.process(item.measurement)
+        tracker.process(item.measurement)
     return tracker.found
+
+
+def several(last_range: float) -> dict[str, Any]:
+    """What is other in a scene of several obstacles, of which the last comes as near."""
+    reached = last_range - SPACING * (OBSTACLES - 1)
+    return {**LEVER, 'obstacles': OBSTACLES, 'spacing': SPACING, 'last_range': reached}
 
 
 def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
@@ -105,7 +112,7 @@ def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bo
     return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
 
 
-def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
+def forecasts(name: str, scenes: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
     """Tables of a case of `DRAWN`: what was stated and what happened, and Brier scores."""
     reach, altitudes = DRAWN[name]
     config = ObstacleConfig(**values)
@@ -113,35 +120,37 @@ def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[
     asked, block = 0, 0
     for kind in KINDS:
         for altitude in altitudes:
-            changes = {'vertical_offset': 0.0, 'offset_spread': reach, 'last_range': -30.0}
-            setting = scenario(kind, {**LEVER, **changes, 'altitude': altitude})
+            drawn = {'vertical_offset': 0.0, 'offset_spread': reach, 'altitude': altitude}
+            setting = scenario(kind, {**several(-10.0), **drawn})
             # Seeds of their own: those of other kinds have the same geometry.
-            seed, done = first + 10000 * block, 0
-            block += 1
-            while done < runs:
+            for seed in range(first + 10000 * block, first + 10000 * block + scenes):
                 scene = simulate(setting, seed)
-                seed += 1
-                truth = truths(scene, TrueObstacle)[0]
-                if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
-                    continue
-                done += 1
-                asked += len(AT)
-                # Ten pings after the last of the forecasts nothing is looked at any more.
-                last = [*np.flatnonzero(truth.range <= min(AT))[:1], len(truth.range)][0]
-                until_ns = int(truth.stamp_ns[min(last + 10, len(truth.range) - 1)])
-                every = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values), until_ns)
-                for misses, final in every.items():
-                    for at in AT:
-                        seen = first_at(truth, final, at)
-                        if seen is None or not np.isfinite(seen[1]['collision_probability']):
-                            continue
-                        ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                        found[misses].append((at, seen[1]['collision_probability'], float(ends)))
+                every = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+                for truth in truths(scene, TrueObstacle):
+                    if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
+                        continue
+                    asked += len(AT)
+                    for misses, final in every.items():
+                        found[misses] += _stated(truth, final, config)
+            block += 1
     return {misses: {name: _calibration(rows, asked)} for misses, rows in found.items()}
 
 
+def _stated(
+    truth: TrueObstacle, final: dict[int, Estimate], config: ObstacleConfig
+) -> list[tuple[float, float, float]]:
+    """The forecasts of an obstacle: range, probability, and whether it happened."""
+    rows = []
+    for at in AT:
+        seen = first_at(truth, final, at)
+        if seen is not None and np.isfinite(seen[1]['collision_probability']):
+            ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
+            rows.append((at, seen[1]['collision_probability'], float(ends)))
+    return rows
+
+
 def _calibration(found: list[tuple[float, float, float]], asked: int) -> dict[str, Any]:
-    """Of forecasts: at which range, stated probability, and whether it happened."""
+    """What became of forecasts (`_stated`)."""
     ranges, p, hit = (np.array(column) for column in zip(*found))
     reliability: dict[str, dict[str, float]] = {}
     for low, high in zip(BINS, BINS[1:]):
@@ -170,14 +179,14 @@ def band(
     offset: float, altitude: float, approaches: int, first: int, values: dict[str, Any]
 ) -> dict[str, Any]:
     """How much of the last 35 m the 90 % band holds, of obstacles at one offset."""
-    setting = scenario('approach', {**LEVER, 'vertical_offset': offset, 'altitude': altitude})
+    changes = {'vertical_offset': offset, 'altitude': altitude}
+    setting = scenario('approach', {**several(6.0), **changes})
     runs: dict[str, list[tuple[TrueObstacle, dict[int, Estimate]]]] = {m: [] for m in MISSES}
     for seed in range(first, first + approaches):
         scene = simulate(setting, seed)
-        truth = truths(scene, TrueObstacle)[0]
         config = config_of(setting, behaviours=BEHAVIOURS, **values)
-        for misses, final in track(scene, config, int(truth.stamp_ns[-1]) + SECOND).items():
-            runs[misses].append((truth, final))
+        for misses, final in track(scene, config).items():
+            runs[misses] += [(truth, final) for truth in truths(scene, TrueObstacle)]
     where = f'{altitude:g} m', f'{offset:g} m'
     return {
         misses: {'band': {where[0]: {where[1]: _held(tracked)}}}
@@ -213,17 +222,17 @@ def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, flo
 
 
 def main(
-    runs: int = 90,
-    approaches: int = 40,
-    first: int = 1000,
-    cases: Sequence[str] = (*DRAWN, 'band'),
+    scenes: int = 27,
+    approaches: int = 10,
+    first: int = 300000,
+    cases: Sequence[str] = ('within 8 m', 'band', 'near the sonar', 'over the beam'),
     tracker: Sequence[str] = (),
 ) -> Parts:
-    yield {'runs': runs, 'approaches': approaches, 'first': first}
+    yield {'obstacles': OBSTACLES * scenes, 'approaches': OBSTACLES * approaches, 'first': first}
     values = dict(map(parsed, tracker))
     for name in cases:
         if name != 'band':
-            yield forecasts(name, runs, first, values)
+            yield forecasts(name, scenes, first, values)
             continue
         for altitude in ALTITUDES:
             for offset in OFFSETS:
