@@ -64,7 +64,7 @@ AT = (60.0, 45.0, 30.0, 20.0, 10.0)
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 KINDS = ('approach', 'swaying', 'mover')
 OFFSETS = (-8.0, -6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0, 8.0)
-OBSTACLES, SPACING = 4, 12.0
+OBSTACLES, SPACING = 8, 8.0
 """In a scene, and m from one to the next."""
 LAST = 35.0
 """m of range over which the band is judged."""
@@ -222,8 +222,8 @@ def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, flo
 
 
 def main(
-    scenes: int = 27,
-    approaches: int = 10,
+    scenes: int = 14,
+    approaches: int = 5,
     first: int = 300000,
     cases: Sequence[str] = ('within 8 m', 'band', 'near the sonar', 'over the beam'),
     tracker: Sequence[str] = (),

@@ -88,8 +88,8 @@ def mix(
 
     prior (C,): see `Motion`. The M components of a slice interact by transition (M, M), ``[i, j]``
     the probability of j after i. States that all have are mixed. A displacement is no velocity: to
-    e, a behaviour brings its own, any other its prior, uncorrelated. Slices below the weight
-    `floor` are dropped.
+    e, a behaviour brings its own, any other its prior, uncorrelated. Slices and components below
+    the weight `floor` are dropped.
     """
     T, C, n = x.shape
     M = len(transition)
@@ -118,6 +118,9 @@ def mix(
                 for i in range(M):
                     share[i] = mu[t, first + i] * transition[i, a]
                     total += share[i]
+                if total < floor:
+                    mu1[t, j] = 0.0
+                    continue
                 mu1[t, j] = total
                 for b in range(size):
                     x1[t, j, b] = 0.0

@@ -49,7 +49,7 @@ WIDER, WIDE_SHARE = 2.0, 0.1
 mooring lets go: one that swings twice as far as believed is outside of the 90 % band in a third of
 all cases. Echoes soon tell the two apart, so the share hardly matters."""
 DROPPED = 1e-5
-"""A slice that weighs less takes no further part."""
+"""A slice that weighs less takes no further part, and a behaviour in one not in this ping."""
 OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
 """1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
 density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which

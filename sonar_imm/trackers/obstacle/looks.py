@@ -96,14 +96,14 @@ class Looks(NamedTuple):
     ) -> Looks:
         """With one more ping, which had an echo of the tracks where `hit` (T,); last: the sonar in
         the ping before."""
-        # What shows an echo begins anew: those of the ping before too, where this one has none.
-        shown = mixture.replaced(silent := np.flatnonzero(self.silent), self.shown.rows(silent))
-        for which, then in ((hit, sonar), (~hit & ~self.silent, last)):
-            if len(rows := np.flatnonzero(which)):
-                shown = shown.replaced(rows, filter_.seen(mixture.rows(rows), sonar, then))
+        silent, fresh = np.flatnonzero(~hit), np.flatnonzero(~hit & ~self.silent)
+        shown = filter_.seen(mixture, sonar, sonar)
+        if len(silent):
+            shown = shown.replaced(silent, self.shown.rows(silent))
+        if len(fresh):
+            shown = shown.replaced(fresh, filter_.seen(mixture.rows(fresh), sonar, last))
         due = np.where(hit, self.due + 1.0 + self.missed, self.due)
         missed = np.where(hit, 0.0, self.missed)
-        silent = np.flatnonzero(~hit)
         if len(silent):
             mean = np.einsum('tk,tk->t', mixture.mu[silent], mixture.x[silent, :, 0])
             stated = filter_.config.detection_at(mean)
