@@ -37,7 +37,7 @@ def poses(rng):
 
 
 def targets(rng, before, slices=2, T=2):
-    """Components fixed, swaying, swaying farther, moving of each slice, and one more that is fixed."""
+    """Components fixed, swaying, swaying farther, moving of each slice, one more is fixed."""
     C = 4 * slices + 1
     x = np.zeros((T, C, 6))
     x[..., 0] = rng.uniform(30.0, 90.0, (T, C))
