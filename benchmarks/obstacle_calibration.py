@@ -32,7 +32,10 @@ forecast. `guess` is the Brier score of who knows nothing but how often it happe
 
 `band` is the share of the pings of the last 35 m of range in which the 90 % band of the vertical
 offset holds the truth, over the fixed obstacles of `approaches` scenes per offset; `worst` that of
-the tenth of the obstacles of which it holds least, `width` its mean width.
+the tenth of the obstacles of which it holds least, `width` its mean width. `beam` is the same for
+obstacles 4 m above and below, where the beam is not as high as the tracker was told:
+
+    python -m benchmarks.obstacle_calibration --cases beam --out docs/results/obstacle_beam.json
 """
 
 from __future__ import annotations
@@ -66,6 +69,8 @@ KINDS = ('approach', 'swaying', 'mover')
 OFFSETS = (-8.0, -6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0, 8.0)
 OBSTACLES, SPACING = 8, 8.0
 """In a scene, and m from one to the next."""
+BEAMS = (12.0, 15.0, 18.0, 20.0)
+"""True heights of the beam, degrees, where the tracker believes in 15."""
 LAST = 35.0
 """m of range over which the band is judged."""
 DEEPEST = 0.2
@@ -176,22 +181,19 @@ def _calibration(found: list[tuple[float, float, float]], asked: int) -> dict[st
 
 
 def band(
-    offset: float, altitude: float, approaches: int, first: int, values: dict[str, Any]
-) -> dict[str, Any]:
-    """How much of the last 35 m the 90 % band holds, of obstacles at one offset."""
-    changes = {'vertical_offset': offset, 'altitude': altitude}
-    setting = scenario('approach', {**several(6.0), **changes})
+    settings: Sequence[dict[str, Any]], approaches: int, first: int, values: dict[str, Any]
+) -> dict[str, dict[str, float]]:
+    """How much of the last 35 m the 90 % band holds, of fixed obstacles in scenes that differ by
+    `settings`, for each way to take misses."""
     runs: dict[str, list[tuple[TrueObstacle, dict[int, Estimate]]]] = {m: [] for m in MISSES}
-    for seed in range(first, first + approaches):
-        scene = simulate(setting, seed)
-        config = config_of(setting, behaviours=BEHAVIOURS, **values)
-        for misses, final in track(scene, config).items():
-            runs[misses] += [(truth, final) for truth in truths(scene, TrueObstacle)]
-    where = f'{altitude:g} m', f'{offset:g} m'
-    return {
-        misses: {'band': {where[0]: {where[1]: _held(tracked)}}}
-        for misses, tracked in runs.items()
-    }
+    for changes in settings:
+        setting = scenario('approach', {**several(6.0), **changes})
+        for seed in range(first, first + approaches):
+            scene = simulate(setting, seed)
+            config = config_of(setting, behaviours=BEHAVIOURS, **values)
+            for misses, final in track(scene, config).items():
+                runs[misses] += [(truth, final) for truth in truths(scene, TrueObstacle)]
+    return {misses: _held(tracked) for misses, tracked in runs.items()}
 
 
 def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, float]:
@@ -230,20 +232,39 @@ def main(
 ) -> Parts:
     yield {'obstacles': OBSTACLES * scenes, 'approaches': OBSTACLES * approaches, 'first': first}
     values = dict(map(parsed, tracker))
+    rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for name in cases:
-        if name != 'band':
+        if name in DRAWN:
             yield forecasts(name, scenes, first, values)
             continue
-        for altitude in ALTITUDES:
-            for offset in OFFSETS:
-                if offset <= altitude - 0.3 - DEEPEST:
-                    yield band(offset, altitude, approaches, first, values)
+        if name == 'band':
+            every = [(altitude, offset) for altitude in ALTITUDES for offset in OFFSETS]
+            rows = {
+                (f'{altitude:g} m', f'{offset:g} m'): [
+                    {'altitude': altitude, 'vertical_offset': offset}
+                ]
+                for altitude, offset in every
+                if offset <= altitude - 0.3 - DEEPEST
+            }
+        else:
+            rows = {
+                (f'{height:g} deg',): [
+                    {'altitude': 25.0, 'vertical_offset': offset, 'vertical_fov_deg': height}
+                    for offset in (-4.0, 4.0)
+                ]
+                for height in BEAMS
+            }
+        for keys, settings in rows.items():
+            for misses, row in band(settings, approaches, first, values).items():
+                for key in reversed(keys):
+                    row = {key: row}
+                yield {misses: {name: row}}
 
 
 if __name__ == '__main__':
     study(
         main,
         first={'help': 'first seed'},
-        cases={'choices': (*DRAWN, 'band')},
+        cases={'choices': (*DRAWN, 'band', 'beam')},
         tracker={'help': 'name=value of the tracker'},
     )

@@ -77,11 +77,12 @@ class Looks(NamedTuple):
         return Looks(np.ones(T), np.ones(T), np.zeros(T), np.full(T, silent), mixture)
 
     def rows(self, which: np.ndarray) -> Looks:
-        return Looks(*(part[which] for part in self[:4]), self.shown.rows(which))
+        seen, due, missed, silent, shown = self
+        return Looks(seen[which], due[which], missed[which], silent[which], shown.rows(which))
 
     def joined(self, other: Looks) -> Looks:
-        parts = (np.concatenate(both) for both in zip(self[:4], other[:4]))
-        return Looks(*parts, self.shown.joined(other.shown))
+        seen, due, missed, silent = (np.concatenate(both) for both in zip(self[:4], other[:4]))
+        return Looks(seen, due, missed, silent, self.shown.joined(other.shown))
 
     def advanced(self, filter_: DepthSlices, before: Sonar, after: Sonar, dt: float) -> Looks:
         """As the sonar will see the obstacles `dt` seconds later."""
