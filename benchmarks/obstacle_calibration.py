@@ -256,9 +256,10 @@ def main(
             }
         for keys, settings in rows.items():
             for misses, row in band(settings, approaches, first, values).items():
+                part: dict[str, Any] = dict(row)
                 for key in reversed(keys):
-                    row = {key: row}
-                yield {misses: {name: row}}
+                    part = {key: part}
+                yield {misses: {name: part}}
 
 
 if __name__ == '__main__':
