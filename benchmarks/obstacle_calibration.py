@@ -16,22 +16,26 @@
 
     python -m benchmarks.obstacle_calibration --out docs/results/obstacle_calibration.json
 
-All runs are of the whole tracker, with `misses: ignored` and with `misses: evidence`, and else
-with its defaults, of which `--tracker name=value` replaces some.
+All runs are of the whole tracker, with its defaults, of which `--tracker name=value` replaces
+some. `misses` changes what is published and not the filter (`looks`), so one run shows both.
+
+Each scene has `OBSTACLES` one behind the other, for as many runs from a third of the time.
 
 `forecasts` compares stated probabilities of a collision with what happened, when the range first
-falls to 60, 45, 30, 20 and 10 m, by five bins: `runs` of a fixed, a swaying and a moving obstacle
+falls to 60, 45, 30, 20 and 10 m, by five bins: fixed, swaying and moving obstacles in `scenes`
 each, per altitude of the vehicle. `within 8 m` draws the vertical offset evenly over 8 m to both
-sides, at altitudes of 6 and 25 m (what would lie in the sea floor is drawn again, by the next
-seed); `over the beam` over what the beam shows at the first ping, and `near the sonar` within 5 m,
-both at 15 m. `error` is the binomial standard error of what happened; forecasts of a run are not
-independent, so that it is rather larger. `lost` is the share of the ranges at which the obstacle
-is not followed: no forecast. `guess` is the Brier score of who knows nothing but how often it
-happens.
+sides, at altitudes of 6 and 25 m (what would lie in the sea floor does not count); `over the beam`
+over what the beam shows 90 m ahead, and `near the sonar` within 5 m, both at 15 m. `error` is the
+binomial standard error of what happened; forecasts of an obstacle are not independent, so that it
+is rather larger. `lost` is the share of the ranges at which the obstacle is not followed: no
+forecast. `guess` is the Brier score of who knows nothing but how often it happens.
 
 `band` is the share of the pings of the last 35 m of range in which the 90 % band of the vertical
-offset holds the truth, over `approaches` fixed obstacles per offset; `worst` that of the tenth of
-the approaches in which it holds least, `width` its mean width.
+offset holds the truth, over the fixed obstacles of `approaches` scenes per offset; `worst` that of
+the tenth of the obstacles of which it holds least, `width` its mean width. `beam` is the same for
+obstacles 4 m above and below, where the beam is not as high as the tracker was told:
+
+    python -m benchmarks.obstacle_calibration --cases beam --approaches 2
 """
 
 from __future__ import annotations
@@ -39,12 +43,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
-from benchmarks.obstacle_accuracy import config_of, LEVER, nearest, parsed, track
+from benchmarks.obstacle_accuracy import config_of, LEVER, nearest, parsed
 from benchmarks.obstacle_sea import first_at
 from benchmarks.study import Parts, rms, study, truths
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, MISSES, ObstacleConfig
+from sonar_imm.trackers.obstacle.state import PingState
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+from sonar_imm.truth import Scene
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 ALTITUDES = (6.0, 25.0)
@@ -58,10 +67,46 @@ AT = (60.0, 45.0, 30.0, 20.0, 10.0)
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 KINDS = ('approach', 'swaying', 'mover')
 OFFSETS = (-8.0, -6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0, 8.0)
+OBSTACLES, SPACING = 8, 8.0
+"""In a scene, and m from one to the next."""
+BEAMS = (12.0, 15.0, 18.0, 20.0)
+"""True heights of the beam, degrees, where the tracker believes in 15."""
 LAST = 35.0
 """m of range over which the band is judged."""
 DEEPEST = 0.2
 """m above the sea floor: no obstacle lies lower."""
+
+
+Found = dict[str, dict[int, Estimate]]
+"""The last estimate of every ping, by stamp, for each way to take misses."""
+
+
+class _Both(ObstacleTracker):
+    """Publishes what each way to take misses would."""
+
+    def __init__(self, config: ObstacleConfig):
+        super().__init__(evolve(config, misses='evidence'))
+        self.ignoring = ObstacleTracker(evolve(config, misses='ignored'))
+        self.found: Found = {misses: {} for misses in MISSES}
+
+    def _estimate(self, ping: PingState) -> Estimate:
+        evidence = super()._estimate(ping)
+        self.found['ignored'][ping.stamp_ns] = self.ignoring._estimate(ping)
+        self.found['evidence'][ping.stamp_ns] = evidence
+        return evidence
+
+
+def track(scene: Scene, config: ObstacleConfig) -> Found:
+    tracker = _Both(config)
+    for item in scene.measurements:
+        tracker.process(item.measurement)
+    return tracker.found
+
+
+def several(last_range: float) -> dict[str, Any]:
+    """What is other in a scene of several obstacles, of which the last comes as near."""
+    reached = last_range - SPACING * (OBSTACLES - 1)
+    return {**LEVER, 'obstacles': OBSTACLES, 'spacing': SPACING, 'last_range': reached}
 
 
 def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
@@ -72,33 +117,45 @@ def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bo
     return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
 
 
-def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
+def forecasts(name: str, scenes: int, first: int, values: dict[str, Any]) -> dict[str, Any]:
     """Tables of a case of `DRAWN`: what was stated and what happened, and Brier scores."""
     reach, altitudes = DRAWN[name]
     config = ObstacleConfig(**values)
-    found: list[tuple[float, float, float]] = []
+    found: dict[str, list[tuple[float, float, float]]] = {misses: [] for misses in MISSES}
     asked, block = 0, 0
     for kind in KINDS:
         for altitude in altitudes:
-            changes = {'vertical_offset': 0.0, 'offset_spread': reach, 'last_range': -30.0}
-            setting = scenario(kind, {**LEVER, **changes, 'altitude': altitude})
+            drawn = {'vertical_offset': 0.0, 'offset_spread': reach, 'altitude': altitude}
+            setting = scenario(kind, {**several(-10.0), **drawn})
             # Seeds of their own: those of other kinds have the same geometry.
-            seed, done = first + 10000 * block, 0
-            block += 1
-            while done < runs:
+            for seed in range(first + 10000 * block, first + 10000 * block + scenes):
                 scene = simulate(setting, seed)
-                seed += 1
-                truth = truths(scene, TrueObstacle)[0]
-                if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
-                    continue
-                done += 1
-                final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
-                for at in AT:
-                    asked += 1
-                    seen = first_at(truth, final, at)
-                    if seen is not None and np.isfinite(seen[1]['collision_probability']):
-                        ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                        found.append((at, seen[1]['collision_probability'], float(ends)))
+                every = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+                for truth in truths(scene, TrueObstacle):
+                    if truth.vertical_offset[0] > altitude - 0.3 - DEEPEST:
+                        continue
+                    asked += len(AT)
+                    for misses, final in every.items():
+                        found[misses] += _stated(truth, final, config)
+            block += 1
+    return {misses: {name: _calibration(rows, asked)} for misses, rows in found.items()}
+
+
+def _stated(
+    truth: TrueObstacle, final: dict[int, Estimate], config: ObstacleConfig
+) -> list[tuple[float, float, float]]:
+    """The forecasts of an obstacle: range, probability, and whether it happened."""
+    rows = []
+    for at in AT:
+        seen = first_at(truth, final, at)
+        if seen is not None and np.isfinite(seen[1]['collision_probability']):
+            ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
+            rows.append((at, seen[1]['collision_probability'], float(ends)))
+    return rows
+
+
+def _calibration(found: list[tuple[float, float, float]], asked: int) -> dict[str, Any]:
+    """What became of forecasts (`_stated`)."""
     ranges, p, hit = (np.array(column) for column in zip(*found))
     reliability: dict[str, dict[str, float]] = {}
     for low, high in zip(BINS, BINS[1:]):
@@ -124,15 +181,24 @@ def forecasts(name: str, runs: int, first: int, values: dict[str, Any]) -> dict[
 
 
 def band(
-    offset: float, altitude: float, approaches: int, first: int, values: dict[str, Any]
-) -> dict[str, float]:
-    """How much of the last 35 m the 90 % band holds, of obstacles at one offset."""
-    setting = scenario('approach', {**LEVER, 'vertical_offset': offset, 'altitude': altitude})
+    settings: Sequence[dict[str, Any]], approaches: int, first: int, values: dict[str, Any]
+) -> dict[str, dict[str, float]]:
+    """How much of the last 35 m the 90 % band holds, of fixed obstacles in scenes that differ by
+    `settings`, for each way to take misses."""
+    runs: dict[str, list[tuple[TrueObstacle, dict[int, Estimate]]]] = {m: [] for m in MISSES}
+    for changes in settings:
+        setting = scenario('approach', {**several(6.0), **changes})
+        for seed in range(first, first + approaches):
+            scene = simulate(setting, seed)
+            config = config_of(setting, behaviours=BEHAVIOURS, **values)
+            for misses, final in track(scene, config).items():
+                runs[misses] += [(truth, final) for truth in truths(scene, TrueObstacle)]
+    return {misses: _held(tracked) for misses, tracked in runs.items()}
+
+
+def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, float]:
     held, widths, errors, followed, pings = [], [], [], 0, 0
-    for seed in range(first, first + approaches):
-        scene = simulate(setting, seed)
-        truth = truths(scene, TrueObstacle)[0]
-        final = track(scene, config_of(setting, behaviours=BEHAVIOURS, **values))
+    for truth, final in runs:
         inside = []
         for ping in np.flatnonzero(truth.range <= LAST).tolist():
             pings += 1
@@ -158,30 +224,48 @@ def band(
 
 
 def main(
-    runs: int = 90,
-    approaches: int = 40,
-    first: int = 1000,
-    cases: Sequence[str] = (*DRAWN, 'band'),
+    scenes: int = 14,
+    approaches: int = 5,
+    first: int = 300000,
+    cases: Sequence[str] = ('within 8 m', 'band', 'near the sonar', 'over the beam'),
     tracker: Sequence[str] = (),
 ) -> Parts:
-    yield {'runs': runs, 'approaches': approaches, 'first': first}
-    for misses in MISSES:
-        values = {**dict(map(parsed, tracker)), 'misses': misses}
-        for name in cases:
-            if name != 'band':
-                yield {misses: {name: forecasts(name, runs, first, values)}}
-                continue
-            for altitude in ALTITUDES:
-                for offset in OFFSETS:
-                    if offset <= altitude - 0.3 - DEEPEST:
-                        row = band(offset, altitude, approaches, first, values)
-                        yield {misses: {'band': {f'{altitude:g} m': {f'{offset:g} m': row}}}}
+    yield {'obstacles': OBSTACLES * scenes, 'approaches': OBSTACLES * approaches, 'first': first}
+    values = dict(map(parsed, tracker))
+    rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for name in cases:
+        if name in DRAWN:
+            yield forecasts(name, scenes, first, values)
+            continue
+        if name == 'band':
+            every = [(altitude, offset) for altitude in ALTITUDES for offset in OFFSETS]
+            rows = {
+                (f'{altitude:g} m', f'{offset:g} m'): [
+                    {'altitude': altitude, 'vertical_offset': offset}
+                ]
+                for altitude, offset in every
+                if offset <= altitude - 0.3 - DEEPEST
+            }
+        else:
+            rows = {
+                (f'{height:g} deg',): [
+                    {'altitude': 25.0, 'vertical_offset': offset, 'vertical_fov_deg': height}
+                    for offset in (-4.0, 4.0)
+                ]
+                for height in BEAMS
+            }
+        for keys, settings in rows.items():
+            for misses, row in band(settings, approaches, first, values).items():
+                part: dict[str, Any] = dict(row)
+                for key in reversed(keys):
+                    part = {key: part}
+                yield {misses: {name: part}}
 
 
 if __name__ == '__main__':
     study(
         main,
         first={'help': 'first seed'},
-        cases={'choices': (*DRAWN, 'band')},
+        cases={'choices': (*DRAWN, 'band', 'beam')},
         tracker={'help': 'name=value of the tracker'},
     )

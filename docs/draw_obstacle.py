@@ -19,6 +19,7 @@ obstacle_paper.png    the paper's Figures 3, 4 and 5 from our scenes; the distri
                       of docs/results/obstacle_section5.json (benchmarks.obstacle_section5)
 obstacle_fig3.png     Figure 3 with the panels and the altitude of the paper
 obstacle_fig4.png     Figure 4 with the diagram of the obstacle and its image
+obstacle_calibration.png   stated against happened collisions (benchmarks.obstacle_calibration)
 
 Needs matplotlib, which nothing else here does. Run it from the project root.
 """
@@ -52,6 +53,7 @@ from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
+CALIBRATION = ROOT / 'docs' / 'results' / 'obstacle_calibration.json'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
 COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN, '#56B4E9')
@@ -69,6 +71,30 @@ def main() -> None:
     draw_paper()
     draw_figure_3()
     draw_figure_4()
+    draw_calibration()
+
+
+def draw_calibration() -> None:
+    """Reliability diagrams, two binomial standard errors to either side of what happened."""
+    found = json.loads(CALIBRATION.read_text(encoding='utf-8'))
+    cases = list(found['evidence'])
+    cases.remove('band')
+    figure, axes = plt.subplots(
+        1, len(cases), figsize=(3.4 * len(cases), 3.6), layout='constrained', sharey=True
+    )
+    for ax, case in zip(axes, cases):
+        ax.plot([0.0, 1.0], [0.0, 1.0], color=INK, lw=0.8)
+        for misses, colour, side in (('ignored', RED, -0.01), ('evidence', BLUE, 0.01)):
+            rows = found[misses][case]['reliability'].values()
+            stated, happened, error = (
+                np.array([row[name] for row in rows]) for name in ('stated', 'happened', 'error')
+            )
+            style = {'color': colour, 'capsize': 2, 'label': f'misses: {misses}'}
+            ax.errorbar(stated + side, happened, 2.0 * error, fmt='o', ms=4, lw=1, **style)
+        ax.set(title=case, xlabel='stated', xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect='equal')
+    axes[0].set_ylabel('happened')
+    axes[0].legend(frameon=False, loc='upper left')
+    figure.savefig(OUT / 'obstacle_calibration.png', dpi=130)
 
 
 def draw_paper() -> None:

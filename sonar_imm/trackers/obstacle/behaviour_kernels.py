@@ -81,20 +81,19 @@ def mix(
     mu: FloatArray,
     prior: FloatArray,
     slices: int,
-    M: int,
-    stay: float,
+    transition: FloatArray,
     floor: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The components before a step in which an obstacle may change what it does.
 
-    prior (C,): see `Motion`. The M components of a slice interact: a behaviour is kept with
-    probability `stay`, the others share the rest. States that all have are mixed. A displacement
-    is no velocity: to e, a behaviour brings its own, any other its prior, uncorrelated. Slices
-    below the weight `floor` are dropped.
+    prior (C,): see `Motion`. The M components of a slice interact by transition (M, M), ``[i, j]``
+    the probability of j after i. States that all have are mixed. A displacement is no velocity: to
+    e, a behaviour brings its own, any other its prior, uncorrelated. Slices and components below
+    the weight `floor` are dropped.
     """
     T, C, n = x.shape
+    M = len(transition)
     x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
-    change = (1.0 - stay) / (M - 1) if M > 1 else 0.0
     share, off = np.empty(M), np.empty((M, n))
     for t in range(T):
         for j in range(slices * M, C):
@@ -117,8 +116,11 @@ def mix(
                 size = n if prior[j] > 0.0 else COMMON
                 total = 0.0
                 for i in range(M):
-                    share[i] = mu[t, first + i] * (stay if i == a else change)
+                    share[i] = mu[t, first + i] * transition[i, a]
                     total += share[i]
+                if total < floor:
+                    mu1[t, j] = 0.0
+                    continue
                 mu1[t, j] = total
                 for b in range(size):
                     x1[t, j, b] = 0.0

@@ -16,7 +16,7 @@
 
 fixed     nothing
 swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
-          `sway_time` and has the standard deviation `sway_std`
+          `sway_time` and has the standard deviation `sway_std`; or `WIDER` times as much
 moving    e is the velocity, m/s, a random walk of `speed_noise`; horizontal only
 others    of other packages, see `own_models`
 seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
@@ -44,8 +44,12 @@ from .filters import depth_slices, depth_span, DepthSlices, Hints, Mixture, Sona
 
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
+WIDER, WIDE_SHARE = 2.0, 0.1
+"""How much farther some of what sways does so, and their share. Nobody knows beforehand how far a
+mooring lets go: one that swings twice as far as believed is outside of the 90 % band in a third of
+all cases. Echoes soon tell the two apart, so the share hardly matters."""
 DROPPED = 1e-5
-"""A slice that weighs less takes no further part."""
+"""A slice that weighs less takes no further part, and a behaviour in one not in this ping."""
 OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
 """1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
 density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which
@@ -68,16 +72,25 @@ class BehaviourSlices(DepthSlices):
         known = (*SWITCHING, *self.own, 'seabed')
         self.behaviours = tuple(name for name in known if name in config.behaviours)
         switching = [name for name in self.behaviours if name != 'seabed']
+        if 'swaying' in switching:
+            switching.insert(switching.index('swaying') + 1, 'swaying')
         self.outlier_density = OUTLIER_DENSITY
         self.slices, self.M = config.components, len(switching)
-        names = switching * self.slices + ['seabed'] * ('seabed' in self.behaviours)
-        self.K = len(names)
-        behaviour = np.array(names)
+        seabed = ['seabed'] * ('seabed' in self.behaviours)
+        behaviour = np.array(switching * self.slices + seabed)
+        self.K = len(behaviour)
+        self._same = behaviour[: self.M, None] == behaviour[: self.M]
+        wide = np.zeros(self.K, np.bool_)
+        for a in np.flatnonzero(np.diagonal(self._same, offset=1)) + 1:
+            wide[a : self.slices * self.M : self.M] = True
+        sways = behaviour == 'swaying'
+        self._sway = config.sway_std * np.where(wide, WIDER, 1.0) * sways
+        self._share = np.where(sways, np.where(wide, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
         self._is = {name: behaviour == name for name in known}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
         self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
-        self._prior = self._swaying * config.sway_std**2
+        self._prior = self._sway**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
         for name, own in self.own.items():
             self._prior += self._is[name] * own.std**2
@@ -114,8 +127,8 @@ class BehaviourSlices(DepthSlices):
                 prior.pop('seabed', None)
             total = sum(prior.values())
             for name in prior:
-                share = prior[name] / total / self._is[name].sum()
-                mu[np.ix_(some, self._is[name])] = share
+                share = prior[name] / total / self._share[self._is[name]].sum()
+                mu[np.ix_(some, self._is[name])] = share * self._share[self._is[name]]
         if 'seabed' in self.behaviours:
             x[:, last, 2] = sonar.pose.position[2] + np.where(known, floor, 0.0)
             P[:, last, 2, 2] = floor_std**2
@@ -128,29 +141,32 @@ class BehaviourSlices(DepthSlices):
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         mixed = behaviour_kernels.mix(
-            *mixture, self._prior, self.slices, self.M, self._stay(dt), DROPPED
+            *mixture, self._prior, self.slices, self._transition(dt), DROPPED
         )
         return self.carried(Mixture(*mixed), before.pose, after.pose, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         return np.asarray(mu @ self._of)
 
-    def _stay(self, dt: float) -> float:
-        """Probability that an obstacle does the same `dt` seconds later."""
-        if self.M == 1:
-            return 1.0
-        rate = self.M / ((self.M - 1) * self.config.behaviour_time)
-        return float(1.0 / self.M + (1.0 - 1.0 / self.M) * np.exp(-rate * dt))
+    def _transition(self, dt: float) -> FloatArray:
+        """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds
+        later. As long as it sways it does so equally far."""
+        share = self._share[: self.M]
+        N = round(share.sum())  # what it may do
+        rate = N / ((N - 1) * self.config.behaviour_time) if N > 1 else 0.0
+        change = (1.0 - 1.0 / N) * -math.expm1(-rate * dt)
+        other = share * change / max(N - 1, 1)
+        return np.where(self._same, np.eye(self.M) * (1.0 - change), other)
 
     def _motion(self, dt: float) -> Motion:
         config, swaying, moving = self.config, self._swaying, self._moving
         phi = math.exp(-dt / config.sway_time)
-        swung = config.sway_std**2 * -math.expm1(-2.0 * dt / config.sway_time)
+        swung = self._sway**2 * -math.expm1(-2.0 * dt / config.sway_time)
         built_in = Motion(
             keep=swaying * phi + moving,
             step=swaying * (phi - 1.0) + moving * dt,
             push=swaying + moving * (0.5 * dt),
-            noise=swaying * swung + moving * (config.speed_noise**2 * dt),
+            noise=swung + moving * (config.speed_noise**2 * dt),
             prior=self._prior,
         )
         steps = built_in[:4]

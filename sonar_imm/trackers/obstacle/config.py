@@ -60,7 +60,8 @@ class ObstacleConfig(
         'and needs another beside it; also behaviours that other packages register',
         choices=BEHAVIOURS, group=MODELS)
     sway_std: float = parameter(0.5, 'm',
-        'behaviour swaying: standard deviation of the position along each axis',
+        'behaviour swaying: standard deviation of the position along each axis; twice as much is '
+        'considered too, at a tenth of the prior probability',
         range=(0.001, 100.0))
     sway_time: float = parameter(20.0, 's',
         'behaviour swaying: time over which the position is correlated', range=(0.1, 3600.0))

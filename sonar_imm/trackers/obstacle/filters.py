@@ -229,10 +229,11 @@ class DepthSlices:
         return Mixture(*after), nis, int(np.count_nonzero(repaired))
 
     def seen(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
-        """With what an echo in the ping before, of the sonar `last`, says of the height
-        (`looks`)."""
+        """With what an echo in this ping says of the height, or one in the ping before, of the
+        sonar `last` (`looks`)."""
         m = kernels.points(mixture.x, *sonar.pose, self.cone)
-        m = geometry.predict(m, sonar.pose, last.pose)
+        if last is not sonar:
+            m = geometry.predict(m, sonar.pose, last.pose)
         other = np.full(len(m), self.config.outlier_probability)
         vertical, *others = self._beam
         edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical

@@ -29,9 +29,9 @@ Z weighs the component, and its derivatives give mean and covariance of what is 
 
 Used is the last echo and the misses since: where it was seen then, and is not now. The next echo
 shows that it was in the beam all the time, and only faint; so the filter goes on without all this,
-and what is published of an obstacle without an echo is a copy. A beam that is higher than stated
-therefore harms no track. Nor does the life of a track depend on it: misses that put an obstacle
-out of the beam would excuse themselves.
+and what is published is a copy. A beam that is higher than stated therefore harms no track. Nor
+does the life of a track depend on it: misses that put an obstacle out of the beam would excuse
+themselves.
 
 p is learned when an echo comes, from how many misses it ends. So misses of what always gave an
 echo say a lot, and those of what flickers little. Where exactly a beam ends is not known: its
@@ -61,29 +61,32 @@ SUREST = 0.95
 class Looks(NamedTuple):
     """Of T tracks: `seen` (T,), pings with an echo; `due` (T,), pings up to the last echo in which
     the beam held the obstacle; `missed` (T,), expected number of pings since, in which it did;
-    `shown`: where that is more than 0, the mixture with the misses since the last echo."""
+    `silent` (T,), whether the newest ping had none; `shown`: the mixture with what the last echo
+    and the misses since say."""
 
     seen: FloatArray
     due: FloatArray
     missed: FloatArray
+    silent: BoolArray
     shown: Mixture
 
     @staticmethod
-    def first(mixture: Mixture) -> Looks:
-        """Of tracks that begin with an echo."""
+    def first(mixture: Mixture, silent: bool = False) -> Looks:
+        """Of tracks that begin, with an echo or, out of memory, without."""
         T = len(mixture.mu)
-        return Looks(np.ones(T), np.ones(T), np.zeros(T), mixture)
+        return Looks(np.ones(T), np.ones(T), np.zeros(T), np.full(T, silent), mixture)
 
     def rows(self, which: np.ndarray) -> Looks:
-        return Looks(self.seen[which], self.due[which], self.missed[which], self.shown.rows(which))
+        seen, due, missed, silent, shown = self
+        return Looks(seen[which], due[which], missed[which], silent[which], shown.rows(which))
 
     def joined(self, other: Looks) -> Looks:
-        seen, due, missed = (np.concatenate(both) for both in zip(self[:3], other[:3]))
-        return Looks(seen, due, missed, self.shown.joined(other.shown))
+        seen, due, missed, silent = (np.concatenate(both) for both in zip(self[:4], other[:4]))
+        return Looks(seen, due, missed, silent, self.shown.joined(other.shown))
 
     def advanced(self, filter_: DepthSlices, before: Sonar, after: Sonar, dt: float) -> Looks:
         """As the sonar will see the obstacles `dt` seconds later."""
-        silent = np.flatnonzero(self.missed > 0.0)
+        silent = np.flatnonzero(self.silent)
         if not len(silent):
             return self
         later, _ = filter_.advance(self.shown.rows(silent), before, after, dt)
@@ -94,23 +97,19 @@ class Looks(NamedTuple):
     ) -> Looks:
         """With one more ping, which had an echo of the tracks where `hit` (T,); last: the sonar in
         the ping before."""
-        due = np.where(hit, self.due + 1.0 + self.missed, self.due)
-        looks = Looks(self.seen + hit, due, np.where(hit, 0.0, self.missed), self.shown)
-        silent = np.flatnonzero(~hit)
-        if not len(silent):
-            return looks
-        mean = np.einsum('tk,tk->t', mixture.mu[silent], mixture.x[silent, :, 0])
-        stated = filter_.config.detection_at(mean)
-        p = (PINGS * stated + self.seen[silent]) / (PINGS + self.due[silent])
-        shown = self.published(mixture)
-        fresh = np.flatnonzero(~hit & (self.missed <= 0.0))
+        silent, fresh = np.flatnonzero(~hit), np.flatnonzero(~hit & ~self.silent)
+        shown = filter_.seen(mixture, sonar, sonar)
+        if len(silent):
+            shown = shown.replaced(silent, self.shown.rows(silent))
         if len(fresh):
             shown = shown.replaced(fresh, filter_.seen(mixture.rows(fresh), sonar, last))
-        shown, inside = filter_.missed(shown.rows(silent), np.minimum(p, SUREST), sonar)
-        looks.missed[silent] += inside
-        return looks._replace(shown=self.shown.replaced(silent, shown))
-
-    def published(self, mixture: Mixture) -> Mixture:
-        """The mixtures, of tracks without an echo with what that says."""
-        silent = np.flatnonzero(self.missed > 0.0)
-        return mixture.replaced(silent, self.shown.rows(silent)) if len(silent) else mixture
+        due = np.where(hit, self.due + 1.0 + self.missed, self.due)
+        missed = np.where(hit, 0.0, self.missed)
+        if len(silent):
+            mean = np.einsum('tk,tk->t', mixture.mu[silent], mixture.x[silent, :, 0])
+            stated = filter_.config.detection_at(mean)
+            p = (PINGS * stated + self.seen[silent]) / (PINGS + self.due[silent])
+            later, inside = filter_.missed(shown.rows(silent), np.minimum(p, SUREST), sonar)
+            shown = shown.replaced(silent, later)
+            missed[silent] += inside
+        return Looks(self.seen + hit, due, missed, ~hit, shown)

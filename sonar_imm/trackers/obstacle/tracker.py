@@ -477,6 +477,7 @@ class ObstacleTracker:
                 mixture,
                 Bodies(np.array([number]), std[None]),
                 odds(each.existence(now.stamp_ns, self.config.landmark_time)),
+                silent=True,
             )._replace(repairs=now.repairs + repairs)
         gone = set(back)
         memory = tuple(each for i, each in enumerate(memory) if i not in gone)
@@ -516,12 +517,18 @@ class ObstacleTracker:
             chance = self.config.outlier_probability
             fresh = updated(fresh, seen, chance, now.sonar.pose, self.config)
         life = now.life.born(len(z), now.stamp_ns, self.rules)
-        return self._joined(now, life, fresh, bodies, 0.0)
+        return self._joined(now, life, fresh, bodies)
 
     def _joined(
-        self, now: PingState, life: Tracks, fresh: Mixture, bodies: Bodies, log_odds: float
+        self,
+        now: PingState,
+        life: Tracks,
+        fresh: Mixture,
+        bodies: Bodies,
+        log_odds: float = 0.0,
+        silent: bool = False,
     ) -> PingState:
-        """With more obstacles, which `life` has already."""
+        """With more obstacles, which `life` has already; silent: they gave no echo."""
         B = len(fresh.mu)
         return now._replace(
             life=life,
@@ -529,7 +536,7 @@ class ObstacleTracker:
             nis=np.append(now.nis, np.full(B, np.nan)),
             strengths=now.strengths.joined(Strengths.unknown(B, self.filter.K)),
             bodies=now.bodies.joined(bodies),
-            looks=now.looks.joined(Looks.first(fresh)),
+            looks=now.looks.joined(Looks.first(fresh, silent)),
             existence=now.existence.joined(Existence.of(np.full(B, log_odds))),
         )
 
@@ -550,7 +557,7 @@ class ObstacleTracker:
         )
 
     def _estimate(self, ping: PingState) -> Estimate:
-        mixture = ping.looks.published(ping.mixture)
+        mixture = ping.looks.shown if self.config.misses == 'evidence' else ping.mixture
         view = self.filter.view(mixture, ping.sonar)
         view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)

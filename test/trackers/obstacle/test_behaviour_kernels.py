@@ -37,8 +37,8 @@ def poses(rng):
 
 
 def targets(rng, before, slices=2, T=2):
-    """Components fixed, swaying, moving of each slice, and one more that is fixed."""
-    C = 3 * slices + 1
+    """Components fixed, swaying, swaying farther, moving of each slice, one more is fixed."""
+    C = 4 * slices + 1
     x = np.zeros((T, C, 6))
     x[..., 0] = rng.uniform(30.0, 90.0, (T, C))
     x[..., 1] = rng.uniform(-0.3, 0.3, (T, C))
@@ -48,7 +48,7 @@ def targets(rng, before, slices=2, T=2):
     scale = np.array([0.2, 0.004, 1.5, 0.003, 0.3, 0.3])
     A = rng.normal(size=(T, C, 6, 6)) * scale[:, None]
     P = A @ np.swapaxes(A, -1, -2)
-    fixed = np.arange(C) % 3 == 0
+    fixed = np.arange(C) % 4 == 0
     x[:, fixed, 4:] = 0.0
     P[:, fixed, 4:, :] = P[:, fixed, :, 4:] = 0.0
     return x, P, rng.dirichlet(np.ones(C), T)
@@ -59,11 +59,13 @@ def motion(dt=0.5, slices=2):
     return BehaviourSlices(config)._motion(dt)
 
 
-def numpy_mix(x, P, mu, prior, slices, M, stay):
+CHAIN = np.full((4, 4), 0.02) + np.diag([0.92, 0.92, 0.9, 0.92])
+CHAIN[2, 3] += 0.02
+
+
+def numpy_mix(x, P, mu, prior, slices, chain):
     """The mixing written out: sources as they look to each behaviour, then moments."""
-    x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
-    chain = np.full((M, M), (1.0 - stay) / max(M - 1, 1))
-    np.fill_diagonal(chain, stay)
+    x1, P1, mu1, M = x.copy(), P.copy(), mu.copy(), len(chain)
     for t in range(len(x)):
         for k in range(slices):
             own = slice(k * M, (k + 1) * M)
@@ -90,8 +92,8 @@ def test_mixing_equals_numpy():
     before, _ = poses(rng)
     x, P, mu = targets(rng, before)
     prior = motion().prior
-    got = behave.mix(x, P, mu, prior, 2, 3, 0.9, 0.0)
-    for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, 3, 0.9)):
+    got = behave.mix(x, P, mu, prior, 2, CHAIN, 0.0)
+    for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, CHAIN)):
         assert_allclose(mine, plain, rtol=1e-12, atol=1e-15)
     assert_allclose(got[2].sum(axis=1), 1.0)
     assert np.all(got[1] == np.swapaxes(got[1], -1, -2))
@@ -101,12 +103,12 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
     rng = np.random.default_rng(2)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before)
-    mu[:, 3:6] *= 1e-9
+    mu[:, 4:8] *= 1e-9
     mu /= mu.sum(axis=1, keepdims=True)
-    x1, P1, mu1 = behave.mix(x, P, mu, motion().prior, 2, 3, 0.9, 1e-6)
-    assert np.all(mu1[:, 3:6] == 0.0)
-    assert_allclose(mu1[:, :3].sum(axis=1) / mu1[:, 6], mu[:, :3].sum(axis=1) / mu[:, 6])
-    assert np.all(x1[:, 6] == x[:, 6]) and np.all(P1[:, 6] == P[:, 6])
+    x1, P1, mu1 = behave.mix(x, P, mu, motion().prior, 2, CHAIN, 1e-6)
+    assert np.all(mu1[:, 4:8] == 0.0)
+    assert_allclose(mu1[:, :4].sum(axis=1) / mu1[:, 8], mu[:, :4].sum(axis=1) / mu[:, 8])
+    assert np.all(x1[:, 8] == x[:, 8]) and np.all(P1[:, 8] == P[:, 8])
 
 
 def numpy_advance(x, P, motion, j, before, after, noise, model):
@@ -159,7 +161,7 @@ def test_prediction_equals_numpy(model):
     x1, P1, repaired = behave.advance(x, P, mu, how, step)
     assert not repaired.any()
     for t in range(2):
-        for j in range(7):
+        for j in range(9):
             mean, covariance = numpy_advance(x[t, j], P[t, j], how, j, before, after, noise, model)
             n = len(mean)
             assert_allclose(x1[t, j, :n], mean, rtol=1e-11, atol=1e-12)

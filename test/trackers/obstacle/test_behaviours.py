@@ -17,7 +17,7 @@
 from types import SimpleNamespace
 
 from attrs import evolve
-from helpers.obstacle_runs import track_scene
+from helpers.obstacle_runs import offset_at, track_scene
 import numpy as np
 import pytest
 
@@ -25,7 +25,11 @@ from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.obstacle import behaviours
-from sonar_imm.trackers.obstacle.behaviours import behaviour_columns, build_filter
+from sonar_imm.trackers.obstacle.behaviours import (
+    behaviour_columns,
+    BehaviourSlices,
+    build_filter,
+)
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
@@ -146,6 +150,41 @@ def test_the_order_of_the_behaviours_does_not_matter():
         assert list(a.columns()) == list(b.columns())
         for name, values in a.columns().items():
             assert np.array_equal(values, b.columns()[name], equal_nan=True)
+
+
+def test_what_sways_farther_counts_as_swaying():
+    """Seen from outside there are three behaviours; how far an obstacle sways never changes."""
+    filter_ = BehaviourSlices(ObstacleConfig())
+    chain = filter_._transition(0.5)
+    change = chain[0, 3]
+    fixed, near, far, moving = range(4)
+    np.testing.assert_allclose(chain.sum(axis=1), 1.0, rtol=1e-15)
+    assert chain[near, far] == chain[far, near] == 0.0
+    assert chain[fixed, near] + chain[fixed, far] == pytest.approx(change)
+    assert chain[near, moving] == chain[far, moving] == change
+    assert change == pytest.approx(0.5 * 0.5 / 1000.0, rel=1e-3)
+    sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), 15.0)
+    begun = filter_.begin(np.array([[60.0, 0.1]]), np.diag([0.02, 2e-5])[None], sonar)
+    np.testing.assert_allclose(filter_.behaviour(begun.mu)[0], [0.54, 0.18, 0.18, 0.1])
+
+
+def test_how_far_an_obstacle_sways_need_not_be_known(monkeypatch):
+    """A metre, twice what `sway_std` says: eight obstacles at 30 m."""
+
+    def nees():
+        values = {'obstacle_sway': 1.0, 'obstacles': 8, 'spacing': 8.0, 'last_range': -30.0}
+        scene, final = track_scene('swaying', 77, values)
+        squared, inside = [], []
+        for truth in scene.truth:
+            error, variance, held, _ = offset_at(evolve(scene, truth=(truth,)), final, 30.0)
+            squared.append(error**2 / variance)
+            inside.append(held)
+        return np.mean(squared), np.mean(inside)
+
+    squared, inside = nees()
+    assert squared < 1.7 and inside > 0.7
+    monkeypatch.setattr(behaviours, 'WIDE_SHARE', 1e-12)
+    assert nees()[0] > 1.5 * squared
 
 
 def test_the_depth_of_the_sea_floor_is_that_of_the_first_sight():

@@ -124,13 +124,30 @@ def test_misses_are_forgotten_with_the_next_echo_but_for_how_often_it_gives_none
     looks = Looks.first(mixture)
     for _ in range(3):
         looks = looks.after(np.array([True, False]), mixture, filter_, sonar, sonar)
-    shown = looks.published(mixture)
-    np.testing.assert_array_equal(shown.x[0], mixture.x[0])
-    assert shown.P[1, 0, 2, 2] > 1.5 * mixture.P[1, 0, 2, 2]  # it may be above the beam or below
+    # It may be above the beam or below.
+    assert looks.shown.P[1, 0, 2, 2] > 1.5 * mixture.P[1, 0, 2, 2]
     np.testing.assert_array_equal(mixture.P[1], np.eye(4)[None])
     looks = looks.after(np.array([True, True]), mixture, filter_, sonar, sonar)
-    assert looks.published(mixture) is mixture
+    np.testing.assert_array_equal(looks.shown.P[1], looks.shown.P[0])
     assert looks.seen.tolist() == [5.0, 2.0] and looks.due[0] == 5.0 and looks.due[1] > 2.5
+
+
+def test_an_echo_says_that_the_beam_holds_it_and_leaving_sideways_takes_nothing_back():
+    mixture = Mixture(np.zeros((1, 1, 4)), np.eye(4)[None, None], np.ones((1, 1)))
+    mixture.x[..., 0], mixture.x[..., 2] = 10.0, DEPTH
+    filter_ = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
+    sonar = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3)))
+    aside = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), geometry.rotation(0.0, 0.0, 1.0)))
+    looks = Looks.first(mixture).after(np.array([True]), mixture, filter_, sonar, sonar)
+    # The beam is 2.6 m high there: of a normal distribution, within 1.1 times that, .52.
+    seen = looks.shown.P[0, 0, 2, 2]
+    assert seen == pytest.approx(0.52, abs=0.03)
+    mixture.x[..., 1] = -1.0
+    for last in (sonar, aside):
+        looks = looks._replace(shown=mixture._replace(P=looks.shown.P))
+        looks = looks.after(np.array([False]), mixture, filter_, aside, last)
+    assert looks.missed[0] == 0.0
+    assert looks.shown.P[0, 0, 2, 2] == pytest.approx(seen, rel=0.01)
 
 
 def test_what_has_left_the_beam_is_no_longer_believed_in_it():
