@@ -43,6 +43,11 @@ ORDER = (
     'seatrac_interfaces',
     'acomms_msgs',
     'stonefish_ros2',
+    'marine_acoustic_msgs',
+    'oculus_interfaces',
+    'ping360_sonar_msgs',
+    'sensors',
+    'dave_interfaces',
 )
 USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs', 'diagnostic_msgs')
 PACKAGE = """<?xml version="1.0"?>
