@@ -98,7 +98,7 @@ def _readers(
     described = made_topics(bag, SYSTEM)
     image, info = made_inputs(SYSTEM)
     for topic in bag.topics:
-        entry = image if topic.name == images else described.get(topic.name)
+        entry = image if topic.name == images else described.get(topic.name, image)
         if (topic.name == images or entry is info) and topic.type_name in entry.readers:
             read = detected.reader(entry, topic.type_name)
             readers[topic.name, topic.type_name] = (
