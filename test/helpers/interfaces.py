@@ -69,8 +69,9 @@ project({name})
 find_package(ament_cmake REQUIRED)
 # What rclpy needs with Fast DDS, and no more.
 foreach(needed rosidl_cmake rosidl_generator_c rosidl_generator_cpp
-    rosidl_generator_type_description rosidl_typesupport_introspection_c rosidl_typesupport_fastrtps_cpp
-    rosidl_typesupport_fastrtps_c rosidl_typesupport_c rosidl_generator_py)
+    rosidl_generator_type_description rosidl_typesupport_introspection_c
+    rosidl_typesupport_fastrtps_cpp rosidl_typesupport_fastrtps_c rosidl_typesupport_c
+    rosidl_generator_py)
   find_package(${{needed}} REQUIRED)
 endforeach()
 {finds}
