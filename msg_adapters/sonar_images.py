@@ -24,6 +24,8 @@
   of the sonar there, whose end is the image. Both are read.
 - ``ping360_sonar_msgs/SonarEcho`` (Centrale Nantes): one direction of a scanning sonar. Sample k
   lies at ``(k + 1) range / samples``, as in the driver.
+- ``marine_interfaces/SonarInfo`` (unh_marine_autonomy), latched beside images, in their frame:
+  what a sample is, and the pulse.
 - ``sensors/SonoptixECHO`` (recordings of SOLAQUA), a Float32MultiArray of ranges by beams, and
   sensor_msgs Image: samples alone; ranges and directions are parameters.
 
@@ -39,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, SonarImage
+from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, SonarImage, SonarInfo
 
 from .detections import beam_bearings, FARTHEST, SOUND_SPEEDS
 from .headers import Make, make_header, places_of, stamp_ns
@@ -58,6 +60,10 @@ _GAIN_BYTES = 4
 _PACKET = b'SO'
 """The first bytes of a packet of the Oculus (0x4f53, little-endian)."""
 _SAMPLES = {1: '<u1', 2: '<u2', 4: '<u4'}
+_CW, _FM_UP, _FM_DOWN = 1, 2, 3
+_SINC = 0.886
+"""-3 dB width of the echo of a frequency-modulated pulse, times its bandwidth."""
+_AMPLITUDE, _POWER, _LINEAR, _DECIBEL = 2, 3, 1, 2
 
 
 def read_projected_image(
@@ -308,3 +314,57 @@ def read_sonoptix_echo(
         )
     pixels = samples[offset:].reshape(sizes)
     return on_a_grid(message, pixels if image_order == 'range_major' else pixels.T, **geometry)
+
+
+def read_sonar_info(message: Any, **_: Any) -> SonarInfo:
+    """Read a SonarInfo. What it does not know, or only the converter of the sonar does, is left
+    to the parameters. Raises `Rejection`."""
+    scale, quantity = '', int(message.intensity_quantity)
+    if message.intensity_scale == _DECIBEL:
+        scale = 'decibel'
+    elif message.intensity_scale == _LINEAR and quantity in (_AMPLITUDE, _POWER):
+        scale = 'amplitude' if quantity == _AMPLITUDE else 'power'
+    gain, offset = (float(value) for value in (message.scale, message.offset))
+    if not scale or gain == 0.0:
+        gain = offset = 0.0
+    if not (np.isfinite([gain, offset]).all() and gain >= 0.0):
+        raise Rejection('out_of_range', f'samples times {gain:g} plus {offset:g} are no levels')
+    return SonarInfo(
+        stamp_ns=stamp_ns(message),
+        scale=scale,
+        gain=gain,
+        offset=offset,
+        echo_duration=_echo_duration(message),
+        frame_id=str(message.header.frame_id),
+    )
+
+
+def _echo_duration(message: Any) -> float:
+    """Seconds; of several sectors the longest, 0 where one of them is not known."""
+    kinds = [int(kind) for kind in message.tx_signal_types]
+    lengths, bandwidths = (
+        np.array(values, np.float64) for values in (message.pulse_lengths, message.bandwidths)
+    )
+    found = np.zeros(len(kinds))
+    for k, kind in enumerate(kinds):
+        if kind == _CW and k < len(lengths):
+            found[k] = lengths[k]
+        elif kind in (_FM_UP, _FM_DOWN) and k < len(bandwidths) and bandwidths[k] > 0.0:
+            found[k] = _SINC / bandwidths[k]
+    known = len(found) and np.isfinite(found).all() and found.min() > 0.0
+    return float(found.max()) if known else 0.0
+
+
+def write_sonar_info(info: SonarInfo, make: Make) -> Any:
+    """Write a SonarInfo; of the pulse it has the length of one that is not modulated."""
+    linear = {'amplitude': _AMPLITUDE, 'power': _POWER}
+    return make(
+        'marine_interfaces/msg/SonarInfo',
+        header=make_header(info.stamp_ns, info.frame_id, make),
+        intensity_quantity=linear.get(info.scale, 0),
+        intensity_scale=_LINEAR if info.scale in linear else _DECIBEL if info.scale else 0,
+        scale=info.gain,
+        offset=info.offset,
+        pulse_lengths=[info.echo_duration] if info.echo_duration else [],
+        tx_signal_types=[_CW] if info.echo_duration else [],
+    )

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Altitude, Detections, Ground, Navigation, SonarImage
+from sonar_imm.measurements import Altitude, Detections, Ground, Navigation, SonarImage, SonarInfo
 
 from ..detections import (
     read_detections,
@@ -43,8 +43,10 @@ from ..sonar_images import (
     read_ping360_echo,
     read_projected_image,
     read_raw_image,
+    read_sonar_info,
     read_sonoptix_echo,
     write_picture,
+    write_sonar_info,
 )
 from ..soundings import read_ground, write_ground
 from ..transforms import TF_STATIC
@@ -129,6 +131,17 @@ IMAGES = (
             'image_first_beam',
             'image_first_range',
         ),
+    ),
+    InputTopic(
+        'sonar_info',
+        'what a sonar says of its images, in place of parameters',
+        measurement=SonarInfo,
+        readers={'marine_interfaces/msg/SonarInfo': read_sonar_info},
+        write=write_sonar_info,
+        companion=True,
+        beside=('detections', 'image'),
+        makes='detections',
+        latched=True,
     ),
 )
 """What the detector before the tracker hears."""

@@ -35,6 +35,7 @@ from .obstacle import (
     Navigation,
     OPTIONAL_COLUMNS,
     SonarImage,
+    SonarInfo,
 )
 from .positions import (
     GeodeticFix,
@@ -73,6 +74,7 @@ __all__ = [
     'scan_of',
     'Snapshot',
     'SonarImage',
+    'SonarInfo',
     'Start',
     'StaticTransforms',
     'Trace',

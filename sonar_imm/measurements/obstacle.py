@@ -142,6 +142,25 @@ class SonarImage:
 
 
 @frozen(eq=False, kw_only=True)
+class SonarInfo:
+    """What a sonar says of its images, in place of parameters; no tracker takes it in.
+
+    scale: what a sample is, ``'amplitude'``, ``'power'``, ``'decibel'``, or '' where it is not
+    stated. gain, offset: a sample times `gain` plus `offset` is that; gain 0: not stated.
+    echo_duration: s between the -3 dB points of the echo of a point, 0: not stated.
+    """
+
+    FRAME: ClassVar[str] = 'own'
+
+    stamp_ns: int
+    scale: str = ''
+    gain: float = 0.0
+    offset: float = 0.0
+    echo_duration: float = 0.0
+    frame_id: str = ''
+
+
+@frozen(eq=False, kw_only=True)
 class Navigation:
     """Where the vehicle was: its pose in the world and its velocity in its own frame.
 

@@ -45,7 +45,7 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import Rejection, StaticTransforms
+from ..measurements import Rejection
 from ..node_config import node_config_type, type_spec, type_specs
 from ..parameters import Config
 from ..trackers import SYSTEMS, WarmStep
@@ -282,14 +282,14 @@ class BaseNode(ManagedNode):
         )
 
     def _wanted(self, topic: InputTopic, settings: Mapping[str, Any]) -> bool:
-        """Whether to hear an input. Frames are heard where their type is installed: PyPI has no
-        tf2_msgs. With `sonar_frame` the node cannot do without."""
+        """Whether to hear an input. What is latched is heard where its type is installed: PyPI has
+        neither tf2_msgs nor marine_interfaces. With `sonar_frame` frames have to be."""
         if not topic.wanted(settings):
             return False
-        if topic.measurement is not StaticTransforms or settings.get('sonar_frame'):
+        if not topic.latched or settings.get('sonar_frame'):
             return True
         try:
-            message_class(self._settings.choice(f'{topic.name}_type'))
+            message_class(self._type_name(topic))
         except ImportError:
             return False
         return True
@@ -298,12 +298,16 @@ class BaseNode(ManagedNode):
         self, topic: InputTopic, name: str, settings: Mapping[str, Any]
     ) -> tuple[InputTopic, str, Callable[[Any], Any]]:
         """One input on the topic `name`: that, its message type and what reads its messages."""
-        spec = type_spec(topic)
-        type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
+        type_name = self._type_name(topic)
         convention = settings.get('world_frame_convention', 'enu')
         reader = topic.reader(type_name, convention, settings, name)
         message_class(type_name)  # ConfigError now where it is not installed
         return evolve(topic, name=name), type_name, reader
+
+    def _type_name(self, topic: InputTopic) -> str:
+        """The message type of an input."""
+        spec = type_spec(topic)
+        return self._settings.choice(spec.name) if spec else next(iter(topic.readers))
 
     def _connected(self) -> set[type] | None:
         """Measurements of the inputs that somebody publishes, None when nobody does."""

@@ -17,6 +17,9 @@
 Hears ``image`` and publishes ``detections``, what the obstacle node hears, one message per image
 (of a scanning sonar one per sweep). Images that no package here can decode are said at the start.
 
+Where marine_interfaces is installed, ``sonar_info`` beside the images counts in place of the
+parameters that say what a sample is and how long an echo.
+
 Every image is answered on ``~/processed``, as the trackers answer their messages; there,
 `estimates` counts the messages of detections and `listeners` those who hear them.
 """
@@ -39,6 +42,7 @@ from msg_adapters.detections import write_detections
 from msg_adapters.inputs import InputTopic
 
 from ..intake import KnownFrames
+from ..measurements import SonarInfo
 from ..node_config import DetectorNodeConfig
 from ..trackers import WarmStep
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
@@ -78,6 +82,9 @@ class FlsDetectorNode(BaseNode):
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Detect and publish."""
         image = reader(message)
+        if isinstance(image, SonarInfo):
+            self._detector.describe(image)
+            return
         self._frames.admit(image)
         found = self._detector.process(image)
         if found is not None:
@@ -86,7 +93,8 @@ class FlsDetectorNode(BaseNode):
 
     def start_afresh(self) -> None:
         """Forget the sweep of a scanning sonar."""
-        self._detector = ImageDetector(self._settings[DetectorConfig])
+        before, self._detector = self._detector, ImageDetector(self._settings[DetectorConfig])
+        self._detector.infos = before.infos
 
     def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
         """The detector has one."""

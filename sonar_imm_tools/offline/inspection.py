@@ -32,7 +32,7 @@ from sonar_imm.trackers import SYSTEMS
 
 from .. import SECOND
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
-from ..recordings.topics import fitting_systems, instruments
+from ..recordings.topics import fed, fitting_systems, instruments
 
 MOST_FIXES = 1000
 """Fixes of a topic by which it is told whether each has a stamp of its own."""
@@ -313,6 +313,6 @@ def _entry(system: str, name: str) -> InputTopic:
 
 def _enough(system: str, names: Collection[str]) -> bool:
     """Whether a tracker with the default parameters can do something with these inputs."""
-    there = {_entry(system, name).makes or name for name in names}
+    there = fed(_entry(system, name) for name in names)
     required, one_of = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())
     return there.issuperset(required) and (not one_of or not there.isdisjoint(one_of))

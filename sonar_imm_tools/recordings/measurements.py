@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic
-from sonar_imm.measurements import Detections, Rejection
+from sonar_imm.measurements import Detections, Rejection, SonarInfo
 from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 
 from .messages import ros_message
@@ -97,17 +97,21 @@ class DetectedImages:
         self._inputs = {entry.name: entry for entry in inputs_of(system)}
         self._settings = settings
         self._config = DetectorConfig.from_mapping(detector)
+        self._detector = ImageDetector(self._config)
 
     def reader(self, entry: InputTopic, type_name: str) -> Callable[[Any], Detections | None]:
-        """The reader of one topic of images: from a message to detections, None while a scanning
-        sonar is at its sweep. It raises `Rejection`."""
+        """The reader of one topic, of images or beside them: from a message to detections, None
+        while a scanning sonar is at its sweep. It raises `Rejection`."""
         made = self._inputs[entry.makes]
         read = entry.reader(type_name, 'enu', self._config.as_dict())
         again = made.reader('sensor_msgs/msg/PointCloud2', 'enu', self._settings)
-        detector = ImageDetector(self._config)
 
         def detections(message: Any) -> Detections | None:
-            found = detector.process(read(message))
+            image = read(message)
+            if isinstance(image, SonarInfo):
+                self._detector.describe(image)
+                return None
+            found = self._detector.process(image)
             return None if found is None else again(made.write(found, ros_message))
 
         return detections

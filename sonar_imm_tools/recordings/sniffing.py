@@ -80,7 +80,12 @@ def sniff(path: Path) -> Guess:
 
 def _of_bag(path: Path) -> Guess:
     with BagReader(path) as bag:
-        found = [topic for system in SYSTEMS for topic in made_topics(bag, system)]
+        found = [
+            topic
+            for system in SYSTEMS
+            for topic, entry in made_topics(bag, system).items()
+            if not entry.companion
+        ]
     if found:
         return Guess('images', f'a recording with images of a sonar on {found[0]}')
     raise BagError(

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 import itertools
 import re
 
@@ -155,7 +155,7 @@ def _evidence(
     bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
 ) -> tuple[bool, bool, int]:
     types = {topic.name: topic.type_name for topic in bag.topics}
-    there = {entry.makes or entry.name for entry in fitting.values()}
+    there = fed(fitting.values())
     required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
     sure = any(
         types[name] not in entry.second for name, entry in fitting.items() if not entry.companion
@@ -180,7 +180,7 @@ def _matching(
         wanted = {entry.name for entry in chosen.values()}
         beside = {
             name: entry
-            for name, entry in fitting.items()
+            for name, entry in (fitting | made_topics(bag, system)).items()
             if wanted & set(entry.beside) and entry.name not in wanted and name not in chosen
         }
         return chosen | beside
@@ -211,11 +211,19 @@ def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, Inpu
         )
         if sentence not in bag.problems:
             bag.add_problem(sentence)
-    inputs = {entry.makes or entry.name for entry in kept.values()}
+    inputs = fed(kept.values())
     return {
         name: entry
         for name, entry in kept.items()
         if not entry.beside or inputs & set(entry.beside)
+    }
+
+
+def fed(entries: Iterable[InputTopic]) -> set[str]:
+    """The inputs of a tracker that these are, or are made into; what only describes images is made
+    into nothing."""
+    return {
+        entry.makes or entry.name for entry in entries if not (entry.makes and entry.companion)
     }
 
 

@@ -43,6 +43,11 @@ ORDER = (
     'seatrac_interfaces',
     'acomms_msgs',
     'stonefish_ros2',
+    'marine_acoustic_msgs',
+    'oculus_interfaces',
+    'ping360_sonar_msgs',
+    'sensors',
+    'dave_interfaces',
 )
 USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs', 'diagnostic_msgs')
 PACKAGE = """<?xml version="1.0"?>
@@ -62,7 +67,13 @@ PACKAGE = """<?xml version="1.0"?>
 CMAKE = """cmake_minimum_required(VERSION 3.12)
 project({name})
 find_package(ament_cmake REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
+# What rclpy needs with Fast DDS, and no more.
+foreach(needed rosidl_cmake rosidl_generator_c rosidl_generator_cpp
+    rosidl_generator_type_description rosidl_typesupport_introspection_c
+    rosidl_typesupport_fastrtps_cpp rosidl_typesupport_fastrtps_c rosidl_typesupport_c
+    rosidl_generator_py)
+  find_package(${{needed}} REQUIRED)
+endforeach()
 {finds}
 # The wheels name the folder in which the headers of Python were when they were built.
 foreach(used builtin_interfaces service_msgs {uses})
@@ -72,6 +83,10 @@ foreach(used builtin_interfaces service_msgs {uses})
   endif()
 endforeach()
 rosidl_generate_interfaces(${{PROJECT_NAME}} {files} DEPENDENCIES {uses})
+foreach(made introspection_c fastrtps_cpp fastrtps_c c)
+  set_target_properties(${{PROJECT_NAME}}__rosidl_typesupport_${{made}}
+    PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
+endforeach()
 ament_package()
 """
 

@@ -111,6 +111,12 @@ OTHERS = {
     'marine_interfaces/msg/ContactArray': (
         'std_msgs/Header header\nmarine_interfaces/Contact[] contacts\n'
     ),
+    'marine_interfaces/msg/SonarInfo': (
+        'std_msgs/Header header\nstring sonar_model\nfloat32[] pulse_lengths\n'
+        'float32[] bandwidths\nuint8[] tx_signal_types\nuint8 intensity_quantity\n'
+        'uint8 intensity_scale\nuint8 intensity_reference\nfloat32 scale\nfloat32 offset\n'
+        'uint8 tvg_model\nfloat32 tvg_absorption_db_per_km\nfloat32 source_level_db\n'
+    ),
     'seatrac_interfaces/msg/ModemRec': (
         'std_msgs/Header header\nuint8 msg_id\nbool position_flt_error\nuint8 src_id\n'
         'int16 attitude_yaw\nint16 depth_local\nuint16 vos\nbool includes_range\n'
@@ -130,7 +136,13 @@ OTHERS = {
         'geometry_msgs/Quaternion local_orientation\nfloat32 local_depth\n'
     ),
 }
-"""Messages of single drivers and simulators; of the DVL without their beams."""
+"""Messages of single drivers and simulators; of the DVL without their beams, of SonarInfo without
+its calibration and curves."""
+
+
+def definitions():
+    """All of them, by full names."""
+    return {PACKAGE + name: text for name, text in DEFINITIONS.items()} | OTHERS
 
 
 @cache
@@ -138,9 +150,7 @@ def typestore():
     """A store that knows the types of Jazzy and these."""
     types = get_typestore(Stores.ROS2_JAZZY)
     found = {}
-    for name, text in DEFINITIONS.items():
-        found |= get_types_from_msg(text, PACKAGE + name)
-    for name, text in OTHERS.items():
+    for name, text in definitions().items():
         found |= get_types_from_msg(text, name)
     types.register(found)
     return types

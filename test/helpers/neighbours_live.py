@@ -17,7 +17,9 @@
 Prints one line of JSON: how many messages each input took and refused, and what came out.
 """
 
+from functools import partial
 import json
+import sys
 
 import numpy as np
 from rclpy.parameter import Parameter
@@ -26,9 +28,10 @@ from helpers.node_bench import Bench
 from msg_adapters.neighbours import TOPICS
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.nodes.diver import DiverNode
+from sonar_imm.nodes.fls_detector import FlsDetectorNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
-from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
 
 ORIGIN = Origin(54.3, 10.2)
 STEPS = 20
@@ -108,6 +111,121 @@ def detections(step):
     return make('vision_msgs/msg/Detection3DArray', header=header(step), detections=[seen])
 
 
+MARINE = 'marine_acoustic_msgs/msg/'
+BEARINGS = np.radians(np.linspace(-20.0, 20.0, 9))
+SAMPLES = np.ones((60, 9), np.uint8)
+SAMPLES[30, 4] = 250
+"""An echo straight ahead at half the range."""
+
+
+def vectors(bearings):
+    return [
+        make('geometry_msgs/msg/Vector3', x=float(np.cos(b)), y=float(np.sin(b))) for b in bearings
+    ]
+
+
+def ping_info():
+    return make(MARINE + 'PingInfo', frequency=450e3, sound_speed=1500.0)
+
+
+def samples():
+    return make(MARINE + 'SonarImageData', beam_count=9, data=SAMPLES.tobytes())
+
+
+def projected(step):
+    return make(
+        MARINE + 'ProjectedSonarImage',
+        header=header(step),
+        ping_info=ping_info(),
+        beam_directions=vectors(BEARINGS),
+        ranges=1.0 + 0.5 * np.arange(60),
+        image=samples(),
+    )
+
+
+def raw(step):
+    return make(
+        MARINE + 'RawSonarImage',
+        header=header(step),
+        ping_info=ping_info(),
+        sample_rate=1500.0,
+        samples_per_beam=60,
+        rx_angles=BEARINGS,
+        image=samples(),
+    )
+
+
+def oculus(step):
+    return make(
+        'oculus_interfaces/msg/Ping',
+        header=header(step),
+        range_resolution=0.5,
+        n_ranges=60,
+        n_beams=9,
+        step=9,
+        sample_size=1,
+        bearings=np.linspace(-2000, 2000, 9).astype(np.int16),
+        ping_data=SAMPLES.tobytes(),
+    )
+
+
+def ping360(step):
+    return make(
+        'ping360_sonar_msgs/msg/SonarEcho',
+        header=header(step),
+        angle=0.05 * abs(10 - step),  # it turns back once, which ends a sweep
+        range=30,
+        intensities=SAMPLES[:, 4].tobytes(),
+    )
+
+
+def sonoptix(step):
+    dims = [make('std_msgs/msg/MultiArrayDimension', size=n) for n in SAMPLES.shape]
+    layout = make('std_msgs/msg/MultiArrayLayout', dim=dims)
+    data = make('std_msgs/msg/Float32MultiArray', layout=layout, data=SAMPLES.ravel())
+    return make('sensors/msg/SonoptixECHO', header=header(step), array_data=data)
+
+
+def sonar_info(step):
+    return make(
+        'marine_interfaces/msg/SonarInfo',
+        header=header(step),
+        intensity_quantity=3,
+        intensity_scale=1,
+        pulse_lengths=[4e-4],
+        tx_signal_types=[1],
+    )
+
+
+def sonar_detections(step):
+    return make(
+        MARINE + 'SonarDetections',
+        header=header(step),
+        ping_info=ping_info(),
+        two_way_travel_times=[0.04],
+        rx_angles=[0.1],
+    )
+
+
+def sonar_ranges(step):
+    return make(
+        MARINE + 'SonarRanges',
+        header=header(step),
+        ping_info=ping_info(),
+        beam_unit_vec=vectors([0.1]),
+        ranges=[30.0],
+    )
+
+
+def dvl(type_name, step):
+    return make(type_name, header=header(step), altitude=12.0)
+
+
+def dave_dvl(step):
+    target = make('dave_interfaces/msg/DVLTarget', type='bottom', range=12.0)
+    return make('dave_interfaces/msg/DVL', header=header(step), target=target)
+
+
 GEODETIC = {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
 FIXED = {'vessel': 'fixed'}
 CASES = {
@@ -121,6 +239,25 @@ CASES = {
     'acomms_msgs/msg/UsblData': (DiverNode, 'relative', usbl, FIXED),
     'stonefish_ros2/msg/BeaconInfo': (DiverNode, 'relative', beacon, FIXED),
     'vision_msgs/msg/Detection3DArray': (ObstacleNode, 'detections', detections, {}),
+    MARINE + 'SonarDetections': (ObstacleNode, 'detections', sonar_detections, {}),
+    MARINE + 'SonarRanges': (ObstacleNode, 'detections', sonar_ranges, {}),
+    **{
+        name: (ObstacleNode, 'altitude', partial(dvl, name), {})
+        for name in (MARINE + 'Dvl', 'stonefish_ros2/msg/DVL')
+    },
+    'dave_interfaces/msg/DVL': (ObstacleNode, 'altitude', dave_dvl, {}),
+    MARINE + 'ProjectedSonarImage': (FlsDetectorNode, 'image', projected, {}),
+    MARINE + 'RawSonarImage': (FlsDetectorNode, 'image', raw, {}),
+    'oculus_interfaces/msg/Ping': (FlsDetectorNode, 'image', oculus, {}),
+    'ping360_sonar_msgs/msg/SonarEcho': (FlsDetectorNode, 'image', ping360, {}),
+    'sensors/msg/SonoptixECHO': (
+        *(FlsDetectorNode, 'image', sonoptix),
+        {'image_far_range': 30.0, 'image_fov_deg': 40.0},
+    ),
+    'marine_interfaces/msg/SonarInfo': (
+        *(FlsDetectorNode, 'sonar_info', sonar_info),
+        {'image_type': 'sensor_msgs/msg/Image'},
+    ),
 }
 
 
@@ -128,6 +265,10 @@ def run(type_name, kind, name, message_of, settings):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
     asked = list(TOPICS) if settings is GEODETIC else []
     settings = {f'{name}_type': type_name, 'also_publish': asked, **settings}
+    quality = lockstep_qos()
+    if name == 'sonar_info':
+        quality = transforms_qos()
+        del settings['sonar_info_type']
     bench = Bench()
     try:
         overrides = [Parameter(key, value=value) for key, value in settings.items() if value != []]
@@ -136,9 +277,7 @@ def run(type_name, kind, name, message_of, settings):
         heard = {
             type_: bench.listen(message_class(type_), f'/{own}/{TOPICS[type_]}') for type_ in asked
         }
-        publisher = bench.peer.create_publisher(
-            message_class(type_name), f'/{name}', lockstep_qos()
-        )
+        publisher = bench.peer.create_publisher(message_class(type_name), f'/{name}', quality)
         bench.spin_until(lambda: publisher.get_subscription_count())
         bench.spin_until(
             lambda: all(node.count_subscribers(f'/{own}/{TOPICS[type_]}') for type_ in asked)
@@ -174,4 +313,5 @@ def last(heard):
 
 
 if __name__ == '__main__':
-    print(json.dumps({name: run(name, *case) for name, case in CASES.items()}))
+    wanted = sys.argv[1:] or CASES
+    print(json.dumps({name: run(name, *CASES[name]) for name in wanted}))

@@ -14,17 +14,18 @@
 
 """Images of both kinds in both orders, and the echoes in them."""
 
+from attrs import asdict, evolve
 from helpers import marine
 import numpy as np
 import pytest
 
 from msg_adapters.inputs import inputs_of
 from msg_adapters.sonar_images import DTYPES
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import Rejection, SonarInfo
 from sonar_imm.trackers.obstacle import detector
-from sonar_imm.trackers.obstacle.detector import DetectorConfig
+from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 
-(IMAGE,) = inputs_of('fls_detector')
+IMAGE, INFO = inputs_of('fls_detector')
 
 BEARINGS = np.radians(np.linspace(20.0, -20.0, 41))  # port first
 RANGES = 2.0 + 0.25 * np.arange(120)
@@ -174,3 +175,117 @@ def test_ranges_that_are_no_numbers_are_left_out():
     message.ranges[40] = np.nan
     message.ranges[41:44] = np.inf
     assert detect(message, config()).intensity.tolist() == [120.0]
+
+
+# -- what a sonar says of its images ------------------------------------------------------------
+
+CW, FM = 1, 2
+AMPLITUDE, POWER = 2, 3
+LINEAR, DECIBEL = 1, 2
+
+
+def sonar_info(frame_id='sonar', **fields):
+    values = {'header': marine.header(frame_id=frame_id), **fields}
+    return marine.driver_message('marine_interfaces/msg/SonarInfo', **values)
+
+
+def described(message, image, **values):
+    """The detector of images, and the echoes after the sonar has said what `message` holds."""
+    of_images = ImageDetector(config(**values))
+    of_images.describe(INFO.reader('marine_interfaces/msg/SonarInfo', 'enu', {})(message))
+    return of_images, of_images.process(image)
+
+
+def samples(values):
+    image = read(projected(), config())
+    return evolve(image, amplitude=values)
+
+
+@pytest.mark.parametrize(
+    'fields, of_amplitude',
+    [
+        ({'intensity_quantity': AMPLITUDE, 'intensity_scale': LINEAR}, lambda a: a),
+        ({'intensity_quantity': POWER, 'intensity_scale': LINEAR}, np.square),
+        (
+            {'intensity_quantity': POWER, 'intensity_scale': DECIBEL, 'scale': 0.25},
+            lambda a: 80.0 * np.log10(np.maximum(a, 0.1)),
+        ),
+        (
+            {
+                'intensity_quantity': POWER,
+                'intensity_scale': LINEAR,
+                'scale': 4.0,
+                'offset': -8.0,
+            },
+            lambda a: np.square(a) / 4.0 + 2.0,
+        ),
+    ],
+)
+@pytest.mark.parametrize('stated', ['amplitude', 'decibel'])
+def test_what_the_sonar_says_of_a_sample_counts_in_place_of_the_parameters(
+    fields, of_amplitude, stated
+):
+    _, found = described(
+        sonar_info(**fields),
+        samples(of_amplitude(picture())),
+        image_scale=stated,
+        decibel_step=3.0,
+    )
+    assert found.range == pytest.approx([RANGES[40], RANGES[90]], abs=0.02)
+    assert found.intensity == pytest.approx([200.0, 120.0])
+
+
+@pytest.mark.parametrize(
+    'fields, resolution',
+    [
+        ({'tx_signal_types': [CW], 'pulse_lengths': [4e-4]}, 0.3),
+        ({'tx_signal_types': [FM], 'pulse_lengths': [1e-2], 'bandwidths': [1329.0]}, 0.5),
+        ({'tx_signal_types': [CW, CW], 'pulse_lengths': [4e-4, 8e-4]}, 0.6),
+        ({'tx_signal_types': [0], 'pulse_lengths': [4e-4]}, 0.7),
+        ({'tx_signal_types': [FM], 'pulse_lengths': [1e-2]}, 0.7),
+        ({'pulse_lengths': [4e-4]}, 0.7),
+    ],
+)
+def test_the_pulse_says_how_long_an_echo_is_where_it_is_known(fields, resolution):
+    of_images, _ = described(
+        sonar_info(**fields), read(projected(), config()), range_resolution=0.7
+    )
+    assert of_images.infos['sonar'][1].range_resolution == pytest.approx(resolution, rel=1e-3)
+
+
+def test_a_sonar_says_it_of_its_own_images_and_of_what_comes_next():
+    power = {'intensity_quantity': POWER, 'intensity_scale': LINEAR}
+    of_images, found = described(sonar_info('stern', **power), read(projected(), config()))
+    assert found.intensity.tolist() == [200.0, 120.0]
+    read_info = INFO.reader('marine_interfaces/msg/SonarInfo', 'enu', {})
+    for fields, strongest in ((power, np.sqrt(200.0)), ({}, 200.0)):
+        of_images.describe(read_info(sonar_info(**fields)))
+        assert of_images.process(read(projected(), config())).intensity[0] == pytest.approx(
+            strongest
+        )
+
+
+@pytest.mark.parametrize(
+    'fields',
+    [
+        {'intensity_scale': DECIBEL, 'scale': np.nan},
+        {'intensity_scale': DECIBEL, 'scale': -1.0},
+        {'tx_signal_types': [CW], 'pulse_lengths': [1e3]},
+    ],
+)
+def test_what_cannot_be_true_of_a_sonar_is_refused_and_nothing_changes(fields):
+    of_images = ImageDetector(config())
+    with pytest.raises(Rejection) as caught:
+        of_images.describe(
+            INFO.reader('marine_interfaces/msg/SonarInfo', 'enu', {})(sonar_info(**fields))
+        )
+    assert caught.value.reason == 'out_of_range' and not of_images.infos
+
+
+def test_what_a_sonar_says_survives_the_way_out_and_back():
+    info = SonarInfo(
+        stamp_ns=5, scale='power', gain=2.0, offset=1.0, echo_duration=2**-10, frame_id='sonar'
+    )
+    read_info = INFO.reader('marine_interfaces/msg/SonarInfo', 'enu', {})
+    again = read_info(INFO.write(info, marine.driver_message))
+    assert asdict(again) == asdict(info)

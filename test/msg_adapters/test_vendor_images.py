@@ -23,7 +23,7 @@ from msg_adapters.sonar_images import write_picture
 from sonar_imm.measurements import Rejection, SonarImage
 from sonar_imm_tools.recordings.messages import ros_message
 
-(IMAGE,) = inputs_of('fls_detector')
+IMAGE = inputs_of('fls_detector')[0]
 GEOMETRY = {'image_near_range': 2.0, 'image_far_range': 22.0, 'image_fov_deg': 60.0}
 PIXELS = np.arange(8 * 6).reshape(8, 6)  # 8 ranges, 6 beams
 

@@ -15,24 +15,36 @@
 """Echoes in images of a forward-looking sonar, as detections for the tracker.
 
 `ImageDetector` takes images in and gives detections out, one message per ping. The directions of a
-scanning sonar come one by one; it gathers a sweep of them first.
+scanning sonar come one by one; it gathers a sweep of them first. What a sonar says of its images
+(`SonarInfo`) counts in place of the parameters.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics.image_echoes import EchoRules, find_echoes
 from ...estimation.arrays import FloatArray
-from ...measurements import BEAM_AXES, Detections, IMAGE_ORDERS, Rejection, SonarImage
-from ...parameters import Config, parameter
+from ...measurements import (
+    BEAM_AXES,
+    Detections,
+    IMAGE_ORDERS,
+    Rejection,
+    SonarImage,
+    SonarInfo,
+)
+from ...parameters import Config, ConfigError, parameter
 
 SIDES = ('port', 'starboard')
 ENDS = ('near', 'far')
 MAX_SWEEP = 1000
 """Directions of a sweep."""
 SCALES = ('amplitude', 'power', 'decibel')
+MOST_INFOS = 16
+"""Sonars, by their frames, of which it is known what they say of their images."""
 
 
 @frozen(kw_only=True)
@@ -131,19 +143,44 @@ class DetectorConfig(Config):
 
 
 class ImageDetector:
-    """Detections from images in the order of their stamps."""
+    """Detections from images in the order of their stamps.
+
+    infos: what sonars say of their images, and the parameters with it, by their frames.
+    """
 
     def __init__(self, config: DetectorConfig):
         self.config = config
         self._sweep: list[SonarImage] = []
+        self.infos: dict[str, tuple[SonarInfo, DetectorConfig]] = {}
 
     def process(self, image: SonarImage) -> Detections | None:
         """The echoes in an image; None for a direction of a sweep that goes on. Raises
         `Rejection`."""
+        info, config = self.infos.get(image.frame_id, (None, self.config))
+        if info is not None and info.gain:
+            image = evolve(image, amplitude=info.gain * image.amplitude + info.offset)
         if not image.scanning:
-            return detect(image, self.config)
+            return detect(image, config)
         whole = self._gathered(image)
-        return None if whole is None else detect(whole, self.config)
+        return None if whole is None else detect(whole, config)
+
+    def describe(self, info: SonarInfo) -> None:
+        """Read the images in the frame of `info` as it says, from the next one on."""
+        changes: dict[str, Any] = {}
+        if info.scale:
+            changes['image_scale'] = info.scale
+        if info.scale == 'decibel' and info.gain:
+            changes['decibel_step'] = 1.0
+        if info.echo_duration > 0.0:
+            changes['range_resolution'] = 0.5 * self.config.sound_speed * info.echo_duration
+        try:
+            config = evolve(self.config, **changes)
+        except ConfigError as error:
+            raise Rejection('out_of_range', f'what the sonar says of itself: {error}') from None
+        self.infos.pop(info.frame_id, None)
+        if len(self.infos) >= MOST_INFOS:
+            self.infos.pop(next(iter(self.infos)))
+        self.infos[info.frame_id] = info, config
 
     def warm(self) -> None:
         """Compile or load the kernels."""

@@ -71,12 +71,12 @@ def convert_images(path: str | Path, out: str | Path, **values: Any) -> Conversi
 
 def _image_topic(bag: BagReader, wanted: str | None) -> str:
     """The topic with the images."""
-    (entry,) = made_inputs(SYSTEM)
+    entry = made_inputs(SYSTEM)[0]
     if wanted is not None:
         if not any(t.name == wanted and t.type_name in entry.readers for t in bag.topics):
             raise BagError(f'{bag.path} has no topic {wanted} with {" or ".join(entry.readers)}')
         return wanted
-    found = list(made_topics(bag, SYSTEM))
+    found = [name for name, each in made_topics(bag, SYSTEM).items() if each is entry]
     if not found:
         raise BagError(f'{bag.path} has no topic with {" or ".join(entry.readers)}')
     if len(found) > 1:
@@ -94,11 +94,13 @@ def _readers(
     of the first topic of each further kind."""
     detected = DetectedImages(SYSTEM, config.as_dict(), {})
     detections = next(entry for entry in inputs_of(SYSTEM) if entry.name == 'detections')
-    (image,) = made_inputs(SYSTEM)
     readers: dict[tuple[str, str], tuple[str, Callable[[Any], Any]]] = {}
+    described = made_topics(bag, SYSTEM)
+    image, info = made_inputs(SYSTEM)
     for topic in bag.topics:
-        if topic.name == images and topic.type_name in image.readers:
-            read = detected.reader(image, topic.type_name)
+        entry = image if topic.name == images else described.get(topic.name, image)
+        if (topic.name == images or entry is info) and topic.type_name in entry.readers:
+            read = detected.reader(entry, topic.type_name)
             readers[topic.name, topic.type_name] = (
                 detections.name,
                 partial(_detections, detections, read),

@@ -211,3 +211,23 @@ def test_several_topics_of_images_have_to_be_chosen_from(tmp_path, capsys):
     arguments = ['convert', 'images', str(bag), str(tmp_path / 'one'), '--topic']
     assert main([*arguments, '/starboard/ping']) == 0
     assert main([*arguments[:-2], str(tmp_path / 'none'), '--topic', '/nowhere']) in (1, 2)
+
+
+def test_what_the_sonar_says_beside_its_images_is_used_from_its_message_on(tmp_path, capsys):
+    said = marine.driver_message(
+        'marine_interfaces/msg/SonarInfo',
+        header=marine.header(),
+        intensity_quantity=3,
+        intensity_scale=1,
+        **dict.fromkeys(('pulse_lengths', 'bandwidths'), marine.floats([])),
+        tx_signal_types=np.zeros(0, np.uint8),
+    )
+    pings = [('/oculus/ping', oculus(k), k * 10**9) for k in range(1, 4)]
+    bag = write(tmp_path / 'bag', [*pings, ('/oculus/sonar_info', said, 25 * 10**8)])
+    with BagReader(bag) as reader:
+        heard = [one.measurement for one in measurements_of(reader, 'obstacle')]
+    strengths = [one.intensity[0] for one in heard if isinstance(one, Detections)]
+    assert strengths == pytest.approx([200.0, 200.0, np.sqrt(200.0)])
+    out = tmp_path / 'out'
+    assert main(['convert', 'images', str(bag), str(out), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['messages'] == {'/detections': 3}
