@@ -18,8 +18,8 @@ child process that may take `MEMORY` bytes and be silent for `SILENCE` seconds. 
 then is kept.
 
 The child gives records, dicts with the key ``kind``: ``ping`` (see the readers), ``profile`` (see
-`_profile`), ``note`` (name, text) and ``problem``, whose ``text`` says why there is no more. This module imports nothing
-of the package, so that the child starts fast.
+`_profile`), ``note`` (name, text) and ``problem``, whose ``text`` says why there is no more. This
+module imports nothing of the package, so that the child starts fast.
 """
 
 from __future__ import annotations
