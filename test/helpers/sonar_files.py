@@ -379,9 +379,9 @@ def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
 
     installation = zero(made.InstallationParameters())
     installation.set_installation_parameters(INSTALLATION_ALL)
-    cast = zero(made.SoundSpeedProfileDatagram(), depth_resolution=1, number_of_entries=2)
+    cast = zero(made.SoundSpeedProfileDatagram(), depth_resolution=100, number_of_entries=2)
     cast.set_profile_date(int(f'{BEGIN:%Y%m%d}'))
-    cast.set_depths_and_sound_speeds(np.array([[0, 14800], [3000, 14900]], np.uint32))
+    cast.set_depths_and_sound_speeds(np.array([[0, 14800], [30, 14900]], np.uint32))
     written = [packed(installation, 0.0), packed(zero(made.RuntimeParameters()), 0.0)]
     written.append(packed(cast, 0.0))
     for k in range(pings):
