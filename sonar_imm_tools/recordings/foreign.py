@@ -350,7 +350,7 @@ def _all(path: str) -> Iterator[Record]:
     kind = kongsbergall.t_KongsbergAllDatagramIdentifier.SoundSpeedProfileDatagram
     handler = kongsbergall.KongsbergAllFileHandler(path, show_progress=False)
     for cast in handler.datagram_interface.datagrams(kind):
-        # The library takes depths for centimetres; they are steps of the resolution, which is in cm.
+        # The library takes depths for centimetres; they are steps of the resolution, in cm.
         depths = 0.01 * cast.get_depth_resolution() * cast.get_depths_and_sound_speeds()[:, 0]
         yield _profile(depths, cast.get_sound_speeds_in_meters_per_second())
     yield from _kongsberg(handler)
