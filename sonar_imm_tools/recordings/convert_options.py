@@ -433,7 +433,7 @@ class XtfOptions:
     Each ping of --side is an image of one beam abeam, in which echoes are found; --set changes the
     detector (docs/parameters/fls_detector.md). Where a side has a channel whose name says phase,
     it becomes /port/snapshot or /starboard/snapshot too: one channel of stave 1 against stave 0,
-    or one for each stave.
+    or one for each stave. Processed soundings of a multibeam become /ground.
     """
 
     EXAMPLES: ClassVar = ('line.xtf line.bag', 'line.xtf line.bag --side port')
@@ -451,7 +451,8 @@ class XtfOptions:
 
 @frozen(kw_only=True)
 class Ek80Options:
-    """Raw file of a Simrad EK80 to /snapshot and /nav. Needs themachinethatgoesping.
+    """Raw file of a Simrad EK80 to /snapshot and /nav. Needs themachinethatgoesping; one of an
+    EK60 or ES60 needs ektools.
 
     The sectors of a split beam are summed to its starboard and its port half; --staves says other
     sums. Power and angles make the same two halves. Chirps are compressed. Of several channels the

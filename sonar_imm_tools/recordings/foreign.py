@@ -18,14 +18,16 @@ child process that may take `MEMORY` bytes and be silent for `SILENCE` seconds. 
 then is kept.
 
 The child gives records, dicts with the key ``kind``: ``ping`` (see the readers), ``profile`` (see
-`_profile`) and ``problem``, whose ``text`` says why there is no more. This module imports nothing
-of the package, so that the child starts fast.
+`_profile`), ``note`` (name, text) and ``problem``, whose ``text`` says why there is no more. This
+module imports nothing of the package, so that the child starts fast.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from datetime import datetime, timedelta
 import math
 import os
 from pathlib import Path
@@ -48,6 +50,10 @@ PACKET_HEAD = 14
 """Bytes at the head of each packet of XTF."""
 DEGREES, METRES = 3, 0
 """What positions of XTF are given in."""
+POWER_STEP = 10.0 * math.log10(2.0) / 256.0
+"""Decibels of a count of the power of an EK60."""
+MOST_WAITING = 200
+"""Pings that wait for a position of the ship."""
 
 
 def read_apart(reader: str, path: Path) -> Iterator[Record]:
@@ -89,8 +95,9 @@ def _end_of(child: subprocess.Popen[bytes], watch: threading.Timer) -> str:
 
 def _xtf(path: str) -> Iterator[Record]:
     """Pings of XTF: stamp_ns, channels (dicts of side, name, samples, slant_range, delay,
-    frequency), sound_speed, place (x, y) in degrees or metres as units says, heading, pitch, roll
-    in degrees, depth, altitude in metres."""
+    frequency), soundings (n, 3): metres east and north of the place, and depth below the surface,
+    None in a ping of side scan; sound_speed, place (x, y) in degrees or metres as units says,
+    heading, pitch, roll in degrees, depth, altitude in metres."""
     import pyxtf
 
     # Beside a file the library would unpickle an index; a file descriptor has nothing beside it.
@@ -99,18 +106,31 @@ def _xtf(path: str) -> Iterator[Record]:
         head = next(packets)
         if head.FileFormat != 0x7B:
             raise ValueError(f'the version of the file is {head.FileFormat}, not 123')
+        kinds = pyxtf.XTFHeaderType
+        others: Counter[str] = Counter()
         for packet in packets:
             if packet.NumBytesThisRecord < PACKET_HEAD:
                 raise ValueError('a packet states no length')
             if isinstance(packet, pyxtf.XTFPingHeader) and (
-                packet.HeaderType == pyxtf.XTFHeaderType.sonar
+                packet.HeaderType in (kinds.sonar, kinds.bathy_xyza)
             ):
-                yield _xtf_ping(head, packet, pyxtf.XTFChannelType)
+                yield _xtf_ping(head, packet, pyxtf)
+            else:
+                with suppress(ValueError):  # a type that the library does not know either
+                    others[kinds(packet.HeaderType).name] += 1
+        if others:
+            text = ', '.join(f'{count} {name}' for name, count in others.most_common(12))
+            yield {'kind': 'note', 'name': 'packets not taken', 'text': text}
 
 
-def _xtf_ping(head: Any, packet: Any, types: Any) -> Record:
+def _xtf_ping(head: Any, packet: Any, pyxtf: Any) -> Record:
+    types = pyxtf.XTFChannelType
     sides = {types.port.value: 'port', types.stbd.value: 'starboard'}
-    channels = []
+    channels, soundings = [], None
+    if packet.HeaderType == pyxtf.XTFHeaderType.bathy_xyza:
+        beams = np.frombuffer(packet.data, np.dtype(pyxtf.XTFBeamXYZA))
+        names = ('dPosOffsetTrX', 'dPosOffsetTrY', 'fDepth')
+        soundings = np.column_stack([beams[name].astype(np.float64) for name in names])
     for header, samples in zip(packet.ping_chan_headers, packet.data):
         if len(samples) < header.NumSamples:
             raise ValueError('a ping is cut off')
@@ -139,6 +159,7 @@ def _xtf_ping(head: Any, packet: Any, types: Any) -> Record:
         'kind': 'ping',
         'stamp_ns': stamp_ns,
         'channels': channels,
+        'soundings': soundings,
         # Half the speed of sound is what many programs write there.
         'sound_speed': packet.SoundVelocity * (2.0 if packet.SoundVelocity < 1000.0 else 1.0),
         # Who has no position leaves it at zero.
@@ -199,8 +220,7 @@ def _simrad(path: str) -> Iterator[Record]:
             'channel': channel,
             'iq': None if pairs is None else np.asarray(pairs)[..., 0] + 1j * pairs[..., 1],
             'power': samples.get_power(True) if samples.has_power() else None,
-            # As they lie in the file: athwartships, then alongships; 128 are half a turn.
-            'angle': None if angle is None else np.asarray(angle)[:, 0] * (math.pi / 128.0),
+            'angle': None if angle is None else _electrical(angle),
             'sample_interval': signal.SampleInterval,
             'frequency': frequency,
             'spacing': transducer.AngleSensitivityAthwartship
@@ -211,6 +231,107 @@ def _simrad(path: str) -> Iterator[Record]:
             **_placed(ping),
         }
         ping.release()
+
+
+def _ek60(path: str) -> Iterator[Record]:
+    """Pings of EK60 and ES60, as `_simrad` has them: power and angles. A ping waits for the next
+    position, between that and the last one it has its place."""
+    from ektools import ekfile, parse
+    from ektools.simrad_parsers import SimradRawParser
+
+    built: list[Any] = []
+    ship, parser, read = _Ship(), SimradRawParser(), 0
+    waiting: list[Record] = []
+    for kind, size, moment, content in ekfile(path).datagrams():
+        read += size + 8
+        if kind == 'CON0':
+            built = list(parse(content)['configuration'].values())
+        elif kind == 'NME0':
+            if ship.takes(_nanoseconds(moment), content[12:]):
+                yield from map(ship.placed, waiting)
+                waiting.clear()
+        elif kind == 'RAW0':
+            data = parser.from_string(content, size)
+            channel = built[data['channel'] - 1]
+            power, angle = data['power'], data['angle']
+            speed, frequency = float(data['sound_velocity']), float(data['frequency'])
+            spacing = channel['angle_sensitivity_athwartship'] * speed
+            waiting.append(
+                {
+                    'kind': 'ping',
+                    'stamp_ns': _nanoseconds(moment),
+                    'channel': channel['channel_id'],
+                    'iq': None,
+                    'power': None if power is None else power * POWER_STEP,
+                    'angle': None if angle is None else _electrical(angle),
+                    'sample_interval': float(data['sample_interval']),
+                    'frequency': frequency,
+                    'spacing': spacing / (2.0 * math.pi * (frequency or math.nan)),
+                    'chirp': None,
+                    'sound_speed': speed,
+                    'pitch': float(data['pitch']),
+                    'roll': float(data['roll']),
+                    'depth': float(data['transducer_depth']),
+                }
+            )
+            if len(waiting) > MOST_WAITING:
+                yield from map(ship.placed, waiting)
+                waiting.clear()
+    yield from map(ship.placed, waiting)
+    if read < os.path.getsize(path):
+        raise ValueError('a datagram is cut off')
+
+
+def _electrical(angle: Any) -> np.ndarray:
+    """Phase in rad of the starboard half against the port half. As they lie in the file:
+    athwartships, then alongships; 128 are half a turn."""
+    return np.asarray(angle)[:, 0] * (math.pi / 128.0)
+
+
+def _nanoseconds(moment: datetime) -> int:
+    """Since 1970, of a time in UTC that does not say so."""
+    return (moment - datetime(1970, 1, 1)) // timedelta(microseconds=1) * 1000
+
+
+class _Ship:
+    """Where a ship is by its last two positions (ns, longitude, latitude), and its heading, or
+    else its course, in degrees."""
+
+    def __init__(self) -> None:
+        self.last = self.next = (0, math.nan, math.nan)
+        self.heading = self.course = math.nan
+
+    def takes(self, stamp_ns: int, content: bytes) -> bool:
+        """Whether a sentence of NMEA says where the ship is."""
+        import pynmea2
+
+        with suppress(Exception):  # whatever is wrong with it, the next one may be right
+            sentence = pynmea2.parse(content.strip(b'\0\r\n ').decode('ascii'))
+            if sentence.sentence_type == 'HDT':
+                self.heading = float(sentence.heading)
+            elif sentence.sentence_type == 'VTG':
+                self.course = float(sentence.true_track)
+            elif sentence.sentence_type in ('GGA', 'GLL', 'RMC') and sentence.lat:
+                place = stamp_ns, float(sentence.longitude), float(sentence.latitude)
+                self.last, self.next = self.next, place
+                return True
+        return False
+
+    def placed(self, ping: Record) -> Record:
+        """A ping with the place of the ship, as in `_placed`."""
+        stamps = [self.last[0], self.next[0]]
+        known = [math.isfinite(place[1]) for place in (self.last, self.next)]
+        east, north = math.nan, math.nan
+        if all(known):
+            east, north = (
+                float(np.interp(ping['stamp_ns'], stamps, [self.last[k], self.next[k]]))
+                for k in (1, 2)
+            )
+        elif known[1]:
+            east, north = self.next[1:]
+        heading = self.heading if math.isfinite(self.heading) else self.course
+        place = {'units': 'degrees', 'place': (east, north), 'heading': heading}
+        return {**ping, **place, 'altitude': math.nan}
 
 
 def _kmall(path: str) -> Iterator[Record]:
@@ -229,7 +350,9 @@ def _all(path: str) -> Iterator[Record]:
     kind = kongsbergall.t_KongsbergAllDatagramIdentifier.SoundSpeedProfileDatagram
     handler = kongsbergall.KongsbergAllFileHandler(path, show_progress=False)
     for cast in handler.datagram_interface.datagrams(kind):
-        yield _profile(cast.get_depths_in_meters(), cast.get_sound_speeds_in_meters_per_second())
+        # The library takes depths for centimetres; they are steps of the resolution, in cm.
+        depths = 0.01 * cast.get_depth_resolution() * cast.get_depths_and_sound_speeds()[:, 0]
+        yield _profile(depths, cast.get_sound_speeds_in_meters_per_second())
     yield from _kongsberg(handler)
 
 
@@ -269,11 +392,16 @@ def _placed(ping: Any) -> Record:
 
 READERS: dict[str, Callable[[str], Iterator[Record]]] = {
     'xtf': _xtf,
+    'ek60': _ek60,
     'ek80': _simrad,
     'kmall': _kmall,
     'all': _all,
 }
-LIBRARIES = {'xtf': 'pyxtf', **dict.fromkeys(('ek80', 'kmall', 'all'), 'themachinethatgoesping')}
+LIBRARIES = {
+    'xtf': 'pyxtf',
+    'ek60': 'ektools',
+    **dict.fromkeys(('ek80', 'kmall', 'all'), 'themachinethatgoesping'),
+}
 
 
 def _bound_memory() -> None:

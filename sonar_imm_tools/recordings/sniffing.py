@@ -32,9 +32,9 @@ from .topics import made_topics
 from .track_files import kind_of_text, START
 
 SONAR_FILES = {
-    'ek80': 'a raw file of a Simrad EK80',
+    'ek80': 'a raw file of a Simrad EK60 or EK80',
     'kongsberg': 'a KMALL or .all file of a Kongsberg multibeam',
-    'xtf': 'side scan in XTF',
+    'xtf': 'side scan or soundings in XTF',
 }
 """Binary files of sonars, by the kind of conversion."""
 PICTURES = ('.png', '.jpg', '.jpeg')

@@ -179,6 +179,22 @@ def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
     assert '<html' in report.read_text().lower()
 
 
+@pytest.mark.parametrize('name', ['usbl.csv', 'harbour.nmea', 'line.xtf', 'd.raw'])
+def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr('webbrowser.open', opened.append)
+    monkeypatch.setenv('TMPDIR', str(tmp_path))
+    monkeypatch.setattr('tempfile.tempdir', None)
+    make = ROADS[name] if name in ROADS else SONARS[name][0]
+    make(tmp_path / name)
+    bag = tmp_path / 'line.bag'
+    assert main(['convert', str(tmp_path / name), str(bag)]) == 0
+    assert main(['view', str(bag), '--browser']) == 0
+    report = Path(capsys.readouterr().out.rpartition('report: ')[2].strip())
+    assert opened == [report.as_uri()] and report.is_relative_to(tmp_path)
+    assert 'plotly' in report.read_text().lower()
+
+
 def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alone(
     tmp_path, capsys
 ):

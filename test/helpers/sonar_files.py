@@ -74,6 +74,21 @@ def xtf_ping(seconds, samples, place=PLACE, slant_range=50.0, **more):
     return ping.to_bytes().ljust(ping.NumBytesThisRecord, b'\0')
 
 
+def xtf_soundings(seconds, beams, place=PLACE):
+    """A ping of processed soundings; beams: (east, north, depth) in metres."""
+    import pyxtf
+
+    ping = pyxtf.XTFPingHeader.from_buffer_copy(xtf_ping(seconds, [], place))
+    ping.HeaderType = pyxtf.XTFHeaderType.bathy_xyza.value
+    ping.NumChansToFollow, content = len(beams), b''
+    for east, north, depth in beams:
+        beam = pyxtf.XTFBeamXYZA()
+        beam.dPosOffsetTrX, beam.dPosOffsetTrY, beam.fDepth = east, north, depth
+        content += bytes(beam)
+    ping.NumBytesThisRecord = len(bytes(ping)) + len(content)
+    return bytes(ping) + content
+
+
 def side_scan(path, pings=60, bins=500, target=(3.0, 30.0), seed=1):
     """A line east at half a metre per second, 5 pings per second, with one target to starboard;
     target: metres east along the line and away from it."""
@@ -110,6 +125,75 @@ FILTERS = [
     (np.array([1.0 + 0.0j]), 3),
 ]
 """Coefficients and decimation of its filters."""
+
+
+def sentences(seconds, place=PLACE):
+    """Datagrams that say where the ship is and that it looks east."""
+    latitude, longitude = place
+    moment = BEGIN + timedelta(seconds=seconds)
+    fix = (
+        f'GPGGA,{moment:%H%M%S}.{moment.microsecond // 10_000:02d},'
+        f'{int(latitude):02d}{latitude % 1 * 60:08.5f},N,'
+        f'{int(longitude):03d}{longitude % 1 * 60:08.5f},E,1,10,1.0,0.0,M,0.0,M,,'
+    )
+    parts = []
+    for text in (fix, 'INHDT,90.0,T'):
+        total = 0
+        for letter in text:
+            total ^= ord(letter)
+        parts.append(ek80_datagram('NME0', seconds, f'${text}*{total:02X}'.encode()))
+    return parts
+
+
+def ek60(path, power, angles):
+    """A raw file of an EK60 with one channel, a ping and a position each 0.2 s, 0.4 m to the east;
+    power (pings, bins), whole numbers of 3.0103/256 dB; angles (pings, bins, 2) as in `ek80`, or
+    None. The datagrams with samples and the configuration are written by the library."""
+    from ektools.simrad_parsers import SimradConfigParser, SimradRawParser
+
+    zeros = dict.fromkeys(
+        ['low_date', 'high_date', 'pulse_length', 'bandwidth', 'absorption_coefficient', 'heave']
+        + ['roll', 'pitch', 'temperature', 'heading', 'transmit_mode', 'offset', 'transmit_power']
+        + ['transducer_depth', 'gain', 'equivalent_beam_angle', 'beam_type']
+        + [f'angle_offset_{way}' for way in ('alongship', 'athwartship')]
+        + [f'beam_width_{way}' for way in ('alongship', 'athwartship')]
+        + [f'{what}_{axis}' for what in ('pos', 'dir') for axis in 'xyz'],
+        0,
+    )
+    texts = ['survey_name', 'transect_name', 'version', 'gpt_software_version']
+    texts += [f'spare{k}' for k in range(5)]
+    channel = {
+        **zeros,
+        **dict.fromkeys(texts, ''),
+        **dict.fromkeys(['pulse_length_table', 'gain_table', 'sa_correction_table'], [0.0] * 5),
+        'sounder_name': 'ER60',
+        'channel_id': 'GPT 38 kHz ES38B',
+        'frequency': 38e3,
+        'angle_sensitivity_alongship': 21.9,
+        'angle_sensitivity_athwartship': 21.9,
+    }
+    built = {**zeros, 'type': 'CON0', 'configuration': {channel['channel_id']: channel}}
+    parts = [ek80_datagram('CON0', 0.0, SimradConfigParser().to_string(built)[16:-4])]
+    for k, row in enumerate(power):
+        seconds = 0.2 * k
+        data = {
+            **zeros,
+            'type': 'RAW0',
+            'channel': 1,
+            'mode': 1 if angles is None else 3,
+            'frequency': 38e3,
+            'sample_interval': 2.56e-4,
+            'sound_velocity': 1490.0,
+            'spare0': '',
+            'count': len(row),
+            'power': row.astype(np.int16),
+            'angle': None if angles is None else angles[k].astype(np.int8),
+        }
+        parts += sentences(seconds, place_of(0.4 * k, 0.0))
+        content = SimradRawParser().to_string(data)[16:-4]
+        parts.append(ek80_datagram('RAW0', seconds + 0.1, content))
+    path.write_bytes(b''.join(parts))
+    return path
 
 
 def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 1-15 ES70'):
@@ -162,18 +246,7 @@ def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 
         parts.append(ek80_datagram('FIL1', 0.0, content.to_binary()[16:-4]))
     for k, rows in enumerate(samples):
         seconds = 0.2 * k
-        latitude, longitude = PLACE
-        moment = BEGIN + timedelta(seconds=seconds)
-        fix = (
-            f'GPGGA,{moment:%H%M%S}.{moment.microsecond // 10_000:02d},'
-            f'{int(latitude):02d}{latitude % 1 * 60:08.5f},N,'
-            f'{int(longitude):03d}{longitude % 1 * 60:08.5f},E,1,10,1.0,0.0,M,0.0,M,,'
-        )
-        for text in (fix, 'INHDT,90.0,T'):
-            total = 0
-            for letter in text:
-                total ^= ord(letter)
-            parts.append(ek80_datagram('NME0', seconds, f'${text}*{total:02X}'.encode()))
+        parts += sentences(seconds)
         parts.append(
             xml(
                 seconds,
@@ -202,6 +275,17 @@ def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 
     return path
 
 
+def zero(part, **values):
+    """A part of a datagram: what the library leaves undefined is 0."""
+    for name in dir(part):
+        if name.startswith('set_') and 'identifier' not in name:
+            with suppress(TypeError):  # texts and lists
+                getattr(part, name)(0)
+    for name, value in values.items():
+        getattr(part, f'set_{name}')(value)
+    return part
+
+
 INSTALLATION = (
     'OSCV:Empty,EMXV:EM2042,PU_0,SN=25002,IP=157.237.20.40:0xffff0000,UDP=1997,TYPE=CON_TECH,'
     'VERSIONS:,CPU:6.3.0,VXW:7,FILTER:1,CBMF:1,TX:1.02,RX:3.3.0,VERSIONS-END,SERIALno:,TX:1,RX:2,'
@@ -217,16 +301,6 @@ def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
     """A KMALL file, written by the library: an EM 2042 that goes east, 5 pings per second; across,
     down: m from the reference point, of the soundings."""
     from themachinethatgoesping.echosounders.kmall import datagrams as made
-
-    def zero(part, **values):
-        """A part of a datagram: what the library leaves undefined is 0."""
-        for name in dir(part):
-            if name.startswith('set_'):
-                with suppress(TypeError):  # texts and lists
-                    getattr(part, name)(0)
-        for name, value in values.items():
-            getattr(part, f'set_{name}')(value)
-        return part
 
     def packed(datagram, seconds):
         nanoseconds = round((BEGIN.timestamp() + seconds) * 1e9)
@@ -270,4 +344,83 @@ def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
         )
         parts.append(packed(ping, 0.2 * k))
     path.write_bytes(b''.join(parts))
+    return path
+
+
+OFFSETS = [f'S{k}{axis}' for k in (1, 2) for axis in 'ZYXHRP'] + [f'P1{axis}' for axis in 'ZYX']
+OFFSETS += [f'MS{axis}' for axis in 'XYZRPG'] + [f'DS{axis}' for axis in 'OXYZ']
+INSTALLATION_ALL = (
+    'WLZ=0,SMH=101,HUN=0,S1S=0,GO1=0,GO2=0,FGD=0,TSV=1,RSV=1,BSV=1,PSV=1,DSV=1,OSV=SIS,DSF=1,'
+    'APS=0,P1M=0,P1T=1,P1D=0,P1G=WGS84,MRP=RP,MSD=0,VSN=1,ARO=2,AHE=2,AHS=2,STC=1,'
+    + ''.join(f'{name}=0,' for name in OFFSETS)
+)
+
+
+def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
+    """The same line as `kmall` in an .all file of an EM 2040, with a compass and a profile."""
+    from themachinethatgoesping.echosounders.kongsbergall import datagrams as made
+
+    parts = made.substructures
+
+    def packed(datagram, seconds):
+        midnight = BEGIN.replace(hour=0, minute=0, second=0)
+        datagram.set_date(int(f'{BEGIN:%Y%m%d}'))
+        clock = (BEGIN - midnight).total_seconds() + seconds
+        datagram.set_time_since_midnight(round(1e3 * clock))
+        datagram.set_model_number(2040)
+        datagram.set_system_serial_number(101)
+        datagram.set_stx(2)
+        datagram.set_etx(3)
+        if isinstance(datagram, made.InstallationParameters):
+            datagram.set_bytes(21 + len(INSTALLATION_ALL))
+        else:
+            datagram.set_bytes(len(datagram.to_binary()) - 4)
+        return datagram.to_binary()
+
+    installation = zero(made.InstallationParameters())
+    installation.set_installation_parameters(INSTALLATION_ALL)
+    cast = zero(made.SoundSpeedProfileDatagram(), depth_resolution=100, number_of_entries=2)
+    cast.set_profile_date(int(f'{BEGIN:%Y%m%d}'))
+    cast.set_depths_and_sound_speeds(np.array([[0, 14800], [30, 14900]], np.uint32))
+    written = [packed(installation, 0.0), packed(zero(made.RuntimeParameters()), 0.0)]
+    written.append(packed(cast, 0.0))
+    for k in range(pings):
+        latitude, longitude = place_of(0.4 * k, 0.0)
+        place = zero(
+            made.PositionDatagram(),
+            latitude=round(2e7 * latitude),
+            longitude=round(1e7 * longitude),
+            heading=9000,
+            course=9000,
+            position_system_descriptor=1,
+            size_of_input_datagram=6,
+        )
+        place.set_input_datagram('$GPGGA')
+        attitude = zero(made.AttitudeDatagram(), number_of_entries=1)
+        entries = parts.AttitudeDatagramAttitudesContainer()
+        entries.set_attitudes([zero(parts.AttitudeDatagramAttitude(), heading=9000)])
+        attitude.set_attitudes(entries)
+        count = len(across)
+        ping = zero(
+            made.XYZDatagram(),
+            heading=9000,
+            ping_counter=k,
+            number_of_beams=count,
+            number_of_valid_detections=count,
+        )
+        beams = parts.XYZDatagramBeamsContainer()
+        beams.set_beams(
+            [
+                zero(
+                    parts.XYZDatagramBeam(),
+                    depth=down,
+                    acrosstrack_distance=y,
+                    alongtrack_distance=0.5,
+                )
+                for y in across
+            ]
+        )
+        ping.beams = beams
+        written += [packed(part, 0.2 * k) for part in (place, attitude, ping)]
+    path.write_bytes(b''.join(written))
     return path

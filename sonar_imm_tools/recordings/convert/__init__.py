@@ -28,6 +28,7 @@ from ..csv_table import CsvOptions
 from .arrivals import convert_arrivals
 from .autoferry import convert_autoferry
 from .detections import convert_detections
+from .echo_sounders import convert_ek80, convert_kongsberg
 from .fixes import convert_fixes
 from .hydrophones import convert_hydrophones
 from .images import convert_images
@@ -35,8 +36,8 @@ from .interferometer import convert_interferometer
 from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
+from .side_scan import convert_pictures, convert_xtf
 from .snapshots import convert_snapshots
-from .sonar_files import convert_ek80, convert_kongsberg, convert_pictures, convert_xtf
 from .traces import convert_traces
 from .truth import convert_truth
 

@@ -22,16 +22,19 @@ import sys
 
 from helpers.sonar_files import (
     BAND,
+    ek60,
     ek80,
-    ek80_datagram,
     FILTERS,
     kmall,
+    kongsberg_all,
+    place_of,
     PULSE,
     RATE,
     side_scan,
     SLOPE,
     xtf_head,
     xtf_ping,
+    xtf_soundings,
 )
 import numpy as np
 import pytest
@@ -122,6 +125,33 @@ class TestXtf:
         assert snapshot.side == 'starboard' and snapshot.staves == 2
         assert snapshot.range[0] == pytest.approx(0.05) and snapshot.frequency == 450e3
 
+    def test_a_channel_of_phases_for_each_stave(self, tmp_path):
+        names = ['amplitude', 'phase 1', 'phase 2']
+        channels = [(name, 'port', 'float32') for name in names]
+        size = np.linspace(1.0, 2.0, 50).astype('f4')
+        turns = [np.linspace(-1.0, 1.0, 50).astype('f4'), np.linspace(2.0, 0.5, 50).astype('f4')]
+        path = xtf(tmp_path / 'a.xtf', [xtf_ping(0.0, [size, *turns])], channels)
+        convert_xtf(path, tmp_path / 'bag')
+        (snapshot,) = read(tmp_path / 'bag', 'bathymetry', Snapshot)
+        wanted = size[::-1, None] * np.exp(1j * np.column_stack(turns)[::-1])
+        assert snapshot.iq == pytest.approx(wanted, rel=1e-5)
+        assert snapshot.side == 'port'
+
+    def test_soundings_of_a_multibeam_are_ground_and_other_packets_are_named(self, tmp_path):
+        raw = bytearray(xtf_soundings(0.1, [(0.0, 0.0, 9.0)]))
+        raw[2] = 2  # bathymetry as the vendor has it
+        beams = [(-10.0, 2.0, 20.0), (10.0, -2.0, 21.0), (0.0, 0.0, 0.0)]
+        pings = [xtf_soundings(0.0, beams), raw, xtf_soundings(0.2, beams, place_of(3.0, 0.0))]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings, []), tmp_path / 'bag')
+        assert report.messages == {'/ground': 2, '/nav': 2, '/altitude': 2}
+        assert report.notes['packets not taken'] == '1 bathy'
+        assert 'samples' not in report.notes and not report.problems
+        with BagReader(tmp_path / 'bag') as bag:
+            grounds = [read_ground(item.message) for item in bag.messages(['/ground'])]
+        for x, ground in zip((0.0, 3.0), grounds):
+            wanted = [[x - 10.0, 2.0, -20.0], [x + 10.0, -2.0, -21.0]]
+            assert ground.position == pytest.approx(np.array(wanted), abs=0.02)
+
     def test_what_came_before_the_damage_is_kept(self, tmp_path):
         whole = xtf(tmp_path / 'a.xtf', some(5)).read_bytes()
         (tmp_path / 'cut.xtf').write_bytes(whole[:-900])
@@ -208,12 +238,15 @@ def test_the_reader_of_echo_sounders_is_here_wherever_it_has_a_wheel():
 
 
 def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
-    for name in ('pyxtf', 'themachinethatgoesping'):
+    for name in ('pyxtf', 'themachinethatgoesping', 'ektools'):
         (tmp_path / f'{name}.py').write_text('raise ImportError("not here")')
     (tmp_path / 'a').write_bytes(b'\x7b' + bytes(2000))
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(BagError, match=r'a needs pyxtf: .*sonar_imm\[xtf\]'):
         convert_xtf(tmp_path / 'a', tmp_path / 'bag')
+    (tmp_path / 'b').write_bytes(bytes(4) + b'CON0' + bytes(600))
+    with pytest.raises(BagError, match=r'b needs ektools: .*sonar_imm\[echosounders\]'):
+        convert_ek80(tmp_path / 'b', tmp_path / 'bag')
     for convert in (convert_ek80, convert_kongsberg):
         with pytest.raises(BagError, match=r'sonar_imm\[echosounders\]'):
             convert(tmp_path / 'a', tmp_path / 'bag')
@@ -299,9 +332,6 @@ class TestEk80:
             convert_ek80(ek80(tmp_path / 'a.raw', samples, chirp=True, filters=[]), tmp_path / 'o')
         with pytest.raises(BagError, match='no ping that could be converted'):
             convert_ek80(ek80(tmp_path / 'b.raw', samples), tmp_path / 'bag', channel='ES38')
-        (tmp_path / 'c.raw').write_bytes(ek80_datagram('CON0', 0.0, bytes(600)))
-        with pytest.raises(BagError, match='of an EK60 or ES60.*echopype'):
-            convert_ek80(tmp_path / 'c.raw', tmp_path / 'bag')
 
     def test_what_came_before_the_cut_is_kept(self, tmp_path, samples):
         path = ek80(tmp_path / 'a.raw', samples)
@@ -309,10 +339,71 @@ class TestEk80:
         assert convert_ek80(path, tmp_path / 'bag').messages['/snapshot'] == 2
 
 
+class TestEk60:
+    @pytest.fixture(autouse=True)
+    def _library(self):
+        pytest.importorskip('ektools')
+
+    @pytest.fixture
+    def samples(self):
+        rng = np.random.default_rng(2)
+        return rng.integers(-9000, -3000, (3, 200)), rng.integers(-128, 128, (3, 200, 2))
+
+    def test_power_and_angles_are_two_halves(self, tmp_path, samples):
+        power, angles = samples
+        report = convert_ek80(ek60(tmp_path / 'a.raw', *samples), tmp_path / 'bag')
+        assert report.messages == {'/nav': 3, '/snapshot': 3} and not report.problems
+        assert report.notes['channel'] == 'GPT 38 kHz ES38B'
+        found = read(tmp_path / 'bag', 'bathymetry', Snapshot)
+        for ping, snapshot in enumerate(found):
+            starboard, port = snapshot.iq.T
+            decibels = 10 * np.log10(np.abs(starboard) ** 2)
+            assert decibels == pytest.approx(power[ping, 1:] * 10 * np.log10(2) / 256, abs=1e-3)
+            turn = starboard * port.conj() / np.abs(port) ** 2
+            wanted = np.exp(1j * np.pi / 128 * angles[ping, 1:, 0])  # athwartships comes first
+            assert turn == pytest.approx(wanted, abs=1e-5)
+        first = found[0]
+        assert first.stamp_ns == pytest.approx((1_717_149_600.1) * 1e9, abs=1e4)
+        assert (first.sound_speed, first.frequency) == pytest.approx((1490.0, 38e3))
+        assert first.element_spacing == pytest.approx(21.9 * 1490 / 38e3 / (2 * np.pi), rel=1e-6)
+        assert first.range[99] == pytest.approx(100 * 0.5 * 1490.0 * 2.56e-4, rel=1e-5)
+
+    def test_a_ping_lies_between_two_positions(self, tmp_path, samples):
+        """Pings 0.1 s after a position each, at 2 m/s to the east; none follows the last."""
+        convert_ek80(ek60(tmp_path / 'a.raw', *samples), tmp_path / 'bag')
+        with BagReader(tmp_path / 'bag') as bag:
+            east = [each.message.pose.pose.position.x for each in bag.messages(['/nav'])]
+        assert np.diff(east) == pytest.approx([0.4, 0.2], abs=0.02)
+
+    def test_power_alone_is_refused(self, tmp_path, samples):
+        with pytest.raises(BagError, match='power alone, which says no direction'):
+            convert_ek80(ek60(tmp_path / 'a.raw', samples[0], None), tmp_path / 'bag')
+
+    def test_what_came_before_the_cut_is_kept(self, tmp_path, samples):
+        path = ek60(tmp_path / 'a.raw', *samples)
+        path.write_bytes(path.read_bytes()[:-500])
+        report = convert_ek80(path, tmp_path / 'bag')
+        assert report.messages['/snapshot'] == 2 and 'a datagram is cut off' in report.problems[0]
+
+
 class TestKongsberg:
     @pytest.fixture(autouse=True)
     def _library(self):
         pytest.importorskip('themachinethatgoesping')
+
+    def test_soundings_of_an_all_file_lie_beside_the_ship(self, tmp_path):
+        """It heads east: starboard is south."""
+        report = convert_kongsberg(kongsberg_all(tmp_path / 'a.all'), tmp_path / 'bag')
+        assert report.messages == {'/ground': 5, '/nav': 5} and not report.problems
+        with BagReader(tmp_path / 'bag') as bag:
+            grounds = [read_ground(item.message) for item in bag.messages(['/ground'])]
+        for k, ground in enumerate(grounds):
+            wanted = [[0.4 * k + 0.5, -y, -20.0] for y in (-10.0, 0.0, 10.0)]
+            assert ground.position == pytest.approx(np.array(wanted), abs=0.02)
+            assert ground.stamp_ns == pytest.approx((1_717_149_600 + 0.2 * k) * 1e9, abs=1e4)
+        own = yaml.safe_load((tmp_path / 'bag' / 'parameters.yaml').read_text())
+        profile = own['bathymetry']['ros__parameters']['sound_speed_profile']
+        assert profile == pytest.approx([0.0, 1480.0, 30.0, 1490.0])
 
     def test_soundings_and_navigation(self, tmp_path):
         report = convert_kongsberg(kmall(tmp_path / 'a.kmall'), tmp_path / 'bag')
