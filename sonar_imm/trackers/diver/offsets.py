@@ -37,7 +37,7 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from ...acoustics.arrivals_3d import arrival_paths
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import TENTATIVE
 from ...measurements import Arrivals
 from .config import DiverConfig
@@ -92,7 +92,7 @@ class Offsets(NamedTuple):
     freedom: float = 0.0
 
     def after(
-        self, ping: Ping, echoes: BoolArray, ids: FloatArray, x: FloatArray, config: DiverConfig
+        self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
     ) -> Offsets:
         """With a ping of a diver at x (2,) or, where depth is a state, (3,): `echoes` (C,) of it
         that may be his, `ids` (rows of the message, 2) of transmitters and receivers."""
@@ -189,8 +189,8 @@ class Offsets(NamedTuple):
             unstated.insert(0, DEPTH)
         what = f'{" or ".join(likely)} would explain it; else ' if likely else ''
         return [
-            'arrivals miss by the same ping after ping, more than is stated of the instruments and '
-            f'wherever the diver is (chi-square {largest:.3g} of {found[EVERY][1]} degrees of '
+            'arrivals miss by the same ping after ping, wherever the diver is and by more than is '
+            f'stated of the instruments (chi-square {largest:.3g} of {found[EVERY][1]} degrees of '
             f'freedom), so that covariances are too small: {what}state ' + ', '.join(unstated)
         ]
 
@@ -243,7 +243,7 @@ def watched(
 
 
 def _fitted(
-    ping: Ping, chosen: np.ndarray, x: FloatArray, config: DiverConfig
+    ping: Ping, chosen: IndexArray, x: FloatArray, config: DiverConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
     """Where the echoes `chosen` (C,) put a diver who is near x (2 or 3,): place (3,), residual
     (C,), its derivative H (C, k) by the place, and by the emission of a tag, length (C,); None
@@ -272,7 +272,7 @@ def _fitted(
     return None
 
 
-def _lengths(ping: Ping, chosen: np.ndarray, place: FloatArray) -> FloatArray:
+def _lengths(ping: Ping, chosen: IndexArray, place: FloatArray) -> FloatArray:
     measured = ping.measured
     tx = None if ping.passive else measured.tx[chosen]
     return arrival_paths(place, tx, measured.rx[chosen]).length
