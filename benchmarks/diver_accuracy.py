@@ -141,9 +141,9 @@ def rmse(estimate: np.ndarray, truth: np.ndarray, columns: slice = slice(0, 2)) 
     return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
 
-def tuned(model_set: str, names: list[str]) -> DiverConfig:
-    """The baseline with the noise that does best on 100 scenes of other seeds."""
-    truth, z, R = load(names, range(10_000, 10_100))
+def tuned(model_set: str, names: list[str], scenes: int = 100) -> DiverConfig:
+    """The baseline with the noise that does best on so many scenes of other seeds."""
+    truth, z, R = load(names, range(10_000, 10_000 + scenes))
     candidates = [
         DiverConfig(
             model_set=model_set,

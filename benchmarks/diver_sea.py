@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.study import final_estimates, Parts, study, truths
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -49,6 +50,11 @@ def score(scene: Scene, config: DiverConfig) -> np.ndarray:
     and `depth_ambiguous`; the last three NaN where depth is no state. A stamp without a track
     gives NaN."""
     final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
+    return score_of(final, scene)
+
+
+def score_of(final: Mapping[int, Estimate], scene: Scene) -> np.ndarray:
+    """As `score`, of estimates by stamp."""
     track = truths(scene, TrueTrack)[0]
     rows: list[list[Any]] = []
     for k, stamp in enumerate(track.stamp_ns.tolist()):
@@ -225,6 +231,50 @@ def lasting_cells() -> Cells:
     return cells
 
 
+UNTOLD = 'untold'
+FIRST, GOOD_NEES = 60.0, 4.0
+"""Seconds within which what is not stated has to warn, and the mean NEES that needs no warning."""
+OFF: Values = {
+    'receiver_position_std': 1.0,
+    'receiver_clock_std': 5e-4,
+    'sound_speed_std': 5.0,
+}
+STATED: dict[str, Values] = {
+    'multistatic': {},
+    'at_depth': {'dimensions': 3},
+    'misplaced_receivers': OFF,
+    'lasting_errors': {'fix_bias_std': 1.0},
+}
+
+
+def warned(name: str, config: Values, runs: int) -> dict[str, Any]:
+    """Of the first minute of `runs` scenes with default parameters and `config`: how many warn,
+    after what time in the median, how many have a mean NEES of `GOOD_NEES` at most, and how many
+    either."""
+    after, nees = [], []
+    for seed in range(runs):
+        made = simulate(scenario(name, {'duration': FIRST}), seed)
+        tracker, when = DiverTracker(DiverConfig(**config)), np.nan
+        first = made.measurements[0].measurement.stamp_ns
+        final = {}
+        for item in made.measurements:
+            estimates = tracker.process(item.measurement)
+            final.update((each.stamp_ns, each) for each in estimates)
+            if np.isnan(when) and tracker.warnings():
+                when = (item.measurement.stamp_ns - first) * 1e-9
+        after.append(when)
+        nees.append(float(np.nanmean(score_of(final, made)[:, 1])))
+    good = np.array(nees) <= GOOD_NEES
+    return {
+        'runs': runs,
+        'warn': int(np.isfinite(after).sum()),
+        'after s': float(np.nanmedian(after)) if np.isfinite(after).any() else None,
+        'NEES good': int(good.sum()),
+        'either': int((good | np.isfinite(after)).sum()),
+        'NEES': nees,
+    }
+
+
 TABLES = {
     'depth': depth_cells,
     'fixes': fix_cells,
@@ -235,7 +285,14 @@ TABLES = {
 
 def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:
     yield {'runs': runs}
-    for name in table or TABLES:
+    for name in table or [*TABLES, UNTOLD]:
+        if name == UNTOLD:
+            for scene_name, config in STATED.items():
+                for column, given in {'nothing stated': {}, 'stated': config}.items():
+                    row = f'{scene_name}, {column}'
+                    if only in row and (given or column != 'stated'):
+                        yield {name: {row: warned(scene_name, given, runs)}}
+            continue
         for row, column, scene_name, scene, config in TABLES[name]():
             if only in row + column:
                 yield {name: {row: {column: errors(scene, config, runs, scene_name)}}}
@@ -244,7 +301,11 @@ def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> 
 if __name__ == '__main__':
     study(
         main,
-        shown=lambda row: {column: text_of(found) for column, found in row.items()},
-        table={'action': 'append', 'choices': list(TABLES)},
+        shown=lambda row: (
+            {key: value for key, value in row.items() if key != 'NEES'}
+            if 'warn' in row
+            else {column: text_of(found) for column, found in row.items()}
+        ),
+        table={'action': 'append', 'choices': [*TABLES, UNTOLD]},
         only={'help': 'columns or rows whose name holds this'},
     )

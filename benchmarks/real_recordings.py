@@ -139,31 +139,30 @@ def tag_scores(estimates: list, truth: np.ndarray) -> list[float]:
     ]
 
 
-def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[float]:
-    """The fixes themselves, or those that each ping gives by itself."""
+def raw_fixes(items: list, config: DiverConfig) -> list[Estimate]:
+    """The fixes themselves, or those that each ping gives by itself, as tracks without a past."""
     rows = []
     for item in items:
         if isinstance(item, Fix):
             assert item.covariance is not None
-            rows.append((item.stamp_ns * 1e-9, item.position[:2], item.covariance[:2, :2]))
+            covariance = config.covariance_scale * item.covariance[:2, :2]
+            rows.append((item.stamp_ns, item.position[:2], covariance))
         elif isinstance(item, Arrivals):
             fix = locate(item, np.arange(len(item)), config, config.covariance_scale)
-            rows += [(item.stamp_ns * 1e-9, fix.position, fix.covariance)] if fix else []
-
-    return tag_scores(
-        [
-            Estimate(
-                stamp_ns=round(stamp * 1e9),
-                frame_id='map',
-                xyz=np.zeros((1, 3), np.float32),
-                state_names=('px', 'py'),
-                state=place[None, :2],
-                covariance=np.asarray(covariance)[None],
-            )
-            for stamp, place, covariance in rows
-        ],
-        truth,
-    )
+            rows += [(item.stamp_ns, fix.position, fix.covariance)] if fix else []
+    alone = {'track_state': np.ones(1, np.uint8)}
+    return [
+        Estimate(
+            stamp_ns=stamp_ns,
+            frame_id='map',
+            xyz=np.zeros((1, 3), np.float32),
+            state_names=('px', 'py'),
+            state=place[None, :2],
+            covariance=np.asarray(covariance)[None],
+            extras={**alone, 'track_id': np.array([number])},
+        )
+        for number, (stamp_ns, place, covariance) in enumerate(rows)
+    ]
 
 
 def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
@@ -186,7 +185,7 @@ def tag_table(title: str, items: list, truth: np.ndarray, **extra: Any) -> None:
     # is the prediction.
     least = {'pings of 3 or more': 3, 'pings of 2 or more': 2, '': 0}
     sizes = {item.stamp_ns: len(item) if isinstance(item, Arrivals) else 3 for item in items}
-    row('each ping or fix by itself', raw_scores(items, truth, config))
+    row('each ping or fix by itself', tag_scores(raw_fixes(items, config), truth))
     for name, values in SETS.items():
         filtered, smooth = follow(DiverConfig(**{**TAG, **extra, **values}), items)
         kinds = {name: filtered}

@@ -20,15 +20,19 @@ have it, or says that it cannot. One scene of each row, from the seed on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 import tempfile
 import time
 
+import numpy as np
+
+from benchmarks.real_recordings import DATA
 from benchmarks.study import Parts, study
 from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.evaluation.tuning import prepared, tune
+from sonar_imm_tools.recordings.convert import convert_fixes
 
 ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | None]] = {
     'diver, covariances 4 times too small': (
@@ -46,6 +50,22 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | Non
         {'model_set': 'heading_speed'},
         'covariance_scale',
         1.0,
+    ),
+    'diver, velocities that wander by 0.1, covariances 6 times too small': (
+        'diver',
+        'wandering',
+        {'fixes': '400', 'noise': '0.1'},
+        {'covariance_scale': '0.1666667', 'model_set': 'cv', 'acceleration_noise': '0.3'},
+        'covariance_scale,acceleration_noise',
+        None,
+    ),
+    'tow tag, a fix in 29 s': (
+        'diver',
+        'tow tag',
+        {},
+        {'max_coast': '600', 'target_z': '-1', 'model_set': 'heading_speed'},
+        'covariance_scale',
+        None,
     ),
     'obstacle, ranges 3 times as noisy': (
         'obstacle',
@@ -73,9 +93,36 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | Non
     ),
 }
 """System, scene, its settings, parameters to begin with, what is fitted, and what is true:
-None where the scene has no such number. Reflectors of the drift move by .01 m from record to
-record, by the tilt of the array and by .03 m of its depth; the heights of the rough patch are
-white, with a standard deviation of .5 m, and the floor beside it is flat."""
+None where the scene has no such number; scenes of `MADE` are no scenarios. The wandering target
+has a scale of 1 and a noise of .1. Reflectors of the drift move by .01 m from record to record, by
+the tilt of the array and by .03 m of its depth; the heights of the rough patch are white, with a
+standard deviation of .5 m, and the floor beside it is flat."""
+
+
+def wandering(out: Path, seed: int, fixes: str, noise: str) -> None:
+    """A target with a velocity that wanders by `noise` m/s in the root of a second: `fixes` of it,
+    one a second, good to 1 m."""
+    rng, csv = np.random.default_rng(seed), out.with_suffix('.csv')
+    q = float(noise) ** 2 * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
+    F, L = np.array([[1.0, 1.0], [0.0, 1.0]]), np.linalg.cholesky(q)
+    x = np.array([[0.0, 0.0], [0.5, 0.3]])
+    lines = ['stamp_s,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2']
+    for second in range(int(fixes)):
+        x = F @ x + L @ rng.normal(size=(2, 2))
+        place = x[0] + rng.normal(size=2)
+        lines.append(f'{1_700_000_000 + second},{place[0]:.4f},{place[1]:.4f},1.0,0.0,1.0')
+    csv.write_text('\n'.join(lines) + '\n', encoding='utf-8')
+    convert_fixes(csv, out)
+
+
+def tow_tag(out: Path, seed: int) -> None:
+    """The fixes of the towed tag (`real_recordings`)."""
+    if not DATA.is_dir():
+        raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
+    convert_fixes(DATA / 'yaps_ssu1' / 'fixes.csv', out)
+
+
+MADE: dict[str, Callable[..., None]] = {'wandering': wandering, 'tow tag': tow_tag}
 
 
 def main(seed: int = 1, rows: Sequence[str] = tuple(ROWS)) -> Parts:
@@ -86,10 +133,12 @@ def main(seed: int = 1, rows: Sequence[str] = tuple(ROWS)) -> Parts:
             bag = Path(folder) / 'scene.bag'
             pairs = [text for k, v in settings.items() for text in ('--set', f'{k}={v}')]
             arguments = ['simulate', system, str(bag), '--scenario', scene, '--seed', str(seed)]
-            if status := sonar_imm([*arguments, *pairs]):
+            if scene in MADE:
+                MADE[scene](bag, seed, **settings)
+            elif status := sonar_imm([*arguments, *pairs]):
                 raise SystemExit(status)
             jobs = Plan(system=system, overrides=begin).jobs(bag, Path(folder))
-            fitting, measurements = prepared(jobs, [parameter])
+            fitting, measurements = prepared(jobs, parameter.split(','))
             start = time.process_time()
             found = tune(fitting, measurements)
         for row in found.parameters:

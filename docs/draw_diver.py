@@ -16,11 +16,14 @@
 
 diver_front.png   for README.md: the dive whose error is the median of 21, with its numbers, which
                   go to docs/results/diver_front.json as well
-diver_paper.png   the paper's Figures 3 and 4
+diver_paper.png   the paper's Figures 3 and 4, and diver_multistatic.png its Figures 6 and 7; their
+                  numbers go to docs/results/diver_figures.json
 
-Figure 3: one simulated dive of Table 1 with the tracks of both kinds of models in one picture.
-Figure 4: RMSE at each scan over 100 runs of that dive, equation (10). The paper does not print its
-path, nor the parameters of its single-direction models; ours are tuned on scenes of other seeds.
+Figures 3 and 6: one simulated dive, of Table 1 and before a multistatic sonar, with the tracks of
+both kinds of models in one picture. Figures 4 and 7: RMSE at each scan over several runs of that
+dive, equation (10). The paper does not print its paths, nor the parameters of its single-direction
+models; ours are tuned on scenes of other seeds. Its Figures 6 and 7 are of one dive at sea, whose
+data are not public: these are simulated fixes of each ping of one transmitter and four receivers.
 Needs matplotlib, which nothing else here does. Run it from the project root.
 """
 
@@ -42,6 +45,7 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_accuracy import track, tuned  # noqa: E402
+from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker  # noqa: E402
 from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
@@ -53,35 +57,54 @@ from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
 from sonar_imm_tools.evaluation.diver.series import Series, series_of  # noqa: E402
 from sonar_imm_tools.evaluation.diver.truth import Truth, TruthPath  # noqa: E402
-from sonar_imm_tools.simulation.diver.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
+    RECEIVERS,
+    scenario,
+    simulate,
+    TRANSMITTER,
+)
 
 IMAGES = ROOT / 'docs' / 'images'
 FRONT = ROOT / 'docs' / 'results' / 'diver_front.json'
+FIGURES = ROOT / 'docs' / 'results' / 'diver_figures.json'
+DIVES = {
+    'of Table 1': ('table1', 100, 'diver_paper.png', 3),
+    'before a multistatic sonar': ('multistatic_fixes', 20, 'diver_multistatic.png', 6),
+}
+"""Scenario, runs, picture and its number in the paper. A fix of a ping takes long to compute."""
 FRONT_SEEDS = range(1, 22)
 BLUE, RED, INK, PALE, GREY = '#0072B2', '#D55E00', '#1b2733', '#b8c0c8', '#8593a1'
-SEED, RUNS = 1, 100
+SEED = 1
 RANGE_STD, BEARING_STD = 0.1, np.radians(2.0)
 
 
 def main() -> None:
     plt.rcParams.update({'font.size': 11, 'axes.spines.top': False, 'axes.spines.right': False})
     draw_front()
-    path = simulate(scenario('table1'), SEED).truth[0].position[:, :2]
-    z, R = observe(path)
-    trackers = {
-        'single direction (IMM CV+CV, tuned)': (RED, tuned('cv_cv', ['table1'])),
-        '16 directions (heading_speed)': (BLUE, DiverConfig(model_set='heading_speed')),
-    }
-    tracks = {
-        label: (colour, track(config, z, R)[0][..., :2])
-        for label, (colour, config) in trackers.items()
-    }
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(9.0, 7.6), layout='constrained')
-    draw_dive(top, path, z[0], {label: (c, runs[0]) for label, (c, runs) in tracks.items()})
-    draw_rmse(bottom, path, {'fixes': (PALE, z), **tracks})
-    figure.savefig(IMAGES / 'diver_paper.png', dpi=110)
-    for label, (_, runs) in tracks.items():
-        print(f'{label}: {np.sqrt(np.mean(squared(runs, path))):.3f} m over all scans')
+    found = {}
+    for name, (at, count, file, picture) in DIVES.items():
+        path = simulate(scenario(at), SEED).truth[0].position[:, :2]
+        z, R = OBSERVE[at](path, count)
+        trackers = {
+            'single direction (IMM CV+CV, tuned)': (RED, tuned('cv_cv', [at], count)),
+            '16 directions (heading_speed)': (BLUE, DiverConfig(model_set='heading_speed')),
+        }
+        tracks = {
+            label: (colour, track(config, z, R)[0][..., :2])
+            for label, (colour, config) in trackers.items()
+        }
+        figure, (top, bottom) = plt.subplots(2, 1, figsize=(9.0, 7.6), layout='constrained')
+        draw_dive(top, path, z[0], {label: (c, runs[0]) for label, (c, runs) in tracks.items()})
+        draw_rmse(bottom, path, {'fixes': (PALE, z), **tracks})
+        top.set(title=f'One dive {name} (Figure {picture})')
+        bottom.set(title=f'RMSE of position, {count} runs (Figure {picture + 1})')
+        figure.savefig(IMAGES / file, dpi=110)
+        found[name] = {
+            label: float(np.sqrt(np.mean(squared(runs, path))))
+            for label, (_, runs) in {'fixes': (PALE, z), **tracks}.items()
+        }
+    FIGURES.write_text(json.dumps(found, indent=2) + '\n', encoding='utf-8')
+    print(found)
 
 
 def draw_front() -> None:
@@ -161,10 +184,10 @@ def draw_headings(ax: Axes, series: Series, truth: Truth) -> None:
     ax.figure.colorbar(image, ax=ax, label='probability', pad=0.02)
 
 
-def observe(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fixes (RUNS, K, 2) of the path (K, 2), with covariances: Table 1's sonar at the origin."""
+def observe(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fixes (count, K, 2) of the path (K, 2), with covariances: Table 1's sonar at the origin."""
     rng = np.random.default_rng(SEED)
-    shape = RUNS, len(path)
+    shape = count, len(path)
     ranges = np.hypot(*path.T) + rng.normal(0.0, RANGE_STD, shape)
     bearings = np.arctan2(path[:, 1], path[:, 0]) + rng.normal(0.0, BEARING_STD, shape)
     z, R = unbiased_polar_to_cartesian(
@@ -173,8 +196,30 @@ def observe(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return z.reshape(*shape, 2), R.reshape(*shape, 2, 2)
 
 
+def multistatic(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fixes (count, K, 2) of the path (K, 2), with covariances: each from the arrivals of one ping
+    at all receivers."""
+    setting = scenario('multistatic_fixes')
+    std, speed = setting.toa_std, setting.sound_speed
+    variance = np.full(len(RECEIVERS), std**2)
+    rng = np.random.default_rng(SEED)
+    tx = np.broadcast_to(TRANSMITTER, RECEIVERS.shape)
+    z, R = np.empty((count, len(path), 2)), np.empty((count, len(path), 2, 2))
+    for k, (x, y) in enumerate(path):
+        at = np.array([x, y, 0.0])
+        length = np.linalg.norm(at - RECEIVERS, axis=1) + np.linalg.norm(at - TRANSMITTER)
+        for run in range(count):
+            toa = length / speed + std * rng.normal(size=len(RECEIVERS))
+            fix = localise(RECEIVERS, toa, variance, tx=tx, sound_speed=speed)
+            z[run, k], R[run, k] = fix.position, fix.covariance
+    return z, R
+
+
+OBSERVE = {'table1': observe, 'multistatic_fixes': multistatic}
+
+
 def squared(runs: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Squared errors (RUNS, K) of tracks (RUNS, K, 2)."""
+    """Squared errors (count, K) of tracks (count, K, 2)."""
     return np.sum((runs - path) ** 2, axis=-1)
 
 
@@ -186,7 +231,7 @@ def draw_dive(
     ax.plot(*path.T, color=INK, lw=1, ls='--', label='truth')
     for label, (colour, run) in tracks.items():
         ax.plot(*run.T, color=colour, lw=1.3, label=label)
-    ax.set(title='One dive of Table 1 (Figure 3)', xlabel='x, m', ylabel='y, m', aspect='equal')
+    ax.set(xlabel='x, m', ylabel='y, m', aspect='equal', adjustable='datalim')
     ax.legend(frameon=False, fontsize=10)
 
 
@@ -194,12 +239,7 @@ def draw_rmse(ax: Axes, path: np.ndarray, tracks: dict[str, tuple[str, np.ndarra
     """RMSE over the runs at each scan."""
     for label, (colour, runs) in tracks.items():
         ax.plot(np.sqrt(squared(runs, path).mean(axis=0)), color=colour, lw=1.3, label=label)
-    ax.set(
-        title=f'RMSE of position, {RUNS} runs (Figure 4)',
-        xlabel='time, s',
-        ylabel='RMSE, m',
-        ylim=(0.0, None),
-    )
+    ax.set(xlabel='time, s', ylabel='RMSE, m', ylim=(0.0, None))
     ax.legend(frameon=False, fontsize=10)
 
 

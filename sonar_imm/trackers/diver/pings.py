@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from ...estimation.association import assign, association_cost, gate_threshold, 
 from ...estimation.covariance import is_psd
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
-from . import coverage
+from . import coverage, offsets
 from .config import DiverConfig
 from .heights import spread
 from .ping_kernels import (
@@ -177,7 +177,7 @@ def _by_ping(
     if name != NOBODY:
         taking = _taking(now, int(own[0]), seen, config, layout, factor)
         takings = {} if taking is None else {int(own[0]): taking}
-        return with_takings(now, takings), ~free
+        return _watched(with_takings(now, takings), takings, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
     takings, taken, score = explain(now, seen, config, layout, factor)
     if detected is not None:
@@ -186,7 +186,16 @@ def _by_ping(
     free[seen.row[taken & seen.echo]] = False
     if ping.passive and not free.all():
         free[:] = False  # all are of one track, also those that were not used
-    return with_takings(now, takings)._replace(score=score), free
+    now = _watched(with_takings(now, takings), takings, ping, seen, config, models)
+    return now._replace(score=score), free
+
+
+def _watched(
+    now: DiverState, takings: dict[int, Taking], ping: Arrivals, seen: Ping, *more: Any
+) -> DiverState:
+    """With what the ping says of errors that last, by the confirmed tracks that took of it."""
+    took = {track: taking.good for track, taking in takings.items() if taking.dof}
+    return now._replace(offsets=offsets.watched(now, took, ping, seen, *more))
 
 
 def with_takings(now: DiverState, takings: dict[int, Taking]) -> DiverState:
@@ -262,9 +271,11 @@ def _by_rank(
             index = np.flatnonzero(mine)
             taking = _taking(now, track, ping.only(mine), config, layout, factor)
             if taking is not None:
-                takings[track] = taking
                 index = index[taking.good]
-                found[index] = True
+                good = np.zeros(len(taken), bool)
+                good[index] = True
+                takings[track] = taking._replace(good=good)
+                found |= good
                 echoes = index[ping.echo[index]]
                 hits[track] = len(echoes)
                 score[track] += fit[track, echoes].sum() + gain * len(echoes)

@@ -34,6 +34,7 @@ from . import family_kernels
 from .clutter import Clutters
 from .config import DiverConfig
 from .family_kernels import Mixing
+from .offsets import Offsets
 from .state_space import Instruments, ModelSet
 
 FIXES, ARRIVALS = 0, 1
@@ -220,7 +221,8 @@ class DiverState(NamedTuple):
     (`coverage`); scale (2, 2): for fixes and for arrivals the sum of squared residuals in units
     of their stated variance, and their number; fixes, arrivals: what innovations say of the
     stated covariances of either; excess: of `estimation.consistency`, that those of arrivals are
-    too small; heights: how many z of fixes could be used; clutter: what each sensor
+    too small; offsets: that arrivals miss by the same ping after ping; heights: how many z of
+    fixes could be used; clutter: what each sensor
     showed that was nobody's; last_named: names and the stamp of each
     one's last measurement; broken: tracks ended so far because their numbers were not finite;
     not_started: starts so far for which there was no room;
@@ -253,6 +255,7 @@ class DiverState(NamedTuple):
     arrivals: NisMemory = NisMemory()
     excess: float = 0.0
     heights: HeightCounts = HeightCounts()
+    offsets: Offsets = Offsets()
     instruments: Instruments = Instruments()
     hypotheses: Hypotheses = Hypotheses.none()
     serial: int = 0

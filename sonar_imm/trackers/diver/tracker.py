@@ -211,6 +211,7 @@ class DiverTracker:
             *state.fixes.warnings(self.config.fix_bias_std > 0.0),
             *state.heights.warnings(self.config),
             *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
+            *state.offsets.warnings(self.config),
             *births.no_room(state, self.config),
             *clutter.warnings(state.clutter, self.config),
         ]

@@ -191,16 +191,17 @@ def test_arrivals_that_miss_name_what_was_not_stated():
         tracker = DiverTracker(DiverConfig(max_tracks=1, model_set='heading_speed', **config))
         for scan in made.measurements:
             tracker.process(scan.measurement)
-        (warning,) = tracker.warnings()
-        assert named in warning and 'receiver_position_std' in warning
-        assert ('sound_speed_std' in warning) == (not config)
+        more, lasting = tracker.warnings()
+        assert named in more and 'receiver_position_std' in more
+        assert ('sound_speed_std' in more) == (not config)
+        assert 'target_z (or dimensions: 3) would explain it' in lasting
 
 
 @pytest.mark.parametrize(
     'name, seeds, stated',
     [
-        ('at_depth', (0, 2, 4), {'dimensions': 3}),
-        ('misplaced_receivers', (0, 1, 3), OFF),
+        ('at_depth', (1, 14, 19), {'dimensions': 3}),
+        ('misplaced_receivers', (0, 11, 15), OFF),
         ('multistatic', (), {}),
     ],
 )

@@ -1,0 +1,139 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Errors of arrivals that last: the evidence is what least squares over all pings says, whatever
+the motion, and what is stated of instruments is taken from it."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Arrivals
+from sonar_imm.trackers.diver import offsets
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.offsets import most, Offsets
+from sonar_imm.trackers.diver.scan import ping_measurements
+from sonar_imm.trackers.diver.state_space import Instruments
+
+RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+STD, SPEED = 2e-4, 1500.0
+EVERY = 'every'
+
+
+def legs(place, tag=False):
+    reach = np.linalg.norm(RECEIVERS - [*place, 0.0], axis=1)
+    return reach if tag else reach + np.hypot(*place)
+
+
+def evidence(places, heard, errors, tag=False, **stated):
+    """The evidence of pings of a diver at `places` (k, 2) whose arrivals, those that were `heard`
+    (k, 4), have the errors (k, 4), m of path."""
+    config = DiverConfig(**stated)
+    models, found = build_models(config), Offsets()
+    layout = Instruments().layout(config, models)
+    for place, rows, error in zip(places, heard, errors):
+        n, tx = int(rows.sum()), [np.nan if tag else 0.0] * 3
+        ping = Arrivals(
+            stamp_ns=1,
+            tx_id=np.ones(n),
+            rx_id=np.flatnonzero(rows),
+            tx=np.tile(tx, (n, 1)),
+            rx=RECEIVERS[rows],
+            toa=(legs(place, tag) + error)[rows] / SPEED,
+            var_toa=np.full(n, STD**2),
+            bearing=np.full(n, np.nan),
+            var_bearing=np.full(n, np.nan),
+        )
+        seen = ping_measurements(ping, np.arange(n), config, 1.0, models, layout)
+        ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
+        found = found.after(seen, seen.echo, ids, place + [0.3, -0.2], config)
+    return found, config
+
+
+def scene(pings=60, seed=1):
+    """A diver who jumps as nobody can: places, which arrivals were heard, and their noise, m."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-40.0, 60.0, (pings, 2))
+    heard = rng.uniform(size=(pings, 4)) < 0.9
+    return places, heard, SPEED * STD * rng.normal(size=(pings, 4))
+
+
+@pytest.mark.parametrize('tag', [False, True])
+def test_the_evidence_is_what_least_squares_gains_by_an_error_of_each_pair(tag, monkeypatch):
+    monkeypatch.setattr(offsets, 'MEMORY', 1e12)
+    monkeypatch.setattr(offsets, 'CAPPED', 1e12)
+    places, heard, noise = scene()
+    errors = noise + np.array([0.0, 0.8, -0.5, 0.3])
+    found, config = evidence(places, heard, errors, tag)
+    # All unknowns at once: k of each ping and four errors.
+    k, rows, residual = 3 if tag else 2, [], []
+    for at, (place, seen, error) in enumerate(zip(places, heard, errors)):
+        if seen.sum() <= k:
+            continue
+        slope = [(legs(place + d, tag) - legs(place - d, tag)) / 2e-3 for d in 1e-3 * np.eye(2)]
+        slope += [np.ones(4)] if tag else []
+        for r in np.flatnonzero(seen):
+            row = np.zeros(len(places) * k + 4)
+            row[k * at : k * at + k] = [part[r] for part in slope]
+            row[len(places) * k + r] = 1.0
+            rows.append(row)
+            residual.append(error[r])
+    A, y = np.array(rows) / (SPEED * STD), np.array(residual) / (SPEED * STD)
+
+    def left(part):
+        return np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)
+
+    gain = left(A[:, :-4]) - left(A)
+    value, rank = found.evidence(config)[EVERY]
+    scatter = max((found.square - gain) / (found.freedom - rank), 1.0)
+    assert value * scatter == pytest.approx(gain, rel=0.1)
+    assert value > most(rank)
+
+
+def test_noise_alone_is_no_evidence_even_where_more_of_it_than_stated():
+    for seed in range(5):
+        places, heard, noise = scene(seed=seed)
+        for times in (1.0, 3.0):
+            found, config = evidence(places, heard, times * noise)
+            assert found.warnings(config) == []
+
+
+def test_what_is_stated_of_instruments_is_expected_and_no_more():
+    places, heard, noise = scene()
+    late = noise + np.array([0.0, 0.8, -0.5, 0.3])
+    found, config = evidence(places, heard, late)
+    (warning,) = found.warnings(config)
+    assert 'receiver_clock_std' in warning and 'target_z' in warning
+    assert found.warnings(DiverConfig(receiver_clock_std=5e-4)) == []
+    assert found.warnings(DiverConfig(receiver_position_std=0.7)) == []
+    assert found.warnings(DiverConfig(receiver_clock_std=1e-5)) != []
+
+
+def test_a_single_cause_that_explains_it_all_is_named():
+    places, heard, noise = scene()
+    deep = np.array([np.linalg.norm(RECEIVERS - [*p, -10.0], axis=1) for p in places])
+    deep += np.hypot(np.hypot(*places.T), 10.0)[:, None] - np.array([legs(p) for p in places])
+    found, config = evidence(places, heard, noise + deep)
+    assert 'target_z (or dimensions: 3) would explain it' in found.warnings(config)[0]
+    slow = 0.01 * np.array([legs(place) for place in places])
+    found, config = evidence(places, heard, noise + slow)
+    assert 'sound_speed would explain it' in found.warnings(config)[0]
+    assert found.warnings(DiverConfig(sound_speed_std=15.0)) == []
+
+
+def test_pings_that_any_place_explains_say_nothing():
+    places, heard, noise = scene()
+    heard[:, 2:] = False
+    found, config = evidence(places, heard, noise + 1.0)
+    assert found.freedom == 0.0 and found.warnings(config) == []
