@@ -297,7 +297,7 @@ def draw_profile(ping, truth, runs) -> None:
     axes[0].legend(loc='upper left', fontsize=10, ncols=3)
     axes[-1].axvspan(40, 50, color=BLUE, alpha=0.1)
     axes[-1].set(xlabel='slant range [m]', ylabel='P(rough)')
-    axes[-1].legend(loc='center left', fontsize=10)
+    axes[-1].legend(loc='upper right', fontsize=10)
     save(figure, 'bathymetry_profile.png', dpi=110)
 
 

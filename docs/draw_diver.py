@@ -180,7 +180,7 @@ def draw_headings(ax: Axes, series: Series, truth: Truth) -> None:
         yticks=np.arange(len(order))[::2],
         yticklabels=[model_label(names[k]) for k in order][::2],
     )
-    ax.legend(facecolor='white', framealpha=1.0, loc='upper right')
+    ax.legend(frameon=False, loc='lower right', bbox_to_anchor=(1.0, 0.99), borderaxespad=0.0)
     ax.figure.colorbar(image, ax=ax, label='probability', pad=0.02)
 
 

@@ -59,6 +59,7 @@ LINES = (
 )
 BLUE, RED, GREEN, AMBER, INK = '#0072B2', '#D55E00', '#009E73', '#E69F00', '#1b2733'
 PASS = (174, 186)
+HIGHEST = 4.5  # metres of the depth axis for the largest amplitude
 COLOURS = (BLUE, RED, GREEN, '#CC79A7', AMBER, '#56B4E9')
 
 
@@ -245,8 +246,9 @@ def drift(seed, shown=range(300), ship_pass=()):
 
 
 def draw_paper(processed) -> None:
-    """As the paper's Figure 1: both processors, the tracks over them, the amplitudes."""
-    figure, axes = plt.subplots(3, 2, figsize=(12, 11), height_ratios=(1.4, 1.4, 1), sharex=True)
+    """As the paper's Figure 1: both processors, the tracks over them, the amplitudes, each drawn
+    upwards from where its reflector lies."""
+    figure, axes = plt.subplots(3, 2, figsize=(12, 13), sharex=True, sharey=True)
     for name, column in zip(('conventional', 'mvdr'), axes.T):
         records, value, depth = processed[name]
         extent = (-0.5, len(records) - 0.5, depth[-1], depth[0])
@@ -255,18 +257,26 @@ def draw_paper(processed) -> None:
         _draw_found(column[1], records)
         column[1].set(ylim=(depth[-1], depth[0]))
         column[0].set(title={'mvdr': 'MVDR, 50-4000 Hz'}.get(name, 'conventional, 200-4000 Hz'))
+        strongest = max(r.found.strength.max() for r in records if len(r.found))
+        scale = HIGHEST / strongest
         for track_id in sorted({int(i) for r in records for i in r.found.track_id}):
-            place = [
-                (k, float(r.found.strength[r.found.track_id == track_id][0]))
-                for k, r in enumerate(records)
-                if track_id in r.found.track_id
-            ]
-            column[2].plot(
-                *zip(*place), '.-', lw=0.8, ms=2, color=COLOURS[track_id % len(COLOURS)]
-            )
-        column[2].set(xlabel='record', ylim=(0.0, None))
-    for axis, label in zip(axes[:, 0], ('depth [m]', 'depth [m]', 'relative amplitude')):
-        axis.set_ylabel(label)
+            of_it = [r.found.track_id == track_id for r in records]
+            shown = [k for k, mine in enumerate(of_it) if mine.any()]
+            strength = [float(records[k].found.strength[of_it[k]][0]) for k in shown]
+            depths = [float(records[k].found.depth[of_it[k]][0]) for k in shown]
+            base = float(np.median(depths))
+            gaps = np.flatnonzero(np.diff(shown) > 1) + 1
+            top = base - scale * np.array(strength)
+            colour = COLOURS[track_id % len(COLOURS)]
+            for there, line in zip(np.split(shown, gaps), np.split(top, gaps)):
+                column[2].fill_between(there, base, line, color=colour, alpha=0.25, lw=0)
+                column[2].plot(there, line, lw=0.9, color=colour)
+        unit = {'conventional': 1.0, 'mvdr': 2.0}[name]
+        column[2].plot([296, 296], [128.0, 128.0 - unit * scale], color=INK, lw=3)
+        column[2].text(292, 128.0 - unit * scale / 2, f'amplitude {unit:g}', ha='right')
+        column[2].set(xlabel='record')
+    for axis in axes[:, 0]:
+        axis.set_ylabel('depth [m]')
     for axis, letter in zip(axes.ravel(), 'abcdef'):
         axis.set_title(f'({letter})', loc='left')
     save(figure, 'fathometer_paper.png')

@@ -21,6 +21,7 @@ import importlib
 import importlib.util
 from pathlib import Path
 import re
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 
@@ -236,7 +237,7 @@ def test_the_conda_recipe_has_the_version_and_the_requirements_of_setup(
     wanted = {line.replace(' ', '').lower() for line in recipe['requirements']['run']}
     ros = {line for line in wanted if line.startswith('ros')}
     named = {line.partition(';')[0].lower() for line in setup_lists['REQUIRES']}
-    assert wanted - named == ros - named | {'python>=3.10'}
+    assert wanted - named == ros - named | {'python>=3.10,<3.14'}
     assert named <= wanted
     assert {line for line in ros if line.startswith('ros-')} == {
         *('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces')
@@ -422,6 +423,30 @@ def test_every_package_says_what_is_public() -> None:
     for package in ('sonar_imm', 'sonar_imm_tools'):
         assert (ROOT / package / 'py.typed').is_file()
     assert "dict.fromkeys(PACKAGES, ['py.typed'])" in (ROOT / 'setup.py').read_text()
+
+
+def test_a_node_without_ros_says_what_to_install() -> None:
+    program = """
+import sys
+from sonar_imm.nodes.commands import main
+
+class NoRos:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'rclpy':
+            raise ModuleNotFoundError(name=name)
+
+sys.meta_path.insert(0, NoRos())
+sys.argv = ['/opt/lib/sonar_imm/diver_node']
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        'diver_node: rclpy is not here. ROS 2 is not found: source a Jazzy workspace, or pip '
+        "install 'sonar_imm[ros]'"
+    ]
 
 
 def test_the_page_of_commands_names_every_subcommand() -> None:

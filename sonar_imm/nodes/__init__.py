@@ -13,6 +13,7 @@
 # limitations under the License.
 
 __all__ = [
+    'NO_ROS',
     'base',
     'commands',
     'diagnostics',
@@ -25,3 +26,6 @@ __all__ = [
     'saved_state',
     'stopping',
 ]
+
+NO_ROS = "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'"
+"""What is said where rclpy cannot be imported."""

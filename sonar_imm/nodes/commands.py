@@ -22,12 +22,19 @@ from pathlib import Path
 import sys
 
 from ..threads import one_blas_thread
+from . import NO_ROS
 from .stopping import stopper
 
 
 def main() -> int:
-    """Start the node that this program is called after, e.g. ``diver_node``."""
+    """Start the node that this program is called after, e.g. ``diver_node``. Gives its exit code,
+    2 where ROS 2 is not installed."""
     stopper.listen()
     one_blas_thread()  # before the node's module imports numpy
-    name = Path(sys.argv[0]).stem.removesuffix('_node')
-    return stopper.end(int(import_module(f'{__package__}.{name}').main()))
+    program = Path(sys.argv[0]).stem
+    try:
+        node = import_module(f'{__package__}.{program.removesuffix("_node")}')
+    except ModuleNotFoundError as error:
+        print(f'{program}: {error.name} is not here. {NO_ROS}', file=sys.stderr)
+        return stopper.end(2)
+    return stopper.end(int(node.main()))

@@ -152,8 +152,7 @@ class Warming:
             done.append(self._doing)
 
     def _do(self, name: str, step: Callable[[], object]) -> None:
-        from ..estimation import jit
-
+        jit = self._jit
         if self._elsewhere is not None:
             if jit.kept(step):
                 return

@@ -209,10 +209,12 @@ def _user_error(error: Exception) -> str | None:
 
 def missing_package(name: str) -> str | None:
     """How to install a package that only some commands need; None for one that all need."""
+    from sonar_imm.nodes import NO_ROS
+
     remedies = {
         'distributed': 'dask.distributed, which distributes the runs, is not installed: pip '
         "install 'sonar_imm[sweep]', or use --workers 1",
-        'rclpy': "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        'rclpy': NO_ROS,
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
