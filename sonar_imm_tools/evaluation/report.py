@@ -48,7 +48,7 @@ LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
 """A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
 only the largest figures of a page are drawn by WebGL."""
-PLOTLYJS = 'plotly.min.js'
+PLOTLYJS = 'plotly.packed.js'
 
 
 @frozen
@@ -137,7 +137,8 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
         return
     folder = path.with_name(f'{path.stem}_runs')
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / PLOTLYJS, plotly.offline.get_plotlyjs())
+    plotlyjs = packed(plotly.offline.get_plotlyjs())
+    _write(folder / PLOTLYJS, f"const packedPlotlyJs = '{plotlyjs}';\n")
     names = page_names(parts)
     for part, name in zip(parts, names):
         _write(folder / name, report_html(part, front_page=f'../{path.name}'))

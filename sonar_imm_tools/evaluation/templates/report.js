@@ -1,5 +1,5 @@
 // Plots are unpacked and drawn when they come into view, plotly.js before the first of them.
-const PLOTLYJS = 'plotly.min.js';
+const PLOTLYJS = 'plotly.packed.js';
 const CONFIG = {displaylogo: false, responsive: true,
   modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d']};
 function unpacked(text) {
@@ -9,23 +9,23 @@ function unpacked(text) {
 }
 let ready = null;
 function plotly() {
-  ready = ready || new Promise((good, bad) => {
+  ready = ready || packedPlotly().then(unpacked).then((text) => {
     const script = document.createElement('script');
-    const inside = document.getElementById('plotlyjs');
-    script.onload = good;
-    script.onerror = () => bad(new Error(`${PLOTLYJS} is not in the folder of this page`));
-    if (inside === null) {
-      script.src = PLOTLYJS;
-      document.head.append(script);
-      return;
-    }
-    unpacked(inside.textContent).then((text) => {
-      script.textContent = text;
-      document.head.append(script);
-      good();
-    }, bad);
+    script.textContent = text;
+    document.head.append(script);
   });
   return ready;
+}
+function packedPlotly() {
+  const inside = document.getElementById('plotlyjs');
+  if (inside !== null) return Promise.resolve(inside.textContent);
+  return new Promise((good, bad) => {
+    const script = document.createElement('script');
+    script.onload = () => good(packedPlotlyJs);
+    script.onerror = () => bad(new Error(`${PLOTLYJS} is not in the folder of this page`));
+    script.src = PLOTLYJS;
+    document.head.append(script);
+  });
 }
 async function draw(plot) {
   if (plot.dataset.figure === undefined) return;
