@@ -1,0 +1,173 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What once made the fathometer tracker sure and wrong, in one table.
+
+    python -m benchmarks.fathometer_robust --out docs/results/fathometer_robust.json
+
+Traces of six or eight layers of 7 to 34 sigma (`fathometer_gaps`, `fathometer_dips`) at the
+defaults: 30 missing records, layers that dip, a speed of sound that is off by so many m/s or drawn
+with the standard deviation of 10 m/s that is the default. Six layers, two of them negative, with
+`polarity: both` and `pulse: processor`, and all positive, at 16 and 32 hydrophones
+(`fathometer_pulse`, 30 records, scored after 5). Pressure of three layers (`fathometer_sea`): the
+conventional processor and the pulse of the band over 20 records of 20 s, which see the same noise,
+and snapshots of 1.4 s in 12 records of 8 s.
+
+P: share of the records whose number of reflectors is right ('1st', '2nd' after a gap, 'later' from
+the third on); inside: depths within two stated standard deviations. Rows are written as runs end,
+and a file that is there already is added to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import fathometer_dips, fathometer_gaps, fathometer_pulse, fathometer_sea
+from benchmarks.study import known, mean_of, Parts, standard_error, study
+from sonar_imm.estimation.arrays import FloatArray
+
+ARRAY, GAP, SPEED = 30.0, 30, 1500.0
+"""Depth of the array of the traces, m; missing records; speed that trackers assume, m/s."""
+Rows = dict[str, dict[str, float]]
+
+
+def after_gap(seed: int, particles: int) -> Rows:
+    made = {}
+    for walk in fathometer_gaps.CASES:
+        traces, truth = fathometer_gaps.scene(GAP, walk, seed)
+        found = fathometer_gaps.summary(
+            [fathometer_gaps.tracked(traces, truth, particles=particles)]
+        )
+        made[f'30 missing, walk {walk:g} m'] = found
+    return made
+
+
+def dipping(seed: int, particles: int) -> Rows:
+    made = {}
+    for gap in (0, GAP):
+        traces, truth = fathometer_dips.case('parallel', 0.4, gap, seed)
+        found = fathometer_gaps.tracked(traces, truth, particles=particles)
+        name = f'dip 0.4 m, {gap} missing'
+        made[name] = fathometer_dips.summary([found]) | {'P': float(np.mean(found['right']))}
+    return made
+
+
+def speeds(seed: int, particles: int) -> Rows:
+    """The speed only scales what is seen, so that one run serves all speeds."""
+    traces, truth = fathometer_gaps.scene(0, 0.1, seed)
+    found = fathometer_gaps.tracked(traces, truth, particles=particles, sound_speed_std=10.0)
+    drawn = 10.0 * np.random.default_rng([seed, 2]).standard_normal(400)
+    return {
+        name: {'P': float(np.mean(found['right'])), 'inside': within(found['found'], truth, off)}
+        for name, off in (
+            ('sound 5 m/s faster', np.array([5.0])),
+            ('sound 10 m/s faster', np.array([10.0])),
+            ('sound drawn', drawn),
+        )
+    }
+
+
+def within(found: FloatArray, truth: FloatArray, faster: FloatArray) -> float:
+    """Share of errors and stated deviations (T, K, 2) within two of these, if the sound were so
+    many m/s faster (R,) than is assumed and the layers (T, K) as much deeper."""
+    error = found[..., 0] - faster[:, None, None] / SPEED * (truth - ARRAY)
+    seen = np.isfinite(found[..., 0])
+    return float(np.mean(np.abs(error[:, seen]) <= 2.0 * found[seen][:, 1]))
+
+
+def signed(seed: int, particles: int, hydrophones: int) -> Rows:
+    made = {}
+    for kind, words in (('signed', 'two of six negative'), ('strong', 'six positive')):
+        scene = kind if hydrophones == 16 else f'{kind} {hydrophones}'
+        found = fathometer_pulse.run(scene, seed, 30, particles, ['processor'], ['both'])
+        made[f'{words}, {hydrophones} hydrophones'] = found[f'{scene}, processor, both']
+    return made
+
+
+def pressure(
+    seed: int, particles: int, scene: dict[str, Any], ways: dict[str, dict[str, Any]]
+) -> Rows:
+    options = [{'particles': particles, **way} for way in ways.values()]
+    made = {}
+    for name, found in zip(ways, fathometer_sea.run('pressure', scene, options, seed)):
+        right, apart = np.array(found['right']), np.array(found['ospa'])
+        late = fathometer_sea.SETTLED
+        made[name] = {
+            'P': float(right.mean()),
+            'OSPA': float(apart.mean()),
+            'P, later': float(right[late:].mean()),
+            'OSPA, later': float(apart[late:].mean()),
+        }
+    return made
+
+
+def short_records(seed: int, particles: int) -> Rows:
+    ways = {
+        '8 s, snapshots of 1.4 s': {'snapshot_seconds': 1.4, **fathometer_sea.MIRROR},
+        '8 s, defaults': {},
+    }
+    return pressure(seed, particles, {}, ways)
+
+
+def long_records(seed: int, particles: int) -> Rows:
+    ways = {
+        '20 s, conventional': {'processor': 'conventional'},
+        '20 s, pulse of the band': {'pulse': 'band'},
+        '20 s, pulse of the processor': {'pulse': 'processor'},
+    }
+    return pressure(seed, particles, {'record_seconds': 20.0, 'records': 20}, ways)
+
+
+CASES: dict[str, Callable[[int, int], Rows]] = {
+    'gap': after_gap,
+    'dip': dipping,
+    'speed': speeds,
+    'signed': lambda seed, particles: signed(seed, particles, 16),
+    'signed 32': lambda seed, particles: signed(seed, particles, 32),
+    '8 s': short_records,
+    '20 s': long_records,
+}
+
+
+def main(
+    runs: int = 20,
+    particles: int = 20_000,
+    cases: Sequence[str] = tuple(CASES),
+    out: Path | None = None,
+) -> Parts:
+    yield known(out)
+    for case in cases:
+        rows: dict[str, list[dict[str, float]]] = {}
+        for seed in range(runs):
+            for name, row in CASES[case](seed, particles).items():
+                each = rows.setdefault(name, [])
+                each.append(row)
+                spread = {
+                    f'{k}, s.e.': standard_error([r[k] for r in each])
+                    for k in ('P', 'OSPA')
+                    if k in row
+                }
+                yield {
+                    'table': {
+                        name: {'runs': len(each), 'particles': particles} | mean_of(each) | spread
+                    }
+                }
+
+
+if __name__ == '__main__':
+    study(main, cases={'choices': list(CASES)})
