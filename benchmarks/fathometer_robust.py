@@ -20,9 +20,10 @@ Traces of six or eight layers of 7 to 34 sigma (`fathometer_gaps`, `fathometer_d
 defaults: 30 missing records, layers that dip, a speed of sound that is off by so many m/s or drawn
 with the standard deviation of 10 m/s that is the default. Six layers, two of them negative, with
 `polarity: both` and `pulse: processor`, and all positive, at 16 and 32 hydrophones
-(`fathometer_pulse`, 30 records, scored after 5). Pressure of three layers (`fathometer_sea`): the
-conventional processor and the pulse of the band over 20 records of 20 s, which see the same noise,
-and snapshots of 1.4 s in 12 records of 8 s.
+(`fathometer_pulse`, 30 records, scored after 5). Three layers (`fathometer_sea`): the conventional
+processor and the pulse of the band over 20 records of 20 s, which see the same noise, as pressure
+and as cross-spectra drawn from the same model, and snapshots of 1.4 s in 12 records of 8 s of
+pressure.
 
 P: share of the records whose number of reflectors is right ('1st', '2nd' after a gap, 'later' from
 the third on); inside: depths within two stated standard deviations. Rows are written as runs end,
@@ -62,8 +63,12 @@ def dipping(seed: int, particles: int) -> Rows:
     for gap in (0, GAP):
         traces, truth = fathometer_dips.case('parallel', 0.4, gap, seed)
         found = fathometer_gaps.tracked(traces, truth, particles=particles)
-        name = f'dip 0.4 m, {gap} missing'
-        made[name] = fathometer_dips.summary([found]) | {'P': float(np.mean(found['right']))}
+        right = found['right']
+        made[f'dip 0.4 m, {gap} missing'] = fathometer_dips.summary([found]) | {
+            'P': float(right.mean()),
+            'P, record 1': float(right[0]),
+            'P, record 2': float(right[1]),
+        }
     return made
 
 
@@ -99,12 +104,16 @@ def signed(seed: int, particles: int, hydrophones: int) -> Rows:
     return made
 
 
-def pressure(
-    seed: int, particles: int, scene: dict[str, Any], ways: dict[str, dict[str, Any]]
+def three_layers(
+    seed: int,
+    particles: int,
+    level: str,
+    scene: dict[str, Any],
+    ways: dict[str, dict[str, Any]],
 ) -> Rows:
     options = [{'particles': particles, **way} for way in ways.values()]
     made = {}
-    for name, found in zip(ways, fathometer_sea.run('pressure', scene, options, seed)):
+    for name, found in zip(ways, fathometer_sea.run(level, scene, options, seed)):
         right, apart = np.array(found['right']), np.array(found['ospa'])
         late = fathometer_sea.SETTLED
         made[name] = {
@@ -121,16 +130,21 @@ def short_records(seed: int, particles: int) -> Rows:
         '8 s, snapshots of 1.4 s': {'snapshot_seconds': 1.4, **fathometer_sea.MIRROR},
         '8 s, defaults': {},
     }
-    return pressure(seed, particles, {}, ways)
+    return three_layers(seed, particles, 'pressure', {}, ways)
 
 
-def long_records(seed: int, particles: int) -> Rows:
-    ways = {
-        '20 s, conventional': {'processor': 'conventional'},
-        '20 s, pulse of the band': {'pulse': 'band'},
-        '20 s, pulse of the processor': {'pulse': 'processor'},
+def long_records(seed: int, particles: int, level: str) -> Rows:
+    ways: dict[str, dict[str, Any]] = {
+        'conventional': {'processor': 'conventional'},
+        'pulse of the band': {'pulse': 'band'},
+        'pulse of the processor': {'pulse': 'processor'},
     }
-    return pressure(seed, particles, {'record_seconds': 20.0, 'records': 20}, ways)
+    if level == 'csdm':
+        ways = {name: {**way, **fathometer_sea.MIRROR} for name, way in ways.items()}
+    scene = {'record_seconds': 20.0, 'records': 20}
+    found = three_layers(seed, particles, level, scene, ways)
+    words = {'pressure': 'pressure', 'csdm': 'cross-spectra'}[level]
+    return {f'20 s, {words}, {name}': row for name, row in found.items()}
 
 
 CASES: dict[str, Callable[[int, int], Rows]] = {
@@ -140,7 +154,8 @@ CASES: dict[str, Callable[[int, int], Rows]] = {
     'signed': lambda seed, particles: signed(seed, particles, 16),
     'signed 32': lambda seed, particles: signed(seed, particles, 32),
     '8 s': short_records,
-    '20 s': long_records,
+    '20 s': lambda seed, particles: long_records(seed, particles, 'pressure'),
+    '20 s, spectra': lambda seed, particles: long_records(seed, particles, 'csdm'),
 }
 
 
