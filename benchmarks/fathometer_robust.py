@@ -33,6 +33,7 @@ and a file that is there already is added to.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,13 +96,9 @@ def within(found: FloatArray, truth: FloatArray, faster: FloatArray) -> float:
     return float(np.mean(np.abs(error[:, seen]) <= 2.0 * found[seen][:, 1]))
 
 
-def signed(seed: int, particles: int, hydrophones: int) -> Rows:
-    made = {}
-    for kind, words in (('signed', 'two of six negative'), ('strong', 'six positive')):
-        scene = kind if hydrophones == 16 else f'{kind} {hydrophones}'
-        found = fathometer_pulse.run(scene, seed, 30, particles, ['processor'], ['both'])
-        made[f'{words}, {hydrophones} hydrophones'] = found[f'{scene}, processor, both']
-    return made
+def six_layers(seed: int, particles: int, scene: str) -> Rows:
+    found = fathometer_pulse.run(scene, seed, 30, particles, ['processor'], ['both'])
+    return {f'{scene}, both': found[f'{scene}, processor, both']}
 
 
 def three_layers(
@@ -147,15 +144,17 @@ def long_records(seed: int, particles: int, level: str) -> Rows:
     return {f'20 s, {words}, {name}': row for name, row in found.items()}
 
 
-CASES: dict[str, Callable[[int, int], Rows]] = {
+CASES: dict[str, Callable[..., Rows]] = {
     'gap': after_gap,
     'dip': dipping,
     'speed': speeds,
-    'signed': lambda seed, particles: signed(seed, particles, 16),
-    'signed 32': lambda seed, particles: signed(seed, particles, 32),
+    **{
+        scene: partial(six_layers, scene=scene)
+        for scene in ('signed', 'strong', 'signed 32', 'strong 32')
+    },
     '8 s': short_records,
-    '20 s': lambda seed, particles: long_records(seed, particles, 'pressure'),
-    '20 s, spectra': lambda seed, particles: long_records(seed, particles, 'csdm'),
+    '20 s': partial(long_records, level='pressure'),
+    '20 s, spectra': partial(long_records, level='csdm'),
 }
 
 
