@@ -17,13 +17,13 @@
     python -m benchmarks.fathometer_robust --out docs/results/fathometer_robust.json
 
 Traces of six or eight layers of 7 to 34 sigma (`fathometer_gaps`, `fathometer_dips`) at the
-defaults: 30 missing records, layers that dip, a speed of sound that is off by so many m/s or drawn
-with the standard deviation of 10 m/s that is the default. Six layers, two of them negative, with
-`polarity: both` and `pulse: processor`, and all positive, at 16 and 32 hydrophones
-(`fathometer_pulse`, 30 records, scored after 5). Three layers (`fathometer_sea`): the conventional
-processor and the pulse of the band over 20 records of 20 s, which see the same noise, as pressure
-and as cross-spectra drawn from the same model, and snapshots of 1.4 s in 12 records of 8 s of
-pressure.
+defaults: 30 or 120 missing records, layers that dip, a speed of sound that is off by so many m/s
+or drawn with the standard deviation of 10 m/s that is the default. Six layers, two of them
+negative (``signed``) or none (``strong``), with `polarity: both` and `pulse: processor`, at 16 or
+32 hydrophones (`fathometer_pulse`, 30 records, scored after 5). Three layers (`fathometer_sea`):
+the conventional processor and the pulse of the band over 20 records of 20 s, which see the same
+noise, as pressure and as cross-spectra drawn from the same model, and snapshots of 1.4 s in 12
+records of 8 s of pressure.
 
 P: share of the records whose number of reflectors is right ('1st', '2nd' after a gap, 'later' from
 the third on); inside: depths within two stated standard deviations. Rows are written as runs end,
@@ -43,8 +43,9 @@ from benchmarks import fathometer_dips, fathometer_gaps, fathometer_pulse, fatho
 from benchmarks.study import known, mean_of, Parts, standard_error, study
 from sonar_imm.estimation.arrays import FloatArray
 
-ARRAY, GAP, SPEED = 30.0, 30, 1500.0
-"""Depth of the array of the traces, m; missing records; speed that trackers assume, m/s."""
+ARRAY, SPEED, GAP, LONG = 30.0, 1500.0, 30, 120
+"""Depth of the array of the traces, m; speed that trackers assume, m/s; missing records, and so
+many that sets begin anew."""
 Rows = dict[str, dict[str, float]]
 
 
@@ -59,13 +60,14 @@ def after_gap(seed: int, particles: int) -> Rows:
     return made
 
 
-def dipping(seed: int, particles: int) -> Rows:
+def dipping(seed: int, particles: int, cases: Sequence[tuple[float, int]]) -> Rows:
+    """cases: dip, m per record, and missing records."""
     made = {}
-    for gap in (0, GAP):
-        traces, truth = fathometer_dips.case('parallel', 0.4, gap, seed)
+    for dip, gap in cases:
+        traces, truth = fathometer_dips.case('parallel', dip, gap, seed)
         found = fathometer_gaps.tracked(traces, truth, particles=particles)
         right = found['right']
-        made[f'dip 0.4 m, {gap} missing'] = fathometer_dips.summary([found]) | {
+        made[f'dip {dip:g} m, {gap} missing'] = fathometer_dips.summary([found]) | {
             'P': float(right.mean()),
             'P, record 1': float(right[0]),
             'P, record 2': float(right[1]),
@@ -146,7 +148,8 @@ def long_records(seed: int, particles: int, level: str) -> Rows:
 
 CASES: dict[str, Callable[..., Rows]] = {
     'gap': after_gap,
-    'dip': dipping,
+    'dip': partial(dipping, cases=((0.4, 0), (0.4, GAP))),
+    'long gap': partial(dipping, cases=((0.0, LONG), (0.1, LONG))),
     'speed': speeds,
     **{
         scene: partial(six_layers, scene=scene)
