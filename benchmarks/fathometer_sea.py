@@ -89,44 +89,49 @@ def floor_of(config: FathometerScenario, seed: int) -> Drift:
     return Drift(depth, amplitude, amplitude > 0.0, array, stated)
 
 
-def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -> dict[str, Any]:
-    """One run; numbers of each record."""
+def run(
+    level: str, scene: dict[str, Any], options: Sequence[dict[str, Any]], seed: int
+) -> list[dict[str, Any]]:
+    """One run with each of `options`, which see the same noise; numbers of each record."""
     kind = level.split()[0]
     config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
     floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
     stated = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
     stated |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     stated.pop('snapshot_seconds', None)
-    settings = FathometerConfig(**{**stated, **options}, seed=seed)
+    settings = [FathometerConfig(**{**stated, **each}, seed=seed) for each in options]
     if kind == 'csdm':
-        seconds = automatic_snapshot(
-            settings, config.phones, config.depth_max - config.array_depth
-        )
-        count = int(config.record_seconds / seconds / (1.0 - settings.overlap)) - 1
-        worth = round(effective_snapshots(settings.window, settings.overlap, count))
+        first = settings[0]
+        seconds = automatic_snapshot(first, config.phones, config.depth_max - config.array_depth)
+        count = int(config.record_seconds / seconds / (1.0 - first.overlap)) - 1
+        worth = round(effective_snapshots(first.window, first.overlap, count))
         if level == 'csdm':
             worth = round(config.record_seconds / seconds)
         config = evolve(config, snapshot_seconds=seconds, snapshots=worth)
         # Drawn frequency by frequency, their noise does not fade.
-        settings = evolve(settings, window='rectangular', overlap=0.0)
-    tracker = FathometerTracker(settings)
-    scores, snr = [], []
+        settings = [evolve(each, window='rectangular', overlap=0.0) for each in settings]
+    trackers = [FathometerTracker(each) for each in settings]
+    found: list[dict[str, Any]] = [{'right': [], 'ospa': [], 'snr': []} for _ in options]
     for record in range(config.records):
         depth = float(floor.array_depth_stated[record])
         if kind == 'csdm':
             measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
         else:
             measured = pressure_blocks(config, floor, record, depth, rng)
-        for estimate in (found for each in measured for found in tracker.process(each)):
-            z = reflectors(estimate)
-            scores.append(score(estimate, floor.depth[record]))
-            near = np.abs(z[:, :1] - floor.depth[record]) < 0.4
-            sigma = float(estimate.extras['sigma'][0])
-            snr.append(
-                [z[near[:, k], 1].max() / sigma if near[:, k].any() else np.nan for k in range(3)]
-            )
-    right, distance = zip(*scores)
-    return {'right': right, 'ospa': distance, 'snr': snr}
+        for tracker, rows in zip(trackers, found):
+            for estimate in (each for item in measured for each in tracker.process(item)):
+                right, distance = score(estimate, floor.depth[record])
+                rows['right'].append(right)
+                rows['ospa'].append(distance)
+                z, sigma = reflectors(estimate), float(estimate.extras['sigma'][0])
+                rows['snr'].append([strongest(z, at) / sigma for at in floor.depth[record]])
+    return found
+
+
+def strongest(found: np.ndarray, depth: float) -> float:
+    """Amplitude of what was found (K, 2) within .4 m of a layer; NaN where nothing was."""
+    near = found[np.abs(found[:, 0] - depth) < 0.4, 1]
+    return float(near.max()) if len(near) else np.nan
 
 
 def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
@@ -151,7 +156,7 @@ def main(runs: int = 8, particles: int = 4000, rows: Sequence[str] = ()) -> Part
             continue
         count = runs if name.startswith('8 s') else max(1, runs // 2)
         given = {'particles': particles, **changes}
-        found = [run(level, scene, given, seed) for seed in range(count)]
+        found = [run(level, scene, [given], seed)[0] for seed in range(count)]
         yield {'table': {name: {'runs': count, **row_of(found)}}}
 
 

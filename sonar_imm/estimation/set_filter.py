@@ -182,7 +182,7 @@ class SetFilter:
                 math.log(max(model.room(m), 1)) - m * math.log(model.cells)
                 for m in range(model.order_min, model.order_max + 1)
             ]
-        )
+        ) - np.log(len(model.start) * model.start)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def _passage(self, records: int) -> Passage:
@@ -190,7 +190,9 @@ class SetFilter:
             return self._passages[records]
         model, shift, walk = self.model, self.model.shift, self.model.walk
         chances, changes = model.transition, model.most_changes
-        if records > 1:
+        if not records:
+            chances = np.eye(len(chances))
+        elif records > 1:
             walk = repeated_walk(walk, records)
             chances, changes = turnover(chances, model.order_min, records), 2 * model.order_max
             shift = shift and evolve(shift, memory=shift.memory**records)
@@ -217,8 +219,8 @@ class SetFilter:
         walks: Walks | None = None,
     ) -> Record:
         """The record b, see `Record`. gram (n,): of this record, where it is not the model's;
-        records: how many records' time passed since the one before; walks: by then, where they are
-        not the model's."""
+        records: how many records' time passed since the one before, 0 for a first one before which
+        no member comes or goes; walks: by then, where they are not the model's."""
         model, passage = self.model, self._passage(records)
         walks = walks or passage.walks
         amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
@@ -345,7 +347,7 @@ class SetFilter:
     def _aged(self, sets: Sets, record: Record) -> Sets:
         """Sets whose amplitudes, expected for the next record, are those for this one."""
         more = record.passage.records - 1
-        if not more or not self.model.amplitude_memory:
+        if more < 1 or not self.model.amplitude_memory:
             return sets
         phi = self.model.amplitude_memory**more
         fresh = (1.0 - phi**2) * self.model.amplitude_std**2

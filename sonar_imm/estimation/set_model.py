@@ -30,7 +30,10 @@ The set, in the order in which it is drawn
     order make it, together with how many members left and were replaced on the way (`turnover`),
     and 3 is the sum of k walks (`repeated_walk`). Where they were in between is of no interest, so
     that 5 is asked at the end only.
-    Before the first record, m is uniform, and so is the set among the possible ones of that size.
+    Before the first record, m is drawn from ``start``, and the set uniformly among the possible
+    ones of that size. If m is uniform, members say something of each other: beside eight that
+    were seen, one more anywhere is nine times as probable as the first. With a Poisson m they say
+    nothing (`independent_orders`).
 
 The record
     ``b (n,)``, in units of its noise: the correlation of what was measured with the pulse that a
@@ -65,7 +68,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from attrs import field, frozen
+from attrs import Factory, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,6 +85,15 @@ def banded_transition(orders: int, switch: float) -> FloatArray:
     the ends the probability of what cannot happen goes to staying."""
     P = np.diag(np.full(orders - 1, switch), 1) + np.diag(np.full(orders - 1, switch), -1)
     return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
+
+
+def independent_orders(order_min: int, orders: int) -> FloatArray:
+    """Probabilities (orders,) of the order of a set whose members lie independently of each other:
+    Poisson. Its mean is one, so that each member is charged for its place, as a birth is, and for
+    nothing else."""
+    m = np.arange(order_min, order_min + orders, dtype=np.float64)
+    chance = np.exp([math.lgamma(order_min + 1.0) - math.lgamma(k + 1.0) for k in m])
+    return np.asarray(chance / chance.sum())
 
 
 def walk_reach(std: float, *, reach: float = 4.0) -> float:
@@ -179,7 +191,8 @@ class SetModel:
     """What is assumed of the set and of the record; see the module's text.
 
     cells: n, of the lattice; separation: smallest distance of two members, cells; order_min: the
-    smallest set; transition (orders, orders); walk (2 r + 1,); gram (n,) by lag in cells, one at
+    smallest set; transition (orders, orders); start (orders,), probabilities of the order before
+    the first record, by default uniform; walk (2 r + 1,); gram (n,) by lag in cells, one at
     0; amplitude_prior: of PRIORS, with amplitude_std: s, and independent_samples: N;
     walk_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
     noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
@@ -205,6 +218,9 @@ class SetModel:
     negative_probability: float = 0.0
     shift: Shift | None = None
     scatter: Scatter | None = None
+    start: FloatArray = Factory(
+        lambda self: np.full(len(self.transition), 1.0 / len(self.transition)), takes_self=True
+    )
 
     def __attrs_post_init__(self) -> None:
         if self.amplitude_prior not in PRIORS:
@@ -219,6 +235,8 @@ class SetModel:
             raise ValueError('negative_probability lies in [0, 1)')
         if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:
             raise ValueError('a set model needs order_min >= 0, separation >= 1, gram (n,)')
+        if np.shape(self.start) != self.transition.shape[:1] or not np.all(self.start > 0.0):
+            raise ValueError('start has a probability above zero for each order')
         if self.room(self.order_max) == 0:
             raise ValueError(
                 f'{self.order_max} members {self.separation} cells apart do not fit into '

@@ -177,6 +177,9 @@ def begin(
     for k, (low, high) in enumerate(zip(first, last)):
         weight[low:high] = 0.0
         log_odds[k] = np.logaddexp.reduce((g[:, low:high] + prior).ravel())
-    log_odds += math.log(len(log_odds) / model.cells) - model.penalty
+    # What one member more costs among so many.
+    order = np.clip(len(log_odds) - model.order_min, 1, len(model.start) - 1)
+    rarer = model.start[order] / model.start[order - 1] if len(model.start) > 1 else 1.0
+    log_odds += math.log(rarer * len(log_odds) / model.cells) - model.penalty
     sure = np.clip(1.0 / (1.0 + np.exp(-log_odds.clip(-50.0, 50.0))), _UNSURE, _SURE)
     return Beginning(first, last, sure, np.append(0.0, np.cumsum(weight)), 0.5), births

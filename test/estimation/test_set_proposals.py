@@ -14,13 +14,23 @@
 
 """Where the filter for sets looks for members: peaks without the side lobes of the others."""
 
+from itertools import combinations, product
+import math
+
 from attrs import evolve
 from helpers.set_cycle import cycle
 import numpy as np
+from oracles.set_particles import weigh
 import pytest
 
 from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_model import banded_transition, gaussian_walk, SetModel
+from sonar_imm.estimation.set_model import (
+    banded_transition,
+    gaussian_walk,
+    independent_orders,
+    SetModel,
+    Sets,
+)
 from sonar_imm.estimation.set_proposals import begin, gains, standing_out
 from sonar_imm.estimation.set_scatter import NO_SCATTER
 
@@ -97,3 +107,48 @@ def test_the_first_record_leaves_many_sets(seed):
         right = tracker.summarise(step).pmf[7]
     assert effective[0] > 20.0 and min(effective[1:]) > 80.0
     assert right > 0.5
+
+
+def test_independent_members_pay_for_their_places_alone():
+    factorials = np.array([math.factorial(m) for m in range(5)])
+    assert independent_orders(0, 5) == pytest.approx(1.0 / factorials / (1.0 / factorials).sum())
+    among = independent_orders(7, 3)
+    assert among.sum() == pytest.approx(1.0)
+    assert among[1:] / among[:-1] == pytest.approx([1 / 8, 1 / 9])
+    assert independent_orders(64, 1) == pytest.approx([1.0])
+    with pytest.raises(ValueError, match='start'):
+        evolve(MODEL, start=independent_orders(1, 11))
+
+
+@pytest.mark.parametrize('start', [np.full(3, 1 / 3), independent_orders(0, 3)])
+def test_before_the_first_record_members_neither_come_nor_go(start):
+    """The orders of a first record by the sum over all sets and all that they walk."""
+    n, walk = 10, np.array([0.25, 0.5, 0.25])
+    model = SetModel(
+        cells=n,
+        separation=2,
+        order_min=0,
+        transition=banded_transition(3, 0.2),
+        walk=walk,
+        gram=np.exp(-0.5 * np.arange(n) ** 2.0),
+        amplitude_std=3.0,
+        start=start,
+    )
+    b = np.random.default_rng(8).standard_normal(n)
+    b[[2, 3, 7]] += 2.0, 3.0, 1.5
+    exact = np.zeros(3)
+    for m in range(3):
+        for places in combinations(range(n), m):
+            for steps in product((-1, 0, 1), repeat=m):
+                z = np.sort(np.array(places, int) + np.array(steps, int))
+                apart = np.append(np.diff(places), np.diff(z)).min(initial=2)
+                if apart < 2 or z.min(initial=0) < 0 or z.max(initial=0) >= n:
+                    continue
+                sets = Sets.empty(model, 1)
+                sets.order[:], sets.cell[0, :m] = m, z
+                chance = np.prod(walk[np.array(steps, int) + 1]) / model.room(m)
+                exact[m] += start[m] * chance * np.exp(weigh(model, b, sets)[0][0])
+    tracker = SetFilter(model, 100_000)
+    record = tracker.record(b, (3, 1), records=0)
+    step = tracker.weigh(tracker.propagate(tracker.start(record), record), record)
+    assert tracker.summarise(step).pmf == pytest.approx(exact / exact.sum(), abs=0.01)

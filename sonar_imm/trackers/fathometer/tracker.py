@@ -55,7 +55,13 @@ from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
-from ...estimation.set_model import banded_transition, gaussian_walk, SetModel, walk_reach
+from ...estimation.set_model import (
+    banded_transition,
+    gaussian_walk,
+    independent_orders,
+    SetModel,
+    walk_reach,
+)
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
@@ -377,7 +383,8 @@ class FathometerTracker:
             gram = np.ascontiguousarray(response.pulse(lags))
         particles, before = self._filter, self._before
         if not self._bridged(records):
-            records, before = 1, None
+            before = None
+        records = 0 if before is None else records
         walks = None
         if before is not None and slopes_followed(self.config):
             walks = self._ids.walks(self._lattice, records, self.config)
@@ -555,5 +562,6 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         negative_probability=config.negative_share,
         shift=heave_shift(config, step),
         scatter=scatter_of(config, lattice),
+        start=independent_orders(config.order_min, config.orders),
         **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )

@@ -50,6 +50,15 @@ def test_a_gap_that_is_taken_for_a_record_loses_layers():
     assert right[BEFORE - 5 : BEFORE].all() and not right[BEFORE : BEFORE + 2].any()
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_the_first_record_has_no_reflector_too_many(seed):
+    """Were every number equally probable before, most first records would have one."""
+    tracker, found = run(scene(0, 0.1, seed)[0][:1], particles=2000)
+    (estimate,) = found.values()
+    assert np.argmax(estimate.probabilities[0]) + 1 == len(LAYERS)
+    assert tracker.health()['effective_sample_size'] > 400.0
+
+
 def test_where_half_may_have_come_and_gone_the_set_begins_anew_and_names_stay():
     """Followed over 120 missing records, one set of 2000 is left."""
     traces, _ = scene(120, 0.1, 4)
