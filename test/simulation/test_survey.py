@@ -90,6 +90,16 @@ def test_true_corrections_put_soundings_back_on_the_floor(name, value, sign, lef
     assert wrong > 1.5 * before
 
 
+def test_neighbours_of_a_swath_share_a_third_of_their_noise():
+    settings = {**EXACT, 'terrain': 'flat', 'noise': 0.1, 'length': 200.0}
+    scene = simulate(scenario('survey', settings), 1)
+    noise = off_the_floor(scene, line_of(scene.points[0], budget())).reshape(-1, 2, 40)
+    assert noise.std() == pytest.approx(0.1, rel=0.05)
+    for apart, share in ((1, 1 / 3), (2, 1 / 9), (5, 0.0)):
+        product = noise[..., apart:] * noise[..., :-apart]
+        assert product.mean() / noise.var() == pytest.approx(share, abs=0.06)
+
+
 def test_the_same_seed_is_the_same_survey():
     config = scenario('survey', {'lines': 2, 'cross_lines': 1, 'length': 60.0})
     one, again, other = simulate(config, 3), simulate(config, 3), simulate(config, 4)

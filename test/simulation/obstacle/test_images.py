@@ -60,6 +60,17 @@ def beams_correlate(lag):
     return np.square(np.abs(together / np.square(weight).sum()))
 
 
+def test_bins_and_beams_fill_range_and_sector():
+    it = sonar()
+    left = 0.5 * it.config.horizontal_fov_deg
+    for cells, first, last in (
+        (it.range, 0.0, it.config.max_range),
+        (np.rad2deg(it.bearing), left, -left),
+    ):
+        half = 0.5 * (last - first) / len(cells)
+        np.testing.assert_allclose(cells[[0, -1]], [first + half, last - half])
+
+
 def test_noise_is_rayleigh_speckle_as_wide_as_a_beam_and_as_long_as_the_pulse():
     one = sonar(**NOWHERE)
     images = [np.square(one.image(LEVEL, [], 1.0) / 40.0) for _ in range(6)]
