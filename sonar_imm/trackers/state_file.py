@@ -38,7 +38,8 @@ from ..parameters import Config, ConfigError
 from . import System, Tracker
 from .state_values import Decoder, Encoder, restore, StateError, understood
 
-FORMAT = 1
+FORMAT = 2
+"""Counts up when a tracker keeps other numbers than before."""
 _MAGIC = b'sonar_imm state '
 _LARGEST = 1 << 30
 

@@ -115,6 +115,16 @@ def test_a_sound_state_under_another_checksum_is_damaged(tmp_path):
         read_state(path)
 
 
+def test_a_state_of_another_format_is_refused(tmp_path):
+    run, path = tracked('diver_table1'), tmp_path / 'state'
+    write_state(path, run.saved(run.until(5)))
+    now = state_file.FORMAT
+    line = path.read_bytes().replace(b'state %d ' % now, b'state %d ' % (now - 1), 1)
+    path.write_bytes(line)
+    with pytest.raises(StateError, match=f'its format is {now - 1}, not {now}'):
+        read_state(path)
+
+
 def test_a_file_larger_than_any_state_is_not_read(tmp_path, monkeypatch):
     path = tmp_path / 'state'
     path.write_bytes(b'x' * 1001)
@@ -134,7 +144,8 @@ def rewrite(path, change):
     change(header)
     np.savez(raw, header=np.frombuffer(json.dumps(header).encode(), np.uint8), block=block)
     body = raw.read_bytes()
-    path.write_bytes(b'sonar_imm state 1 %s\n' % hashlib.sha256(body).hexdigest().encode() + body)
+    line = f'sonar_imm state {state_file.FORMAT} {hashlib.sha256(body).hexdigest()}\n'
+    path.write_bytes(line.encode() + body)
 
 
 @pytest.mark.parametrize(
