@@ -23,7 +23,6 @@ ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
 
 LIBRARY = {
     'sonar_imm.acoustics.arrivals_3d.arrival_angles': 'angles of many receivers at once',
-    'sonar_imm.acoustics.arrivals_3d.arrival_paths': 'paths of many receivers at once',
     'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
     'sonar_imm.estimation.consistency.rmse': 'accuracy of one target',
     'sonar_imm.estimation.imm.gate': 'the readable form of imm_kernels.gate',

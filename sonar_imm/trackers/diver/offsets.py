@@ -32,20 +32,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from ...acoustics.arrivals_3d import arrival_paths
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import TENTATIVE
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .scan import Ping
-from .state_space import ModelSet
-
-if TYPE_CHECKING:
-    from .state import DiverState
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""
@@ -203,29 +198,27 @@ def most(rank: int) -> float:
 
 
 def watched(
-    now: DiverState,
+    found: Offsets,
+    places: Mapping[int, FloatArray],
     took: Mapping[int, BoolArray],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
-    models: ModelSet,
 ) -> Offsets:
-    """The evidence after a ping `seen`, of which tracks `took` (C,) measurements each.
+    """The evidence `found` and that of a ping `seen`, of which tracks `took` (C,) measurements
+    each; only of those whose places (2 or 3,) are given.
 
     Of each pair it is the echo that a track took, else the nearest that is no other track's: where
     an error is large, the echoes that have it are refused.
     """
-    found, taken = now.offsets, np.zeros(len(seen.row), bool)
+    taken = np.zeros(len(seen.row), bool)
     for good in took.values():
         taken |= good
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
-    axes = [0, 1] if models.height < 0 else [0, 1, models.height]
-    for track, good in took.items():
-        if now.life.status[track] == TENTATIVE:
-            continue
-        place = now.x[track, now.mu[track].argmax(), axes]
+    for track, place in places.items():
+        good = took[track]
         echo = np.flatnonzero(seen.echo)
         mine = good[echo]
         whole = place if len(place) == 3 else np.append(place, config.target_z)

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -160,8 +160,7 @@ def _by_ping(
     models: ModelSet,
     detected: coverage.Seen | None,
 ) -> tuple[DiverState, BoolArray]:
-    """`associate_and_update` of what was heard; detected: how probable a detection is, None where
-    it is the same everywhere."""
+    """`associate_and_update` of what was heard; detected: None where that is equally probable."""
     name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(now.target_id == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
@@ -184,18 +183,24 @@ def _by_ping(
         looks = 1 if ping.passive else len(seen.nodes)
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
     free[seen.row[taken & seen.echo]] = False
-    if ping.passive and not free.all():
-        free[:] = False  # all are of one track, also those that were not used
+    free &= free.all() or not ping.passive  # a tag's are of one track, also those not used
     now = _watched(with_takings(now, takings), takings, ping, seen, config, models)
     return now._replace(score=score), free
 
 
 def _watched(
-    now: DiverState, takings: dict[int, Taking], ping: Arrivals, seen: Ping, *more: Any
+    now: DiverState,
+    takings: dict[int, Taking],
+    ping: Arrivals,
+    seen: Ping,
+    config: DiverConfig,
+    models: ModelSet,
 ) -> DiverState:
     """With what the ping says of errors that last, by the confirmed tracks that took of it."""
     took = {track: taking.good for track, taking in takings.items() if taking.dof}
-    return now._replace(offsets=offsets.watched(now, took, ping, seen, *more))
+    axes = [0, 1] if models.height < 0 else [0, 1, models.height]
+    at = {t: now.x[t, now.mu[t].argmax(), axes] for t in took if now.life.status[t] != TENTATIVE}
+    return now._replace(offsets=offsets.watched(now.offsets, at, took, ping, seen, config))
 
 
 def with_takings(now: DiverState, takings: dict[int, Taking]) -> DiverState:
