@@ -14,8 +14,7 @@
 
 """Boats in clutter (Autoferry scenario 13): trackers tuned on one half and scored on the other.
 
-    SONAR_IMM_DATA=../shared/data python -m benchmarks.real_boats \\
-        --out docs/results/real_boats.json
+    SONAR_IMM_DATA=../shared/data python -m benchmarks.real_boats
 
 Radar and lidar by themselves, two boats with GNSS. Each tracker has the same number of settings,
 and the one with the best GOSPA in the first half of the recording is scored in the second, and the

@@ -73,6 +73,7 @@ SINGLE: dict[str, dict[str, Any]] = {
     },
     'quiet alone': {'model_set': 'cv', 'acceleration_noise': (0.03,)},
 }
+THINNED = ('CV Kalman', 'steady alone (heading_speed)', 'brisk alone')
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
     'tow tag, fixes': ('fixes', TAG),
     'tow tag, fixes, covariances times 6': ('fixes', {**TAG, 'covariance_scale': 6.0}),
@@ -253,10 +254,7 @@ def of_recording(name: str) -> Iterator[tuple[str, dict[str, float]]]:
 def in_eight_ways() -> Iterator[tuple[str, str, dict[str, float]]]:
     """RMSE with some receivers of each ping, by their number and the tracker."""
     pings, truth = load('arrivals')
-    ways = {
-        'default': {},
-        **{name: SINGLE[name] for name in SINGLE if not name.startswith('quiet')},
-    }
+    ways = {'default': {}, **{name: SINGLE[name] for name in THINNED}}
     for receivers in RECEIVERS:
         for name, values in ways.items():
             found = []
