@@ -23,22 +23,28 @@ other way round. `PlainKalman` is what one writes in an afternoon: it shows what
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.real_recordings import autoferry, boat_scores, BOATS, DATA, header, HEADINGS, row
-from benchmarks.study import final_estimates
+from benchmarks.real_recordings import autoferry, boat_scores, BOATS, DATA, HEADINGS
+from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 STDS, LIVES = (2.0, 3.0, 4.0, 6.0), ((3, 5), (4, 6))
-OFFSETS = {'radar': (0.0, -1.5), 'lidar': (0.0,)}
-"""Seconds added to the stamps: those of the radar are known to be about one scan late."""
+RECORDINGS = {
+    'radar': ('radar', 0.0),
+    'radar, stamps -1.5 s': ('radar', -1.5),
+    'lidar': ('lidar', 0.0),
+}
+"""Each with its sensor and the seconds that are added to its stamps: those of the radar are known
+to be about one scan late."""
+HALVES = ('GOSPA first half', 'GOSPA second half')
 
 
 class PlainKalman:
@@ -138,37 +144,33 @@ def half(final: dict[int, Estimate], middle_ns: int, second: bool) -> dict[int, 
     return {stamp: estimate for stamp, estimate in final.items() if (stamp >= middle_ns) == second}
 
 
-def sensor_table(sensor: str, offset: float) -> None:
-    items, truth = autoferry(sensor, round(offset * 1e9))
+def tuned(make: Make, noises: Sequence[float], items: list, truth: np.ndarray) -> dict[str, float]:
+    """Scores of each half with the setting that is best in the other; all but GOSPA are means."""
     stamps = sorted(item.stamp_ns for item in items)
     middle = stamps[len(stamps) // 2]
-    later = f', stamps {offset:+g} s' if offset else ''
-    print(
-        f'\n### {sensor.capitalize()}{later}: {len(items)} scans, {sum(map(len, items))} fixes\n'
-    )
-    header('GOSPA first half', 'GOSPA second half', 'missed', 'false', 'tracks', 'RMSE m')
-    for label, (make, noises) in TRACKERS.items():
-        runs = [final_estimates(make(*s), items) for s in product(noises, STDS, LIVES)]
-        halves = [
-            [boat_scores(half(final, middle, second), truth) for final in runs]
-            for second in (False, True)
-        ]
-        best = [int(np.argmin([scores[0] for scores in each])) for each in halves]
-        # Chosen on one half, scored on the other.
-        scored = [halves[0][best[1]], halves[1][best[0]]]
-        row(
-            label,
-            [scored[0][0], scored[1][0], *np.mean([scores[1:] for scores in scored], axis=0)],
-        )
+    runs = [final_estimates(make(*s), items) for s in product(noises, STDS, LIVES)]
+    halves = [
+        [boat_scores(half(final, middle, second), truth) for final in runs]
+        for second in (False, True)
+    ]
+    best = [int(np.argmin([scores[0] for scores in each])) for each in halves]
+    scored = [halves[0][best[1]], halves[1][best[0]]]
+    means = np.mean([scores[1:] for scores in scored], axis=0).tolist()
+    return {
+        **{name: float(scores[0]) for name, scores in zip(HALVES, scored)},
+        **dict(zip(('missed', 'false', 'tracks', 'RMSE'), means)),
+    }
 
 
-def main() -> None:
+def main(recordings: Sequence[str] = tuple(RECORDINGS)) -> Parts:
     if not (DATA / 'autoferry').is_dir():
         raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
-    for sensor, offsets in OFFSETS.items():
-        for offset in offsets:
-            sensor_table(sensor, offset)
+    for name in recordings:
+        sensor, offset = RECORDINGS[name]
+        items, truth = autoferry(sensor, round(offset * 1e9))
+        for label, (make, noises) in TRACKERS.items():
+            yield {'table': {name: {label: tuned(make, noises, items, truth)}}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, recordings={'choices': list(RECORDINGS)})

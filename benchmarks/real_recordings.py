@@ -12,13 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diver tracker on real recordings: a towed acoustic tag (yaps) and boats (Autoferry).
+"""Real recordings, read and scored: a towed acoustic tag (yaps) and boats (Autoferry).
 
-    SONAR_IMM_DATA=../shared/data python -m benchmarks.real_recordings
-
-Prints docs/results/real_recordings.md, from which docs/real_recordings.md quotes. Truth of the tag
-is a hand-held GPS, itself good to a few metres and ahead of the tag, which is towed: errors are
-given against GPS as it is and against GPS 3.4 s later.
+`recording_scores` and `real_boats` print docs/results/real_recordings.md. Truth of the tag is a
+hand-held GPS, itself good to a few metres and ahead of the tag, which is towed: errors are given
+against GPS as it is and against GPS 3.4 s later.
 """
 
 from __future__ import annotations
@@ -30,15 +28,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.study import final_estimates
 from msg_adapters.estimates import read_estimate
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.trackers.diver.births import locate
-from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm_tools.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes
+from sonar_imm.trackers.diver.tracker import DiverConfig
+from sonar_imm_tools.recordings.convert import convert_autoferry
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 
@@ -62,22 +58,6 @@ PACE: dict[str, Any] = {**HEADINGS, 'speed_noise': 0.07}
 """A swimmer whose speed, spread by `speed_std` = .4 m/s, is another one after a minute: a random
 walk of sqrt(2 / 60 s) .4 m/s over a second, as that of a process that forgets within a minute."""
 COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
-SETS: dict[str, dict[str, Any]] = {
-    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
-    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
-    'families (default)': {},
-    'heading_speed': HEADINGS,
-    'heading_speed, pace kept a minute': PACE,
-    'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
-}
-OF_BOATS: dict[str, dict[str, Any]] = {
-    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
-    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-    'families (default)': {},
-    'families, gnn': {'association': 'gnn'},
-    'heading_speed': {**HEADINGS, **BOATS},
-    'heading_speed, jipda': {**HEADINGS, **BOATS, 'association': 'jipda'},
-}
 
 
 def load(bag: Path) -> tuple[list, np.ndarray]:
@@ -95,13 +75,6 @@ def load(bag: Path) -> tuple[list, np.ndarray]:
                 )
             ]
     return [each for each in found if not isinstance(each, Rejection)], np.array(truth)
-
-
-def follow(config: DiverConfig, items: list) -> tuple[list, list]:
-    """Estimates of the filter and of the smoother, the last word on each stamp."""
-    tracker = SmoothingDiverTracker(config)
-    final = final_estimates(tracker, items)
-    return [final[stamp] for stamp in sorted(final)], tracker.smoothed()
 
 
 def against_gps(
@@ -177,58 +150,6 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
     return out
 
 
-def tag_table(title: str, items: list, truth: np.ndarray, **extra: Any) -> None:
-    print(f'\n### {title} ({len(items)} messages)\n')
-    header('RMSE m', 'RMSE, GPS 3.4 s later', 'median', 'NEES (2)', 'compared')
-    config = DiverConfig(**{**TAG, **extra})
-    # Three arrivals give a fix. Of a tag two give a hyperbola and one nothing: what is said then
-    # is the prediction.
-    least = {'pings of 3 or more': 3, 'pings of 2 or more': 2, '': 0}
-    sizes = {item.stamp_ns: len(item) if isinstance(item, Arrivals) else 3 for item in items}
-    row('each ping or fix by itself', tag_scores(raw_fixes(items, config), truth))
-    for name, values in SETS.items():
-        filtered, smooth = follow(DiverConfig(**{**TAG, **extra, **values}), items)
-        kinds = {name: filtered}
-        if not all(np.array_equal(a.state, b.state) for a, b in zip(filtered, smooth)):
-            kinds[f'{name}, smoothed'] = smooth
-        for label, estimates in kinds.items():
-            last: list[float] = []
-            for which, size in least.items():
-                shared = [each for each in estimates if sizes.get(each.stamp_ns, 0) >= size]
-                scores = tag_scores(shared, truth)
-                if not which or last != scores and len(shared) < len(estimates):
-                    row(', '.join(filter(None, (label, which))), scores)
-                last = scores
-
-
-def seeds_table(pings: list, truth: np.ndarray) -> None:
-    print('\n### yaps, raw arrivals thinned in eight ways: RMSE, GPS 3.4 s later\n')
-    header('5 receivers', '4 receivers', '3 receivers')
-    for name, values in {
-        'families (default)': {},
-        'heading_speed': HEADINGS,
-        'heading_speed, pace kept a minute': PACE,
-        'heading_speed, receivers known to 1.4 m': {**HEADINGS, 'receiver_position_std': 1.4},
-    }.items():
-        cells = []
-        for receivers in (5, 4, 3):
-            scores = []
-            for seed in range(1, 9):
-                tracker = DiverTracker(DiverConfig(**{**TAG, **values}))
-                final = final_estimates(tracker, thinned(pings, receivers, 1.0, seed))
-                scores.append(tag_scores([final[stamp] for stamp in sorted(final)], truth)[1])
-            cells.append(' '.join(f'{score:.1f}' for score in scores))
-        print(f'| {name} | {" | ".join(cells)} |')
-
-
-def header(*columns: str) -> None:
-    print(f'| | {" | ".join(columns)} |\n{"|---" * (len(columns) + 1)}|')
-
-
-def row(name: str, values: list[float]) -> None:
-    print(f'| {name} | {" | ".join(f"{v:.2f}".removesuffix(".00") for v in values)} |')
-
-
 def autoferry(sensor: str, time_offset_ns: int = 0) -> tuple[list, np.ndarray]:
     """The scans of radar or lidar in Autoferry scenario 13, and the truth, as `load` has them."""
     with tempfile.TemporaryDirectory() as scratch:
@@ -241,25 +162,6 @@ def autoferry(sensor: str, time_offset_ns: int = 0) -> tuple[list, np.ndarray]:
             time_offset_ns=time_offset_ns,
         )
         return load(out)
-
-
-def boats() -> None:
-    for sensor in ('radar', 'lidar'):
-        items, truth = autoferry(sensor)
-        print(
-            f'\n### Autoferry scenario 13, {sensor}: {len(items)} scans, '
-            f'{sum(map(len, items))} fixes\n'
-        )
-        header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
-        for name, values in OF_BOATS.items():
-            config = DiverConfig(
-                fix_std=4.0 if sensor == 'radar' else 2.0,
-                clutter_density=1e-5,
-                confirm_hits=4,
-                confirm_window=6,
-                **values,
-            )
-            row(name, boat_scores(final_estimates(DiverTracker(config), items), truth))
 
 
 def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
@@ -283,38 +185,3 @@ def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
         ids.update(estimate.extras['track_id'][rows].tolist())
     n = len(final)
     return [np.mean(distance), missed / n, false / n, len(ids), np.sqrt(np.mean(squared))]
-
-
-def main() -> None:
-    folder = DATA / 'yaps_ssu1'
-    if not folder.is_dir():
-        raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
-    with tempfile.TemporaryDirectory() as scratch:
-        fixes, arrivals = Path(scratch) / 'fixes', Path(scratch) / 'arrivals'
-        convert_fixes(folder / 'fixes.csv', fixes, truth=folder / 'gps_truth.csv')
-        convert_arrivals(
-            folder / 'arrivals.csv',
-            arrivals,
-            receivers=folder / 'receivers.csv',
-            truth=folder / 'gps_truth.csv',
-        )
-        items, truth = load(fixes)
-        tag_table('yaps, fixes as they are', items, truth)
-        tag_table('yaps, fixes, covariances times 6', items, truth, covariance_scale=6.0)
-        tag_table(
-            'yaps, fixes, covariance scale learnt', items, truth, estimate_covariance_scale=True
-        )
-        pings, truth = load(arrivals)
-        tag_table('yaps, raw arrivals, all receivers', pings, truth)
-        for receivers in (5, 4, 3):
-            tag_table(
-                f'yaps, raw arrivals, {receivers} receivers per ping',
-                thinned(pings, receivers, 1.0),
-                truth,
-            )
-        seeds_table(pings, truth)
-    boats()
-
-
-if __name__ == '__main__':
-    main()

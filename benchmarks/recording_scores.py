@@ -21,7 +21,9 @@ conventional filters, and a peer.
 `plain CV Kalman` is that of `real_boats`; the peer is FilterPy's Kalman filter with the noise of
 ours, which takes the fixes of a tag one by one and knows no clutter. Tags are
 compared with GPS 3.4 s later, boats with GNSS within 20 m of a track; `seen` is the share of what
-there was to see that has a confirmed track, `ids` counts their identities.
+there was to see that has a confirmed track, `ids` counts their identities. Of raw arrivals the
+tables hold pings of three or more. `thinned` is the RMSE with fewer receivers, chosen in eight
+ways.
 """
 
 from __future__ import annotations
@@ -35,19 +37,33 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 
 from benchmarks.real_boats import PlainKalman
-from benchmarks.real_recordings import autoferry, DATA, HEADINGS, LAG, PACE, raw_fixes, TAG
+from benchmarks.real_recordings import (
+    autoferry,
+    DATA,
+    HEADINGS,
+    LAG,
+    PACE,
+    raw_fixes,
+    TAG,
+    tag_scores,
+    thinned,
+)
 from benchmarks.real_recordings import load as load_bag
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.convert import convert_arrivals, convert_fixes
 
 NOISE = 0.1
+BOATS = ('radar', 'lidar')
+WAYS, RECEIVERS = 8, (5, 4, 3)
 CUTOFF, NINETY_FIVE, LONGEST_GAP = 20.0, 5.991, 60.0
 SINGLE: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (NOISE,)},
+    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
     'steady alone (heading_speed)': HEADINGS,
     'brisk alone': PACE,
     'lively alone': {
@@ -57,10 +73,16 @@ SINGLE: dict[str, dict[str, Any]] = {
     },
     'quiet alone': {'model_set': 'cv', 'acceleration_noise': (0.03,)},
 }
+THINNED = ('CV Kalman', 'steady alone (heading_speed)', 'brisk alone')
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
     'tow tag, fixes': ('fixes', TAG),
     'tow tag, fixes, covariances times 6': ('fixes', {**TAG, 'covariance_scale': 6.0}),
+    'tow tag, fixes, covariance scale learnt': (
+        'fixes',
+        {**TAG, 'estimate_covariance_scale': True},
+    ),
     'tow tag, arrivals': ('arrivals', TAG),
+    **{f'tow tag, {n} receivers a ping': (f'arrivals {n}', TAG) for n in RECEIVERS},
     'boats, radar, stamps -1.5 s': ('radar', {'fix_std': 4.0}),
     'boats, lidar': ('lidar', {'fix_std': 2.0}),
 }
@@ -69,7 +91,8 @@ RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
 
 def load(kind: str) -> tuple[list[Any], np.ndarray]:
     """Measurements and truth, rows (stamp s, id, x, y), of a recording."""
-    if kind in ('radar', 'lidar'):
+    kind, _, receivers_a_ping = kind.partition(' ')
+    if kind in BOATS:
         return autoferry(kind, round(-1.5e9) if kind == 'radar' else 0)
     folder = DATA / 'yaps_ssu1'
     with tempfile.TemporaryDirectory() as scratch:
@@ -79,7 +102,8 @@ def load(kind: str) -> tuple[list[Any], np.ndarray]:
         else:
             receivers = folder / 'receivers.csv'
             convert_arrivals(folder / 'arrivals.csv', out, receivers=receivers, truth=truth)
-        return load_bag(out)
+        items, places = load_bag(out)
+    return (thinned(items, int(receivers_a_ping), 1.0) if receivers_a_ping else items), places
 
 
 def present(truth: np.ndarray, at: float) -> np.ndarray:
@@ -96,7 +120,10 @@ def present(truth: np.ndarray, at: float) -> np.ndarray:
 def scores(estimates: Sequence[Estimate], truth: np.ndarray, tag: bool) -> dict[str, float]:
     """What a recording makes of a tracker: of a tag every estimate counts, however far it is."""
     cutoff, lag = (1e6, LAG) if tag else (CUTOFF, 0.0)
-    squared, normalised, ids, there, distance = [], [], set(), 0, []
+    squared: list[float] = []
+    normalised: list[float] = []
+    ids: set[int] = set()
+    there, distance = 0, []
     for estimate in estimates:
         at = present(truth, estimate.stamp_ns * 1e-9 + lag)
         if tag and not len(at):
@@ -119,7 +146,13 @@ def scores(estimates: Sequence[Estimate], truth: np.ndarray, tag: bool) -> dict[
         'seen': len(squared) / there,
         'ids': len(ids),
     }
-    return out if tag else {**out, 'GOSPA': float(np.mean(distance))}
+    if not tag:
+        return {**out, 'GOSPA': float(np.mean(distance))}
+    return {
+        **out,
+        'RMSE, no lag': tag_scores(list(estimates), truth)[0],
+        'median': float(np.median(np.sqrt(squared))),
+    }
 
 
 class Peer:
@@ -156,7 +189,7 @@ class Peer:
 
 def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Each tracker of a recording by its name."""
-    clutter = {} if kind in ('fixes', 'arrivals') else {'clutter_density': 1e-5}
+    clutter = {'clutter_density': 1e-5} if kind in BOATS else {}
 
     def ours(values: dict[str, Any]) -> DiverTracker:
         return DiverTracker(DiverConfig(**{**stated, **clutter, **values}))
@@ -164,9 +197,9 @@ def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[
     yield 'default', lambda: DiverTracker(DiverConfig(**stated))
     for name, values in SINGLE.items():
         yield name, lambda values=values: ours(values)
-    if kind == 'fixes':
+    if kind == 'fixes' and 'estimate_covariance_scale' not in stated:
         yield 'FilterPy, CV Kalman', lambda: Peer(stated.get('covariance_scale', 1.0))
-    if kind in ('radar', 'lidar'):
+    if kind in BOATS:
         yield 'plain CV Kalman', lambda: PlainKalman(0.3, stated['fix_std'], 3, 5)
 
 
@@ -194,23 +227,54 @@ def raw(items: Sequence[Any], stated: dict[str, Any]) -> list[Estimate]:
     return out
 
 
-def main(recordings: Sequence[str] = tuple(RECORDINGS)) -> Parts:
+def of_recording(name: str) -> Iterator[tuple[str, dict[str, float]]]:
+    """The rows of a recording's table, each with its name."""
+    kind, stated = RECORDINGS[name]
+    items, truth = load(kind)
+    tag, arrivals = kind not in BOATS, kind.startswith('arrivals')
+    # Of a tag two arrivals give a hyperbola, and a single arrival nothing.
+    shown = {item.stamp_ns for item in items if not arrivals or len(item) >= 3}
+    yield 'raw', scores(raw(items, stated), truth, tag)
+    for label, make in trackers(kind, stated):
+        final = final_estimates(make(), items)
+        kept = [final[stamp] for stamp in sorted(final) if stamp in shown]
+        yield label, scores(kept, truth, tag)
+        if arrivals and label == 'default' and len(shown) < len(items):
+            yield (
+                'default, all pings',
+                scores([final[stamp] for stamp in sorted(final)], truth, tag),
+            )
+    if tag:
+        smoother = SmoothingDiverTracker(DiverConfig(**{**stated, **SINGLE['CV Kalman']}))
+        final_estimates(smoother, items)
+        smooth = [each for each in smoother.smoothed() if each.stamp_ns in shown]
+        yield 'CV Kalman, smoothed', scores(smooth, truth, tag)
+
+
+def in_eight_ways() -> Iterator[tuple[str, str, dict[str, float]]]:
+    """RMSE with some receivers of each ping, by their number and the tracker."""
+    pings, truth = load('arrivals')
+    ways = {'default': {}, **{name: SINGLE[name] for name in THINNED}}
+    for receivers in RECEIVERS:
+        for name, values in ways.items():
+            found = []
+            for seed in range(1, WAYS + 1):
+                tracker = DiverTracker(DiverConfig(**{**TAG, **values}))
+                final = final_estimates(tracker, thinned(pings, receivers, 1.0, seed))
+                found.append(scores([final[s] for s in sorted(final)], truth, True)['RMSE'])
+            row = {'mean': float(np.mean(found)), 'least': min(found), 'most': max(found)}
+            yield f'{receivers} receivers a ping', name, row
+
+
+def main(recordings: Sequence[str] = tuple(RECORDINGS), no_thinning: bool = False) -> Parts:
     if not DATA.is_dir():
         raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
     for name in recordings:
-        kind, stated = RECORDINGS[name]
-        items, truth = load(kind)
-        tag = kind in ('fixes', 'arrivals')
-        if kind == 'arrivals':
-            # Of a tag two arrivals give a hyperbola, and one nothing.
-            shown = {item.stamp_ns for item in items if len(item) >= 3}
-        else:
-            shown = {item.stamp_ns for item in items}
-        yield {'table': {name: {'raw': scores(raw(items, stated), truth, tag)}}}
-        for label, make in trackers(kind, stated):
-            final = final_estimates(make(), items)
-            kept = [final[stamp] for stamp in sorted(final) if stamp in shown]
-            yield {'table': {name: {label: scores(kept, truth, tag)}}}
+        for label, row in of_recording(name):
+            yield {'table': {name: {label: row}}}
+    if not no_thinning:
+        for thinning, label, row in in_eight_ways():
+            yield {'thinned': {thinning: {label: row}}}
 
 
 if __name__ == '__main__':
