@@ -251,4 +251,4 @@ def test_track_says_what_it_takes_and_what_not(tmp_path, capsys):
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
     printed = capsys.readouterr().out
     assert 'diver <- /usbl/fix as fix (80 messages)' in printed
-    assert 'ignored: /gps (80 messages); --topic fix=/gps would take it' in printed
+    assert "ignored: /gps (80 messages): the ship's own position? --topic fix=/gps" in printed
