@@ -99,6 +99,9 @@ class TracksNodeConfig(PlacedNodeConfig):
         'further types for confirmed tracks', kind='str[]', choices=tuple(TOPICS))
     targets_to: str = parameter('', '',
         'address of NMEA 0183 targets, such as 192.168.1.20:10110; empty: none')
+    targets_as: str = parameter('tll', '',
+        'sentences of targets, of latitude and longitude: tll, or ais (virtual aids to '
+        'navigation, message 21; needs pyais)', choices=('tll', 'ais'))
     targets_period: float = parameter(1.0, 's',
         'time between rounds of targets', range=(0.1, 3600.0))
     # fmt: on
@@ -119,10 +122,11 @@ class ObstacleNodeConfig(TracksNodeConfig):
     """Besides, where the frame of the navigation lies on Earth."""
 
     # fmt: off
-    targets_as: str = parameter('ttm', '',
-        'sentences of targets: ttm (distance and bearing from the vehicle) or tll (latitude and '
-        'longitude, for which origin_latitude and origin_longitude are needed)',
-        choices=('ttm', 'tll'))
+    targets_as: str = inherited(TracksNodeConfig, 'targets_as', 'ttm',
+        description='sentences of targets: ttm (distance and bearing from the vehicle), or of '
+        'latitude and longitude, for which origin_latitude and origin_longitude are needed: tll, '
+        'or ais (virtual aids to navigation, message 21; needs pyais)',
+        choices=('ttm', 'tll', 'ais'))
     origin_latitude: float = parameter(0.0, 'deg',
         'latitude of the origin of the frame of nav, for targets and messages in latitude and '
         'longitude; with both latitude and longitude 0: not known', range=(-90.0, 90.0))
@@ -141,7 +145,8 @@ class ObstacleNodeConfig(TracksNodeConfig):
 
     def check(self) -> list[str]:
         problems = super().check()
-        wanting = {"'targets_as' tll": self.targets_to and self.targets_as == 'tll'}
+        form = self.targets_as
+        wanting = {f"'targets_as' {form}": self.targets_to and form != 'ttm'}
         wanting[f"'also_publish' {GEO_POSE}"] = GEO_POSE in self.also_publish
         if self.origin() is None:
             problems += [

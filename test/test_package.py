@@ -73,6 +73,7 @@ WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Libraries that some commands need, each with an extra of its own.
 PEERS = {
+    'sonar_imm.nodes.tracks': {'pyais'},
     'sonar_imm_tools.offline.jobs': {'distributed'},
     'sonar_imm_tools.offline.run_folder': {'pyarrow'},
     'sonar_imm_tools.viewing.rerun_file': {'rerun'},

@@ -20,21 +20,25 @@ to be installed. `targets_to` is the address to which the confirmed tracks go as
 
 - ``TLL``: latitude and longitude, where it is known where the frame of the tracks lies on Earth;
 - ``TTM``: distance over ground in nautical miles and bearing in degrees clockwise from the bow,
-  with speed, course, and distance and time of the closest approach.
+  with speed, course, and distance and time of the closest approach;
+- AIS message 21 in ``AIVDM``, encoded by pyais: a virtual aid to navigation at that latitude and
+  longitude. Not a position report of a vessel: a plotter would draw a ship and offer to call it.
 
-They go out at most every `targets_period` seconds; a track that is over is sent once more as lost.
+They go out at most every `targets_period` seconds; a track that is over is sent once more as lost,
+for which AIS has no word: there the plotter drops it as old.
 A network that refuses does not stop the node: it is said once, and in /diagnostics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 import math
 import operator
 import socket
 import time
 from typing import Any
+import zlib
 
 import numpy as np
 
@@ -51,6 +55,10 @@ from .outputs import DisplayPublisher
 
 MILE, KNOT = 1852.0, 1852.0 / 3600.0
 """Metres, and metres per second."""
+ISOLATED_DANGER, SPECIAL_MARK = 28, 30
+"""Kinds of aids to navigation of AIS message 21."""
+ACCURATE = 10.0
+"""An AIS position is accurate when it is better than this, m."""
 
 
 class TracksNode(TrackerNode):
@@ -70,10 +78,11 @@ class TracksNode(TrackerNode):
         self._neighbours = DisplayPublisher(neighbours, self.advertise)
         self._targets = Targets(
             self._node_config.targets_to,
-            getattr(self._node_config, 'targets_as', 'tll'),
+            self._node_config.targets_as,
             self._node_config.targets_period,
             self._name.upper(),
             self.get_logger().warning,
+            sender=self._full_name,
         )
 
     def release(self) -> None:
@@ -102,18 +111,30 @@ class TracksNode(TrackerNode):
 class Targets:
     """Sends tracks as targets to one address, ``''``: does nothing.
 
-    form: ``'tll'`` or ``'ttm'``; period: least time between two rounds, s; name: what a target is
-    called before its number; warn: is told once why targets cannot be sent.
+    form: ``'tll'``, ``'ttm'`` or ``'ais'``; period: least time between two rounds, s; name: what a
+    target is called before its number; warn: is told once why targets cannot be sent; sender: the
+    node, whose identities of AIS differ. Raises `ConfigError` where ``'ais'`` is wanted without
+    pyais.
     """
 
     def __init__(
-        self, address: str, form: str, period: float, name: str, warn: Callable[[str], Any]
+        self,
+        address: str,
+        form: str,
+        period: float,
+        name: str,
+        warn: Callable[[str], Any],
+        sender: str = '',
     ):
         self._address, self._warn, self._period = address, warn, period
         self._form, self._name = form, name
+        # 99MID6xxx is a virtual aid to navigation; below 200 MID is the code of no country.
+        self._identity = 990_006_000 + zlib.crc32(sender.encode()) % 200 * 10_000
+        if address and form == 'ais':
+            self._encode = _ais_encoder()
         self._next_round = -math.inf
         self._socket: socket.socket | None = None
-        self._shown: dict[int, list[str]] = {}
+        self._shown: dict[int, str] = {}
         self._warned = False
         self.trouble = ''
 
@@ -123,20 +144,27 @@ class Targets:
         if not self._address or now < self._next_round:
             return
         self._next_round = now + self._period
-        shown = {}
+        sentences, shown = [], {}
         for row in confirmed_rows(estimate):
-            fields = self._ttm(estimate, row) if self._form == 'ttm' else None
-            if self._form == 'tll' and origin is not None:
+            if self._form == 'ttm':
+                fields = self._ttm(estimate, row)
+            elif origin is None or not np.isfinite(motion_of(estimate, row).place).all():
+                continue
+            elif self._form == 'ais':
+                sentences.append(self._ais(estimate, row, origin))
+                continue
+            else:
                 fields = self._tll(estimate, row, origin)
             if fields is not None:
-                shown[int(estimate.extras['track_id'][row])] = fields
-        ended = [fields for each, fields in self._shown.items() if each not in shown]
+                sentences.append(_sentence(fields))
+                shown[int(estimate.extras['track_id'][row])] = self._lost(fields)
+        ended = [lost for each, lost in self._shown.items() if each not in shown]
         self._shown = shown
-        self._send([*map(_sentence, shown.values()), *map(self._lost, ended)])
+        self._send([*sentences, *ended])
 
     def forget(self) -> None:
         """Send all as lost."""
-        self._send([self._lost(fields) for fields in self._shown.values()])
+        self._send([*self._shown.values()])
         self._shown = {}
 
     def close(self) -> None:
@@ -168,11 +196,29 @@ class Targets:
         fields[fields.index('T', len(fields) - 4)] = 'L'
         return _sentence(fields)
 
-    def _tll(self, estimate: Estimate, row: int, origin: Origin) -> list[str] | None:
+    def _ais(self, estimate: Estimate, row: int, origin: Origin) -> str:
         motion = motion_of(estimate, row)
-        if not np.isfinite(motion.place).all():
-            return None
         latitude, longitude, _ = (float(value) for value in origin.geodetic(motion.place))
+        track_id = int(estimate.extras['track_id'][row])
+        error = float(np.linalg.eigvalsh(motion.covariance[:2, :2])[-1])
+        (sentence,) = self._encode(
+            {
+                'type': 21,
+                'mmsi': self._identity + track_id % 1000,
+                'aid_type': SPECIAL_MARK if self._name == 'DIVER' else ISOLATED_DANGER,
+                'name': f'{self._name}{track_id}',
+                'accuracy': 4.0 * error < ACCURATE**2,  # of two standard deviations
+                'lat': latitude,
+                'lon': longitude,
+                'second': estimate.stamp_ns // 10**9 % 60,
+                'virtual_aid': 1,
+            }
+        )
+        return sentence
+
+    def _tll(self, estimate: Estimate, row: int, origin: Origin) -> list[str]:
+        place = motion_of(estimate, row).place
+        latitude, longitude, _ = (float(value) for value in origin.geodetic(place))
         number, name = self._called(estimate, row)
         at = (*_degrees(latitude, 2, 'NS'), *_degrees(longitude, 3, 'EW'))
         return ['RATLL', number, *at, name, _clock(estimate.stamp_ns), 'T', '']
@@ -200,6 +246,16 @@ class Targets:
         """Number of two digits and name of a target."""
         track_id = int(estimate.extras['track_id'][row])
         return f'{track_id % 100:02d}', f'{self._name}{track_id}'
+
+
+def _ais_encoder() -> Callable[[dict[str, Any]], list[str]]:
+    try:
+        from pyais import encode_dict
+    except ImportError:
+        raise ConfigError(
+            "parameter 'targets_as': ais needs pyais: pip install 'sonar_imm[nmea]'"
+        ) from None
+    return partial(encode_dict, talker_id='AI', sentence_type='VDM')
 
 
 def _connected(address: str) -> socket.socket:

@@ -307,7 +307,7 @@ def choose_system(
 ) -> System:
     """The tracker called `name`, or else the one that fits an open recording best. Raises
     `BagError` when none does."""
-    from ..recordings.topics import fitting_systems, instruments, knows_inputs
+    from ..recordings.topics import fitting_systems, instruments, knows_inputs, system_in_mind
 
     if name is not None:
         return SYSTEMS[name]
@@ -317,7 +317,12 @@ def choose_system(
         inputs = {*(topics or {}).values()}
         meant = [system for system in SYSTEMS if inputs and knows_inputs(system, inputs)]
         fits = fitting_systems(reader)
-        best = [system for system in fits if system in meant] or meant or fits or [*SYSTEMS]
+        best = (
+            [system for system in fits if system in meant]
+            or meant
+            or fits
+            or [system_in_mind(reader)]
+        )
         instruments(reader, best[0], topics)
     return SYSTEMS[found[0]]
 

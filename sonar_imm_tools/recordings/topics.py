@@ -116,11 +116,13 @@ def remarks_on_topics(
             continue
         entries = [entry for entry in inputs_of(system) if _can_read(topic, entry)]
         could = [e.name for e in entries if e.may_be(topic.name, topic.type_name)]
+        seconds = [entry for entry in entries if topic.type_name in entry.second]
         # What has the name of an input and is not used would only help what is not there.
-        if could and not any(entry.is_named(topic.name) for entry in entries):
+        if could and (seconds or not any(entry.is_named(topic.name) for entry in entries)):
+            why = ": the ship's own position?" if seconds else ';'
             sentences.append(
-                f'ignored: {topic.name} ({topic.count} messages); --topic {could[0]}={topic.name} '
-                'would take it'
+                f'ignored: {topic.name} ({topic.count} messages){why} --topic '
+                f'{could[0]}={topic.name} would take it'
             )
     return sentences
 
@@ -140,6 +142,25 @@ def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> 
             continue
         found[system] = max(_evidence(bag, system, each) for each in inputs.values())
     return sorted(found, key=lambda system: found[system], reverse=True)
+
+
+def system_in_mind(bag: BagReader) -> str:
+    """The tracker for which most inputs could be there, if topics were named to it."""
+
+    def could(system: str) -> tuple[bool, int]:
+        entries = [
+            entry
+            for entry in (*inputs_of(system), *made_inputs(system))
+            if not entry.companion
+            and any(
+                entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
+                for topic in bag.topics
+            )
+        ]
+        required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
+        return bool(entries) and fed(entries).issuperset(required), len(entries)
+
+    return max(SYSTEMS, key=could)
 
 
 def ready_systems(bag: BagReader) -> list[str]:
@@ -188,10 +209,33 @@ def _matching(
     fitting |= {
         name: entry for name, entry in made_topics(bag, system).items() if entry.makes not in there
     }
-    fitting = _of_use(bag, fitting)
+    fitting = _of_use(bag, fitting | _sure_instead(bag, system, fitting))
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
     return fitting
+
+
+def _sure_instead(
+    bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
+) -> dict[str, InputTopic]:
+    """The one topic without the name of an input that is nobody else's instrument, where all that
+    have such names may be: a pose, where the only fix is in latitude and longitude."""
+    types = {topic.name: topic.type_name for topic in bag.topics}
+    primary = {name: entry for name, entry in fitting.items() if not entry.companion}
+    if not primary or not all(types[name] in entry.second for name, entry in primary.items()):
+        return {}
+    wanted = {entry.name: entry for entry in primary.values()}
+    found = {
+        topic.name: entry
+        for topic in bag.topics
+        for entry in wanted.values()
+        if topic.name not in fitting
+        and topic.type_name not in entry.second
+        and entry.may_be(topic.name, topic.type_name)
+        and not any(each.is_named(topic.name) for each in inputs_of(system))
+        and 'truth' not in topic.name.split('/')
+    }
+    return found if len(found) == 1 else {}
 
 
 def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, InputTopic]:

@@ -14,9 +14,12 @@
 
 """The road of a stranger's file: convert, info, track, export, with nothing but its name."""
 
+import base64
 import csv
+import gzip
 import itertools
 from pathlib import Path
+import re
 
 from helpers.dive_scenes import legs
 from helpers.sonar_files import ek80, kmall, side_scan
@@ -25,7 +28,7 @@ import pytest
 
 from msg_adapters.fixes import write_fix
 from msg_adapters.geodetic import write_geodetic
-from sonar_imm.measurements import Fix, VesselFix
+from sonar_imm.measurements import Fix, GeodeticFix, VesselFix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
@@ -238,8 +241,30 @@ def test_what_cannot_be_converted_is_one_sentence(
     assert wanted.lower() in printed.lower() and 'Traceback' not in printed
 
 
-def test_track_says_what_it_takes_and_what_not(tmp_path, capsys):
+def test_the_map_of_fixes_on_earth_is_in_degrees(tmp_path):
+    """Also where nobody stated the origin, which the first fix is then."""
+    times, place = dive()
+    with BagWriter(tmp_path / 'bag') as bag:
+        for t, latitude, longitude in zip(times.tolist(), *degrees_of(place)):
+            fix = GeodeticFix(
+                stamp_ns=t * 10**9,
+                latitude=latitude,
+                longitude=longitude,
+                height=0.0,
+                frame_id='gps',
+                covariance=np.eye(3),
+            )
+            bag.write('/fix', write_geodetic(fix, ros_message), t * 10**9)
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
+    report = tmp_path / 'report.html'
+    assert main(['evaluate', str(tmp_path / 'run'), '--report', str(report)]) == 0
+    packed = re.findall('H4sI[A-Za-z0-9+/=]+', report.read_text())
+    plots = ''.join(gzip.decompress(base64.b64decode(each)).decode() for each in packed)
+    assert '"text":"latitude"' in plots and '"text":"longitude"' in plots
+    assert '"text":"x [m]"' not in plots
 
+
+def test_track_says_what_it_takes_and_what_not(tmp_path, capsys):
     times, place = dive()
     with BagWriter(tmp_path / 'bag') as bag:
         for t, (x, y) in zip(times.tolist(), place):
@@ -251,4 +276,4 @@ def test_track_says_what_it_takes_and_what_not(tmp_path, capsys):
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
     printed = capsys.readouterr().out
     assert 'diver <- /usbl/fix as fix (80 messages)' in printed
-    assert 'ignored: /gps (80 messages); --topic fix=/gps would take it' in printed
+    assert "ignored: /gps (80 messages): the ship's own position? --topic fix=/gps" in printed

@@ -17,7 +17,9 @@
 import json
 import shlex
 
+from helpers.dive_bags import write_dive
 from helpers.source import ROOT
+import numpy as np
 import pytest
 
 from msg_adapters.geodetic import write_geodetic
@@ -108,6 +110,54 @@ def test_the_ships_own_position_is_no_diver(tmp_path, capsys):
     assert [command.split()[-1] for command in commands] == ['obstacle', 'diver']
     assert main(['track', str(bag), str(tmp_path / 'out')]) == 0
     assert json.loads((tmp_path / 'out' / 'run.json').read_text())['system'] == 'obstacle'
+
+
+def test_a_pose_is_the_diver_rather_than_a_receivers_position(tmp_path, capsys):
+    """Neither is named: of both, the one that may be the ship's own is not tracked."""
+    bag = write_dive(tmp_path / 'dive', topic='/usbl/pose', truth=False)
+    with BagReader(bag) as reader, BagWriter(tmp_path / 'bag') as writer:
+        for item in reader.messages():
+            own = GeodeticFix(
+                stamp_ns=item.log_ns, latitude=54.0, longitude=10.0, height=0.0, frame_id='gps'
+            )
+            writer.write(item.topic, item.message, item.log_ns)
+            writer.write('/gps/fix', write_geodetic(own, ros_message), item.log_ns)
+    bag = tmp_path / 'bag'
+    assert main(['track', str(bag), str(tmp_path / 'out')]) == 0
+    printed = capsys.readouterr().out
+    assert 'diver <- /usbl/pose as fix (120 messages)' in printed
+    assert "ignored: /gps/fix (120 messages): the ship's own position?" in printed
+    (command,) = recommended(bag, capsys)
+    assert run(command, tmp_path / 'again', capsys)['topics'] == {'/usbl/pose': 'fix'}
+    own = run(command, tmp_path / 'own', capsys, '--topic', 'fix=/gps/fix')
+    assert own['topics'] == {'/gps/fix': 'fix'}
+
+
+def test_a_laser_scan_with_odometry_is_tracked_as_info_says(tmp_path, capsys):
+    """Without its options the refusal speaks of the tracker that ``info`` recommends."""
+    with BagReader(ROOT / 'bags' / 'obstacle_movers') as reader:
+        navs = [(item.message, item.log_ns) for item in reader.messages(['/nav'])][:100]
+    ranges = np.full(101, 30.0, np.float32)
+    ranges[50] = 12.0
+    with BagWriter(tmp_path / 'bag') as writer:
+        for nav, log_ns in navs:
+            scan = ros_message(
+                'sensor_msgs/msg/LaserScan',
+                header=nav.header,
+                **{'angle_min': -0.5, 'angle_max': 0.5, 'angle_increment': 0.01},
+                **{'time_increment': 0.0, 'scan_time': 0.1, 'range_min': 0.1, 'range_max': 25.0},
+                **{'ranges': ranges, 'intensities': np.ones(101, np.float32)},
+            )
+            writer.write('/odom', nav, log_ns)
+            writer.write('/scan', scan, log_ns)
+    bag = tmp_path / 'bag'
+    (command,) = recommended(bag, capsys)
+    assert '--topic nav=/odom --topic detections=/scan' in command
+    assert run(command, tmp_path / 'out', capsys)['rows'] > 0
+    assert main(['track', str(bag), str(tmp_path / 'no')]) == 2
+    refusal = capsys.readouterr().err
+    assert 'no topic for the obstacle tracker' in refusal
+    assert '/odom as nav' in refusal and '/scan as detections' in refusal
 
 
 def test_both_sides_of_a_side_scan(tmp_path, capsys):

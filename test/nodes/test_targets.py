@@ -15,6 +15,7 @@
 """Targets over UDP: what arrives on a socket is decoded by another library."""
 
 import socket
+import sys
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm.nodes.tracks import Targets
 from sonar_imm.parameters import ConfigError
 
+pyais = pytest.importorskip('pyais')
 pynmea2 = pytest.importorskip('pynmea2')
 
 SECOND = 10**9
@@ -51,6 +53,12 @@ def address(listening):
     return f'127.0.0.1:{listening.getsockname()[1]}'
 
 
+def parsed(sentence):
+    if sentence.startswith('!'):
+        return pyais.decode(sentence, error_if_checksum_invalid=True)
+    return pynmea2.parse(sentence, check=True)
+
+
 def heard(listening):
     """All sentences that have arrived, parsed, their sums checked."""
     found = []
@@ -61,7 +69,7 @@ def heard(listening):
         except BlockingIOError:
             return found
         assert datagram.endswith(b'\r\n') and len(datagram) <= 82
-        found.append(pynmea2.parse(datagram.decode('ascii').strip(), check=True))
+        found.append(parsed(datagram.decode('ascii').strip()))
 
 
 def divers(ids=(3,), states=(1,), x=100.0, y=-50.0):
@@ -108,9 +116,10 @@ def targets(listening, form='tll', period=0.1, warnings=None):
     return Targets(address(listening), form, period, 'DIVER', warn)
 
 
-@pytest.mark.parametrize(
-    ('latitude', 'longitude'), [(54.25, 10.5), (-33.9999999, -151.25), (0.01, 179.9999999)]
-)
+PLACES = [(54.25, 10.5), (-33.9999999, -151.25), (0.01, 179.9999999)]
+
+
+@pytest.mark.parametrize(('latitude', 'longitude'), PLACES)
 def test_latitude_and_longitude_arrive(plotter, latitude, longitude):
     origin = Origin(latitude, longitude)
     targets(plotter).send(divers(states=(2,)), origin)
@@ -141,6 +150,53 @@ def test_what_is_not_known_stays_empty(plotter):
     (sentence,) = heard(plotter)
     assert sentence.data[4:6] == ['', '']
     assert float(sentence.distance) * 1852.0 == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize(('latitude', 'longitude'), PLACES)
+def test_a_diver_is_a_virtual_special_mark_of_ais(plotter, latitude, longitude):
+    """Of which AIS knows a ten thousandth of a minute, and that it is better than 10 m."""
+    origin = Origin(latitude, longitude)
+    targets(plotter, 'ais').send(divers(), origin)
+    (message,) = heard(plotter)
+    expected = origin.geodetic(np.array([100.0, -50.0, -8.0]))
+    assert (message.msg_type, message.virtual_aid, message.accuracy) == (21, True, True)
+    assert message.lat == pytest.approx(expected[0], abs=1.5e-6)
+    assert message.lon == pytest.approx(expected[1], abs=1.5e-6)
+    assert (message.name, message.second) == ('DIVER3', 20)
+    assert message.aid_type == pyais.constants.NavAid.SPECIAL_MARK
+
+
+def test_an_obstacle_is_an_isolated_danger_with_an_identity_of_its_own(plotter):
+    """The same number of another node, and a place that is not better than 10 m."""
+    uncertain = obstacles(0.0)
+    for axis, variance in {'xx': 40.0, 'yy': 1.0, 'zz': 1.0, 'xy': 0.0}.items():
+        uncertain.extras[f'place_cov_{axis}'] = np.array([variance])
+    names = 'obstacle_node', 'port/obstacle_node'
+    for name in names:
+        Targets(address(plotter), 'ais', 1.0, 'OBSTACLE', print, name).send(
+            uncertain, Origin(54.0, 10.0)
+        )
+    found = heard(plotter)
+    assert {m.aid_type for m in found} == {pyais.constants.NavAid.ISOLATED_DANGER}
+    assert {(m.name, m.accuracy) for m in found} == {('OBSTACLE112', False)}
+    identities = [f'{m.mmsi:09d}' for m in found]
+    assert len({*identities}) == 2
+    assert all(i[:2] == '99' and i[2:5] < '200' and i[5:] == '6112' for i in identities)
+
+
+def test_ais_falls_silent_about_a_track_that_is_over(plotter):
+    sender = targets(plotter, 'ais', period=0.0)
+    for ids in ((3, 4), (4,), ()):
+        sender.send(divers(ids, (1,) * len(ids)), Origin(54.0, 10.0))
+    sender.close()
+    assert [m.name for m in heard(plotter)] == ['DIVER3', 'DIVER4', 'DIVER4']
+
+
+def test_ais_without_its_library_is_a_sentence(make_bench, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pyais', None)
+    bench = make_bench('-p', 'targets_to:=127.0.0.1:10110', '-p', 'targets_as:=ais')
+    with pytest.raises(ConfigError, match=r"'targets_as': ais needs pyais: pip install '.*nmea"):
+        DiverNode(context=bench.context)
 
 
 def test_a_track_that_is_over_is_sent_once_as_lost(plotter, monkeypatch):
@@ -178,8 +234,9 @@ def test_all_are_lost_when_the_tracker_starts_afresh(plotter):
     assert [s.data[-2] for s in heard(plotter)] == ['T', 'L']
 
 
-def test_without_an_origin_nothing_is_sent(plotter):
-    targets(plotter).send(divers(), None)
+@pytest.mark.parametrize('form', ['tll', 'ais'])
+def test_without_an_origin_nothing_is_sent(plotter, form):
+    targets(plotter, form).send(divers(), None)
     assert heard(plotter) == []
 
 
@@ -209,9 +266,10 @@ def test_an_address_that_is_none_is_a_sentence(make_bench, wrong):
         DiverNode(context=bench.context)
 
 
-def test_latitudes_of_obstacles_need_an_origin(make_bench):
-    bench = make_bench('-p', 'targets_to:=127.0.0.1:10110', '-p', 'targets_as:=tll')
-    with pytest.raises(ConfigError, match="'targets_as' tll needs origin_latitude"):
+@pytest.mark.parametrize('form', ['tll', 'ais'])
+def test_latitudes_of_obstacles_need_an_origin(make_bench, form):
+    bench = make_bench('-p', 'targets_to:=127.0.0.1:10110', '-p', f'targets_as:={form}')
+    with pytest.raises(ConfigError, match=f"'targets_as' {form} needs origin_latitude"):
         ObstacleNode(context=bench.context)
 
 

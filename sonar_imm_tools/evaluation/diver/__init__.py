@@ -28,6 +28,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
@@ -67,7 +68,9 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         # plotly, which only a report needs, takes a second to load.
         from .figures import sections
 
-        return sections(run, metrics, series, truth, raw, config.origin())
+        # Of a run whose first fix was the origin, only the run knows it.
+        origin = Origin(**run['origin']) if run.get('origin') else config.origin()
+        return sections(run, metrics, series, truth, raw, origin)
 
     return Judgement(
         run=run,
