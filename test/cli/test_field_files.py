@@ -182,13 +182,24 @@ def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
     assert '<html' in report.read_text().lower()
 
 
-@pytest.mark.parametrize('name', ['usbl.csv', 'harbour.nmea', 'line.xtf', 'd.raw'])
+def sound(path):
+    """What the 16 hydrophones of a shipped recording heard."""
+    with BagReader(BAGS / 'fathometer_pressure') as bag:
+        first = itertools.islice(measurements_of(bag, 'fathometer'), 12)
+        blocks = [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+    steps = np.round(np.concatenate([block.pressure / block.scale for block in blocks]))
+    soundfile.write(path, steps.astype(np.int16), int(blocks[0].sample_rate), subtype='PCM_16')
+
+
+@pytest.mark.parametrize(
+    'name', ['usbl.csv', 'harbour.nmea', 'line.xtf', 'd.raw', 'array_20240531_100000.wav']
+)
 def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr('webbrowser.open', opened.append)
     monkeypatch.setenv('TMPDIR', str(tmp_path))
     monkeypatch.setattr('tempfile.tempdir', None)
-    make = ROADS[name] if name in ROADS else SONARS[name][0]
+    make = ROADS.get(name) or (SONARS[name][0] if name in SONARS else sound)
     make(tmp_path / name)
     bag = tmp_path / 'line.bag'
     assert main(['convert', str(tmp_path / name), str(bag)]) == 0

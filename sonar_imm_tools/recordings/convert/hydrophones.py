@@ -49,6 +49,8 @@ _NAMED = re.compile(r'(?<!\d)(?:20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)
 def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert the channels of a sound file to the topic ``/pressure``, block by block.
 
+    The bag gets ``parameters.yaml`` with the number of hydrophones.
+
     values: as in `HydrophonesOptions`. Needs soundfile. A file that ends early keeps what could be
     read. Raises `BagError`.
     """
@@ -69,7 +71,8 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
         )
         report.notes['full scale'] = f'{how.full_scale:g} Pa'
         notes = provenance(path.name, report.notes)
-        with BagWriter(report.path, storage=how.storage, custom_data=notes) as bag:
+        own = {'fathometer': {'phones': len(channels)}}
+        with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
             _write_blocks(sound, bag, report, how, channels, start_ns, rows)
             if not bag.count:
                 raise BagError(f'{path} holds no block of sound that could be converted')
