@@ -289,7 +289,7 @@ class SetFilter:
             w,
             amplitude,
             propagated.path,
-            log_evidence=float(log_sum - propagated.log_before),
+            log_evidence=float(log_sum) - propagated.log_before,  # of no weights at all: NaN
             effective=float(effective_sample_size(w)) if ok else 0.0,
             ok=ok,
             after=Weighted(sets, log_weight, propagated.path),

@@ -64,6 +64,11 @@ def test_messages_that_once_broke_hypotheses_of_divers(bad):
     run('diver', (3, [Bad.of('diver', number) for number in numbers]))
 
 
+def test_a_record_that_no_set_explains_is_no_warning_of_numpy():
+    numbers = {2: 146, 9: 300657}
+    run('fathometer', (0, [Bad.of('fathometer', numbers.get(k, 0)) for k in range(50)]))
+
+
 def test_where_the_last_diver_has_gone_existence_is_a_number_still():
     assert run_extreme('diver', 41)
 

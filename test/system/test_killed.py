@@ -119,7 +119,7 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
     simulate = command('simulate', 'survey', lines, '--soundings', *small)
     subprocess.run(simulate, cwd=ROOT, check=True)
     first = None
-    for work in (None, 'lines/*.npz', 'looks/*.npz', 'tiles/*.npz'):
+    for work in (None, 'lines/*.npz', 'looks/*.npy', 'tiles/*.npz'):
         out = tmp_path / f'out{len(list(tmp_path.iterdir()))}'
         arguments = command('survey', lines, out, '--adjust', '--jobs', 2)
         with subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, text=True) as it:
