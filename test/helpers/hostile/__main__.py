@@ -37,6 +37,7 @@ from sonar_imm.trackers import SYSTEMS
 
 from .runs import BATCH, batches, run, run_extreme, Tally
 
+ROOT = Path(__file__).parents[3]
 MOST_EXAMPLES = 500
 """Batches of one search of hypothesis, which remembers those it has tried."""
 
@@ -62,7 +63,7 @@ def messages(system, cases, first_seed=0):
         try:
             search()
         except BaseException as error:  # groups of several failures too
-            failures.append(_told(error))
+            failures.append(_text_of(error))
             if len(failures) == 5:
                 break
         number += 1
@@ -91,7 +92,7 @@ def parameters(system, draws):
         try:
             found = run_extreme(system, number)
         except Exception as error:
-            failures.append(_told(error))
+            failures.append(_text_of(error))
             continue
         ran += found is not None
         estimates += found or 0
@@ -104,8 +105,9 @@ def parameters(system, draws):
     }
 
 
-def _told(error):
-    return ''.join(traceback.format_exception(type(error), error, error.__traceback__))[-3000:]
+def _text_of(error):
+    lines = traceback.format_exception(type(error), error, error.__traceback__)
+    return ''.join(lines).replace(f'{ROOT}/', '')[-3000:]
 
 
 def _all(system, cases, draws):
