@@ -106,11 +106,16 @@ def test_from_a_file_to_a_file_in_three_commands(tmp_path, name, capsys):
     assert np.isfinite([float(row['std_major']) for row in rows]).all()
 
 
-def test_from_sound_to_reflectors(tmp_path, capsys):
-    """The sound of a shipped array comes back from a WAV sample by sample, and is tracked."""
+def shipped_sound():
+    """Blocks of what the 16 hydrophones of a shipped recording heard."""
     with BagReader(BAGS / 'fathometer_pressure') as bag:
         first = itertools.islice(measurements_of(bag, 'fathometer'), 12)
-        blocks = [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+        return [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+
+
+def test_from_sound_to_reflectors(tmp_path, capsys):
+    """The sound of a shipped array comes back from a WAV sample by sample, and is tracked."""
+    blocks = shipped_sound()
     pressure = np.concatenate([block.pressure for block in blocks])
     rate, scale = blocks[0].sample_rate, blocks[0].scale
     steps = np.round(pressure / scale).astype(np.int16)
@@ -183,10 +188,7 @@ def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
 
 
 def sound(path):
-    """What the 16 hydrophones of a shipped recording heard."""
-    with BagReader(BAGS / 'fathometer_pressure') as bag:
-        first = itertools.islice(measurements_of(bag, 'fathometer'), 12)
-        blocks = [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+    blocks = shipped_sound()
     steps = np.round(np.concatenate([block.pressure / block.scale for block in blocks]))
     soundfile.write(path, steps.astype(np.int16), int(blocks[0].sample_rate), subtype='PCM_16')
 
