@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.estimates import read_estimate
@@ -40,6 +41,7 @@ from .link import Link, LinkError, MATCH_LIMIT
 ANSWER_LIMIT = 15.0
 """Seconds a node may take over one message. Its kernels are warm before it listens."""
 _ANSWERS = '/processed'
+_ASKED_AGAIN = 5.0
 _SECOND_LOOK = 0.5
 _OTHER_INPUTS = 4.0
 """Seconds in which further inputs of a node may be found. They become known one by one, and what
@@ -122,9 +124,7 @@ class LockStep:
         self._sent = 0
         self._estimates_before = 0
         self.delays: list[float] = []
-        link.node.create_subscription(
-            PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
-        )
+        self._answers = self._subscribe()
 
     @property
     def counts(self) -> Counts:
@@ -140,7 +140,7 @@ class LockStep:
         waited for could be taken for somebody else's. Raises `LinkError` saying what is missing.
         """
         publishers = list(publishers)
-        if not self._link.wait_for(lambda: self._counts is not None, limit, self._trouble):
+        if not self._answered_within(limit):
             raise LinkError(
                 f"no answer from a node '{self._name}': is it running, in this ROS "
                 'domain, and one of this package?'
@@ -197,6 +197,26 @@ class LockStep:
         """Serve the link until `predicate` holds: True, or False after `limit` seconds. Raises
         `LinkError` when the node ends."""
         return self._link.wait_for(predicate, limit, self._lost)
+
+    def _subscribe(self) -> Subscription:
+        return self._link.node.create_subscription(
+            PointCloud2, self._name + _ANSWERS, self._answered, latched_qos()
+        )
+
+    def _answered_within(self, limit: float) -> bool:
+        """Wait for the row that a node keeps for who comes late. It is sent once to each
+        subscription and can be lost on a busy machine: ask for it anew now and then."""
+        end = time.monotonic() + limit
+        while not self._link.wait_for(
+            lambda: self._counts is not None,
+            min(_ASKED_AGAIN, end - time.monotonic()),
+            self._trouble,
+        ):
+            if time.monotonic() >= end:
+                return False
+            self._link.node.destroy_subscription(self._answers)
+            self._answers = self._subscribe()
+        return True
 
     def _answered(self, message: PointCloud2) -> None:
         columns = decode_table(message)

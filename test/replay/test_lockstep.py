@@ -29,6 +29,7 @@ from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.replay import lockstep as lockstep_module
+from sonar_imm_tools.replay.harness import START_LIMIT
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.replay.lockstep import Counts, LockStep, Recorder
 from sonar_imm_tools.replay.player import play, Player, PlayOptions
@@ -101,7 +102,7 @@ def stepping(bag, link, monkeypatch):
 def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
     start(*RELIABLE)
     player, recorder, step = stepping()
-    player.run()
+    player.run(start_limit=START_LIMIT)
     assert player.result().published == COUNT + 1  # the other topic goes along, unanswered
     assert step.counts == (COUNT, 1, COUNT - 1)
     assert len(player.result().delays) == COUNT - 1
@@ -114,9 +115,9 @@ def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
 def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping):
     start(*RELIABLE)
     first, _, _ = stepping()
-    first.run()
+    first.run(start_limit=START_LIMIT)
     second, recorder, step = stepping(start_offset=0.1)
-    second.run()
+    second.run(start_limit=START_LIMIT)
     assert step.counts == (COUNT - 10, 0, 0)  # all duplicates: answered without an estimate
     assert len(recorder) == 0
 
@@ -133,6 +134,16 @@ def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(
         play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
 
 
+def test_a_row_that_was_lost_is_asked_for_again(link, start, stepping, monkeypatch):
+    monkeypatch.setattr(lockstep_module, '_ASKED_AGAIN', 0.1)
+    start(*RELIABLE)
+    player, recorder, step = stepping()
+    lost = step._answers
+    link.node.destroy_subscription(lost)  # as if its row never came
+    player.run(start_limit=START_LIMIT)
+    assert step._answers is not lost and len(recorder) == COUNT - 1
+
+
 def test_lockstep_without_a_node_says_so(link, stepping):
     player, _, _ = stepping()
     with pytest.raises(LinkError, match="no answer from a node '/walker'"):
@@ -144,7 +155,7 @@ def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, step
     start('-p', 'fix_type:=geometry_msgs/msg/PointStamped')
     player, _, _ = stepping(topics=('/fix',))
     with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
-        player.run()
+        player.run(start_limit=START_LIMIT)
 
 
 def test_lockstep_says_when_no_topic_fits(link, start, monkeypatch, stepping):
@@ -152,7 +163,7 @@ def test_lockstep_says_when_no_topic_fits(link, start, monkeypatch, stepping):
     start()
     player, _, _ = stepping(topics=('/other',))
     with pytest.raises(LinkError, match=r'listens to none of the topics of the bag \(/other\)'):
-        player.run()
+        player.run(start_limit=START_LIMIT)
 
 
 def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, stepping):
@@ -163,7 +174,7 @@ def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, 
     player, _, _ = stepping()
     try:
         with pytest.raises(LinkError, match='did not answer message 1 on /fix within 0.3 s'):
-            player.run()
+            player.run(start_limit=START_LIMIT)
     finally:
         release.set()
 
@@ -221,7 +232,7 @@ def test_a_step_waits_until_the_estimates_of_the_message_are_here(link):
 def test_recorded_estimates_read_back(link, start, stepping):
     start(*RELIABLE)
     player, recorder, _ = stepping(topics=('/fix',))
-    player.run()
+    player.run(start_limit=START_LIMIT)
     estimate = recorder.estimates()[0]
     assert estimate.frame_id == 'map'
     assert estimate.model_names == ('slow', 'fast')
