@@ -41,7 +41,7 @@ class Viewer:
     def __exit__(self, *error):
         self._connection.__exit__(*error)
 
-    def wait(self, predicate, limit=20.0):
+    def wait(self, predicate, limit=120.0):
         """Read until `predicate()` holds; AssertionError after `limit` seconds."""
         end = time.monotonic() + limit
         while not predicate():

@@ -46,7 +46,7 @@ class Steps:
 
     def work(self, name):
         self.begun[name].set()
-        assert self.go[name].wait(30.0)
+        assert self.go[name].wait(240.0)
         self.done.append(name)
 
     def let_go(self):

@@ -53,11 +53,11 @@ def test_what_is_published_comes_first_and_the_rest_after_the_node_is_ready():
     steps = Steps(fixes=Fix, echoes=Arrivals)
     warming = Warming(steps, lambda: {Arrivals}, kernels_of)
     try:
-        assert steps.begun['echoes'].wait(30.0) and not warming.ready()
+        assert steps.begun['echoes'].wait(240.0) and not warming.ready()
         assert 'kernels (echoes)' in warming.sentence()
         assert 'no input is heard until then' in warming.sentence()
         steps.go['echoes'].set()
-        assert steps.begun['fixes'].wait(30.0)
+        assert steps.begun['fixes'].wait(240.0)
         assert warming.ready() and not warming.done()
         assert 'messages may wait for it' in warming.sentence()
     finally:
@@ -70,7 +70,7 @@ def test_when_nobody_publishes_everything_is_there_before_the_node_is_ready():
     warming = Warming(steps, lambda: None, kernels_of)
     try:
         steps.go['fixes'].set()
-        assert steps.begun['echoes'].wait(30.0) and not warming.ready()
+        assert steps.begun['echoes'].wait(240.0) and not warming.ready()
     finally:
         finish(warming, steps)
     assert steps.done == ['fixes', 'echoes'] and warming.ready()
@@ -87,12 +87,12 @@ def test_the_sentence_counts_the_kernels_of_what_is_published_and_then_of_all(mo
         return warming.sentence()
 
     try:
-        assert steps.begun['fixes'].wait(30.0)
+        assert steps.begun['fixes'].wait(240.0)
         assert warming.sentence() == 'loading kernels (fixes); no input is heard until then'
         once, end = 'kernels, once for this machine, some 0 s more', 'no input is heard until then'
         assert compiled('first') == f'compiling 2 of 3 {once} (fixes); {end}'
         steps.go['fixes'].set()
-        assert steps.begun['echoes'].wait(30.0)
+        assert steps.begun['echoes'].wait(240.0)
         end = 'messages may wait for it'
         assert compiled('second') == f'compiling 3 of 6 {once} (echoes); {end}'
     finally:
@@ -137,7 +137,7 @@ def test_a_process_of_its_own_compiles_and_ends(kept, monkeypatch):
     monkeypatch.setattr(jit, 'kept', lambda step: kept and bool(there))
     steps = [(name, lambda name=name: done.append(name)) for name in ('fixes', 'echoes')]
     warming = Warming(lambda inputs: steps, lambda: None, kernels_of, lambda: [])
-    warming._thread.join(30.0)
+    warming._thread.join(240.0)
     assert warming.ready() and warming.sentence() == ''
     warming.trouble()
     assert there == (['fixes', 'ended'] if kept else ['fixes', 'echoes', 'ended'])

@@ -55,7 +55,7 @@ class Live:
 
     def end(self):
         self.executor.shutdown()
-        self.thread.join(10.0)
+        self.thread.join(120.0)
         self.node.destroy_node()
         self.link.__exit__()
 
@@ -183,7 +183,7 @@ def test_lockstep_notices_somebody_else_who_publishes(link, start, stepping):
     start(*RELIABLE)
     other = link.node.create_publisher(PoseWithCovarianceStamped, '/fix', lockstep_qos())
     player, _, _ = stepping()
-    link.wait_for(other.get_subscription_count, 15.0)
+    link.wait_for(other.get_subscription_count, 120.0)
 
     def meddle(count):
         other.publish(PoseWithCovarianceStamped())

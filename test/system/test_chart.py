@@ -107,11 +107,11 @@ def test_a_chart_grows_with_the_lines(monkeypatch):
             link.node.create_subscription(
                 PointCloud2, '/sonar_imm_chart/nodes', clouds.append, latched_qos()
             )
-            assert link.wait_for(lambda: clouds, 30.0)
+            assert link.wait_for(lambda: clouds, 120.0)
             for message in messages(scene.points[0], frame='odom'):
                 publisher.publish(message)
                 break
-            output, error = it.communicate(timeout=60)
+            output, error = it.communicate(timeout=240)
         finally:
             it.kill()
             it.wait()
@@ -138,6 +138,6 @@ def test_a_topic_that_is_no_soundings_is_one_sentence(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with reserved_domain_id() as domain:
         it = started(domain, '/nobody/soundings', '--timeout', '1')
-        output, error = it.communicate(timeout=60)
+        output, error = it.communicate(timeout=240)
     assert it.returncode == 1 and 'nobody publishes /nobody/soundings' in error
     assert 'Traceback' not in error

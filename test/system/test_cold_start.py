@@ -28,7 +28,7 @@ from sonar_imm_tools.replay.harness import local_discovery, NodeProcess, reserve
 from sonar_imm_tools.replay.link import Link
 
 pytestmark = pytest.mark.system
-LIMIT = 60.0
+LIMIT = 240.0
 ANSWER = 2.0
 """Seconds in which a service is answered."""
 
@@ -72,7 +72,7 @@ def test_a_node_that_had_to_compile_has_the_memory_of_one_that_had_not(tmp_path,
     with local_discovery(), reserved_domain_id() as domain, Link('asks', domain_id=domain) as link:
         for _ in range(2):
             with NodeProcess('fathometer', domain_id=domain) as node:
-                assert link.wait_for(lambda node=node: 'ready, hears' in node.log(), 5 * LIMIT)
+                assert link.wait_for(lambda node=node: 'ready, hears' in node.log(), LIMIT)
                 status = Path(f'/proc/{node.process.pid}/status').read_text()
                 memory.append(int(re.search(r'VmHWM:\s+(\d+) kB', status)[1]))
     assert memory[0] < 1.1 * memory[1]

@@ -70,7 +70,7 @@ def test_two_robots_in_one_process_have_their_own_parameters_and_end_cleanly(
             with Link('asker', domain_id=domain) as link:
                 told = [parameters(link, name) for name in nodes]
             process.send_signal(how)
-            assert process.wait(60.0) == 0, log.read_text()
+            assert process.wait(240.0) == 0, log.read_text()
         finally:
             if process.poll() is None:
                 process.kill()
@@ -82,9 +82,9 @@ def test_two_robots_in_one_process_have_their_own_parameters_and_end_cleanly(
 def parameters(link, name):
     """What the node of that name says."""
     client = link.node.create_client(GetParameters, f'{name}/get_parameters')
-    assert link.wait_for(client.service_is_ready, 30.0)
+    assert link.wait_for(client.service_is_ready, 120.0)
     answer = client.call_async(GetParameters.Request(names=['frame_id', 'stale_after']))
-    assert link.wait_for(answer.done, 30.0)
+    assert link.wait_for(answer.done, 120.0)
     frame, stale = answer.result().values
     return frame.string_value, stale.double_value
 

@@ -35,7 +35,7 @@ from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = pytest.mark.system
 START_LIMIT = 240.0  # seconds; four nodes compile their kernels at once when the cache is empty
-STOP_LIMIT = 30.0
+STOP_LIMIT = 120.0
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ def test_what_cannot_be_secured_does_not_start(keystore, enclave):
         command = [sys.executable, '-m', 'sonar_imm.nodes.diver', '--ros-args', '-e', enclave]
         try:
             done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=60.0
+                command, env=environment, capture_output=True, text=True, timeout=240.0
             )
         except subprocess.TimeoutExpired:
             pytest.skip('this Fast DDS has the security plugins, and the node runs')

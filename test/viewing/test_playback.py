@@ -25,7 +25,7 @@ from sonar_imm_tools.viewing.playback import Playback, Status
 STEP = 20_000_000
 FIRST = 1_700_000_000 * 10**9
 TIMES = [FIRST + k * STEP for k in range(20)]
-LIMIT = 10.0
+LIMIT = 120.0
 
 
 class Played:
