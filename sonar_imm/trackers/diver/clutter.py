@@ -48,6 +48,9 @@ PRIOR_SCANS, PRIOR_AREA = 5.0, 4e4
 ENOUGH, EVIDENT = 20.0, 0.5
 """Scans, and false fixes in each, from which `gnn` says that it should not ignore them."""
 
+ALL = 0.9
+"""False fixes in each scan that are all of them, where there is no track."""
+
 MOST_SENSORS = 20
 """Sensors that are remembered, those that showed a scan last."""
 
@@ -120,8 +123,16 @@ def replaced(known: Clutters, sensor: str, clutter: Clutter) -> Clutters:
     return (*others, (sensor, clutter))[-MOST_SENSORS:]
 
 
-def warnings(known: Clutters, config: DiverConfig) -> list[str]:
-    """Sentences on false fixes that the association does not expect."""
+def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
+    """Sentences on fixes that no track takes, where nobody is `tracked`, and on false ones that
+    the association does not expect."""
+    if not tracked and any(
+        clutter.scans >= ENOUGH and clutter.false > ALL * clutter.scans for _, clutter in known
+    ):
+        return [
+            'no track takes the fixes: nobody is there, or they are further apart than a diver '
+            'gets; check units and stated covariances, or state target (boat, ship)'
+        ]
     if config.pairing != 'gnn':
         return []
     found = [clutter for _, clutter in known if clutter.evident]

@@ -213,7 +213,7 @@ class DiverTracker:
             *state.arrivals.warnings('arrivals', advice, more_than_stated=state.excess >= ENOUGH),
             *state.offsets.warnings(self.config),
             *births.no_room(state, self.config),
-            *clutter.warnings(state.clutter, self.config),
+            *clutter.warnings(state.clutter, self.config, (state.life.status != TENTATIVE).any()),
         ]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -369,7 +369,7 @@ class DiverTracker:
             hit = hit if seen is None else hit | ~seen.unseen
         layout, whole = self._layout(now.instruments), association.densities.whole
         parts = self.models, self._chain, layout, seen
-        return families.reacquired(now, fixes, hit, left, whole, *parts)
+        return families.reacquired(now, fixes, hit, left, association.free, whole, *parts)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
         """The tracks after the fixes that are theirs."""
@@ -551,7 +551,7 @@ class DiverTracker:
                 'target_id': np.array([birth.target_id for birth in found]),
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
-                'refused': np.full((count, 6), np.nan),
+                'refused': births.first_fixes(found, now.stamp_ns),
                 'history': np.zeros((count, self._window), np.int64),
                 'came_from': np.full(count, -1),
                 'looks': np.zeros(count),

@@ -21,7 +21,7 @@ from helpers.estimates import same
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.measurements import Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import family_kernels
 from sonar_imm.trackers.diver.families import FAMILIES
@@ -368,3 +368,63 @@ def test_one_copy_and_no_hover():
     assert estimate.extras['covariance_scale'].tolist() == [1.0]
     assert estimate.extras['hover'].tolist() == [0.0]
     assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 1.0
+
+
+def boat(speed, dt, count, std, name=NOBODY):
+    """Fixes of a boat that turns slowly, and its true path (count, 2)."""
+    turn = 0.01 * dt * np.arange(count)
+    truth = speed / 0.01 * np.column_stack([np.sin(turn), 1.0 - np.cos(turn)])
+    at = truth + std * np.random.default_rng(3).normal(size=truth.shape)
+    fixes = [
+        Fixes(
+            stamp_ns=int(k * dt * SECOND) + SECOND,
+            position=[[*place, 0.0]],
+            covariance=[std**2 * np.eye(2)],
+            target_id=None if name == NOBODY else [name],
+        )
+        for k, place in enumerate(at)
+    ]
+    return fixes, truth
+
+
+@pytest.mark.parametrize('name', [NOBODY, 7], ids=['no name', 'name'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
+@pytest.mark.parametrize(('speed', 'dt', 'std'), [(8.0, 1.0, 0.3), (15.0, 2.0, 1.0)])
+def test_what_is_faster_than_any_diver_is_tracked_from_its_third_fix(
+    association, name, speed, dt, std
+):
+    tracker = DiverTracker(DiverConfig(association=association))
+    fixes, truth = boat(speed, dt, 20, std, name)
+    made = [tracker.process(item)[-1] for item in fixes]
+    assert {tuple(each.extras['track_id'].tolist()) for each in made} == {(1,)}
+    assert all(each.extras['track_state'][0] > 0 for each in made[2:])
+    miss = np.array([each.state[0, :2] for each in made[4:]]) - truth[4:]
+    P = np.array([each.covariance[0, :2, :2] for each in made[4:]])
+    assert np.sqrt(np.square(miss).sum(axis=1).mean()) < 2.0 * std
+    assert np.einsum('ka,kab,kb->k', miss, np.linalg.inv(P), miss).mean() < 4.0
+    assert not tracker.warnings()
+
+
+def test_fixes_that_nothing_that_swims_can_cause_are_no_track_and_warn():
+    """In millimetres, as it may be."""
+    tracker = DiverTracker(DiverConfig())
+    fixes, _ = boat(800.0, 1.0, 30, 0.3)
+    made = [tracker.process(item)[-1] for item in fixes]
+    assert not any((each.extras['track_state'] > 0).any() for each in made)
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('no track takes the fixes') and 'target' in sentence
+
+
+def test_the_second_of_two_divers_is_not_taken_for_the_first_grown_fast():
+    """Two that were seen in the same scan are two."""
+    tracker = DiverTracker(DiverConfig())
+    for k in range(8):
+        seen = [[0.5 * k, 0.0, 0.0], [0.5 * k, 12.0, 0.0]][: 1 if k == 0 else 2]
+        made = tracker.process(
+            Fixes(
+                stamp_ns=(k + 1) * SECOND,
+                position=seen,
+                covariance=np.tile(0.04 * np.eye(2), (len(seen), 1, 1)),
+            )
+        )[-1]
+    assert (made.extras['track_state'] > 0).sum() == 2
