@@ -214,17 +214,6 @@ def each_name_once(births: Sequence[Birth]) -> list[Birth]:
     return first
 
 
-def first_fixes(births: Sequence[Birth], stamp_ns: int) -> FloatArray:
-    """(B, 6): stamp, position and covariance of the fixes at which tracks begin, as
-    `DiverState.refused`; NaN where one begins at no fix."""
-    first = np.full((len(births), 6), np.nan)
-    for row, birth in enumerate(births):
-        if birth.ping is None and birth.measured:
-            (xx, xy), (_, yy) = birth.covariance.tolist()
-            first[row] = stamp_ns, *birth.position, xx, xy, yy
-    return first
-
-
 def new_tracks(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -162,7 +162,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     speed_std: float = parameter(0.4, 'm/s',
         'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
         'families)', range=(1e-3, 20.0))
-    velocity_std: float = parameter(0.7, 'm/s',
+    velocity_std: float = parameter(2.0, 'm/s',
         'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
         'velocity state)', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',

@@ -78,13 +78,6 @@ MISTAKEN = 0.02
 """A false fix is expected beside another this often, at most, where two refused fixes that agree
 begin a track anew."""
 
-FASTEST = 20.0
-"""Speed in m/s of what is tracked, at most."""
-
-MISTAKEN_ONCE = 0.2
-"""As `MISTAKEN`, where the first two fixes of a track would otherwise be two divers: whether they
-are one is for the third to tell."""
-
 CONFIRMS, ENDS = 0.9, 0.002
 """Probability that a track is a diver above which hits confirm it, and below which it ends."""
 
@@ -373,7 +366,6 @@ def reacquired(
     fixes: Positions,
     hit: BoolArray,
     left: BoolArray,
-    free: BoolArray,
     whole: FloatArray,
     models: ModelSet,
     chain: AdaptiveChain,
@@ -381,31 +373,24 @@ def reacquired(
     seen: Seen | None,
 ) -> tuple[DiverState, bool]:
     """What becomes of tracks that were not `hit` (T,) by a group of fixes of which some are `left`
-    (D,) by confirmed tracks, and `free` (D,) of all, and whether one began anew; whole (T, D) as
-    in `Densities`; seen: whoever is where the sensor does not see (`Seen.unseen`) may have done
-    anything there.
+    (D,), and whether one began anew; whole (T, D) as in `Densities`; seen: whoever
+    is where the sensor does not see (`Seen.unseen`) may have done anything there.
 
-    A fix that may have been a track's own and was not believed is remembered, as the first of a
-    track is. One that agrees with it, as the next fix of a track that began at the first would,
-    begins the track anew: of a track that was seen once, as fast as the two say that it is.
+    A fix that may have been a track's own and was not believed is remembered. One that agrees with
+    it, as the next fix of a track that began at the first would, begins the track anew.
     """
     refused = now.refused
     if hit.any():
         refused = refused.copy()
         refused[hit] = np.nan
     begun: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}
-    young = ~hit & (now.life.age == 1) & np.isfinite(refused[:, 0])
-    for track, row in _refusals(now, fixes, hit, left, free, young, whole):
+    for track, row in _refusals(now, fixes, hit, left, whole):
         z, R = fixes.z[row], fixes.R[row]
-        parts, speed = None, 0.0
+        parts = None
         hidden = seen is not None and seen.unseen[track]
-        if young[track]:
-            speed = _speed(now, refused[track], z)
-            lost = speed <= FASTEST
-        else:
-            lost = _reaches(now, track, z, fixes) if hidden else _may_be_lost(now, track, fixes)
+        lost = _reaches(now, track, z, fixes) if hidden else _may_be_lost(now, track, fixes)
         if np.isfinite(refused[track, 0]) and lost:
-            parts = _anew(now, track, refused[track], z, R, speed, fixes, models, chain, layout)
+            parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
         refused = refused.copy()
         if parts is None:
             refused[track] = now.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
@@ -420,25 +405,17 @@ def reacquired(
 
 
 def _refusals(
-    now: DiverState,
-    fixes: Positions,
-    hit: BoolArray,
-    left: BoolArray,
-    free: BoolArray,
-    young: BoolArray,
-    whole: FloatArray,
+    now: DiverState, fixes: Positions, hit: BoolArray, left: BoolArray, whole: FloatArray
 ) -> Iterator[tuple[int, int]]:
     """Tracks, each with the fix that may have been its own: by the name, or the nearest of what
-    confirmed tracks `left`, each to the track it is nearest to; for `young` (T,) tracks the
-    nearest of those that are `free`, where it is the only one within reach."""
+    confirmed tracks `left`, each to the track it is nearest to."""
     if fixes.target_id is not None:
         own = now.target_id[:, None] == fixes.target_id[None]
         for track, row in zip(*np.nonzero(own)):
             if not hit[track]:
                 yield int(track), int(row)
         return
-    yield from _first_pairs(now, fixes, np.flatnonzero(young), np.flatnonzero(free))
-    waiting = np.flatnonzero(~hit & ~young & (now.life.status != TENTATIVE))
+    waiting = np.flatnonzero(~hit & (now.life.status != TENTATIVE))
     rows = np.flatnonzero(left)
     if not len(waiting) or not len(rows):
         return
@@ -448,23 +425,6 @@ def _refusals(
         own = np.flatnonzero(nearest == place)
         if len(own):
             yield track, int(rows[own[near[place, own].argmax()]])
-
-
-def _first_pairs(
-    now: DiverState, fixes: Positions, young: IndexArray, rows: IndexArray
-) -> Iterator[tuple[int, int]]:
-    """Of `young` tracks and free `rows` those that can only be of each other: nothing else is
-    within reach of either, and no false fix is probable where the fix is."""
-    if not len(young) or not len(rows):
-        return
-    first = now.refused[young]
-    reach = FASTEST * (now.stamp_ns - first[:, 0]) * 1e-9
-    apart = np.hypot(*(fixes.z[rows] - first[:, None, 1:3]).transpose(2, 0, 1))
-    near = apart <= reach[:, None]
-    alone = near & (near.sum(axis=0) == 1) & (near.sum(axis=1, keepdims=True) == 1)
-    alone &= fixes.clutter * math.pi * apart**2 <= MISTAKEN_ONCE
-    for place, row in zip(*np.nonzero(alone)):
-        yield int(young[place]), int(rows[row])
 
 
 def _may_be_lost(now: DiverState, track: int, fixes: Positions) -> bool:
@@ -485,33 +445,21 @@ def _reaches(now: DiverState, track: int, z: FloatArray, fixes: Positions) -> bo
     return bool(np.hypot(*(z - mean)) <= fastest * passed)
 
 
-def _speed(now: DiverState, first: FloatArray, z: FloatArray) -> float:
-    """With which a diver came from the `first` (6,) fix to z (2,), in m/s."""
-    dt = (now.stamp_ns - first[0]) * 1e-9
-    return float(np.hypot(*(z - first[1:3])) / dt) if dt > 0.0 else math.inf
-
-
 def _anew(
     now: DiverState,
     track: int,
     refused: FloatArray,
     z: FloatArray,
     R: FloatArray,
-    speed: float,
     fixes: Positions,
     models: ModelSet,
     chain: AdaptiveChain,
     layout: Layout,
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """x, P and mu now of the track, had it begun at the fix that it `refused` (6,); None where the
-    fix z (2,), R (2, 2) does not agree, or two false fixes may well do. speed: standard deviation
-    of velocities that are not known, in m/s, where it is above that of every new track."""
+    fix z (2,), R (2, 2) does not agree, or two false fixes may well do."""
     stamp, px, py, xx, xy, yy = refused.tolist()
     x, P, mu = models.new_tracks(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
-    if speed and models.mixing is not None:
-        moving = np.flatnonzero(np.tile(models.mixing.kind == VELOCITY, models.copies))
-        for axis in (2, 3):
-            P[:, moving, axis, axis] = np.maximum(P[:, moving, axis, axis], speed**2)
     x, P = layout.widened(x, P)
     row = np.arange(len(now.x)) == track
     alone = now.only(row)._replace(x=x, P=P, mu=mu)
@@ -521,7 +469,7 @@ def _anew(
     h = expected(alone.x, layout.H)
     if densities(alone, h, layout, z[None], R[None]).whole[0, 0] <= bound(fixes):
         return None
-    if not speed and fixes.target_id is None and fixes.config.max_tracks > 1:
+    if fixes.target_id is None and fixes.config.max_tracks > 1:
         _, covariance = imm_kernels.combine(alone.x, alone.P, alone.mu, layout.H[0])
         area = math.pi * REACH * math.sqrt(np.linalg.det(covariance[0] + R))
         if fixes.clutter * area > MISTAKEN:

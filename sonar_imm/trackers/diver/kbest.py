@@ -95,7 +95,7 @@ def branched(
         # A track that nothing can be of is lost where two fixes agree that nobody takes.
         hit, left = np.asarray(believed.any(axis=1)), np.asarray(~believed.any(axis=0))
         now, again = families.reacquired(
-            now, fixes, hit, left, left, densities.whole, models, chain, layout, seen
+            now, fixes, hit, left, densities.whole, models, chain, layout, seen
         )
         if again:
             h = expected(now.x, layout.H)

@@ -369,7 +369,7 @@ class DiverTracker:
             hit = hit if seen is None else hit | ~seen.unseen
         layout, whole = self._layout(now.instruments), association.densities.whole
         parts = self.models, self._chain, layout, seen
-        return families.reacquired(now, fixes, hit, left, association.free, whole, *parts)
+        return families.reacquired(now, fixes, hit, left, whole, *parts)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
         """The tracks after the fixes that are theirs."""
@@ -551,7 +551,7 @@ class DiverTracker:
                 'target_id': np.array([birth.target_id for birth in found]),
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
-                'refused': births.first_fixes(found, now.stamp_ns),
+                'refused': np.full((count, 6), np.nan),
                 'history': np.zeros((count, self._window), np.int64),
                 'came_from': np.full(count, -1),
                 'looks': np.zeros(count),
