@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import inspect
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -60,7 +60,7 @@ class Convert(click.Group):
         if source.exists():
             from ..recordings.sniffing import sniff
 
-            guess = sniff(source)
+            guess = sniff(source, _named_columns(args))
             taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
             click.echo(visible(taken), err=True)
             # Where no bag is named it is made in the folder of the command.
@@ -68,6 +68,14 @@ class Convert(click.Group):
         elif source.suffix:
             ctx.fail(f'{source} does not exist')
         return super().resolve_command(ctx, args)
+
+
+def _named_columns(args: Sequence[str]) -> dict[str, str]:
+    """What ``--column NAME=HEADER`` say, before it is known of which subcommand they are."""
+    words = [word.removeprefix('--column=') for word in args if word.startswith('--column=')]
+    words += [word for flag, word in zip(args, args[1:]) if flag == '--column']
+    pairs = (word.partition('=') for word in words)
+    return {name: header for name, equals, header in pairs if equals}
 
 
 @click.group(

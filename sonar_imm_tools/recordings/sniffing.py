@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 import zipfile
 
@@ -25,7 +26,7 @@ from sonar_imm.trackers import SYSTEMS
 from .convert.arrivals import names_tags
 from .convert.nmea import SENTENCE
 from .convert.snapshots import NAMES as SNAPSHOT_NAMES
-from .csv_table import CsvTable
+from .csv_table import CsvOptions, CsvTable
 from .reader import BagReader
 from .sources import BagError, SUFFIXES
 from .topics import made_topics
@@ -48,8 +49,9 @@ class Guess:
     why: str
 
 
-def sniff(path: Path) -> Guess:
-    """What a file is. Raises `BagError` with what it could be and what would settle it."""
+def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
+    """What a file is; columns: headers of a table that its user names, as in `CsvOptions`. Raises
+    `BagError` with what it could be and what would settle it."""
     if path.is_dir() and any(each.suffix.lower() in PICTURES for each in path.iterdir()):
         return Guess('pictures', 'a folder of pictures')
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
@@ -75,7 +77,7 @@ def sniff(path: Path) -> Guess:
         return Guess('fixes', f'a {kind.upper()} file of positions')
     if _is_nmea(start):
         return Guess('nmea', 'NMEA 0183 or AIS sentences')
-    return _of_table(CsvTable(path))
+    return _of_table(CsvTable(path, CsvOptions(columns=columns or {})))
 
 
 def _of_bag(path: Path) -> Guess:
@@ -155,9 +157,9 @@ def _of_table(table: CsvTable) -> Guess:
     if table.has('stamp') and any(table.has(*pair) for pair in places):
         return Guess('fixes', why)
     missing = 'a time' if not table.has('stamp') else 'a position'
-    flag = 'stamp' if missing == 'a time' else 'x'
+    flag = next(name for name in ('stamp', 'x', 'y') if not table.has(name))
     raise BagError(
         f'{table.path} is {why}: no name among them stands for {missing}. It could be fixes of '
-        f'divers (sonar-imm convert fixes IN OUT --column {flag}=HEADER), or relative, arrivals, '
+        f'divers (sonar-imm convert IN OUT --column {flag}=HEADER), or relative, arrivals, '
         'detections or traces; sonar-imm convert lists them'
     )

@@ -19,6 +19,8 @@ import json
 import numpy as np
 import pytest
 
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
@@ -84,3 +86,15 @@ def test_what_is_not_known_is_said_with_what_would_help(tmp_path, content, wante
     (tmp_path / 'file.dat').write_bytes(content)
     with pytest.raises(BagError, match=wanted):
         sniff(tmp_path / 'file.dat')
+
+
+def test_columns_that_are_named_settle_it_without_the_kind(tmp_path, capsys):
+    table, bag = tmp_path / 'ausgabe.csv', tmp_path / 'bag'
+    table.write_text('Zeit,Ost,Nord\n0,1,2\n1,2,3\n')
+    named = ('--column', 'stamp=Zeit', '--column=x=Ost', '--column', 'y=Nord')
+    assert main(['convert', str(table), str(bag), *named]) == 0
+    assert 'convert fixes' in capsys.readouterr().err
+    with BagReader(bag) as made:
+        assert [topic.name for topic in made.topics] == ['/fix']
+    assert main(['convert', str(table), str(tmp_path / 'other'), *named[:3]]) == 2
+    assert '--column y=HEADER' in capsys.readouterr().err
