@@ -173,9 +173,9 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     capsys.readouterr()
     (bags[0] / 'notes.txt').write_text('one byte more')
     assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
-    said = capsys.readouterr()
-    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in said.err
-    assert '3 runs in' in said.out and '2 kept, 1 failed' in said.out
+    output = capsys.readouterr()
+    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in output.err
+    assert '3 runs in' in output.out and '2 kept, 1 failed' in output.out
 
 
 def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):

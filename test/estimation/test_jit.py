@@ -183,7 +183,11 @@ def test_a_folder_that_is_deleted_while_a_process_runs_is_made_again(fresh, tmp_
 @pytest.mark.parametrize('place', ['the folder', 'a folder in it'])
 def test_a_file_where_the_cache_should_be_costs_a_sentence(fresh, tmp_path, monkeypatch, place):
     implementation = caching.CompileResultCacheImpl
-    only = [one for one in implementation._locator_classes if 'UserProvided' in one.__name__]
+    only = [
+        locator
+        for locator in implementation._locator_classes
+        if 'UserProvided' in locator.__name__
+    ]
     monkeypatch.setattr(implementation, '_locator_classes', only)
     if place == 'a folder in it':
         fresh()

@@ -171,7 +171,11 @@ def test_a_failing_run_does_not_stop_the_others(diver, monkeypatch):
 
     monkeypatch.setattr(diver_scenes, 'simulate', moody)
     outcomes = list(sweeps.run_here(diver, range(3)))
-    assert [one.failure for one in outcomes] == ['', 'ZeroDivisionError: division by zero', '']
+    assert [outcome.failure for outcome in outcomes] == [
+        '',
+        'ZeroDivisionError: division by zero',
+        '',
+    ]
     content = sweeps.record(diver, outcomes)
     assert content['seeds'] == [0, 1, 2]
     assert content['failures'] == {'1': 'ZeroDivisionError: division by zero'}
@@ -200,9 +204,9 @@ def test_nested_metrics_become_flat_numbers():
         'list': [1.0],
         'far': math.inf,
     }
-    told = sweeps.finite_numbers(metrics)
-    assert told == {'n': 3, 'a.b.c': 0.5, 'a.ok': 1}
-    assert type(told['a.ok']) is int  # not True in a table
+    given = sweeps.finite_numbers(metrics)
+    assert given == {'n': 3, 'a.b.c': 0.5, 'a.ok': 1}
+    assert type(given['a.ok']) is int  # not True in a table
 
 
 @pytest.mark.filterwarnings('error')  # one run has no spread, and says nothing on the terminal

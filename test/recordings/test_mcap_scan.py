@@ -267,9 +267,9 @@ def test_a_packed_file_of_zeros_is_not_written_to_disk(tmp_path, with_size, monk
         link = writer.add_connection('/a', TEXT, typestore=typestore())
         writer.write(link, 1, typestore().serialize_cdr(ros_message(TEXT, data='x'), TEXT))
     metadata = path / 'metadata.yaml'
-    told = metadata.read_text().replace("compression_mode: ''", 'compression_mode: file')
-    told = told.replace("compression_format: ''", 'compression_format: zstd')
-    metadata.write_text(told.replace('bag.mcap', 'bag.mcap.zstd'))
+    given = metadata.read_text().replace("compression_mode: ''", 'compression_mode: file')
+    given = given.replace("compression_format: ''", 'compression_format: zstd')
+    metadata.write_text(given.replace('bag.mcap', 'bag.mcap.zstd'))
     plain = (path / 'bag.mcap').read_bytes()
     (path / 'bag.mcap').unlink()
     packed = path / 'bag.mcap.zstd'

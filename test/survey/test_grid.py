@@ -218,8 +218,8 @@ def test_two_sigma_hold_the_truth_of_one_run(terrain, slope, cell):
 
 def test_the_budget_is_that_of_the_run():
     assert budget_of({}) == (BUDGET, 1500.0)
-    told = {'parameters': {'heave_std': 0.2, 'sound_speed': 1480.0, 'system': 'other'}}
-    found, speed = budget_of(told)
+    values = {'parameters': {'heave_std': 0.2, 'sound_speed': 1480.0, 'system': 'other'}}
+    found, speed = budget_of(values)
     assert found.heave == 0.2 and found.attitude == BUDGET.attitude and speed == 1480.0
 
 
