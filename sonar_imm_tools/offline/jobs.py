@@ -30,6 +30,8 @@ from sonar_imm.parameters import ConfigError
 
 from ..recordings.sources import BagError
 
+LIBRARIES = ['sonar_imm_tools.offline.tracking', 'sonar_imm.estimation.imm_kernels']
+"""Modules that most of the work needs, and that take seconds to load."""
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer."""
 
@@ -39,8 +41,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """So many fresh processes. What has not begun when the context is left by an error is not
     begun any more.
 
-    Raises OSError when one of them dies, or where there is no shared memory (/dev/shm). They are
-    started anew and not forked: a fork copies the threads of a library half.
+    Raises OSError when one of them dies, or where there is no shared memory (/dev/shm).
     """
     pool = _fresh(count)
     try:
@@ -57,12 +58,14 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _fresh(count: int) -> ProcessPoolExecutor:
+    """Processes that are no forks of this one: a fork copies the threads of a library half. Where
+    the system can, they are forks of a process that has done nothing but load the libraries."""
+    apart = 'forkserver' in multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context('forkserver' if apart else 'spawn')
+    if apart:
+        context.set_forkserver_preload(LIBRARIES)
     try:
-        return ProcessPoolExecutor(
-            count,
-            mp_context=multiprocessing.get_context('spawn'),
-            initializer=ignore_interrupt,
-        )
+        return ProcessPoolExecutor(count, mp_context=context, initializer=ignore_interrupt)
     except (OSError, ImportError, NotImplementedError) as error:  # Python has three ways to say it
         raise OSError(
             f'processes cannot share work here ({error}): is there a /dev/shm? with --jobs 1 '
