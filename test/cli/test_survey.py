@@ -204,9 +204,8 @@ def test_the_page_shows_chart_misties_and_what_is_not_known(made):
     assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
 
 
-@pytest.mark.parametrize('count', [2, 8])
-def test_the_same_bytes_with_many_processes(lines, made, tmp_path, count):
-    assert run('survey', lines, tmp_path / 'out', '--adjust', '--jobs', count) == 0
+def test_the_same_bytes_with_many_processes(lines, made, tmp_path):
+    assert run('survey', lines, tmp_path / 'out', '--adjust', '--jobs', 3) == 0
     assert products(tmp_path / 'out') == products(made)
 
 

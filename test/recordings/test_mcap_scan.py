@@ -231,9 +231,15 @@ def zeros(compression, size, *, with_size):
     return b''.join(stream.compress(block) for _ in range(size >> 20)) + stream.flush()
 
 
-@pytest.mark.parametrize('compression', [b'zstd', b'lz4'])
-@pytest.mark.parametrize('with_size', [True, False])
-@pytest.mark.parametrize('stated', [10, 600 << 20])
+@pytest.mark.parametrize(
+    'compression, with_size, stated',
+    [
+        (b'zstd', True, 10),
+        (b'zstd', False, 600 << 20),
+        (b'lz4', True, 600 << 20),
+        (b'lz4', False, 10),
+    ],
+)
 def test_a_chunk_of_a_great_many_zeros_costs_no_memory(tmp_path, compression, with_size, stated):
     packed = zeros(compression, 600 << 20, with_size=with_size)
     file = bomb(tmp_path / 'bomb.mcap', compression, packed, stated)

@@ -195,6 +195,7 @@ def test_the_vectors_with_the_corrections_of_the_prototype():
     assert both.sum() > 90 and np.nanmedian(near) < 0.45
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize(
     'terrain, slope, cell', [('flat', 0.0, 1.0), ('flat', 0.0, 5.0), ('slope', 0.1, 1.0)]
 )
