@@ -78,9 +78,7 @@ def test_a_falsified_number_is_found_out(checker: Any) -> None:
     sources = checker.known_sources()
     tables = [table for page in checker.pages() for table in checker.tables(page)]
     wrong = [
-        of
-        for table in tables
-        for of in falsified_tables(checker, table, 8, Random(table.place))
+        of for table in tables for of in falsified_tables(checker, table, 8, Random(table.place))
     ]
     passed = [of for of in wrong if not checker.doubts(of, sources) + checker.unread(of)]
     assert passed == []
