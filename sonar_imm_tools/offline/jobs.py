@@ -23,6 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 import contextlib
 import multiprocessing
 import signal
+import sys
 from typing import Any
 
 from sonar_imm.measurements import Rejection
@@ -58,11 +59,11 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _fresh(count: int) -> ProcessPoolExecutor:
-    """Processes that are no forks of this one: a fork copies the threads of a library half. Where
-    the system can, they are forks of a process that has done nothing but load the libraries."""
-    apart = 'forkserver' in multiprocessing.get_all_start_methods()
-    context = multiprocessing.get_context('forkserver' if apart else 'spawn')
-    if apart:
+    """Processes that are no forks of this one: a fork copies the threads of a library half. On
+    Linux they are forks of one that has done nothing but load the libraries; those of macOS do not
+    outlive a fork."""
+    context = multiprocessing.get_context('forkserver' if sys.platform == 'linux' else 'spawn')
+    if sys.platform == 'linux':
         context.set_forkserver_preload(LIBRARIES)
     try:
         return ProcessPoolExecutor(count, mp_context=context, initializer=ignore_interrupt)
