@@ -51,8 +51,9 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
     $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
     test/trackers test/cli/test_bathymetry_vectors.py
 
-# The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels.
-unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
+# The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels. And
+# Python keeps what it has compiled of the sources: else each process compiles them anew, for seconds.
+unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH PYTHONDONTWRITEBYTECODE
 
 .NOTPARALLEL:
 .PHONY: help venv demo test test-core test-statistics test-bounds test-system fuzz reliability lint generate docs docs-numbers dist placeholders bench clean

@@ -391,8 +391,8 @@ def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: A
 def mean_over(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Means of all numbers; the advice of those runs that gave one."""
     out = {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
-    told = [run['advice'] for run in runs if np.isfinite(run['advice'])]
-    return {**out, 'advice': float(np.mean(told)) if told else None}
+    advised = [run['advice'] for run in runs if np.isfinite(run['advice'])]
+    return {**out, 'advice': float(np.mean(advised)) if advised else None}
 
 
 def cost() -> dict[str, float]:
@@ -437,14 +437,14 @@ def main(seeds: int = 2, runs: int = 20) -> Parts:
             yield {'usbl': {f'{model_set}, {label}': mean_over(found)}}
     found = [robust(wild(seed), model_set='families') for seed in range(runs)]
     yield {'wild': {'families': mean_over(found)}}
-    told, advised = [], []
+    given, advised = [], []
     for seed in range(runs):
         path = swimmer(np.random.default_rng([seed, 7]), 1.0, 1.5)
-        told.append(robust(path, 0.04, model_set='families'))
-        scale = told[-1]['advice'] if np.isfinite(told[-1]['advice']) else 1.0
+        given.append(robust(path, 0.04, model_set='families'))
+        scale = given[-1]['advice'] if np.isfinite(given[-1]['advice']) else 1.0
         advised.append(robust(path, 0.04, model_set='families', covariance_scale=scale))
     yield {'cost': cost()}
-    yield {'stated': {'as stated': mean_over(told), 'advice followed': mean_over(advised)}}
+    yield {'stated': {'as stated': mean_over(given), 'advice followed': mean_over(advised)}}
 
 
 if __name__ == '__main__':

@@ -30,6 +30,8 @@ A table with measured numbers has a comment above it, which the site shows below
 
 A digest that is missing or wrong is told with the right one: copy it when the numbers are right.
 Figures in code or in a word (`table1`) are parts of names, and not checked.
+Numbers that nobody measured, in words or under `none`, have to stay as they were read, too:
+`docs/unmeasured.json` has the digests of their tables, by page.
 `docs/results/sources.json` says by which command a file of `docs/results` was made, and when.
 
 CELLS are paths into the file, one for each of the last columns, divided by `|`; a single one with
@@ -88,6 +90,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
 RESULTS = DOCS / 'results'
 SOURCES = RESULTS / 'sources.json'
+UNMEASURED = DOCS / 'unmeasured.json'
 
 MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r'(?<![\w.])[-+]?(?:\d+(?:,\d{3})*(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?(?![\w.]*\w)')
@@ -121,7 +124,7 @@ class Table:
         )
 
     def exempt(self) -> str:
-        """Why its numbers are not checked, '' where they are, or where there are none."""
+        """Why its numbers are those of no result, '' where they are, or where there are none."""
         kind, _, reason = self.mark.partition(';')
         if kind not in {'', 'none'} or not self.numbers():
             return ''
@@ -425,6 +428,23 @@ def dated(place: str, day: str, command: str) -> list[str]:
     return [] if command else [f'{place}: no command']
 
 
+def unread(table: Table) -> list[str]:
+    """What is wrong with the numbers of a table that were not measured."""
+    right = digest(table.numbers())
+    if not table.exempt() or right in unmeasured().get(table.page, []):
+        return []
+    return [
+        f'{table.place}: not the numbers that were read. If they are right, {UNMEASURED.name} has '
+        f'"{right}" for this page'
+    ]
+
+
+@lru_cache
+def unmeasured() -> dict[str, list[str]]:
+    """Of each page the digests of the numbers of its tables in which none was measured."""
+    return json.loads(UNMEASURED.read_text(encoding='utf-8'))
+
+
 def known_sources() -> dict[str, dict[str, str]]:
     return json.loads(SOURCES.read_text(encoding='utf-8'))
 
@@ -432,9 +452,11 @@ def known_sources() -> dict[str, dict[str, str]]:
 def all_doubts() -> list[str]:
     """Everything that is wrong, with tables and with the list of sources."""
     sources = known_sources()
-    found = [
-        doubt for page in pages() for table in tables(page) for doubt in doubts(table, sources)
-    ]
+    every = [table for page in pages() for table in tables(page)]
+    found = [doubt for table in every for doubt in [*doubts(table, sources), *unread(table)]]
+    there = {(table.page, digest(table.numbers())) for table in every if table.exempt()}
+    known = {(page, each) for page, digests in unmeasured().items() for each in digests}
+    found += [f'{UNMEASURED.name}: no table of {page} is {each}' for page, each in known - there]
     for path in sorted(RESULTS.glob('*.json')):
         if path != SOURCES and path.name not in sources:
             found.append(f'{SOURCES.name} does not say what made {path.name}')
@@ -500,7 +522,7 @@ def main() -> int:
         print(f'{table.place}: {table.mark}; {aged_reading(table.mark)}')
     for table in every:
         if reason := table.exempt():
-            print(f'{table.place}: {len(table.numbers())} numbers are not checked: {reason}')
+            print(f'{table.place}: {len(table.numbers())} numbers of no result: {reason}')
     bound = sum('.json' in table.mark.partition(';')[0] for table in every)
     print(f'{bound} tables bound to results, {len(read)} read by hand')
     found = all_doubts()

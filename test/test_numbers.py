@@ -74,21 +74,18 @@ def falsified_tables(checker: Any, table: Any, most: int, draw: Random) -> Itera
 
 
 def test_a_falsified_number_is_found_out(checker: Any) -> None:
-    """In every table that is checked: of some of its numbers the last digit, wrong by 2 to 9."""
+    """In every table: of some of its numbers the last digit, wrong by 2 to 9."""
     sources = checker.known_sources()
     tables = [table for page in checker.pages() for table in checker.tables(page)]
     wrong = [
-        of
-        for table in tables
-        if table.mark and not table.exempt()
-        for of in falsified_tables(checker, table, 8, Random(table.place))
+        of for table in tables for of in falsified_tables(checker, table, 8, Random(table.place))
     ]
-    passed = [of for of in wrong if not checker.doubts(of, sources)]
+    passed = [of for of in wrong if not checker.doubts(of, sources) + checker.unread(of)]
     assert passed == []
     assert len(wrong) > 800
 
 
-def test_few_tables_with_numbers_are_not_checked(checker: Any) -> None:
+def test_few_tables_with_numbers_are_of_no_result(checker: Any) -> None:
     """Each says why; none of them looks measured."""
     tables = [table for page in checker.pages() for table in checker.tables(page)]
     exempt = {table.place: table.exempt() for table in tables if table.exempt()}

@@ -118,7 +118,10 @@ def test_the_ends_of_a_range_belong_to_it():
 def test_values_become_what_the_kind_says():
     walker = Walker(speed=1, weights=[1, 0], stops=[3], roads=['x'])
     assert walker == Walker(speed=1.0, weights=(1.0, 0.0), stops=(3,), roads=('x',))
-    assert type(walker.speed) is float and [type(one) for one in walker.weights] == [float, float]
+    assert type(walker.speed) is float and [type(weight) for weight in walker.weights] == [
+        float,
+        float,
+    ]
     assert (walker.weights, walker.stops, walker.roads) == ((1.0, 0.0), (3,), ('x',))
     assert hash(walker) == hash(Walker(speed=1.0, weights=(1, 0), stops=(3,), roads=('x',)))
     assert type(Walker(steps=2).steps) is int
@@ -132,8 +135,8 @@ def test_a_list_may_be_empty():
 
 
 def test_every_mistake_is_told_at_once():
-    told = problems(sped=1.0, speed=9.0, steps=0, colour='red')
-    assert told == (
+    given = problems(sped=1.0, speed=9.0, steps=0, colour='red')
+    assert given == (
         "unknown parameter 'sped' (did you mean 'speed'?)",
         "unknown parameter 'colour'",
         "parameter 'speed' must be between 0 and 3, got 9.0 m/s",
@@ -189,7 +192,7 @@ def test_any_mapping_gives_a_config_or_sentences(system, values):
     try:
         config = SYSTEMS[system].config_type().from_mapping(values)
     except ConfigError as error:
-        assert error.problems and all(isinstance(one, str) for one in error.problems)
+        assert error.problems and all(isinstance(problem, str) for problem in error.problems)
     else:
         assert set(values) <= set(config.as_dict())
 

@@ -75,7 +75,7 @@ def test_the_api_has_every_public_module(made: Any) -> None:
     names = {'.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in files}
     public = {name.removesuffix('.__init__') for name in names}
     assert public - described == {
-        name for name in public if any(f'{name}.'.startswith(f'{one}.') for one in NO_API)
+        name for name in public if any(f'{name}.'.startswith(f'{item}.') for item in NO_API)
     }
     assert '::: sonar_imm.estimation.imm\n' in made.api_page('sonar_imm.estimation', 'x')
     assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')

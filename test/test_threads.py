@@ -48,7 +48,7 @@ def threads_of(tmp_path_factory):
     tmp_path = tmp_path_factory.mktemp('witness')
     (tmp_path / 'sitecustomize.py').write_text(WITNESS)
 
-    def run(*arguments, **said):
+    def run(*arguments, **message):
         kept = {
             name: value
             for name, value in os.environ.items()
@@ -57,7 +57,7 @@ def threads_of(tmp_path_factory):
         paths = os.pathsep.join([str(tmp_path), str(ROOT), str(ROOT / 'test')])
         done = subprocess.run(
             [sys.executable, *arguments],
-            env={**kept, 'PYTHONPATH': paths, **said},
+            env={**kept, 'PYTHONPATH': paths, **message},
             capture_output=True,
             text=True,
             cwd=tmp_path,

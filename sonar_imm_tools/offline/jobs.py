@@ -23,6 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 import contextlib
 import multiprocessing
 import signal
+import sys
 from typing import Any
 
 from sonar_imm.measurements import Rejection
@@ -30,6 +31,8 @@ from sonar_imm.parameters import ConfigError
 
 from ..recordings.sources import BagError
 
+LIBRARIES = ['sonar_imm_tools.offline.tracking', 'sonar_imm.estimation.imm_kernels']
+"""Modules that most of the work needs, and that take seconds to load."""
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer."""
 
@@ -39,8 +42,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """So many fresh processes. What has not begun when the context is left by an error is not
     begun any more.
 
-    Raises OSError when one of them dies, or where there is no shared memory (/dev/shm). They are
-    started anew and not forked: a fork copies the threads of a library half.
+    Raises OSError when one of them dies, or where there is no shared memory (/dev/shm).
     """
     pool = _fresh(count)
     try:
@@ -57,12 +59,14 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _fresh(count: int) -> ProcessPoolExecutor:
+    """Processes that are no forks of this one: a fork copies the threads of a library half. On
+    Linux they are forks of one that has done nothing but load the libraries; those of macOS do not
+    outlive a fork."""
+    context = multiprocessing.get_context('forkserver' if sys.platform == 'linux' else 'spawn')
+    if sys.platform == 'linux':
+        context.set_forkserver_preload(LIBRARIES)
     try:
-        return ProcessPoolExecutor(
-            count,
-            mp_context=multiprocessing.get_context('spawn'),
-            initializer=ignore_interrupt,
-        )
+        return ProcessPoolExecutor(count, mp_context=context, initializer=ignore_interrupt)
     except (OSError, ImportError, NotImplementedError) as error:  # Python has three ways to say it
         raise OSError(
             f'processes cannot share work here ({error}): is there a /dev/shm? with --jobs 1 '

@@ -46,13 +46,13 @@ def found(iq, noise=1.0, spacing=0.5):
 def test_residuals_are_those_of_the_prototype_or_smaller(staves):
     with np.load(VECTORS / 'residuals.npz') as known:
         y, R, L = (known[f'{name}{staves}'] for name in 'yRL')
-    power, one, two = layover.residuals(y, 0.5)
+    power, single, two = layover.residuals(y, 0.5)
     assert power == pytest.approx(R[:, 0], rel=1e-6)
-    assert one == pytest.approx(R[:, 1], abs=1e-3)
+    assert single == pytest.approx(R[:, 1], abs=1e-3)
     assert (two - R[:, 2]).max() < 1e-3
     same = np.abs(two - R[:, 2]) < 1e-3  # elsewhere the prototype stayed on a lower maximum
     assert same.mean() > 0.85
-    assert (2.0 * (np.sqrt(one) - np.sqrt(two)) - L)[same] == pytest.approx(0.0, abs=2e-3)
+    assert (2.0 * (np.sqrt(single) - np.sqrt(two)) - L)[same] == pytest.approx(0.0, abs=2e-3)
 
 
 @pytest.mark.parametrize('staves, spacing', [(4, 0.5), (8, 0.5), (8, 0.3), (5, 3.66)])
@@ -61,10 +61,10 @@ def test_two_exact_waves_leave_nothing(staves, spacing):
     a, b = rng.uniform(-0.9, 0.9, (2, 200))
     p = 2.0 * math.pi * spacing * np.arange(staves)
     waves = np.exp(1j * a[:, None] * p) + 0.1 * np.exp(1j * (b[:, None] * p + 1.0))
-    power, one, two = layover.residuals(waves, spacing)
+    power, single, two = layover.residuals(waves, spacing)
     assert np.quantile(two / power, 0.95) < 1e-4
     # What is left beside one wave is at most all of the second.
-    assert (one <= 0.01 * staves * 1.001).all()
+    assert (single <= 0.01 * staves * 1.001).all()
 
 
 def test_no_random_start_finds_much_more():
@@ -103,10 +103,10 @@ def test_the_table_is_normalised_so_that_its_mean_under_one_surface_is_one():
 
 
 def test_pooling_keeps_the_mean_and_makes_an_increasing_ratio():
-    two, one = np.array([0.2, 0.1, 0.3, 0.1, 0.3]), np.array([0.5, 0.1, 0.3, 0.1, 0.0])
-    ratio = np.exp(pooled(two, one))
+    two, single = np.array([0.2, 0.1, 0.3, 0.1, 0.3]), np.array([0.5, 0.1, 0.3, 0.1, 0.0])
+    ratio = np.exp(pooled(two, single))
     assert (np.diff(ratio) >= -1e-12).all() and np.isfinite(ratio).all()
-    assert (one * ratio).sum() == pytest.approx(1.0)
+    assert (single * ratio).sum() == pytest.approx(1.0)
 
 
 def test_other_numbers_of_staves_take_the_next_smaller_table():
@@ -184,7 +184,7 @@ def test_of_staves_close_to_each_other_only_directions_that_are_there_are_fitted
     rng = np.random.default_rng(6)
     iq = np.exp(1j * np.outer(rng.uniform(1.7, np.pi, 20), np.arange(8)))  # beyond end fire
     iq += 0.1 * rng.normal(size=(20, 8))
-    power, one, _ = layover.residuals(iq, 0.25)
+    power, single, _ = layover.residuals(iq, 0.25)
     phase = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
     beams = np.abs(iq @ np.exp(-1j * np.outer(np.arange(8), phase))) ** 2 / 8.0
-    np.testing.assert_allclose(one, power - beams.max(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(single, power - beams.max(axis=1), rtol=1e-4)

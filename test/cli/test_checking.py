@@ -42,7 +42,7 @@ def dive(tmp_path_factory):
 def check(dive, tmp_path, monkeypatch):
     """Check `dive` against a node that publishes `change` of the offline estimates."""
 
-    def check(change=lambda estimates: estimates, **said):
+    def check(change=lambda estimates: estimates, **facts):
         def played(bag, system, **options):
             estimates = change(list(RunFolder(tmp_path / 'offline').read_estimates()))
             counts = Counts(40, 1, len(estimates))
@@ -54,13 +54,13 @@ def check(dive, tmp_path, monkeypatch):
                     'exit_code': 0,
                     'log': '',
                     'problems': (),
-                    **said,
+                    **facts,
                 }
             )
 
         monkeypatch.setattr(checking, 'run_lockstep', played)
         checked = checking.play_recording(dive, 'diver', tmp_path, quiet=True).judged()
-        return {one.name: one for one in checked.checks}, checked.good
+        return {check.name: check for check in checked.checks}, checked.good
 
     return check
 
@@ -82,7 +82,7 @@ def nudged(estimates):
 
 
 def renamed(estimates):
-    return [evolve(one, frame_id='odom') for one in estimates]
+    return [evolve(estimate, frame_id='odom') for estimate in estimates]
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_node_that_does_otherwise_is_found_out(check, change, rows):
 
 
 @pytest.mark.parametrize(
-    'said, name',
+    'facts, name',
     [
         ({'counts': Counts(39, 1, 39)}, 'messages taken / refused by the node'),
         ({'counts': Counts(40, 0, 39)}, 'messages taken / refused by the node'),
@@ -110,9 +110,9 @@ def test_a_node_that_does_otherwise_is_found_out(check, change, rows):
         ({'log': 'Traceback (most recent call last):'}, 'end of the node after Ctrl-C'),
     ],
 )
-def test_a_node_that_loses_messages_or_dies_is_found_out(check, said, name):
-    checks, good = check(**said)
-    assert not good and [one.name for one in checks.values() if not one.good] == [name]
+def test_a_node_that_loses_messages_or_dies_is_found_out(check, facts, name):
+    checks, good = check(**facts)
+    assert not good and [check.name for check in checks.values() if not check.good] == [name]
 
 
 def test_a_recording_may_state_its_own_limit(check, dive):
@@ -156,9 +156,9 @@ def test_what_is_installed_is_used_as_it_is(dive, tmp_path, monkeypatch):
 def test_the_exit_code_is_one_when_anything_fell_short(dive, monkeypatch, capsys, good, as_json):
     checked = [
         checking.CheckedRecording(
-            'diver', dive, dive, (Check('a', '1', '1', one),), {'p50': 1.0, 'p99': 2.0}, None
+            'diver', dive, dive, (Check('a', '1', '1', item),), {'p50': 1.0, 'p99': 2.0}, None
         )
-        for one in good
+        for item in good
     ]
     monkeypatch.setattr('sonar_imm_tools.cli.check.run_checks', lambda *_, **__: checked)
     assert main(['check', 'diver', *(['--json'] if as_json else [])]) == int(not all(good))

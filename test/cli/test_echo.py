@@ -69,7 +69,11 @@ def test_tables_without_rows_and_messages_that_are_none():
 
 
 def test_json_has_all_columns_with_their_types():
-    told = json.loads(json_line(table({**ESTIMATE.columns(), 'bad': np.array([np.nan])})))
-    assert told['columns']['px'] == [ESTIMATE.state[0, 0]] and told['columns']['bad'] == [None]
-    assert told['types']['px'] == 'f8' and told['types']['x'] == 'f4'
-    assert told['types']['track_id'] == 'u4' and told['stamp_ns'] == 1_700_000_000_250_000_000
+    content = json.loads(json_line(table({**ESTIMATE.columns(), 'bad': np.array([np.nan])})))
+    assert content['columns']['px'] == [ESTIMATE.state[0, 0]] and content['columns']['bad'] == [
+        None
+    ]
+    assert content['types']['px'] == 'f8' and content['types']['x'] == 'f4'
+    assert (
+        content['types']['track_id'] == 'u4' and content['stamp_ns'] == 1_700_000_000_250_000_000
+    )

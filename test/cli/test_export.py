@@ -28,7 +28,7 @@ SMALL = ('--set', 'pings=3', '--set', 'last_range=30', '--set', 'bin_width=0.1')
 
 
 def run(*arguments):
-    return main([str(one) for one in arguments])
+    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope='module')
@@ -42,9 +42,9 @@ def tracked(tmp_path_factory):
 
 def test_a_run_holds_the_soundings_of_both_sides(tracked):
     points = read_points(tracked / 'soundings.csv')
-    told = json.loads((tracked / 'run.json').read_text())
-    assert len(points) == told['soundings'] > 400
-    assert told['parameters']['navigation'] == 'required' and told['estimates'] == 6
+    content = json.loads((tracked / 'run.json').read_text())
+    assert len(points) == content['soundings'] > 400
+    assert content['parameters']['navigation'] == 'required' and content['estimates'] == 6
     assert set(points['side']) == {0.0, 1.0} and points['z'].mean() == pytest.approx(-20, abs=0.2)
     assert all(np.isfinite(column).all() for column in points.columns.values())
 
@@ -109,18 +109,18 @@ def test_obstacles_of_a_run_as_geojson(tmp_path, capsys):
     scene = ('simulate', 'obstacle', tmp_path / 'bag', '--set', 'last_range=50')
     assert run(*scene) == 0
     assert run('track', tmp_path / 'bag', tmp_path / 'run') == 0
-    (told,) = json.loads((tmp_path / 'run' / 'run.json').read_text())['landmarks']
+    (landmark,) = json.loads((tmp_path / 'run' / 'run.json').read_text())['landmarks']
     place = ('--epsg', '32632', '--origin', '500000,6000000,-5')
     assert run('export', tmp_path / 'run', tmp_path / 'a.geojson', '--map', *place) == 0
     (found,) = json.loads((tmp_path / 'a.geojson').read_text())['features']
     longitude, latitude, height = found['geometry']['coordinates']
     # 500 km east is the central meridian; a degree of latitude is about 111.3 km here.
-    assert longitude == pytest.approx(9.0 + told['x'] / 65_500.0, abs=1e-4)
-    assert latitude == pytest.approx(54.1481 + told['y'] / 111_300.0, abs=2e-4)
-    assert height == pytest.approx(told['z'] - 5.0, abs=1e-3)
+    assert longitude == pytest.approx(9.0 + landmark['x'] / 65_500.0, abs=1e-4)
+    assert latitude == pytest.approx(54.1481 + landmark['y'] / 111_300.0, abs=2e-4)
+    assert height == pytest.approx(landmark['z'] - 5.0, abs=1e-3)
     properties = found['properties']
-    assert properties['track_id'] == told['track_id'] and properties['existence'] > 0.99
+    assert properties['track_id'] == landmark['track_id'] and properties['existence'] > 0.99
     assert properties['z_low_m'] < height < properties['z_high_m']
-    assert properties['x_std_m'] == pytest.approx(told['cov_x_x'] ** 0.5, abs=1e-3)
+    assert properties['x_std_m'] == pytest.approx(landmark['cov_x_x'] ** 0.5, abs=1e-3)
     assert run('export', tmp_path / 'run', tmp_path / 'b.geojson', '--map') == 2
     assert '--epsg' in capsys.readouterr().err

@@ -68,19 +68,19 @@ def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
 def test_hostile_records_of_a_bag_are_named_and_counted_and_the_rest_is_tracked(call, tmp_path):
     """One dead hydrophone in every other record, and of each kind of useless record one."""
     scene = simulate(scenario('small', {'records': 6, 'fading': (), 'depth_companion': False}), 2)
-    good = [one.measurement for one in scene.measurements]
-    one = np.arange(6, dtype=np.float32)
+    good = [item.measurement for item in scene.measurements]
+    each = np.arange(6, dtype=np.float32)
     identity = np.tile(np.eye(8, dtype=np.complex64), (6, 1, 1))
     upper, dead, same = identity + np.triu(0.5 * np.ones((8, 8)), 1), identity.copy(), identity * 0
     dead[:] = np.nan
     same += 1.0
     hostile = [
-        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(upper)}),
-        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(same)}),
-        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(dead)}),
-        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(identity)[:, :30]}),
-        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(identity[:, :6, :6])}),
-        ('trace', {'depth': one[:1], 'amplitude': one[:1]}),
+        ('csdm', {'frequency': 100.0 + each, 'csdm': flat(upper)}),
+        ('csdm', {'frequency': 100.0 + each, 'csdm': flat(same)}),
+        ('csdm', {'frequency': 100.0 + each, 'csdm': flat(dead)}),
+        ('csdm', {'frequency': 100.0 + each, 'csdm': flat(identity)[:, :30]}),
+        ('csdm', {'frequency': 100.0 + each, 'csdm': flat(identity[:, :6, :6])}),
+        ('trace', {'depth': each[:1], 'amplitude': each[:1]}),
     ]
     with BagWriter(tmp_path / 'bag') as bag:
         for k, record in enumerate(good):
@@ -128,10 +128,11 @@ def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
     call('convert', 'segy', DATA / line, tmp_path / 'bag', *cut)
     call('track', tmp_path / 'bag', tmp_path / 'out', '--set', 'particles=3000')
     estimates = {
-        one.stamp_ns: one.columns() for one in RunFolder(tmp_path / 'out').read_estimates()
+        estimate.stamp_ns: estimate.columns()
+        for estimate in RunFolder(tmp_path / 'out').read_estimates()
     }
     with BagReader(tmp_path / 'bag') as bag:
-        traces = [heard.measurement for heard in measurements_of(bag, 'fathometer')]
+        traces = [received.measurement for received in measurements_of(bag, 'fathometer')]
     hits, ids = [], set()
     for trace in traces:
         # Three samples in a row above an eighth of full scale; the greatest of the next four.

@@ -181,8 +181,8 @@ def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
     suggested = capsys.readouterr().out.split('to track it: sonar-imm ')[1].splitlines()[0]
     assert suggested.startswith('track') and f'--system {system}' in suggested
     assert main(suggested.replace('OUT_DIR', str(run)).split()) == 0
-    said = capsys.readouterr().out
-    assert f'{system} <- ' in said and 'no track' not in said
+    output = capsys.readouterr().out
+    assert f'{system} <- ' in output and 'no track' not in output
     assert main(['evaluate', str(run), '--report', str(report)]) == 0
     assert '<html' in report.read_text().lower()
 
@@ -223,8 +223,8 @@ def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alon
     printed = capsys.readouterr().out
     assert 'fits obstacle ground' in printed and 'no tracker can use it' in printed
     assert main(['track', str(bag), str(run), '--system', 'obstacle']) == 0
-    assert 'obstacle <- /ground as ground (5 messages)' in (said := capsys.readouterr().out)
-    assert 'no track was made' in said
+    assert 'obstacle <- /ground as ground (5 messages)' in (output := capsys.readouterr().out)
+    assert 'no track was made' in output
 
 
 def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):

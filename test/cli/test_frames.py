@@ -56,10 +56,10 @@ def ned_bag(tmp_path):
     write = {entry.measurement: (entry.name, entry.write) for entry in inputs_of('obstacle')}
     with BagReader(BAG) as bag, BagWriter(tmp_path / 'ned') as out:
         topics = {name: entry.name for name, entry in fitting_topics(bag, 'obstacle').items()}
-        for heard in measurements_of(bag, 'obstacle', topics):
-            name, written = write[type(heard.measurement)]
-            message = written(other_way(heard.measurement), ros_message)
-            out.write(f'/{name}', message, heard.measurement.stamp_ns)
+        for received in measurements_of(bag, 'obstacle', topics):
+            name, written = write[type(received.measurement)]
+            message = written(other_way(received.measurement), ros_message)
+            out.write(f'/{name}', message, received.measurement.stamp_ns)
     return tmp_path / 'ned'
 
 
@@ -70,8 +70,10 @@ def estimates(path):
 
 def test_both_conventions_give_the_same_places(ned_bag, tmp_path):
     assert main(['track', str(BAG), str(tmp_path / 'enu_run'), '--order', 'stamp']) == 0
-    told = ('--set', 'world_frame_convention=ned', '--set', 'bearing_positive=starboard')
-    assert main(['track', str(ned_bag), str(tmp_path / 'ned_run'), '--order', 'stamp', *told]) == 0
+    given = ('--set', 'world_frame_convention=ned', '--set', 'bearing_positive=starboard')
+    assert (
+        main(['track', str(ned_bag), str(tmp_path / 'ned_run'), '--order', 'stamp', *given]) == 0
+    )
     enu, ned = estimates(tmp_path / 'enu_run'), estimates(tmp_path / 'ned_run')
     assert len(enu) > 500
     np.testing.assert_allclose(ned, enu, rtol=1e-5, atol=1e-5)

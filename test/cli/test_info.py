@@ -84,8 +84,8 @@ def test_topics_that_have_to_be_named_are_all_named(tmp_path, capsys):
     assert '--topic nav=/odom' in command and '--topic detections=/fls/points' in command
     assert run(command, tmp_path / 'out', capsys)['rows'] > 0
     bag = copied('obstacle_movers', tmp_path / 'one', {'/nav': '/odom'})
-    told = run(recommended(bag, capsys)[0], tmp_path / 'out1', capsys)
-    assert told['rows'] > 0 and told['system'] == 'obstacle'
+    given = run(recommended(bag, capsys)[0], tmp_path / 'out1', capsys)
+    assert given['rows'] > 0 and given['system'] == 'obstacle'
 
 
 def test_the_ships_own_position_is_no_diver(tmp_path, capsys):
@@ -180,5 +180,5 @@ def test_both_sides_of_a_side_scan(tmp_path, capsys):
 def test_a_file_of_another_kind_names_convert(name, kind, tmp_path, capsys):
     (tmp_path / name).write_text('1,2\n')
     assert main(['track', str(tmp_path / name), str(tmp_path / 'out')]) == 2
-    said = capsys.readouterr().err
-    assert f'sonar-imm convert {kind} {tmp_path / name} OUT_BAG' in said
+    errors = capsys.readouterr().err
+    assert f'sonar-imm convert {kind} {tmp_path / name} OUT_BAG' in errors

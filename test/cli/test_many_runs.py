@@ -173,9 +173,9 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     capsys.readouterr()
     (bags[0] / 'notes.txt').write_text('one byte more')
     assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
-    said = capsys.readouterr()
-    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in said.err
-    assert '3 runs in' in said.out and '2 kept, 1 failed' in said.out
+    output = capsys.readouterr()
+    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in output.err
+    assert '3 runs in' in output.out and '2 kept, 1 failed' in output.out
 
 
 def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
@@ -226,14 +226,14 @@ def test_the_tracker_with_the_best_evidence_is_chosen():
 
 def test_shards_share_the_bags_out(tmp_path, capsys):
     """As a Slurm array does: each command has the same bags, in any order, and makes its share."""
-    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abcde')]
+    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abc')]
     out = tmp_path / 'out'
     assert track(*bags[::-1], out, '--shard', '1/2') == 0
-    assert sorted(path.name for path in out.iterdir()) == ['a', 'c', 'e', 'summary-1-of-2.json']
-    assert track(*bags, out, '--shard', '2/2', '--jobs', '2') == 0
+    assert sorted(path.name for path in out.iterdir()) == ['a', 'c', 'summary-1-of-2.json']
+    assert track(*bags, out, '--shard', '2/2') == 0
     assert not (out / 'summary.json').exists()
     runs = json.loads((out / 'summary-2-of-2.json').read_text())['runs']
-    assert [run['folder'] for run in runs] == ['b', 'd']
+    assert [run['folder'] for run in runs] == ['b']
     assert track(*bags, tmp_path / 'whole') == 0
     assert {name: text for name, text in contents(out).items() if 'summary' not in name} == (
         contents(tmp_path / 'whole')
@@ -241,12 +241,12 @@ def test_shards_share_the_bags_out(tmp_path, capsys):
     # Downstream all shards are one; a share again makes what is missing; one may be empty.
     capsys.readouterr()
     assert main(['evaluate', str(out), '--json', '--no-report']) == 0
-    assert sorted(json.loads(capsys.readouterr().out)) == list('abcde')
+    assert sorted(json.loads(capsys.readouterr().out)) == list('abc')
     assert main(['export', str(out), str(tmp_path / 'x.csv')]) == 2
     assert 'several runs, which summary-1-of-2.json lists' in capsys.readouterr().err
     (out / 'c' / 'run.json').unlink()
     assert track(*bags, out, '--shard', '1/2') == 0
-    assert '1 tracked, 2 kept' in capsys.readouterr().out
+    assert '1 tracked, 1 kept' in capsys.readouterr().out
     assert track(bags[0], tmp_path / 'few', '--shard', '2/3') == 0
     assert '0 runs in' in capsys.readouterr().out
     assert track(bags[0], tmp_path / 'few', '--shard', '1/3') == 0

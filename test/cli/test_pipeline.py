@@ -181,8 +181,8 @@ def test_topics_are_named_and_suggested(call, tmp_path, capsys):
 )
 def test_the_system_that_is_meant_is_named(dive, tmp_path, capsys, topic, words):
     assert main(['track', str(dive), str(tmp_path / 'run'), '--topic', topic]) == 2
-    said = capsys.readouterr().err
-    assert words in said and 'bathymetry' not in said
+    errors = capsys.readouterr().err
+    assert words in errors and 'bathymetry' not in errors
 
 
 def test_smoothing_is_recorded_in_the_run(call, dive, tmp_path):

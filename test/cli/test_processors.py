@@ -101,12 +101,12 @@ def columns(path):
     return {name: np.array([float(row[name] or 'nan') for row in table]) for name in table[0]}
 
 
-def apart(one, other):
+def apart(first, other):
     """Largest difference of two columns as a share of their largest magnitude."""
-    known = np.isfinite(one)
+    known = np.isfinite(first)
     assert np.array_equal(known, np.isfinite(other))
-    difference = np.abs(one - other)[known].max(initial=0.0)
-    return difference / np.abs(one[known]).max(initial=0.0) if difference else 0.0
+    difference = np.abs(first - other)[known].max(initial=0.0)
+    return difference / np.abs(first[known]).max(initial=0.0) if difference else 0.0
 
 
 def test_another_processor_gives_the_same_estimates_to_the_promised_digits(tmp_path):

@@ -101,13 +101,13 @@ def test_export_of_one_run_is_the_same_grid(lines, tmp_path):
     assert run('survey', runs, tmp_path / 'out', '--resolution', 1) == 0
     assert run('export', runs / 'line_001', tmp_path / 'one.tif', '--cell', 1) == 0
     survey, there, _ = read(tmp_path / 'out' / 'survey.tif')
-    one, here, _ = read(tmp_path / 'one.tif')
+    chart, here, _ = read(tmp_path / 'one.tif')
     top, left = round(there.f - here.f), round(here.c - there.c)
-    rows, columns = one['depth'].shape
+    rows, columns = chart['depth'].shape
     for name in ('depth', 'uncertainty', 'count', 'hypotheses', 'competing_depth'):
         whole = survey[name][top : top + rows, left : left + columns]
-        assert np.isfinite(one[name]).sum() > 30, name
-        assert one[name] == pytest.approx(whole, abs=1e-4, nan_ok=True), name
+        assert np.isfinite(chart[name]).sum() > 30, name
+        assert chart[name] == pytest.approx(whole, abs=1e-4, nan_ok=True), name
 
 
 def test_tiles_are_the_chart(made):
@@ -204,9 +204,8 @@ def test_the_page_shows_chart_misties_and_what_is_not_known(made):
     assert not re.search(r'<(script|link)[^>]+(src|href)=', page)  # nothing from elsewhere
 
 
-@pytest.mark.parametrize('count', [2, 8])
-def test_the_same_bytes_with_many_processes(lines, made, tmp_path, count):
-    assert run('survey', lines, tmp_path / 'out', '--adjust', '--jobs', count) == 0
+def test_the_same_bytes_with_many_processes(lines, made, tmp_path):
+    assert run('survey', lines, tmp_path / 'out', '--adjust', '--jobs', 3) == 0
     assert products(tmp_path / 'out') == products(made)
 
 

@@ -64,10 +64,10 @@ def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path,
     for jobs in ('1', '2'):
         capsys.readouterr()
         assert main(['track', *bags, str(tmp_path / jobs), '--jobs', jobs]) == 1
-        said = capsys.readouterr()
-        assert said.err.startswith(f'{broken}: ')
-        assert 'Traceback' not in said.err and said.err.count('broken') == 2
-        found.append((contents(tmp_path / jobs), said.out.replace(str(tmp_path / jobs), '')))
+        output = capsys.readouterr()
+        assert output.err.startswith(f'{broken}: ')
+        assert 'Traceback' not in output.err and output.err.count('broken') == 2
+        found.append((contents(tmp_path / jobs), output.out.replace(str(tmp_path / jobs), '')))
     assert found[0] == found[1]
     assert {name.split('/')[0] for name in found[0][0]} == {'swaths', 'dive'}
     capsys.readouterr()
@@ -95,4 +95,4 @@ def test_a_worker_that_dies_is_one_sentence(swaths, tmp_path, capsys, monkeypatc
 
     monkeypatch.setattr(OfflineRun, '_taken', dies)
     assert main(['track', str(swaths), str(tmp_path / 'out'), *FEW, '--jobs', '2']) == 2
-    assert 'Traceback' not in (said := capsys.readouterr().err) and 'lack of memory' in said
+    assert 'Traceback' not in (errors := capsys.readouterr().err) and 'lack of memory' in errors

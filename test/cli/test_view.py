@@ -33,8 +33,8 @@ from sonar_imm_tools.resources import shared_file
 def run(tmp_path_factory):
     """A short dive, tracked."""
     folder = tmp_path_factory.mktemp('view')
-    told = ['--set', 'duration=20', '--seed', '1']
-    assert main(['simulate', 'diver', str(folder / 'bag'), *told]) == 0
+    given = ['--set', 'duration=20', '--seed', '1']
+    assert main(['simulate', 'diver', str(folder / 'bag'), *given]) == 0
     assert main(['track', str(folder / 'bag'), str(folder / 'run')]) == 0
     return folder / 'run'
 
@@ -53,8 +53,8 @@ def run(tmp_path_factory):
 )
 def test_mistakes_are_one_sentence(arguments, sentence, capsys):
     assert main(['view', *arguments]) == 2
-    said = capsys.readouterr().err
-    assert sentence in said and said.count('\n') == 1
+    errors = capsys.readouterr().err
+    assert sentence in errors and errors.count('\n') == 1
 
 
 def test_a_topic_that_is_not_there(run, capsys):
@@ -66,8 +66,8 @@ def test_without_the_package_it_says_what_to_do(run, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'foxglove', None)
     monkeypatch.delitem(sys.modules, 'sonar_imm_tools.viewing.server', raising=False)
     assert main(['view', str(run), '--port', '0']) == 2
-    said = capsys.readouterr().err
-    assert "pip install 'sonar_imm[view]'" in said and '--browser' in said
+    errors = capsys.readouterr().err
+    assert "pip install 'sonar_imm[view]'" in errors and '--browser' in errors
 
 
 @pytest.mark.parametrize('kind', ['run', 'bag'])
@@ -112,7 +112,7 @@ def test_names_in_a_recording_do_not_steer_the_terminal_nor_the_page(
     assert main(['view', str(bag), '--browser']) == 0
     assert main(['view', str(bag), '--port', '0', '--topics', f'{name}']) == 2
     assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
-    said = capsys.readouterr()
-    assert '\\x1b[2J' in said.out and '\x1b' not in said.out + said.err
+    output = capsys.readouterr()
+    assert '\\x1b[2J' in output.out and '\x1b' not in output.out + output.err
     page = Path(opened[0].removeprefix('file://')).read_text()
     assert 'alert(1)' in page and '<script>alert(1)' not in page

@@ -27,9 +27,9 @@ def test_a_system_is_compiled_and_the_next_time_it_is_there(capsys):
     assert main(['warm', 'bathymetry']) == 0
     capsys.readouterr()
     assert main(['warm', 'bathymetry']) == 0
-    said = capsys.readouterr().out
-    assert said.startswith('bathymetry: 0 kernels compiled, ')
-    assert int(said.split(', ')[1].split()[0]) > 0
+    output = capsys.readouterr().out
+    assert output.startswith('bathymetry: 0 kernels compiled, ')
+    assert int(output.split(', ')[1].split()[0]) > 0
 
 
 def test_parameters_belong_to_one_system(capsys):

@@ -81,7 +81,7 @@ def test_shuffled_input_gives_the_bytes_of_sorted_input(name):
     for order in (measurements, shuffled):
         tracker = run.build()
         estimates = [estimate for m in order for estimate in tracker.process(m)]
-        made.append([as_bytes(one) for one in final_estimates(estimates, run.config)])
+        made.append([as_bytes(estimate) for estimate in final_estimates(estimates, run.config)])
         assert not tracker.counts['too_late']
     assert made[0] == made[1] and tracker.counts['late'] > 3
 
@@ -191,11 +191,11 @@ def test_process_is_pure(run):
     np.random.seed(1)  # the state of the process, which nobody may touch
     state = np.random.get_state()[1].tobytes()
     estimates = [estimate for m in run.input[:60] for estimate in tracker.process(m)]
-    copies = [as_bytes(one) for one in deepcopy(estimates)]
+    copies = [as_bytes(estimate) for estimate in deepcopy(estimates)]
     for measurement in run.input[60:]:
         tracker.process(measurement)
     assert pickle.dumps(run.input[:60]) == before
-    assert [as_bytes(one) for one in estimates] == copies
+    assert [as_bytes(estimate) for estimate in estimates] == copies
     assert np.random.get_state()[1].tobytes() == state
 
 

@@ -183,7 +183,11 @@ def test_a_folder_that_is_deleted_while_a_process_runs_is_made_again(fresh, tmp_
 @pytest.mark.parametrize('place', ['the folder', 'a folder in it'])
 def test_a_file_where_the_cache_should_be_costs_a_sentence(fresh, tmp_path, monkeypatch, place):
     implementation = caching.CompileResultCacheImpl
-    only = [one for one in implementation._locator_classes if 'UserProvided' in one.__name__]
+    only = [
+        locator
+        for locator in implementation._locator_classes
+        if 'UserProvided' in locator.__name__
+    ]
     monkeypatch.setattr(implementation, '_locator_classes', only)
     if place == 'a folder in it':
         fresh()
@@ -221,76 +225,78 @@ def test_two_versions_of_numba_leave_each_other_alone(fresh, tmp_path, monkeypat
     assert len(list(tmp_path.rglob('*.nbc'))) == 2
 
 
-def copied(folder):
-    """A copy of the package without anything compiled; gives its root."""
-    root = folder / 'copy'
-    for room in ('sonar_imm', 'msg_adapters'):
-        ignore = shutil.ignore_patterns('__pycache__')
-        shutil.copytree(ROOT / room, root / room, ignore=ignore)
-    return root
+SMALL = {
+    'estimation/constants.py': 'SHIFT = 0.25\n',
+    'acoustics/callee.py': """
+from ..estimation.constants import SHIFT
+from ..estimation.jit import kernel
+
+@kernel
+def shifted(x):
+    return x + SHIFT
+""",
+    'acoustics/caller.py': """
+from ..estimation.jit import kernel
+from .callee import shifted
+
+@kernel
+def double(x, out):
+    out[0] = 2.0 * shifted(x)
+""",
+}
+CALL = """
+import numpy as np
+from sonar_imm.acoustics.caller import double
+out = np.empty(1)
+double(1.0, out)
+print(out[0], sum(double.stats.cache_hits.values()))
+"""
 
 
-@pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
-def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
+@pytest.fixture
+def root(tmp_path):
+    """Of a package with a kernel, a callee and a constant in files of their own, and our `jit`."""
+    package = tmp_path / 'root' / 'sonar_imm'
+    for room in ('estimation', 'acoustics'):
+        (package / room).mkdir(parents=True)
+    for name, text in SMALL.items():
+        (package / name).write_text(text)
+    shutil.copy(jit.__file__, package / 'estimation')
+    return package.parent
+
+
+def test_kernels_of_a_read_only_installation_are_cached_elsewhere(root, tmp_path):
     """`NUMBA_CACHE_DIR` takes what the installation cannot, and a second process loads it."""
-    code = (
-        'from sonar_imm.estimation.imm_kernels import combine; import numpy as np;'
-        'o = np.ones; combine(o((1, 1, 1)), o((1, 1, 1, 1)), o((1, 1)), o((1, 1, 1)));'
-        'print(sum(combine.stats.cache_hits.values()))'
-    )
-    root, cache = copied(tmp_path), tmp_path / 'cache'
-    assert [run(code, root, cache) for _ in range(2)] == [['0'], ['1']]
-    assert list(cache.rglob('*.nbc'))
+    cache = tmp_path / 'cache'
+    assert [run(CALL, root, cache) for _ in range(2)] == [['2.5', '0'], ['2.5', '1']]
+    assert list(cache.rglob('*.nbc')) and not list(root.rglob('*.nbc'))
 
 
-@pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
-def test_what_was_compiled_beside_the_source_serves_others(tmp_path):
+def test_what_was_compiled_beside_the_source_serves_others(root, tmp_path):
     """Who installed the package compiled it; another user can only read that folder."""
-    code = (
-        'from sonar_imm.estimation.small_matrices import product; import numpy as np;'
-        'product(np.eye(2), np.eye(2), np.empty((2, 2)));'
-        'print(sum(product.stats.cache_hits.values()))'
-    )
     elsewhere = (
         'from numba.core.caching import CacheImpl as impl;'
         'impl._locator_classes = [c for c in impl._locator_classes if "InTree" not in c.__name__];'
     )
-    root = copied(tmp_path)
-    assert run(code, root, '') == ['0']
-    assert list((root / 'sonar_imm' / 'estimation' / '__pycache__').glob('*.nbc'))
-    assert run(elsewhere + code, root, '', XDG_CACHE_HOME=str(tmp_path / 'home')) == ['1']
-    assert run(code, root, tmp_path / 'told') == ['0']  # NUMBA_CACHE_DIR is the only folder
-    for path in (root / 'sonar_imm').rglob('*.nbc'):
+    assert run(CALL, root, '') == ['2.5', '0']
+    assert list((root / 'sonar_imm' / 'acoustics' / '__pycache__').glob('*.nbc'))
+    assert run(elsewhere + CALL, root, '', XDG_CACHE_HOME=str(tmp_path / 'home')) == ['2.5', '1']
+    # NUMBA_CACHE_DIR is the only folder.
+    assert run(CALL, root, tmp_path / 'other') == ['2.5', '0']
+    for path in root.rglob('*.nbc'):
         path.unlink()
     nowhere = {'HOME': os.devnull, 'XDG_CACHE_HOME': ''}
-    assert run(elsewhere + code, root, '', **nowhere) == ['0']
+    assert run(elsewhere + CALL, root, '', **nowhere) == ['2.5', '0']
 
 
-@pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
-def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path):
-    root, cache = copied(tmp_path), tmp_path / 'cache'
-    code = """
-import numpy as np
-from sonar_imm.estimation import imm_particles as imm
-from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.likelihood import level_geometry
-out = np.empty(1)
-sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((2, 1)), out)
-drawn, c = np.empty((1, 1, 2)), np.empty(1)
-scratch = imm.ResampleScratch(np.empty((1, 2)), np.empty(2), np.empty(3, np.int64))
-imm.resample(np.array([[[3.0, 4.0]]]), np.full((1, 2), 0.5), np.ones(1), np.eye(1),
-             np.full(1, 0.6), scratch, drawn, c)
-hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.resample))
-print(out[0], drawn[0, 0, 0], hits)
-"""
-    assert run(code, root, cache) == ['0.5', '3.0', '0']
-    assert run(code, root, cache) == ['0.5', '3.0', '2']
-    callee = root / 'sonar_imm/acoustics/likelihood_kernels.py'
-    edit(callee, 'out[i] = ratio * cos_tilt', 'out[i] = 3.0 * ratio * cos_tilt')
-    constant = root / 'sonar_imm/estimation/elementary.py'
-    edit(constant, 'ROUND = 1.5 * 2.0**52', 'ROUND = 0.0')
-    assert run(code, root, cache) == ['1.5', '4.0', '0']
-    assert run(code, root, cache) == ['1.5', '4.0', '2']
+def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(root, tmp_path):
+    cache, package = tmp_path / 'cache', root / 'sonar_imm'
+    assert run(CALL, root, cache) == ['2.5', '0']
+    edit(package / 'acoustics/callee.py', 'x + SHIFT', 'x - SHIFT')
+    assert run(CALL, root, cache) == ['1.5', '0']
+    edit(package / 'estimation/constants.py', '0.25', '0.5')
+    assert run(CALL, root, cache) == ['1.0', '0']
+    assert run(CALL, root, cache) == ['1.0', '1']
 
 
 def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
@@ -366,23 +372,16 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new), encoding='utf-8')
 
 
-def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypatch):
-    code = """
-import numpy as np
-from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.likelihood import level_geometry
-geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
-try:
-    sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])
-    print('unchecked')
+def test_code_with_and_without_bounds_checks_is_not_confused(root, tmp_path, monkeypatch):
+    monkeypatch.delenv('NUMBA_BOUNDSCHECK', raising=False)
+    assert run(CALL, root, tmp_path) == ['2.5', '0']
+    monkeypatch.setenv('NUMBA_BOUNDSCHECK', '1')
+    beyond = f"""
+try:{CALL.replace('np.empty(1)', 'np.empty(0)').replace(chr(10), chr(10) + '    ')}
 except IndexError:
     print('checked')
 """
-    monkeypatch.delenv('NUMBA_BOUNDSCHECK', raising=False)
-    spare = code.replace('np.empty(1)[:0]', 'np.empty(1)')
-    assert run(spare, ROOT, tmp_path) == ['unchecked']
-    monkeypatch.setenv('NUMBA_BOUNDSCHECK', '1')
-    assert run(code, ROOT, tmp_path) == ['checked']
+    assert run(beyond, root, tmp_path) == ['checked']
 
 
 def test_a_digest_follows_every_form_of_import(tmp_path):

@@ -86,7 +86,7 @@ def test_estimates_of_something_else_are_one_sentence(tmp_path):
     from helpers.dive_scenes import single_run
 
     whales = [
-        attrs.evolve(one, state_names=('a', 'b', 'c', 'd')) for one in single_run(count=3)[0]
+        attrs.evolve(item, state_names=('a', 'b', 'c', 'd')) for item in single_run(count=3)[0]
     ]
     with pytest.raises(BagError, match="no column 'px'"):
         judge(folder_of(tmp_path, whales))
@@ -98,7 +98,7 @@ def test_what_went_into_a_run_is_read_again(tmp_path):
     write_dive(tmp_path / 'dive', count=10, spoilt=(3,))
     assert len(read_truth(run)) == 20
     measured = list(read_measurements(run))
-    assert len(measured) == 9 and all(isinstance(one, Fix) for one in measured)
+    assert len(measured) == 9 and all(isinstance(item, Fix) for item in measured)
 
 
 def test_a_truth_bag_without_truth_is_told(tmp_path):

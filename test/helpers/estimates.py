@@ -15,11 +15,11 @@
 """Comparing estimates."""
 
 
-def same(one, other):
+def same(estimate, other):
     """Equal to the last bit: stamp, frame, names, types and contents of all columns."""
-    ours, theirs = one.columns(), other.columns()
+    ours, theirs = estimate.columns(), other.columns()
     return (
-        (one.stamp_ns, one.frame_id) == (other.stamp_ns, other.frame_id)
+        (estimate.stamp_ns, estimate.frame_id) == (other.stamp_ns, other.frame_id)
         and list(ours) == list(theirs)
         and all(
             ours[name].dtype == theirs[name].dtype

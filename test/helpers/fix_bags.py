@@ -51,11 +51,11 @@ class Ear:
     """Hears everything on a topic, though it only listens when asked."""
 
     def __init__(self, link, message_type, topic):
-        self.link, self.heard = link, []
+        self.link, self.received = link, []
         self.subscription = link.node.create_subscription(
-            message_type, topic, self.heard.append, lockstep_qos()
+            message_type, topic, self.received.append, lockstep_qos()
         )
 
     def positions(self, count):
-        assert self.link.wait_for(lambda: len(self.heard) >= count, 10.0)
-        return [message.pose.pose.position.x for message in self.heard]
+        assert self.link.wait_for(lambda: len(self.received) >= count, 10.0)
+        return [message.pose.pose.position.x for message in self.received]

@@ -69,7 +69,7 @@ MOTIONS = {
 }
 
 
-def agree(told, kind, got, wanted, tolerance, relative=False):
+def agree(given, kind, got, wanted, tolerance, relative=False):
     """Hold two arrays to a tolerance, for `relative` of one plus what is wanted; told[kind] is the
     worst difference seen."""
     got, wanted = np.asarray(got, float), np.asarray(wanted, float)
@@ -77,14 +77,14 @@ def agree(told, kind, got, wanted, tolerance, relative=False):
     same = (got == wanted) | (np.isnan(got) & np.isnan(wanted))
     scale = 1.0 + np.abs(wanted) if relative else np.ones(wanted.shape)
     worst = float(np.max(np.abs(got - wanted)[~same] / scale[~same], initial=0.0))
-    told[kind] = max(told.get(kind, 0.0), worst)
+    given[kind] = max(given.get(kind, 0.0), worst)
     assert worst <= tolerance, f'{kind}: {worst}'
 
 
 def run(system, measurements, **parameters):
     entry = SYSTEMS[system]
     tracker = entry.build(entry.config_type().from_mapping(parameters))
-    return [estimate for one in measurements for estimate in tracker.process(one)]
+    return [estimate for item in measurements for estimate in tracker.process(item)]
 
 
 RX = np.array([[0.0, 0, 0], [70, 10, 0], [-60, 45, 0], [10, 85, 0]])
@@ -117,23 +117,23 @@ def divers(motion, order=(0, 1), receivers=(0, 1, 2, 3)):
 
 
 def same_divers(plain, moved, motion, tolerance):
-    told = {}
+    values = {}
     assert len(plain) == len(moved)
-    for one, other in zip(plain, moved):
-        assert other.stamp_ns == one.stamp_ns + motion.late_ns and len(one) == len(other)
-        place = motion.point(np.column_stack([one.state[:, :2], np.zeros(len(one))]))[:, :2]
-        velocity = one.state[:, 2:4] @ motion.A[:2, :2].T
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns and len(first) == len(other)
+        place = motion.point(np.column_stack([first.state[:, :2], np.zeros(len(first))]))[:, :2]
+        velocity = first.state[:, 2:4] @ motion.A[:2, :2].T
         gap = np.abs(place[:, None] - other.state[None, :, :2]).sum(axis=2)
         row = gap.argmin(axis=1)  # tracks begin in the order of the fixes
         assert sorted(row) == list(range(len(row)))
-        agree(told, 'places', other.state[row, :2], place, tolerance)
-        agree(told, 'states', other.state[row, 2:4], velocity, tolerance)
-        turned = motion.covariance(one.covariance)
-        agree(told, 'covariances', other.covariance[row], turned, tolerance)
-        permuted = np.empty_like(one.probabilities)
-        permuted[:, _headings(one.model_names, motion)] = one.probabilities
-        agree(told, 'probabilities', other.probabilities[row], permuted, tolerance)
-    return told
+        agree(values, 'places', other.state[row, :2], place, tolerance)
+        agree(values, 'states', other.state[row, 2:4], velocity, tolerance)
+        turned = motion.covariance(first.covariance)
+        agree(values, 'covariances', other.covariance[row], turned, tolerance)
+        permuted = np.empty_like(first.probabilities)
+        permuted[:, _headings(first.model_names, motion)] = first.probabilities
+        agree(values, 'probabilities', other.probabilities[row], permuted, tolerance)
+    return values
 
 
 def _headings(names, motion):
@@ -184,22 +184,22 @@ def obstacles(motion, order=(0, 1)):
 
 
 def same_obstacles(plain, moved, motion, tolerance):
-    told = {}
+    values = {}
 
     def close(kind, got, wanted):
-        agree(told, kind, got, wanted, tolerance, relative=True)
+        agree(values, kind, got, wanted, tolerance, relative=True)
 
     assert len(plain) == len(moved) > 20
-    for one, other in zip(plain, moved):
-        assert other.stamp_ns == one.stamp_ns + motion.late_ns and len(one) == len(other)
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns and len(first) == len(other)
         side = np.array([1.0, motion.sign, 1.0])
-        state = one.state * side
+        state = first.state * side
         row = np.abs(state[:, None] - other.state[None]).sum(axis=2).argmin(axis=1)
         close('states', other.state[row], state)
-        close('covariances', other.covariance[row], one.covariance * np.outer(side, side))
-        close('probabilities', other.probabilities[row], one.probabilities)
-        agree(told, 'places', other.xyz[row], motion.point(one.xyz), max(tolerance, 1e-8) * 10)
-    return told
+        close('covariances', other.covariance[row], first.covariance * np.outer(side, side))
+        close('probabilities', other.probabilities[row], first.probabilities)
+        agree(values, 'places', other.xyz[row], motion.point(first.xyz), max(tolerance, 1e-8) * 10)
+    return values
 
 
 def pings(motion, side='starboard'):
@@ -226,17 +226,17 @@ def pings(motion, side='starboard'):
 
 
 def same_floor(plain, moved, motion, tolerance, place):
-    told = {}
+    values = {}
     assert len(plain) == len(moved) >= 3
-    for one, other in zip(plain, moved):
-        assert other.stamp_ns == one.stamp_ns + motion.late_ns
-        np.testing.assert_array_equal(one.extras['valid'], other.extras['valid'])
-        assert one.extras['valid'].mean() > 0.5
-        agree(told, 'states', other.state, one.state, tolerance)
-        agree(told, 'covariances', other.covariance, one.covariance, tolerance)
-        agree(told, 'probabilities', other.probabilities, one.probabilities, tolerance)
-        agree(told, 'places', other.xyz, motion.point(one.xyz), place)
-    return told
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns
+        np.testing.assert_array_equal(first.extras['valid'], other.extras['valid'])
+        assert first.extras['valid'].mean() > 0.5
+        agree(values, 'states', other.state, first.state, tolerance)
+        agree(values, 'covariances', other.covariance, first.covariance, tolerance)
+        agree(values, 'probabilities', other.probabilities, first.probabilities, tolerance)
+        agree(values, 'places', other.xyz, motion.point(first.xyz), place)
+    return values
 
 
 def traces(deeper=0.0, late_ns=0, louder=1.0):

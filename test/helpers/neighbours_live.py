@@ -274,7 +274,7 @@ def run(type_name, kind, name, message_of, settings):
         overrides = [Parameter(key, value=value) for key, value in settings.items() if value != []]
         node = bench.add(kind(context=bench.context, parameter_overrides=overrides))
         own = node.get_name()
-        heard = {
+        received = {
             type_: bench.listen(message_class(type_), f'/{own}/{TOPICS[type_]}') for type_ in asked
         }
         publisher = bench.peer.create_publisher(message_class(type_name), f'/{name}', quality)
@@ -286,21 +286,21 @@ def run(type_name, kind, name, message_of, settings):
             publisher.publish(message_of(step))
             bench.spin_until(lambda step=step: node.answer()['messages'] > step)
         if asked:
-            bench.spin_until(lambda: all(heard.values()), 20.0)
+            bench.spin_until(lambda: all(received.values()), 20.0)
         counts = node.answer()
-        seen = {type_: len(found) for type_, found in heard.items()}
-        return {**counts, 'out': seen, **last(heard)}
+        seen = {type_: len(found) for type_, found in received.items()}
+        return {**counts, 'out': seen, **last(received)}
     finally:
         bench.close()
 
 
-def last(heard):
+def last(received):
     """Where the diver is by the last message of two types, metres from where it is."""
-    if not heard:
+    if not received:
         return {}
-    at = heard['geographic_msgs/msg/GeoPoseStamped'][-1].pose.position
+    at = received['geographic_msgs/msg/GeoPoseStamped'][-1].pose.position
     off = ORIGIN.local(at.latitude, at.longitude, 0.0)[:2] - place(STEPS - 1)[:2]
-    contact = heard['marine_interfaces/msg/Contact'][-1]
+    contact = received['marine_interfaces/msg/Contact'][-1]
     point = contact.kinematics.pose.pose.position
     apart = np.array([point.x, point.y]) - place(STEPS - 1)[:2]
     variance = float(contact.kinematics.pose.covariance[0])

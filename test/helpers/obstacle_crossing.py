@@ -40,7 +40,7 @@ def crossing(pings=80, detected=1.0, clutter=0.0, late=10**6):
         echoes = [z[0], z[1]]
         if detected < 1.0 or k >= late:
             z[2] += rng.normal(size=2) * [0.1, 0.003]
-            echoes = [one for one in z[: 3 if k >= late else 2] if rng.uniform() < detected]
+            echoes = [item for item in z[: 3 if k >= late else 2] if rng.uniform() < detected]
             echoes += [
                 rng.uniform([5.0, -0.39], [99.0, 0.39]) for _ in range(rng.poisson(clutter))
             ]

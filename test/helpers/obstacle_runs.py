@@ -114,7 +114,7 @@ def track_scene(name, seed, overrides=None, **values):
             **values,
         }
     )
-    return scene, run(ObstacleTracker(config), [one.measurement for one in scene.measurements])
+    return scene, run(ObstacleTracker(config), [item.measurement for item in scene.measurements])
 
 
 def followed(estimate, truth, ping, near=5.0):

@@ -47,7 +47,7 @@ RUNS = {
 class Tracked:
     """A shipped recording, the parameters for it, and what an uninterrupted run makes of it."""
 
-    def __init__(self, name, most=120):
+    def __init__(self, name, most=80):
         self.system = SYSTEMS[name.split('_')[0]]
         bag = BAGS / name
         self.config = load_config(self.system, own_parameters(bag), RUNS[name])[0]

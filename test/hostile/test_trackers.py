@@ -78,7 +78,7 @@ def test_no_parameter_breaks_a_tracker(system):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         ran = [run_extreme(system, seed) for seed in range(15)]
-    assert sum(bool(one) for one in ran) > 5
+    assert sum(bool(item) for item in ran) > 5
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
@@ -91,7 +91,7 @@ def test_every_type_of_every_input_is_tried(system):
         tally = Tally()
         run(system, (variant, []), tally)
         assert tally.estimates >= len(stream(system, variant)) / 4
-    unchanged = next(i for i, one in enumerate(MUTATIONS) if one.__name__ == 'again')
+    unchanged = next(i for i, mutation in enumerate(MUTATIONS) if mutation.__name__ == 'again')
     tally = Tally()
     run(system, (0, [Bad(i, unchanged, 5) for i in range(len(tried))]), tally)
     assert tally.read >= 0.75 * len(tried)  # good messages are good

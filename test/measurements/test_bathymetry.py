@@ -32,12 +32,12 @@ def snapshot(bins=20, staves=4, **changes):
 
 
 def test_what_is_fine_is_kept_as_it_came_and_read_only():
-    one = snapshot()
-    assert len(one) == 20 and one.staves == 4 and one.usable.all()
-    assert one.iq.dtype == np.complex128 and one.bin_width == pytest.approx(0.05)
-    single = one.iq.astype(np.complex64)
+    ping = snapshot()
+    assert len(ping) == 20 and ping.staves == 4 and ping.usable.all()
+    assert ping.iq.dtype == np.complex128 and ping.bin_width == pytest.approx(0.05)
+    single = ping.iq.astype(np.complex64)
     assert snapshot(iq=single).iq.dtype == np.complex64
-    for array in (one.range, one.iq, one.usable):
+    for array in (ping.range, ping.iq, ping.usable):
         assert not array.flags.writeable
     single[0] = 0.0  # the caller's array stays the caller's
     assert single.flags.writeable
@@ -86,21 +86,21 @@ def test_a_storm_of_bins_is_refused():
 def test_spoilt_bins_are_kept_and_marked():
     iq = np.array(snapshot().iq)
     iq[3, 1], iq[7], iq[9, 0] = np.nan, 0.0, np.inf
-    one = snapshot(iq=iq)
-    assert np.flatnonzero(~one.usable).tolist() == [3, 7, 9]
+    ping = snapshot(iq=iq)
+    assert np.flatnonzero(~ping.usable).tolist() == [3, 7, 9]
 
 
 def test_variances_that_are_none_become_unknown():
     variances = np.full(20, 2.0)
     variances[:3] = [0.0, -1.0, np.inf]
-    one = snapshot(noise_variance=variances, signal_variance=np.zeros(20))
-    assert np.isnan(one.noise_variance[:3]).all() and (one.noise_variance[3:] == 2.0).all()
-    assert one.signal_variance is None
+    ping = snapshot(noise_variance=variances, signal_variance=np.zeros(20))
+    assert np.isnan(ping.noise_variance[:3]).all() and (ping.noise_variance[3:] == 2.0).all()
+    assert ping.signal_variance is None
 
 
 def test_spacing_in_wavelengths_when_all_is_known():
-    one = snapshot(element_spacing=0.00165, frequency=455e3, sound_speed=1500.0)
-    assert one.spacing_wavelengths == pytest.approx(0.5005)
+    ping = snapshot(element_spacing=0.00165, frequency=455e3, sound_speed=1500.0)
+    assert ping.spacing_wavelengths == pytest.approx(0.5005)
     assert snapshot(element_spacing=0.00165, frequency=455e3).spacing_wavelengths is None
 
 

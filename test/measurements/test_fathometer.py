@@ -65,10 +65,10 @@ def test_traces_that_cannot_be_used(changes, reason):
 def test_a_trace_keeps_what_it_can():
     sigma = np.ones(10)
     sigma[:3] = np.nan, -1.0, 0.0
-    one = Trace(stamp_ns=1, **trace(sigma=sigma, reference_depth=np.nan))
-    assert np.isnan(one.sigma[:3]).all() and (one.sigma[3:] == 1.0).all()
-    assert one.reference_depth is None
-    assert one.step == 1.0
+    item = Trace(stamp_ns=1, **trace(sigma=sigma, reference_depth=np.nan))
+    assert np.isnan(item.sigma[:3]).all() and (item.sigma[3:] == 1.0).all()
+    assert item.reference_depth is None
+    assert item.step == 1.0
     assert Trace(stamp_ns=1, **trace(sigma=np.zeros(10))).sigma is None
 
 
@@ -163,17 +163,17 @@ def test_a_dead_hydrophone_is_masked(value):
     fields = spectra()
     fields['csdm'][:, 2] = value
     fields['csdm'][:, :, 2] = value
-    one = CrossSpectra(stamp_ns=1, **fields)
-    assert one.alive.tolist() == [True, True, False, True, True]
-    assert one.usable.all()
+    item = CrossSpectra(stamp_ns=1, **fields)
+    assert item.alive.tolist() == [True, True, False, True, True]
+    assert item.usable.all()
 
 
 def test_a_bad_row_is_masked():
     fields = spectra()
     fields['csdm'][3, 0, 1] = np.nan
-    one = CrossSpectra(stamp_ns=1, **fields)
-    assert one.alive.all()
-    assert np.flatnonzero(~one.usable).tolist() == [3]
+    item = CrossSpectra(stamp_ns=1, **fields)
+    assert item.alive.all()
+    assert np.flatnonzero(~item.usable).tolist() == [3]
 
 
 def samples():
@@ -202,10 +202,10 @@ def test_a_hydrophone_with_a_lost_sample_is_masked():
     p = samples()
     p[7, 1] = np.nan
     p[:, 3] = 2.5
-    one = Pressure(stamp_ns=1, pressure=p, sample_rate=100.0)
-    assert one.alive.tolist() == [True, False, True, False, True]
-    assert np.isfinite(one.pressure).all()
-    assert one.duration_ns == 500_000_000
+    item = Pressure(stamp_ns=1, pressure=p, sample_rate=100.0)
+    assert item.alive.tolist() == [True, False, True, False, True]
+    assert np.isfinite(item.pressure).all()
+    assert item.duration_ns == 500_000_000
 
 
 def test_depths_of_the_array():

@@ -88,15 +88,15 @@ def reason(read, message):
 
 
 def test_cross_spectra_come_back_as_they_went():
-    one = spectra()
-    message = write_csdm(one, ros_message)
+    item = spectra()
+    message = write_csdm(item, ros_message)
     back = read_csdm(message)
-    assert (back.csdm == one.csdm).all() and back.csdm.dtype == np.complex64
-    assert (back.frequency == one.frequency).all() and back.snapshots == 7
+    assert (back.csdm == item.csdm).all() and back.csdm.dtype == np.complex64
+    assert (back.frequency == item.frequency).all() and back.snapshots == 7
     assert back.reference_depth == 73.5 and back.frame_id == 'array' and back.stamp_ns == STAMP
     row = decode_table(message)['csdm'][2]
-    assert row[2 * (1 * N + 3)] == one.csdm[2, 1, 3].real  # row-major, real part first
-    assert row[2 * (1 * N + 3) + 1] == one.csdm[2, 1, 3].imag
+    assert row[2 * (1 * N + 3)] == item.csdm[2, 1, 3].real  # row-major, real part first
+    assert row[2 * (1 * N + 3) + 1] == item.csdm[2, 1, 3].imag
 
 
 def test_what_is_not_said_is_not_known():
@@ -230,7 +230,7 @@ def test_a_dead_hydrophone_does_not_spoil_the_block():
 
 def test_traces_come_back_with_their_noise():
     depth = 120.0 + 0.25 * np.arange(80)
-    one = Trace(
+    trace = Trace(
         stamp_ns=STAMP,
         depth=depth,
         amplitude=np.cos(depth),
@@ -238,8 +238,8 @@ def test_traces_come_back_with_their_noise():
         frame_id='array',
         reference_depth=0.0,
     )
-    back = read_trace(write_trace(one, ros_message))
-    assert np.allclose(back.amplitude, one.amplitude, atol=1e-7)
+    back = read_trace(write_trace(trace, ros_message))
+    assert np.allclose(back.amplitude, trace.amplitude, atol=1e-7)
     assert (back.depth == depth).all() and (back.sigma == 0.5).all()
     assert back.reference_depth == 0.0  # at the surface, not unknown
     assert read_trace(trace_table()).sigma is None

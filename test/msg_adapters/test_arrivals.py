@@ -104,19 +104,19 @@ def test_each_kind_of_variance_has_its_own_least_value():
 
 
 def test_elevation_and_depth_come_and_go_and_degrees_are_refused():
-    told = {
+    values = {
         'elevation': np.array([-0.2, np.nan, 0.1]),
         'var_elevation': np.float32([1e-4, np.nan, 2e-4]),
         'depth': np.array([11.0, 11.0, np.inf]),
         'var_depth': np.float32([0.04, 0.04, 0.0]),
     }
-    arrivals = read_arrivals(message(**told))
+    arrivals = read_arrivals(message(**values))
     again = read_arrivals(write_arrivals(arrivals, ros_message))
-    for one in (arrivals, again):
-        np.testing.assert_array_equal(one.elevation, told['elevation'])
-        np.testing.assert_array_equal(one.depth, [11.0, 11.0, np.nan])
-        np.testing.assert_array_equal(one.var_depth, np.float32([0.04, 0.04, np.nan]))
-        np.testing.assert_array_equal(one.var_elevation, told['var_elevation'])
+    for item in (arrivals, again):
+        np.testing.assert_array_equal(item.elevation, values['elevation'])
+        np.testing.assert_array_equal(item.depth, [11.0, 11.0, np.nan])
+        np.testing.assert_array_equal(item.var_depth, np.float32([0.04, 0.04, np.nan]))
+        np.testing.assert_array_equal(item.var_elevation, values['var_elevation'])
     assert np.isnan(read_arrivals(message()).depth).all()
     for degrees in (45.0, -45.0):
         assert reason(elevation=np.array([0.1, degrees, 0.1])) == 'out_of_range'

@@ -329,12 +329,12 @@ def beams(axes):
 
 
 @pytest.mark.parametrize('axes', ['marine', 'rep103'])
-@pytest.mark.parametrize('told', ['right', 'auto'])
-def test_both_beam_axes_give_port_as_positive(axes, told):
+@pytest.mark.parametrize('given', ['right', 'auto'])
+def test_both_beam_axes_give_port_as_positive(axes, given):
     message = marine.sent(marine.sonar_ranges(beams(axes), [20.0, 30.0]))
     ping = read_sonar_ranges(
         message,
-        beam_axes=axes if told == 'right' else 'auto',
+        beam_axes=axes if given == 'right' else 'auto',
         world_frame='enu',
         sound_speed=1400.0,
     )
@@ -406,8 +406,8 @@ def test_a_speed_of_sound_that_is_none_gives_way_to_the_parameter(stated):
 
 def test_times_without_angles_are_no_detections():
     assert len(read_sonar_detections(marine.sonar_detections([0.02, 0.03], []))) == 0
-    one = read_sonar_detections(marine.sonar_detections([0.02, 0.03], [0.1]))
-    assert one.bearing == pytest.approx([-0.1, -0.1])
+    item = read_sonar_detections(marine.sonar_detections([0.02, 0.03], [0.1]))
+    assert item.bearing == pytest.approx([-0.1, -0.1])
 
 
 # -- hostile -----------------------------------------------------------------------------------
@@ -418,7 +418,9 @@ numbers = arrays(np.float32, st.integers(0, 6), elements=st.sampled_from(NASTY).
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(numbers, numbers, numbers, st.lists(st.integers(0, 255), max_size=6))
 def test_anything_gives_sound_detections_or_a_rejection(a, b, c, flags):
-    rows = np.column_stack([np.resize(one, 4) if len(one) else np.zeros(4) for one in (a, b, c)])
+    rows = np.column_stack(
+        [np.resize(item, 4) if len(item) else np.zeros(4) for item in (a, b, c)]
+    )
     for read, message in [
         (read_detections, table(x=rows[:, 0], range=rows[:, 1], bearing=rows[:, 2])),
         (read_detections, table(x=rows[:, 0], y=rows[:, 1], z=rows[:, 2])),

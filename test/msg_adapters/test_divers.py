@@ -71,7 +71,7 @@ def test_the_ellipse_holds_nine_of_ten_samples_and_lies_along_the_covariance():
     assert inside.mean() == pytest.approx(0.9, abs=0.01)
     assert [(end.x, end.y) for end in course.points] == [(30.0, -5.0), (33.0, -1.0)]
     assert label.text == '3: 1.0 m/s' and label.pose.position.z == -3.0
-    assert {one.id for one in (place, course, label)} == {3}
+    assert {item.id for item in (place, course, label)} == {3}
 
 
 def test_a_diver_that_coasts_is_grey_and_says_so():
@@ -83,7 +83,7 @@ def test_a_diver_that_coasts_is_grey_and_says_so():
 
 def drawn(displays, estimate):
     return [
-        [(one.ns, one.id, one.action) for one in message.markers]
+        [(marker.ns, marker.id, marker.action) for marker in message.markers]
         for name, message in displays.of(estimate, ros_message, lambda name: name == 'markers')
     ]
 
@@ -98,4 +98,4 @@ def test_markers_of_a_track_that_is_over_are_deleted_at_once():
     assert drawn(displays, an_estimate([])) == [[(n, 1, DELETE) for n in NAMES]]
     assert drawn(displays, an_estimate([])) == []
     ((name, message),) = displays.forget(ros_message)
-    assert name == 'markers' and [one.action for one in message.markers] == [DELETE_ALL]
+    assert name == 'markers' and [marker.action for marker in message.markers] == [DELETE_ALL]

@@ -73,17 +73,17 @@ def test_an_estimate_reads_back_bit_for_bit(rows):
 @pytest.mark.parametrize('nan', [False, True])
 def test_an_estimate_is_packed_as_the_table_of_its_columns(rows, nan):
     """Its numbers go in as one block; `encode_table` takes column by column."""
-    one = estimate(rows)
+    item = estimate(rows)
     more = {
         'nis': np.full(rows, np.nan if nan else 1.0),
         'valid': np.ones(rows, bool),
         'outline': np.arange(3.0 * rows, dtype=np.float32).reshape(rows, 3),
     }
-    one = evolve(one, extras=one.extras | more)
+    item = evolve(item, extras=item.extras | more)
     expected = encode_table(
-        one.columns(), stamp_ns=one.stamp_ns, frame_id=one.frame_id, make=ros_message
+        item.columns(), stamp_ns=item.stamp_ns, frame_id=item.frame_id, make=ros_message
     )
-    message = write_estimate(one, ros_message)
+    message = write_estimate(item, ros_message)
     assert bytes(message.data) == bytes(expected.data) and message.fields == expected.fields
     assert message.is_dense is expected.is_dense is (not nan or not rows)
     assert (message.width, message.point_step) == (expected.width, expected.point_step)

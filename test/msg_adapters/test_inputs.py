@@ -62,8 +62,8 @@ def test_each_class_of_measurements_is_heard_under_one_name():
         # Several trackers take navigation; a sonar with two sides has a namespace for each.
         first = names.setdefault(entry.measurement, entry.name)
         assert '/' not in first and entry.name.split('/')[-1] == first
-    heard = {one for entry in entries for one in entry.measurements}
-    assert heard == set(get_args(Measurement))
+    received = {item for entry in entries for item in entry.measurements}
+    assert received == set(get_args(Measurement))
 
 
 def test_an_unknown_system_has_no_inputs():

@@ -63,12 +63,12 @@ def reason(read, message, **options):
 def test_writing_and_reading_gives_the_same_navigation():
     covariance = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     covariance[0, 1] = covariance[1, 0] = 0.5
-    one = navigation(pose_covariance=covariance)
-    again = read_navigation(write_navigation(one, ros_message))
+    item = navigation(pose_covariance=covariance)
+    again = read_navigation(write_navigation(item, ros_message))
     for name in ('stamp_ns', 'frame_id', 'child_frame_id'):
-        assert getattr(again, name) == getattr(one, name)
+        assert getattr(again, name) == getattr(item, name)
     for name in ('position', 'orientation', 'velocity', 'turn_rate', 'pose_covariance'):
-        assert np.array_equal(getattr(again, name), getattr(one, name))
+        assert np.array_equal(getattr(again, name), getattr(item, name))
     assert again.twist_covariance is None
 
 
@@ -164,8 +164,8 @@ def test_a_covariance_of_another_size_is_refused_and_a_missing_frame_doubted():
 
 def test_an_altitude_is_written_and_read():
     for variance in (0.25, np.nan):
-        one = Altitude(stamp_ns=12, altitude=15.5, variance=variance, frame_id='altimeter')
-        again = read_range(write_range(one, ros_message))
+        item = Altitude(stamp_ns=12, altitude=15.5, variance=variance, frame_id='altimeter')
+        again = read_range(write_range(item, ros_message))
         assert (again.stamp_ns, again.altitude, again.frame_id) == (12, 15.5, 'altimeter')
         assert np.array_equal(again.variance, variance, equal_nan=True)
 

@@ -40,7 +40,7 @@ def reason(read, message):
 
 
 def modem(**values):
-    told = {
+    given = {
         'header__stamp__sec': 7,
         'header__frame_id': 'x150',
         'src_id': 3,
@@ -50,7 +50,7 @@ def modem(**values):
         'usbl_azimuth': 900,
         'usbl_elevation': -300,
     }
-    return driver_message('seatrac_interfaces/msg/ModemRec', **{**told, **values})
+    return driver_message('seatrac_interfaces/msg/ModemRec', **{**given, **values})
 
 
 def test_a_modem_gives_range_and_direction_clockwise_and_up():
@@ -84,9 +84,9 @@ def test_what_a_modem_flags_or_does_not_know_is_refused():
 
 
 def usbl(**values):
-    told = {'header__stamp__sec': 9, 'current_time': 102.0, 'measurement_time': 100.0}
+    given = {'header__stamp__sec': 9, 'current_time': 102.0, 'measurement_time': 100.0}
     return driver_message(
-        'acomms_msgs/msg/UsblData', **{**told, 'remote_address': 5, 'accuracy': 0.5, **values}
+        'acomms_msgs/msg/UsblData', **{**given, 'remote_address': 5, 'accuracy': 0.5, **values}
     )
 
 

@@ -121,7 +121,7 @@ def test_north_east_down_is_turned():
 @pytest.mark.parametrize('deep', [False, True])
 def test_writing_and_reading_gives_the_same_scan(n, named, deep):
     rng = np.random.default_rng(n)
-    one = Fixes(
+    fixes = Fixes(
         stamp_ns=STAMP,
         position=rng.normal(size=(n, 3)) * 1e5,
         covariance=np.tile(
@@ -130,19 +130,19 @@ def test_writing_and_reading_gives_the_same_scan(n, named, deep):
         target_id=np.arange(n) if named else None,
         frame_id='map',
     )
-    message = write_scan(one, ros_message)
+    message = write_scan(fixes, ros_message)
     assert ('cov_z_z' in [each.name for each in message.fields]) == (deep and n > 0)
     again = read_scan(message)
-    assert again.stamp_ns == one.stamp_ns and (again.position == one.position).all()
-    assert n == 0 or again.covariance.tobytes() == one.covariance.tobytes()
+    assert again.stamp_ns == fixes.stamp_ns and (again.position == fixes.position).all()
+    assert n == 0 or again.covariance.tobytes() == fixes.covariance.tobytes()
     assert (again.target_id is None) == (not named or n == 0)
 
 
 def test_poses_are_fixes_without_covariance():
-    one = Fixes(stamp_ns=STAMP, position=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], frame_id='map')
-    message = write_poses(one, ros_message)
+    fixes = Fixes(stamp_ns=STAMP, position=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], frame_id='map')
+    message = write_poses(fixes, ros_message)
     got = read_poses(message)
-    assert (got.position == one.position).all() and got.covariance is None
+    assert (got.position == fixes.position).all() and got.covariance is None
     message.poses[0].position.x = math.nan
     left = read_poses(message)
     assert len(left) == 1 and doubt_scan(message, left) == 'unusable_rows'

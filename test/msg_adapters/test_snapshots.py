@@ -55,31 +55,35 @@ def organised(**changes):
     return cloud
 
 
-def reason(one):
+def reason(item):
     with pytest.raises(Rejection) as caught:
-        read_snapshot(one)
+        read_snapshot(item)
     return caught.value.reason
 
 
 def test_samples_are_interleaved_real_and_imaginary():
-    one = read_snapshot(message())
+    snapshot = read_snapshot(message())
     iq = columns()['iq']
-    assert one.iq.dtype == np.complex64 and one.staves == STAVES
-    assert (one.iq == iq[:, 0::2] + 1j * iq[:, 1::2]).all()
-    assert (one.range == columns()['range']).all() and one.frame_id == 'sonar'
-    assert one.sound_speed == 1500.0 and one.frequency is None and one.noise_variance is None
+    assert snapshot.iq.dtype == np.complex64 and snapshot.staves == STAVES
+    assert (snapshot.iq == iq[:, 0::2] + 1j * iq[:, 1::2]).all()
+    assert (snapshot.range == columns()['range']).all() and snapshot.frame_id == 'sonar'
+    assert (
+        snapshot.sound_speed == 1500.0
+        and snapshot.frequency is None
+        and snapshot.noise_variance is None
+    )
 
 
 def test_an_organised_cloud_says_the_same():
-    one, other = read_snapshot(message()), read_snapshot(organised())
-    assert (one.iq == other.iq).all() and (one.range == other.range).all()
+    first, other = read_snapshot(message()), read_snapshot(organised())
+    assert (first.iq == other.iq).all() and (first.range == other.range).all()
     assert reason(organised(range=np.zeros(BINS * STAVES))) == 'bad_range'
 
 
 def test_times_become_ranges():
     time = (17.0 + 0.05 * np.arange(BINS)) / 750.0
-    one = read_snapshot(message(range=None, time=time))
-    assert np.allclose(one.range, 750.0 * time) and (one.two_way_time == time).all()
+    snapshot = read_snapshot(message(range=None, time=time))
+    assert np.allclose(snapshot.range, 750.0 * time) and (snapshot.two_way_time == time).all()
     unknown = read_snapshot(message(range=None, time=time, sound_speed=None))
     assert np.allclose(unknown.ranges(1480.0), 740.0 * time)
 
@@ -90,8 +94,8 @@ def test_constants_hold_for_the_whole_ping():
     partly = np.float32([np.nan] * (BINS - 1) + [1501.0])
     assert read_snapshot(message(sound_speed=partly)).sound_speed == 1501.0
     for nothing in (0.0, np.nan):
-        one = read_snapshot(message(sound_speed=np.full(BINS, nothing)))
-        assert one.sound_speed is None
+        snapshot = read_snapshot(message(sound_speed=np.full(BINS, nothing)))
+        assert snapshot.sound_speed is None
 
 
 @pytest.mark.parametrize(
@@ -137,7 +141,7 @@ def test_writing_and_reading_gives_the_same_snapshot(times):
     rng = np.random.default_rng(1)
     noise = np.float32([1.0, 2.0, np.nan, 4.0])
     time = np.arange(1.0, 5.0) * 1e-3 / 3.0
-    one = Snapshot(
+    snapshot = Snapshot(
         stamp_ns=10**18 + 1,
         frame_id='sonar',
         range=np.float32([17.0, 17.1, 17.2, 17.3]),
@@ -150,11 +154,11 @@ def test_writing_and_reading_gives_the_same_snapshot(times):
         element_spacing=2.0**-9,
         sample_rate=15e3,
     )
-    again = read_snapshot(write_snapshot(one, ros_message))
-    assert again.stamp_ns == one.stamp_ns and (again.iq == one.iq).all()
-    assert np.allclose(again.range, 750.0 * time if times else one.range, rtol=1e-15)
+    again = read_snapshot(write_snapshot(snapshot, ros_message))
+    assert again.stamp_ns == snapshot.stamp_ns and (again.iq == snapshot.iq).all()
+    assert np.allclose(again.range, 750.0 * time if times else snapshot.range, rtol=1e-15)
     for name in (*VARIANCES, *CONSTANTS):
-        assert np.array_equal(getattr(again, name), getattr(one, name), equal_nan=True), name
+        assert np.array_equal(getattr(again, name), getattr(snapshot, name), equal_nan=True), name
 
 
 NASTY = np.array([0.1, 1.0, 17.0, 0.0, -1.0, 1e-30, 1e30, 1e38, 1500.0, np.nan, np.inf, -np.inf])
@@ -181,12 +185,16 @@ def test_hostile_snapshots_are_refused_or_usable(bins, staves, nasty, gone, cut,
     cloud = encode_table(table, stamp_ns=10**18, frame_id='sonar', make=ros_message)
     cloud.data = cloud.data[: len(cloud.data) - cut]
     try:
-        one = read_snapshot(cloud)
+        snapshot = read_snapshot(cloud)
     except Rejection as rejection:
         assert rejection.reason and rejection.sentence
         return
-    assert one.usable.any() and np.isfinite(one.iq[one.usable]).all() and one.bin_width > 0.0
+    assert (
+        snapshot.usable.any()
+        and np.isfinite(snapshot.iq[snapshot.usable]).all()
+        and snapshot.bin_width > 0.0
+    )
     for name in VARIANCES:
-        known = getattr(one, name)
+        known = getattr(snapshot, name)
         assert known is None or (known[~np.isnan(known)] > 0.0).all()
-    assert one.sound_speed is None or 1300.0 <= one.sound_speed <= 1700.0
+    assert snapshot.sound_speed is None or 1300.0 <= snapshot.sound_speed <= 1700.0

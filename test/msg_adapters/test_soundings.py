@@ -30,10 +30,10 @@ def soundings(n=4):
 
 
 def test_what_is_written_reads_back_bit_for_bit():
-    one = soundings()
-    again = read_soundings(write_soundings(one, ros_message))
-    assert (again.stamp_ns, again.frame_id) == (one.stamp_ns, one.frame_id)
-    for name, column in one.columns.items():
+    points = soundings()
+    again = read_soundings(write_soundings(points, ros_message))
+    assert (again.stamp_ns, again.frame_id) == (points.stamp_ns, points.frame_id)
+    for name, column in points.columns.items():
         assert (again.columns[name] == column).all() and again.columns[name].dtype == column.dtype
 
 
@@ -58,19 +58,19 @@ def test_the_layout_is_what_cube_expects():
 def test_the_topic_reads_back_with_the_reader_of_ros():
     point_cloud2 = pytest.importorskip('sensor_msgs_py.point_cloud2')
     messages = pytest.importorskip('sonar_imm.nodes.messages')
-    one = soundings()
-    table = point_cloud2.read_points(write_soundings(one, messages.make), skip_nans=True)
-    for name, column in one.columns.items():
+    points = soundings()
+    table = point_cloud2.read_points(write_soundings(points, messages.make), skip_nans=True)
+    for name, column in points.columns.items():
         assert (table[name] == column).all()
 
 
 def test_older_soundings_without_exact_places_and_surfaces_are_read():
-    one = soundings()
+    points = soundings()
     later = (*PLACES, *LATER)
-    older = {name: column for name, column in one.columns.items() if name not in later}
+    older = {name: column for name, column in points.columns.items() if name not in later}
     again = read_soundings(encode_table(older, stamp_ns=1, frame_id='map', make=ros_message))
     assert list(again.columns) == list(COLUMNS) and again.columns['py'].dtype == np.float64
-    assert (again.columns['py'] == one.columns['y']).all()
+    assert (again.columns['py'] == points.columns['y']).all()
     assert (again.columns['surface'] == 1).all() and (again.columns['existence'] == 0.0).all()
 
 

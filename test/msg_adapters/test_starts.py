@@ -26,7 +26,7 @@ from sonar_imm_tools.recordings.messages import ros_message
 STAMP = 1_700_000_000_123_456_789
 
 
-def pose(x=1.0, y=2.0, z=3.0, covariance=None, **told):
+def pose(x=1.0, y=2.0, z=3.0, covariance=None, **values):
     start = Start(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=np.eye(2), frame_id='map')
     message = write_start(start, ros_message)
     place = message.pose.pose.position
@@ -34,7 +34,7 @@ def pose(x=1.0, y=2.0, z=3.0, covariance=None, **told):
     whole = np.zeros((6, 6))
     whole[:2, :2] = [[4.0, 1.0], [1.0, 9.0]] if covariance is None else covariance
     message.pose.covariance = whole.ravel()
-    for name, value in told.items():
+    for name, value in values.items():
         setattr(message.header, name, value)
     return message
 
@@ -70,7 +70,7 @@ def test_north_east_down_is_turned():
 
 
 @pytest.mark.parametrize(
-    'told, code',
+    'given, code',
     [
         ({'x': math.nan}, 'nan'),
         ({'y': math.inf}, 'nan'),
@@ -85,8 +85,8 @@ def test_north_east_down_is_turned():
         ({'frame_id': 'map_ned'}, 'frame_ned'),
     ],
 )
-def test_what_cannot_be_used_is_refused_with_its_reason(told, code):
-    assert reason(pose(**told)) == code
+def test_what_cannot_be_used_is_refused_with_its_reason(given, code):
+    assert reason(pose(**given)) == code
 
 
 def test_a_start_without_a_stamp_is_refused():

@@ -45,23 +45,23 @@ def test_what_is_written_reads_back(seed):
 
 
 def test_one_transform_alone_is_read_and_a_leading_slash_dropped():
-    (one,) = message(parent='/base_link', child='/sonar').transforms
-    assert list(read_transforms(one).poses) == ['sonar']
-    assert read_transforms(one).poses['sonar'][0] == 'base_link'
+    (item,) = message(parent='/base_link', child='/sonar').transforms
+    assert list(read_transforms(item).poses) == ['sonar']
+    assert read_transforms(item).poses['sonar'][0] == 'base_link'
 
 
 @pytest.mark.parametrize(
     'spoil, code',
     [
-        (lambda one: setattr(one.transform.translation, 'x', math.nan), 'nan'),
-        (lambda one: setattr(one.transform.rotation, 'w', math.inf), 'nan'),
-        (lambda one: setattr(one.transform.rotation, 'w', 7.0), 'out_of_range'),
-        (lambda one: setattr(one.transform.rotation, 'x', 1e300), 'out_of_range'),
-        (lambda one: setattr(one.transform.translation, 'y', 1e9), 'out_of_range'),
-        (lambda one: setattr(one.header, 'frame_id', ''), 'no_frame'),
-        (lambda one: setattr(one, 'child_frame_id', 'base_link'), 'no_frame'),
-        (lambda one: setattr(one, 'child_frame_id', 'f' * 1001), 'too_large'),
-        (lambda one: setattr(one.header, 'frame_id', 'f' * 1001), 'too_large'),
+        (lambda item: setattr(item.transform.translation, 'x', math.nan), 'nan'),
+        (lambda item: setattr(item.transform.rotation, 'w', math.inf), 'nan'),
+        (lambda item: setattr(item.transform.rotation, 'w', 7.0), 'out_of_range'),
+        (lambda item: setattr(item.transform.rotation, 'x', 1e300), 'out_of_range'),
+        (lambda item: setattr(item.transform.translation, 'y', 1e9), 'out_of_range'),
+        (lambda item: setattr(item.header, 'frame_id', ''), 'no_frame'),
+        (lambda item: setattr(item, 'child_frame_id', 'base_link'), 'no_frame'),
+        (lambda item: setattr(item, 'child_frame_id', 'f' * 1001), 'too_large'),
+        (lambda item: setattr(item.header, 'frame_id', 'f' * 1001), 'too_large'),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_its_reason(spoil, code):

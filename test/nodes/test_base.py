@@ -125,9 +125,9 @@ def test_hostile_messages_are_refused_counted_and_survived(rig, capfd):
 
 def test_a_refusal_is_said_once_a_reason(rig, capfd):
     rig.send(nan_fix(1.0), nan_fix(2.0), a_fix(3.0), a_fix(4.0, frame_id='odom'))
-    said = [line for line in capfd.readouterr().err.splitlines() if 'is refused' in line]
-    assert len(said) == 2
-    assert "the frame 'odom' is not the frame 'map' of the tracks" in said[1]
+    errors = [line for line in capfd.readouterr().err.splitlines() if 'is refused' in line]
+    assert len(errors) == 2
+    assert "the frame 'odom' is not the frame 'map' of the tracks" in errors[1]
 
 
 def test_a_bug_in_the_tracker_does_not_end_the_node(rig, capfd):
@@ -158,7 +158,7 @@ def test_disabled_input_is_answered_but_not_used(rig):
 
 def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench):
     rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
-    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     rig.bench.spin_until(lambda: rig.node.count_subscribers('/diagnostics'))
     rig.node.set_parameters([Parameter('max_revisions', value=1)])
     rig.send(*map(a_fix, (1.0, 3.0, 4.0, 2.0)))
@@ -168,10 +168,12 @@ def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench)
     rig.node.tracker.explode = True
     rig.send(a_fix(7.0), a_fix(8.0), a_fix(9.0))
     rig.node._saved_state.trouble = 'the state cannot be saved'
-    heard.clear()
+    received.clear()
 
-    rig.bench.spin_until(lambda: any('cannot be saved' in one.status[1].message for one in heard))
-    tracker = heard[-1].status[1]
+    rig.bench.spin_until(
+        lambda: any('cannot be saved' in item.status[1].message for item in received)
+    )
+    tracker = received[-1].status[1]
     counts = {pair.key: pair.value for pair in tracker.values}
     assert counts['count: revisions_withheld'] == '1'
     assert counts['count: ignored_while_disabled'] == '2'
@@ -260,20 +262,20 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
 
 
 def test_an_incompatible_publisher_is_named(make_bench, capfd):
-    told = '-p', 'diagnostics_period:=0.05'
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable', *told)
-    heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    given = '-p', 'diagnostics_period:=0.05'
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable', *given)
+    received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
     bench.spin_until(lambda: node._endpoints.incompatible)
     assert node._endpoints.incompatible == {'fix': 'RELIABILITY'}
-    said = capfd.readouterr().err
-    assert "a peer on '/fix' cannot be heard: its RELIABILITY" in said
-    assert '-p qos_overrides./fix.subscription.reliability' in said
+    errors = capfd.readouterr().err
+    assert "a peer on '/fix' cannot be heard: its RELIABILITY" in errors
+    assert '-p qos_overrides./fix.subscription.reliability' in errors
 
     def values():
         """Of the newest report; one may have been on its way."""
-        return {pair.key: pair.value for pair in heard[-1].status[0].values} if heard else {}
+        return {pair.key: pair.value for pair in received[-1].status[0].values} if received else {}
 
     bench.spin_until(lambda: 'incompatible peer on fix' in values(), 30.0)
     assert values()['incompatible peer on fix'] == 'RELIABILITY'
@@ -285,16 +287,16 @@ def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, c
     )
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/usbl/fix'))
-    told = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
-    assert told in capfd.readouterr().err
+    given = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
+    assert given in capfd.readouterr().err
 
 
 def test_accepted_changes_are_said_on_rosout(rig):
     # A late subscriber gets what was logged before: it may be known here and not yet matched.
     lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    heard = rig.bench.listen(Log, '/rosout', lasting)
+    received = rig.bench.listen(Log, '/rosout', lasting)
     rig.node.set_parameters([Parameter('stale_after', value=3.5)])
-    rig.bench.spin_until(lambda: any('stale_after is 3.5 now' in one.msg for one in heard))
+    rig.bench.spin_until(lambda: any('stale_after is 3.5 now' in item.msg for item in received))
 
 
 def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):

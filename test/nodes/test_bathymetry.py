@@ -77,7 +77,7 @@ def table(rows, *, stamp_ns=5 * 10**9, **columns):
 
 def test_a_ping_becomes_the_floor_under_it(rig):
     snapshots, truth = pings()
-    rig.send(*[write_snapshot(one, make) for one in snapshots])
+    rig.send(*[write_snapshot(snapshot, make) for snapshot in snapshots])
     assert len(rig.tables) == 3
     for message, snapshot, true in zip(rig.tables, snapshots, truth):
         estimate = read_estimate(message)
@@ -129,15 +129,15 @@ def test_pings_of_changing_sizes_and_some_bad_bins_are_used(rig):
     for number, values in enumerate(
         ({'staves': 8}, {'staves': 2}, {'staves': 16}, {'last_range': 18.0}, {'first_range': 10.0})
     ):
-        one = pings(pings=1, **values)[0][0]
-        message = write_snapshot(one, make)
+        item = pings(pings=1, **values)[0][0]
+        message = write_snapshot(item, make)
         message.header.stamp.sec = 100 + number
-        raw = np.frombuffer(bytes(message.data), np.uint8).copy().reshape(len(one), -1)
+        raw = np.frombuffer(bytes(message.data), np.uint8).copy().reshape(len(item), -1)
         iq = next(field.offset for field in message.fields if field.name == 'iq')
         raw[5, iq : iq + 4] = np.array([np.nan], np.float32).view(np.uint8)
         message.data = raw.tobytes()
         rig.send(message)
-        sizes.append(len(one))
+        sizes.append(len(item))
     assert [message.width for message in rig.tables] == sizes
     for message in rig.tables:
         assert np.isfinite(read_estimate(message).state).all()
@@ -146,7 +146,7 @@ def test_pings_of_changing_sizes_and_some_bad_bins_are_used(rig):
 
 def test_a_spacing_other_than_configured_is_counted(make_bench):
     rig = Rig(make_bench('-p', 'max_wait:=0.0', '-p', 'element_spacing_wavelengths:=0.7'))
-    rig.send(*[write_snapshot(one, make) for one in pings()[0]])
+    rig.send(*[write_snapshot(ping, make) for ping in pings()[0]])
     assert not rig.tables
     assert rig.node.tracker.counts['other_spacing'] == 3
 
@@ -154,7 +154,7 @@ def test_a_spacing_other_than_configured_is_counted(make_bench):
 def test_pings_that_waited_too_long_are_dropped_whole_and_counted(make_bench):
     limit = 0.2
     rig = Rig(make_bench('-p', f'max_wait:={limit}'))
-    first, second, last = [write_snapshot(one, make) for one in pings()[0]]
+    first, second, last = [write_snapshot(ping, make) for ping in pings()[0]]
     begin = time.monotonic()
     rig.publisher.publish(first)
     rig.publisher.publish(second)
@@ -198,7 +198,7 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
     outputs = ('estimate', 'soundings', 'model_probabilities')
     bench.spin_until(
         lambda: (
-            all(one.get_subscription_count() for one in publishers.values())
+            all(item.get_subscription_count() for item in publishers.values())
             and all(node.count_subscribers(f'/bathymetry/{name}') for name in outputs)
         )
     )
@@ -230,10 +230,10 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
 
 def test_with_coupled_labels_an_estimate_comes_with_the_next_ping(make_bench):
     coupled = {'engine': 'grid', 'smoothing': 'states', 'grid_extent': 3.0, 'ping_coupling': 0.35}
-    told = [part for pair in coupled.items() for part in ('-p', '{}:={}'.format(*pair))]
-    rig = Rig(make_bench('-p', 'max_wait:=0.0', *told))
+    given = [part for pair in coupled.items() for part in ('-p', '{}:={}'.format(*pair))]
+    rig = Rig(make_bench('-p', 'max_wait:=0.0', *given))
     snapshots, _ = pings()
-    rig.send(*[write_snapshot(one, make) for one in snapshots])
+    rig.send(*[write_snapshot(snapshot, make) for snapshot in snapshots])
     found = [read_estimate(message).stamp_ns for message in rig.tables]
-    assert found == [one.stamp_ns for one in snapshots[:2]]
+    assert found == [snapshot.stamp_ns for snapshot in snapshots[:2]]
     assert rig.node.tracker.health()['pings_held'] == 1 and not rig.node._errors

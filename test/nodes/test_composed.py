@@ -123,10 +123,10 @@ def test_robots_in_domains_of_their_own_do_not_hear_each_other(monkeypatch):
     """With the same names on one machine: only the domain is another one."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     no_signals = rclpy.signals.SignalHandlerOptions.NO
-    with reserved_domain_id() as one, reserved_domain_id() as another:
-        assert one != another
+    with reserved_domain_id() as item, reserved_domain_id() as another:
+        assert item != another
         contexts = [rclpy.Context(), rclpy.Context()]
-        for context, domain in zip(contexts, (one, another)):
+        for context, domain in zip(contexts, (item, another)):
             rclpy.init(context=context, domain_id=domain, signal_handler_options=no_signals)
         executors = [rclpy.executors.SingleThreadedExecutor(context=each) for each in contexts]
         trackers = [TrackerNode('walker', context=each) for each in contexts]
@@ -139,12 +139,12 @@ def test_robots_in_domains_of_their_own_do_not_hear_each_other(monkeypatch):
             for second in range(1, 600):
                 for executor in executors:
                     executor.spin_once(timeout_sec=0.02)
-                heard = [each.get_subscription_count() for each in fixes]
-                if heard == [1, 1]:
+                counts = [each.get_subscription_count() for each in fixes]
+                if counts == [1, 1]:
                     fixes[0].publish(a_fix(float(second)))
                 if trackers[0]._meter.received['fix'] >= 5:
                     break
-            assert heard == [1, 1]  # and not two each
+            assert counts == [1, 1]  # and not two each
             assert trackers[0]._meter.received['fix'] >= 5
             assert not trackers[1]._meter.received
             assert [each.count_publishers('/fix') for each in trackers] == [1, 1]

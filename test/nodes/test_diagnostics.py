@@ -294,17 +294,17 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     bench = make_bench(
         '-p', 'diagnostics_period:=0.05', '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
     )  # no /clock at all: still it reports
-    heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     bench.add(TrackerNode('walker', context=bench.context))
-    bench.spin_until(lambda: len(heard) >= 3 and 'message' in heard[-1].status[0].message)
-    assert [status.name for status in heard[-1].status] == [
+    bench.spin_until(lambda: len(received) >= 3 and 'message' in received[-1].status[0].message)
+    assert [status.name for status in received[-1].status] == [
         'auv1/walker: input',
         'auv1/walker: tracker',
     ]
-    values = {pair.key: pair.value for pair in heard[-1].status[0].values}
+    values = {pair.key: pair.value for pair in received[-1].status[0].values}
     assert values['fix topic'] == '/auv1/fix'
-    told = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/relative or /auv1/arrivals'
-    assert heard[-1].status[0].message == told
+    given = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/relative or /auv1/arrivals'
+    assert received[-1].status[0].message == given
 
 
 def test_obstacles_that_all_move_alike_warn_of_the_navigation(desk):
@@ -364,17 +364,17 @@ def test_periods_without_a_message_say_nothing():
 def test_the_health_of_a_node_is_its_worst_entry(desk):
     desk.meter.arrived('fix', 1.0)
     desk.report(1.0, lost={'fix': 4})
-    told = summary('diver', [desk.input, desk.tracker])
-    assert (told.level, told.name) == (DiagnosticStatus.WARN, 'diver')
-    assert told.message == desk.input.message
-    assert {pair.key for pair in told.values} == {'input', 'tracker'}
+    given = summary('diver', [desk.input, desk.tracker])
+    assert (given.level, given.name) == (DiagnosticStatus.WARN, 'diver')
+    assert given.message == desk.input.message
+    assert {pair.key for pair in given.values} == {'input', 'tracker'}
     desk.report(2.0, counts={'internal_error': 1})
     assert summary('diver', [desk.input, desk.tracker]).level == DiagnosticStatus.ERROR
     desk.report(60.0, counts={'internal_error': 1})
     assert desk.input.level == DiagnosticStatus.STALE
-    told = summary('diver', [desk.input, desk.tracker])
-    assert told.level == DiagnosticStatus.ERROR  # a caught error is worse than silence
-    assert told.message == desk.tracker.message != desk.input.message
+    given = summary('diver', [desk.input, desk.tracker])
+    assert given.level == DiagnosticStatus.ERROR  # a caught error is worse than silence
+    assert given.message == desk.tracker.message != desk.input.message
 
 
 def test_a_warning_is_the_same_one_when_its_numbers_change():
@@ -439,20 +439,20 @@ def test_stamps_of_one_clock_are_no_two(desk):
 
 def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, walker):
     rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
-    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     other = rig.bench.peer.create_publisher(message_class(FIX), '/fix', 10)
     rig.bench.spin_until(other.get_subscription_count)
     start = time.time()
-    rig.bench.spin_until(lambda: heard)
+    rig.bench.spin_until(lambda: received)
     # As long as it takes: where the machine was busy meanwhile, messages came late as well.
     for k in range(1000):
         now = time.time() - start + 100.0
         rig.fix.publish(a_fix(now))
         other.publish(a_fix(now + 7.0))
         rig.bench.spin_until(lambda count=2 * k + 2: rig.answer[0] == count)
-        if '7.0 s apart' in heard[-1].status[0].message:
+        if '7.0 s apart' in received[-1].status[0].message:
             break
     else:
-        pytest.fail(heard[-1].status[0].message)
+        pytest.fail(received[-1].status[0].message)
     rig.bench.peer.destroy_publisher(other)
-    rig.bench.spin_until(lambda: 'apart' not in heard[-1].status[0].message)
+    rig.bench.spin_until(lambda: 'apart' not in received[-1].status[0].message)

@@ -36,7 +36,7 @@ SECOND = 10**9
 
 
 def start(make_bench, *parameters):
-    bench = make_bench(*(one for value in parameters for one in ('-p', value)))
+    bench = make_bench(*(item for value in parameters for item in ('-p', value)))
     node = bench.add(DiverNode(context=bench.context))
     return bench, node
 
@@ -86,15 +86,15 @@ def test_what_has_no_fix_and_what_is_repeated_is_in_diagnostics(make_bench):
     bench, node = start(
         make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix', 'diagnostics_period:=0.1'
     )
-    heard = bench.listen(DiagnosticArray, '/diagnostics')
+    arrived = bench.listen(DiagnosticArray, '/diagnostics')
     fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
     for k, x, status in ((1, 0.0, 0), (2, 0.0, 0), (3, 0.5, -1), (4, 0.6, 0)):
         fixes.publish(on_earth(k, x, status))
     bench.spin_until(lambda: received(node) == 4)
     assert dict(node._meter.refused) == {'repeated': 1, 'no_fix': 1}
-    count = len(heard)
-    bench.spin_until(lambda: len(heard) > count + 1)
-    values = {one.key: one.value for status in heard[-1].status for one in status.values}
+    count = len(arrived)
+    bench.spin_until(lambda: len(arrived) > count + 1)
+    values = {item.key: item.value for status in arrived[-1].status for item in status.values}
     assert values['refused: repeated'] == '1' and values['refused: no_fix'] == '1'
 
 

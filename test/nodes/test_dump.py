@@ -37,11 +37,11 @@ def dumped(bench, name):
     asked = GetParameters.Request(names=names)
     values = bench.call(GetParameters, f'{name}/get_parameters', asked).values
     assert len(values) == len(names) > 5
-    unset = [one for one, v in zip(names, values) if v.type == ParameterType.PARAMETER_NOT_SET]
+    unset = [name for name, v in zip(names, values) if v.type == ParameterType.PARAMETER_NOT_SET]
     assert not unset
     tree = {}
-    for one, value in zip(names, values):
-        *folders, last = one.split('.')
+    for item, value in zip(names, values):
+        *folders, last = item.split('.')
         inside = tree
         for folder in folders:
             inside = inside.setdefault(folder, {})
@@ -59,9 +59,9 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
     bench.spin_until(lambda: node.state == 'active')  # inputs have parameters from then on
     file = tmp_path / 'live.yaml'
     file.write_text(dumped(bench, f'/{system}'))
-    config, told = load_config(SYSTEMS[system], file, {})
+    config, given = load_config(SYSTEMS[system], file, {})
     assert config == node.tracker.config
-    assert (told.stale_after, told.frame_id) == (7.5, 'harbour')
+    assert (given.stale_after, given.frame_id) == (7.5, 'harbour')
     again = make_bench('--params-file', str(file))
     second = again.add(NODES[system](context=again.context))
     again.spin_until(lambda: second.state == 'active')

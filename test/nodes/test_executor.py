@@ -28,9 +28,13 @@ def test_messages_come_at_once_and_events_within_their_period(make_bench):
     bench = make_bench()
     node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
     bench.nodes.append(node)
-    endpoints, heard, ticks = Endpoints(node), [], []
-    endpoints.subscribe(Empty, 'good', lambda message, info: heard.append(message), output_qos())
-    endpoints.subscribe(Empty, 'bad', lambda message, info: heard.append(message), lockstep_qos())
+    endpoints, received, ticks = Endpoints(node), [], []
+    endpoints.subscribe(
+        Empty, 'good', lambda message, info: received.append(message), output_qos()
+    )
+    endpoints.subscribe(
+        Empty, 'bad', lambda message, info: received.append(message), lockstep_qos()
+    )
     node.create_timer(0.05, lambda: ticks.append(time.monotonic()))
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     bench.peer.create_publisher(Empty, 'bad', best_effort)
@@ -39,8 +43,8 @@ def test_messages_come_at_once_and_events_within_their_period(make_bench):
     executor.add_node(node)
     try:
         end = time.monotonic() + 120.0
-        while not (heard and endpoints.incompatible and len(ticks) > 3):
-            assert time.monotonic() < end, (heard, endpoints.incompatible, ticks)
+        while not (received and endpoints.incompatible and len(ticks) > 3):
+            assert time.monotonic() < end, (received, endpoints.incompatible, ticks)
             good.publish(Empty())
             executor.spin_once(timeout_sec=0.02)
         assert endpoints.incompatible == {'bad': 'RELIABILITY'}
@@ -64,5 +68,5 @@ def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
     finally:
         executor.shutdown()
     assert 2 <= len(looks) <= 4
-    asked = [one for one in node.waitables if executor.can_execute(one)]
+    asked = [waitable for waitable in node.waitables if executor.can_execute(waitable)]
     assert len(list(node.waitables)) >= 3 and not asked

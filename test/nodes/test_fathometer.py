@@ -57,7 +57,7 @@ class Rig:
         )
         bench.spin_until(
             lambda: (
-                all(one.get_subscription_count() for one in self.publishers.values())
+                all(item.get_subscription_count() for item in self.publishers.values())
                 and self.node.count_subscribers('/fathometer/estimate')
             )
         )
@@ -82,7 +82,7 @@ def rig(make_bench):
 
 def traces(**values):
     scene = simulate(scenario('drift_traces', {'records': 4, 'appearing': (), **values}), 3)
-    return [one.measurement for one in scene.measurements], scene.truth
+    return [item.measurement for item in scene.measurements], scene.truth
 
 
 def table(**columns):
@@ -102,7 +102,7 @@ def test_traces_become_reflectors_with_ids_and_displays(make_bench):
         )
     )
     measured, truth = traces(fading=(), layers=4)
-    rig.send('trace', *[write_trace(one, make) for one in measured])
+    rig.send('trace', *[write_trace(item, make) for item in measured])
     rig.bench.spin_until(lambda: len(responses) == len(numbers) == len(rig.tables) == 4)
     estimate = read_estimate(rig.tables[-1])
     assert estimate.stamp_ns == measured[-1].stamp_ns
@@ -122,11 +122,11 @@ def test_traces_become_reflectors_with_ids_and_displays(make_bench):
 def test_cross_spectra_use_the_depth_that_a_companion_tells(rig):
     scene = simulate(scenario('small', {'records': 3, 'fading': ()}), 2)
     for item in scene.measurements:
-        one = item.measurement
-        if isinstance(one, ArrayDepth):
-            rig.send('array_depth', write_array_depth(one, make))
+        entry = item.measurement
+        if isinstance(entry, ArrayDepth):
+            rig.send('array_depth', write_array_depth(entry, make))
         else:
-            rig.send('csdm', write_csdm(one, make))
+            rig.send('csdm', write_csdm(entry, make))
     assert len(rig.tables) == 3 and not rig.node._meter.refused
     estimate = read_estimate(rig.tables[-1])
     distance = np.abs(estimate.state[:, :1] - scene.truth[-1].depth)
@@ -154,9 +154,9 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     )
     rig.send(
         'pressure',
-        *[write_pressure(attrs.evolve(one, scale=1e-3), make) for one in blocks_of(10.0)],
+        *[write_pressure(attrs.evolve(block, scale=1e-3), make) for block in blocks_of(10.0)],
     )
-    preview = [int(read_estimate(one).extras['preview'][0]) for one in rig.tables]
+    preview = [int(read_estimate(table).extras['preview'][0]) for table in rig.tables]
     assert preview.count(0) == 2
     assert preview.count(1) >= 2
     assert rig.node.tracker.counts['blocks'] == 20
@@ -175,7 +175,7 @@ HEARD = (
 
 
 @pytest.fixture(scope='module')
-def heard():
+def received():
     """Twenty seconds of pressure over two layers, at 132 m and 136 m, in blocks of 0.5 s."""
     array = {'phones': 12, 'element_spacing': 0.36, 'sample_rate': 6000.0}
     times = {'records': 1, 'block_seconds': 0.5, 'record_seconds': 19.5}
@@ -183,15 +183,15 @@ def heard():
     sound = {'frequency_min': 50.0, 'frequency_max': 2000.0, 'amplitude': 0.6}
     scene = simulate(scenario('pressure', {**array, **times, **floor, **sound}), 1)
     assert scene.truth[0].depth == pytest.approx([131.6, 136.4], abs=0.05)
-    return [write_pressure(one.measurement, make) for one in scene.measurements]
+    return [write_pressure(item.measurement, make) for item in scene.measurements]
 
 
 def spectra_of(messages, stamp_ns):
     """The cross-spectra of all the pressure, averaged at once."""
-    blocks = [read_pressure(one) for one in messages]
+    blocks = [read_pressure(message) for message in messages]
     length, first, last = 3000, 25, 1000
     stream = SnapshotStream(length, length // 2, slice(first, last + 1))
-    parts = stream.push(np.concatenate([one.pressure for one in blocks]))
+    parts = stream.push(np.concatenate([block.pressure for block in blocks]))
     (average,) = BlockAverage(len(parts)).push(parts)
     return CrossSpectra(
         stamp_ns=stamp_ns,
@@ -203,15 +203,15 @@ def spectra_of(messages, stamp_ns):
     )
 
 
-def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, heard):
+def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):
     rig = rig_of(make_bench, *HEARD)
-    rig.send('pressure', *heard)
+    rig.send('pressure', *received)
     assert len(rig.tables) == 1 and not rig.node._meter.refused
     live = read_estimate(rig.tables[0])
     assert live.state[:, 0] == pytest.approx([131.6, 136.4], abs=0.2)
     response = rig.node.tracker.response
     rig.bench.call(Trigger, '/fathometer/reset', Trigger.Request())
-    rig.send('csdm', write_csdm(spectra_of(heard, live.stamp_ns), make))
+    rig.send('csdm', write_csdm(spectra_of(received, live.stamp_ns), make))
     other = read_estimate(rig.tables[1])
     assert other.stamp_ns == live.stamp_ns
     columns, expected = live.columns(), other.columns()
@@ -225,10 +225,10 @@ def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, heard):
     assert columns['depth'] == pytest.approx(expected['depth'], abs=0.02)
 
 
-def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, heard):
+def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, received):
     rig = rig_of(make_bench, *HEARD)
-    more = [write_pressure(one, make) for one in follow(heard, 3)]
-    blocks = [*heard, *more]
+    more = [write_pressure(item, make) for item in follow(received, 3)]
+    blocks = [*received, *more]
     order = [0, 1, 1, 2, 4, 3, 5, *range(7, len(blocks))]
     rig.send('pressure', *[blocks[k] for k in order])
     counts = rig.node.tracker.counts
@@ -242,11 +242,11 @@ def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, hear
 
 def follow(messages, count):
     """The first `count` blocks again, as if they came after the last."""
-    blocks = [read_pressure(one) for one in messages]
+    blocks = [read_pressure(message) for message in messages]
     end = blocks[-1].stamp_ns + blocks[-1].duration_ns
     return [
-        attrs.evolve(one, stamp_ns=one.stamp_ns - blocks[0].stamp_ns + end)
-        for one in blocks[:count]
+        attrs.evolve(block, stamp_ns=block.stamp_ns - blocks[0].stamp_ns + end)
+        for block in blocks[:count]
     ]
 
 
@@ -256,7 +256,7 @@ def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
     driver = rig.bench.peer.create_publisher(PointCloud2, '/pressure', input_qos(50))
     rig.bench.spin_until(driver.get_subscription_count)
     blocks = blocks_of(28.0, hydrophones=32, rate=12000.0, block=1.4)
-    for message in [write_pressure(one, make) for one in blocks]:
+    for message in [write_pressure(block, make) for block in blocks]:
         driver.publish(message)
         rig.bench.executor.spin_once(timeout_sec=0.02)
     rig.bench.spin_until(lambda: rig.node._meter.received['pressure'] == len(blocks), 30.0)
@@ -297,9 +297,9 @@ def test_hostile_records_are_named_and_counted_and_harm_nobody(rig):
 
 def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     rig = rig_of(make_bench, *SMALL, 'loading:=0.0', 'diagnostics_period:=0.05')
-    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     scene = simulate(scenario('small', {'records': 4, 'fading': (), 'depth_companion': False}), 2)
-    records = [one.measurement for one in scene.measurements]
+    records = [item.measurement for item in scene.measurements]
     for k, record in enumerate(records):
         csdm = np.array(record.csdm)
         csdm[:, 5], csdm[:, :, 5] = np.nan, np.nan
@@ -315,13 +315,16 @@ def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     csdm = np.broadcast_to(upper.astype(np.complex64), (6, 8, 8)).reshape(6, -1).view(np.float32)
     rig.send('csdm', table(frequency=np.float32(100.0 + np.arange(6)), csdm=csdm))
 
-    def told():
+    def newest():
         return {
-            pair.key: pair.value for one in heard[-1:] for s in one.status for pair in s.values
+            pair.key: pair.value
+            for item in received[-1:]
+            for s in item.status
+            for pair in s.values
         }
 
-    rig.bench.spin_until(lambda: told().get('refused: not_hermitian') == '1')
-    values = told()
+    rig.bench.spin_until(lambda: newest().get('refused: not_hermitian') == '1')
+    values = newest()
     assert values['count: singular'] == '1' and values['count: dead_hydrophones_masked'] == '3'
     assert values['count: used'] == '4' and len(rig.tables) == 4
     offset = np.abs(read_estimate(rig.tables[-1]).state[:, :1] - scene.truth[-1].depth)
@@ -347,12 +350,16 @@ def test_an_array_of_another_size_is_counted_and_a_dead_hydrophone_masked(rig):
 
 def test_offline_says_the_same_to_the_bit(rig):
     measured, _ = traces(fading=(), layers=4)
-    rig.send('trace', *[write_trace(one, make) for one in measured])
+    rig.send('trace', *[write_trace(item, make) for item in measured])
     system = SYSTEMS['fathometer']
     tracker = system.build(
         system.config_type()(phones=8, element_spacing=0.36, frequency_max=2000.0, particles=2000)
     )
-    expected = [one for m in measured for one in tracker.process(read_trace(write_trace(m, make)))]
-    for message, one in zip(rig.tables, expected, strict=True):
-        live, offline = read_estimate(message).columns(), one.columns()
+    expected = [
+        estimate
+        for m in measured
+        for estimate in tracker.process(read_trace(write_trace(m, make)))
+    ]
+    for message, entry in zip(rig.tables, expected, strict=True):
+        live, offline = read_estimate(message).columns(), entry.columns()
         assert all(live[name].tobytes() == offline[name].tobytes() for name in offline)

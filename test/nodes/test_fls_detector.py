@@ -91,8 +91,8 @@ def test_without_the_message_package_the_node_says_what_is_missing(make_bench):
 def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
     bench = make_bench(*PARAMETERS)
     answers = bench.listen(PointCloud2, '/fls_detector/processed', latched_qos())
-    heard = bench.listen(PointCloud2, '/detections')
-    told = bench.listen(DiagnosticArray, '/diagnostics')
+    received = bench.listen(PointCloud2, '/detections')
+    given = bench.listen(DiagnosticArray, '/diagnostics')
     node = bench.add(FlsDetectorNode(context=bench.context))
     sender = bench.peer.create_publisher(Image, '/image', 10)
     bench.spin_until(sender.get_subscription_count)
@@ -101,12 +101,12 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
         before = len(answers)
         sender.publish(message)
         bench.spin_until(lambda before=before: len(answers) > before)
-    bench.spin_until(lambda: len(heard) == 2)
-    ping = read_detections(heard[0])
+    bench.spin_until(lambda: len(received) == 2)
+    ping = read_detections(received[0])
     assert ping.range == pytest.approx([30.5], abs=0.1)
     assert ping.bearing == pytest.approx([np.radians(40.0 * (0.5 - 2.5 / 9.0))], abs=0.01)
     assert np.isfinite([ping.var_range[0], ping.extent_bearing[0], ping.intensity[0]]).all()
-    assert [one.header.stamp.sec for one in heard] == [100, 102]
+    assert [item.header.stamp.sec for item in received] == [100, 102]
     assert node.refused == {'short_data': 1}
     assert counts(answers[-1]) == {
         'messages': 3,
@@ -115,11 +115,11 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
         'listeners': 1,
     }
     assert answers[-1].header.stamp.sec == 102
-    before = len(told)
-    bench.spin_until(lambda: len(told) > before + 1)
-    values = {pair.key: pair.value for pair in told[-1].status[0].values}
+    before = len(given)
+    bench.spin_until(lambda: len(given) > before + 1)
+    values = {pair.key: pair.value for pair in given[-1].status[0].values}
     assert values['image received'] == '3' and values['refused: short_data'] == '1'
-    assert {pair.key: pair.value for pair in told[-1].status[1].values}['count: published'] == '2'
+    assert {pair.key: pair.value for pair in given[-1].status[1].values}['count: published'] == '2'
 
 
 def test_images_of_another_sonar_are_refused(make_bench):
@@ -132,13 +132,15 @@ def test_images_of_another_sonar_are_refused(make_bench):
 
 def test_without_images_the_node_waits_for_them(make_bench):
     bench = make_bench(*PARAMETERS)
-    told = bench.listen(DiagnosticArray, '/diagnostics')
+    received = bench.listen(DiagnosticArray, '/diagnostics')
     node = bench.add(FlsDetectorNode(context=bench.context))
     # What comes before is that it loads or compiles kernels.
-    bench.spin_until(lambda: told and told[-1].status[0].message == 'no message yet on /image')
-    assert told[-1].status[0].level == told[-1].status[1].level == DiagnosticStatus.STALE
+    bench.spin_until(
+        lambda: received and received[-1].status[0].message == 'no message yet on /image'
+    )
+    assert received[-1].status[0].level == received[-1].status[1].level == DiagnosticStatus.STALE
     node.receive('image', picture())
-    bench.spin_until(lambda: told[-1].status[0].message == 'receiving')
+    bench.spin_until(lambda: received[-1].status[0].message == 'receiving')
 
 
 def test_a_package_that_is_there_is_used(make_bench, monkeypatch):
@@ -151,15 +153,15 @@ def test_a_package_that_is_there_is_used(make_bench, monkeypatch):
         lambda name: known('sensor_msgs/msg/Image' if name.startswith('marine') else name),
     )
     node = bench.add(FlsDetectorNode(context=bench.context))
-    heard = bench.listen(PointCloud2, '/detections')
+    received = bench.listen(PointCloud2, '/detections')
     bench.spin_until(lambda: node.count_subscribers('/detections'))
     answers = bench.listen(PointCloud2, '/fls_detector/processed', latched_qos())
     bench.spin_until(lambda: answers and counts(answers[-1])['listeners'])
     message = projected()
     message.header.stamp = make('builtin_interfaces/msg/Time', sec=100, nanosec=5)
     node.receive('image', message)
-    bench.spin_until(lambda: heard)
-    ping = read_detections(heard[0])
+    bench.spin_until(lambda: received)
+    ping = read_detections(received[0])
     assert ping.range == pytest.approx([31.0], abs=0.1)
     assert ping.bearing == pytest.approx([np.radians(10.0)], abs=0.02)
 

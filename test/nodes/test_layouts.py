@@ -69,12 +69,14 @@ def topics(system, make_bench):
     bench = make_bench()
     module = import_module(f'sonar_imm.nodes.{system}')
     node = bench.add(getattr(module, f'{system.capitalize()}Node')(context=bench.context))
-    heard = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.spin_until(lambda: heard and node._hears)  # inputs are heard once kernels are compiled
+    received = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.spin_until(
+        lambda: received and node._hears
+    )  # inputs are heard once kernels are compiled
     published = node.get_publisher_names_and_types_by_node(system, '/')
     subscribed = node.get_subscriber_names_and_types_by_node(system, '/')
     found = {name: types[0] for name, types in published + subscribed}
-    found['states'] = {status.name for status in heard[0].status}
+    found['states'] = {status.name for status in received[0].status}
     return found
 
 
@@ -87,7 +89,9 @@ def estimate(system):
     values = values.get('/**', {}).get('ros__parameters', values)
     with BagReader(path) as bag:
         config = record.config_type().from_mapping(values, ignore_unknown=True)
-        return next(one for one in OfflineRun(bag, record, config).estimates() if len(one))
+        return next(
+            estimate for estimate in OfflineRun(bag, record, config).estimates() if len(estimate)
+        )
 
 
 def layout_of(system):
@@ -137,7 +141,7 @@ def placed(tree):
 def test_rviz_layout(system, topics, estimate):
     displays = yaml.safe_load(shared_file(f'config/{system}.rviz').read_text())
     displays = displays['Visualization Manager']['Displays']
-    drawn = [one for one in displays if 'Topic' in one]
+    drawn = [display for display in displays if 'Topic' in display]
     assert drawn
     for display in drawn:
         assert topics[display['Topic']['Value']] == RVIZ[display['Class'].partition('/')[2]]

@@ -111,9 +111,9 @@ def test_a_publisher_that_left_is_not_continued_by_another():
 
 def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_bench, capfd):
     bench = make_bench()
-    heard = []
+    received = []
     endpoints = Endpoints(bench.peer)
-    endpoints.subscribe(Float64, 'depth', lambda m, _: heard.append(m.data), input_qos(10))
+    endpoints.subscribe(Float64, 'depth', lambda m, _: received.append(m.data), input_qos(10))
     writer = bench.add(
         type(bench.peer)('writer', context=bench.context, use_global_arguments=False)
     )
@@ -121,17 +121,17 @@ def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_benc
         reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000
     )
     publishers = [writer.create_publisher(Float64, 'depth', qos) for _ in range(2)]
-    bench.spin_until(lambda: all(one.get_subscription_count() for one in publishers))
+    bench.spin_until(lambda: all(item.get_subscription_count() for item in publishers))
     sent = itertools.count()
     for publisher in publishers:
         publisher.publish(Float64(data=float(next(sent))))
-    bench.spin_until(lambda: len(heard) == 2)
+    bench.spin_until(lambda: len(received) == 2)
     assert not endpoints.lost
     for publisher in publishers * 100:  # while the node is busy
         publisher.publish(Float64(data=float(next(sent))))
-    bench.spin_until(lambda: 201.0 in heard)
-    assert endpoints.lost == {'depth': 202 - len(heard)}
-    assert len(heard) <= 2 + 10
+    bench.spin_until(lambda: 201.0 in received)
+    assert endpoints.lost == {'depth': 202 - len(received)}
+    assert len(received) <= 2 + 10
     assert capfd.readouterr().err.count("'depth' are lost before") == 1
 
 
@@ -153,7 +153,7 @@ def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
 
     bench = make_bench('-p', 'diagnostics_period:=0.05', '-p', 'queue_depth:=5')
     node = bench.add(TrackerNode('walker', context=bench.context))
-    told = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    given = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     kind = message_class('geometry_msgs/msg/PoseWithCovarianceStamped')
     fix = bench.peer.create_publisher(kind, 'fix', 100)
     bench.spin_until(fix.get_subscription_count)
@@ -163,13 +163,13 @@ def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
     bench.spin_until(lambda: node._meter.received['fix'] == 1)
     for _ in range(100):
         fix.publish(message)
-    bench.spin_until(lambda: any('are lost before' in one.status[0].message for one in told))
-    said = next(one.status[0] for one in told if 'are lost before' in one.status[0].message)
-    assert said.level == DiagnosticStatus.WARN
-    assert '% on fix' in said.message
+    bench.spin_until(lambda: any('are lost before' in item.status[0].message for item in given))
+    printed = next(item.status[0] for item in given if 'are lost before' in item.status[0].message)
+    assert printed.level == DiagnosticStatus.WARN
+    assert '% on fix' in printed.message
 
     def values():
-        return {pair.key: pair.value for pair in told[-1].status[0].values}
+        return {pair.key: pair.value for pair in given[-1].status[0].values}
 
     bench.spin_until(lambda: int(values()['lost on fix']) == 101 - node._meter.received['fix'])
     assert int(values()['lost on fix']) > 90

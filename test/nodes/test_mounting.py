@@ -39,8 +39,8 @@ ALONE = 'geometry_msgs/msg/TransformStamped'
 def transform(child, parent, position, rpy):
     """A TransformStamped, which is installed everywhere; tf2_msgs is not."""
     pose = Pose(np.array(position), geometry.rotation(*np.radians(rpy)))
-    told = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
-    turn = told.transforms[0].transform.rotation
+    given = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
+    turn = given.transforms[0].transform.rotation
     where = {
         'translation': make('geometry_msgs/msg/Vector3', **dict(zip('xyz', position))),
         'rotation': make(
@@ -60,7 +60,7 @@ class Life:
 
     def __init__(self, make_bench, node_type, state, *more):
         words = [f'state_file:={state}', f'tf_static_type:={ALONE}', *more]
-        self.bench = make_bench(*[word for one in words for word in ('-p', one)])
+        self.bench = make_bench(*[word for item in words for word in ('-p', item)])
         self.node = self.bench.add(node_type(context=self.bench.context))
         self.sent = 0
 
@@ -85,8 +85,10 @@ def a_ping(name):
     made = {'obstacle': (ahead, 'approach', Detections), 'bathymetry': (swath, 'paper', Snapshot)}
     scenes, scenario, kind = made[name]
     scene = scenes.simulate(scenes.scenario(scenario, {}), 1)
-    ping = next(one.measurement for one in scene.measurements if isinstance(one.measurement, kind))
-    entry = next(one for one in inputs_of(name) if one.measurement is kind)
+    ping = next(
+        item.measurement for item in scene.measurements if isinstance(item.measurement, kind)
+    )
+    entry = next(item for item in inputs_of(name) if item.measurement is kind)
     return f'/{entry.name}', entry.write(ping, make), next(iter(entry.readers))
 
 
@@ -115,38 +117,38 @@ def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp
 
 def test_a_place_that_was_said_before_the_node_was_there_is_heard(make_bench):
     words = f'tf_static_type:={ALONE}', 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
-    bench = make_bench(*[word for one in words for word in ('-p', one)])
-    said = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
-    said.publish(transform('sonar', 'base_link', LEVER, RPY))
+    bench = make_bench(*[word for item in words for word in ('-p', item)])
+    publisher = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
+    publisher.publish(transform('sonar', 'base_link', LEVER, RPY))
     node = bench.add(BathymetryNode(context=bench.context))
     bench.spin_until(lambda: node._meter.received.total())
     assert node.tracker.config.sonar_lever == LEVER
 
 
 def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, tmp_path, capfd):
-    def told(topic, seconds, frame_id, x, y):
+    def fix_at(topic, seconds, frame_id, x, y):
         fix = Fix(
             stamp_ns=round(seconds * 1e9),
             position=(x, y, 0.0),
             covariance=np.eye(2),
             frame_id=frame_id,
         )
-        entry = next(one for one in inputs_of('diver') if one.name == topic.rpartition('/')[2])
+        entry = next(item for item in inputs_of('diver') if item.name == topic.rpartition('/')[2])
         return topic, entry.write(fix, make), next(iter(entry.readers))
 
     more = 'use_tf_static:=true', 'frame_id:=map'
     first = Life(make_bench, DiverNode, tmp_path / 'state', *more)
     first.tell('odom', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    first.send(*told('/diver/initial', 1.0, 'map', 105.0, 7.0))
+    first.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))
     first.end()
     again = Life(make_bench, DiverNode, tmp_path / 'state', *more)
-    again.send(*told('/fix', 2.0, 'odom', 5.5, 7.0))
+    again.send(*fix_at('/fix', 2.0, 'odom', 5.5, 7.0))
     state = again.node.tracker._stream.state
     assert not again.node._meter.refused
     assert len(state.x) == 1
     assert state.mu[0] @ state.x[0, :, 0] == pytest.approx(105.4, abs=0.3)
     assert state.life.track_id.tolist() == [1] and state.life.status.tolist() == [1]
-    again.send(*told('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
+    again.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
     assert len(again.node.tracker._stream.state.x) == 1
 
 
@@ -156,8 +158,8 @@ def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(m
     kind = next(entry for entry in inputs_of('diver') if entry.name == 'fix')
     type_name = next(iter(kind.readers))
     fixes = bench.peer.create_publisher(message_class(type_name), '/fix', lockstep_qos())
-    said = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
-    bench.spin_until(lambda: fixes.get_subscription_count() and said.get_subscription_count())
+    publisher = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
+    bench.spin_until(lambda: fixes.get_subscription_count() and publisher.get_subscription_count())
 
     def send(publisher, message):
         before = node._meter.received.total()
@@ -171,7 +173,7 @@ def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(m
     send(fixes, fix(1, 'buoy'))
     assert node._meter.refused['frame'] == 1
     assert "'buoy' is not the frame 'map' of the tracks, and no fixed" in capfd.readouterr().err
-    send(said, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
+    send(publisher, transform('buoy', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 90.0)))
     send(fixes, fix(2, 'buoy'))
     assert node._meter.refused['frame'] == 1
     send(fixes, fix(4, 'odom'))

@@ -101,10 +101,10 @@ def an_estimate(ids, states, above=0.02):
 
 
 def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
-    one = an_estimate([7], [1])
+    estimate = an_estimate([7], [1])
     # 1.0 to 4.5 m below a sonar at z = -20.
-    assert band(one, 0) == (-24.5, -21.0)
-    bar, ball, label = write_markers(one, [0], make).markers
+    assert band(estimate, 0) == (-24.5, -21.0)
+    bar, ball, label = write_markers(estimate, [0], make).markers
     assert (bar.ns, bar.type, bar.id, bar.action) == ('band', Marker.CUBE, 7, Marker.ADD)
     assert bar.scale.z == 3.5 and bar.pose.position.z == -22.75
     assert ball.type == Marker.SPHERE and ball.pose.position.z == -23.0
@@ -141,9 +141,11 @@ def test_colours_tell_above_from_below_from_unknown():
 
 @pytest.mark.parametrize('risk, colour', [(0.01, 'g'), (0.5, 'r'), (np.nan, None)])
 def test_the_ball_tells_how_probable_a_collision_is(risk, colour):
-    one = an_estimate([1], [1])
-    one = evolve(one, extras={**one.extras, 'collision_probability': np.array([risk])})
-    _, ball, label = write_markers(one, [0], make).markers
+    estimate = an_estimate([1], [1])
+    estimate = evolve(
+        estimate, extras={**estimate.extras, 'collision_probability': np.array([risk])}
+    )
+    _, ball, label = write_markers(estimate, [0], make).markers
     strongest = max('rgb', key=lambda name: getattr(ball.color, name))
     if colour is None:
         assert ball.color.r == ball.color.g == ball.color.b and 'collision' not in label.text
@@ -176,15 +178,18 @@ def test_reset_deletes_all_markers(rig):
 
 def test_the_node_says_what_the_tracker_says(rig):
     received = [
-        one.measurement for one in simulate(scenario('late', {'last_range': 60.0}), 3).measurements
+        item.measurement
+        for item in simulate(scenario('late', {'last_range': 60.0}), 3).measurements
     ]
     # A Range holds the altitude as a float32.
     received = [
-        evolve(one, altitude=float(np.float32(one.altitude))) if isinstance(one, Altitude) else one
-        for one in received
+        evolve(item, altitude=float(np.float32(item.altitude)))
+        if isinstance(item, Altitude)
+        else item
+        for item in received
     ]
     tracker = ObstacleTracker(ObstacleConfig())
-    wanted = [one for each in received for one in tracker.process(each)]
+    wanted = [estimate for each in received for estimate in tracker.process(each)]
     for each in received:
         rig.send(each)
     rig.bench.spin_until(lambda: len(rig.tables) == len(wanted))
@@ -264,20 +269,20 @@ def test_places_far_from_the_origin_keep_their_centimetres():
 
 def test_places_of_the_tracker_are_not_rounded_either():
     config = scenario('late', {'last_range': 60.0})
-    near = [one.measurement for one in simulate(config, 3).measurements]
+    near = [item.measurement for item in simulate(config, 3).measurements]
     shift = np.array([500_000.0, 9_000_000.0, 0.0])
     far = [
-        evolve(one, position=one.position + shift) if isinstance(one, Navigation) else one
-        for one in near
+        evolve(item, position=item.position + shift) if isinstance(item, Navigation) else item
+        for item in near
     ]
     trackers = ObstacleTracker(ObstacleConfig()), ObstacleTracker(ObstacleConfig())
     runs = [
-        [estimate for one in scene for estimate in tracker.process(one)]
+        [estimate for item in scene for estimate in tracker.process(item)]
         for tracker, scene in zip(trackers, (near, far))
     ]
     assert any(len(estimate) for estimate in runs[0])
-    for one, other in zip(*runs, strict=True):
-        np.testing.assert_allclose(other.xyz - shift, one.xyz, atol=1e-4)
+    for run, other in zip(*runs, strict=True):
+        np.testing.assert_allclose(other.xyz - shift, run.xyz, atol=1e-4)
 
 
 def test_what_was_passed_is_on_the_map(rig):

@@ -54,8 +54,8 @@ def allowed(name, node):
     for group in profile:
         ((rule, word),) = group.attrib.items()
         assert word == 'ALLOW'
-        names = [one.text.replace('~', f'/{node.get_name()}') for one in group]
-        assert not any('*' in one for one in names)  # nothing wholesale
+        names = [item.text.replace('~', f'/{node.get_name()}') for item in group]
+        assert not any('*' in name for name in names)  # nothing wholesale
         rules[group.tag, rule] = set(names)
     return rules
 
@@ -64,7 +64,7 @@ def allowed(name, node):
 def test_a_policy_allows_what_its_node_does_and_nothing_else(name, make_bench):
     bench = make_bench('-p', 'use_sim_time:=true', *EXTRA.get(name, []))
     node = bench.add(NODES[name](context=bench.context))
-    told = allowed(name, node)
+    given = allowed(name, node)
     who = node.get_name(), node.get_namespace()
     graph = {
         ('topics', 'publish'): node.get_publisher_names_and_types_by_node,
@@ -76,14 +76,14 @@ def test_a_policy_allows_what_its_node_does_and_nothing_else(name, make_bench):
         # The graph hears of a node's own endpoints a little later.
         with contextlib.suppress(AssertionError):
             bench.spin_until(
-                lambda rule=rule, ask=ask: told.get(rule, set()) == {n for n, _ in ask(*who)}, 5.0
+                lambda rule=rule, ask=ask: given.get(rule, set()) == {n for n, _ in ask(*who)}, 5.0
             )
-        assert told.get(rule, set()) == {one for one, _ in ask(*who)}, rule
-    assert '/rosout' in told['topics', 'publish']
-    assert '/parameter_events' in told['topics', 'publish']
-    assert '/clock' in told['topics', 'subscribe']
-    assert f'/{name}/get_type_description' in told['services', 'reply']
+        assert given.get(rule, set()) == {item for item, _ in ask(*who)}, rule
+    assert '/rosout' in given['topics', 'publish']
+    assert '/parameter_events' in given['topics', 'publish']
+    assert '/clock' in given['topics', 'subscribe']
+    assert f'/{name}/get_type_description' in given['services', 'reply']
 
 
 def test_every_node_has_a_policy():
-    assert {one.stem for one in FOLDER.iterdir()} == NODES.keys()
+    assert {path.stem for path in FOLDER.iterdir()} == NODES.keys()

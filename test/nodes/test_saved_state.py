@@ -32,8 +32,10 @@ pytestmark = pytest.mark.usefixtures('walker')
 def start(make_bench, tmp_path):
     """Start a rig whose node keeps its state in `tmp_path`, with more parameters."""
 
-    def begin(*told, file='state'):
-        words = [word for one in (f'state_file:={tmp_path / file}', *told) for word in ('-p', one)]
+    def begin(*given, file='state'):
+        words = [
+            word for item in (f'state_file:={tmp_path / file}', *given) for word in ('-p', item)
+        ]
         return Rig(make_bench(*words))
 
     return begin
@@ -76,7 +78,7 @@ def test_a_node_that_is_started_again_goes_on(start, tmp_path):
     rig = start()
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
     end(rig)
-    assert [one.name for one in tmp_path.iterdir()] == ['state']
+    assert [path.name for path in tmp_path.iterdir()] == ['state']
     again = start()
     again.send(a_fix(2.0, 2.0, 8.0), a_fix(3.0, 4.0, 4.0), a_fix(4.0, 2.0, 0.0, 'odom'))
     assert again.means() == [(3.0, 2.0, 4.0)]

@@ -77,7 +77,7 @@ def test_a_start_begins_a_track_and_a_useless_one_is_refused_by_name(make_bench,
         send(initial, bad)
     assert node._meter.refused == {'nan': 1, 'no_covariance': 1, 'frame': 1}
     assert node._meter.received == {'initial': 4, 'fix': 1} and len(estimates) == 2
-    said = capfd.readouterr().err
-    assert "the frame 'odom' is not the frame 'map' of the tracks" in said
-    assert 'the start has no covariance of x and y' in said
-    assert 'the start has a position that is not finite' in said
+    errors = capfd.readouterr().err
+    assert "the frame 'odom' is not the frame 'map' of the tracks" in errors
+    assert 'the start has no covariance of x and y' in errors
+    assert 'the start has a position that is not finite' in errors

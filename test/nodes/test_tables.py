@@ -66,19 +66,19 @@ CASES = [
 def test_what_arrives_is_what_was_published_whatever_came_before(repeat):
     paper = Paper()
     publisher = TablePublisher(paper)
-    for told in CASES:
+    for case in CASES:
         for _ in range(repeat):
-            publisher.publish(table(**told))
-            assert isinstance(paper.sent[-1], bytes) and paper.message == table(**told)
+            publisher.publish(table(**case))
+            assert isinstance(paper.sent[-1], bytes) and paper.message == table(**case)
 
 
 def test_a_table_whose_bytes_are_not_understood_is_published_as_any_other_message(monkeypatch):
     monkeypatch.setattr('sonar_imm.nodes.outputs._STAMP', 8)
     paper = Paper()
     publisher = TablePublisher(paper)
-    for told in CASES:
-        publisher.publish(table(**told))
-        assert paper.sent[-1] == table(**told)
+    for case in CASES:
+        publisher.publish(table(**case))
+        assert paper.sent[-1] == table(**case)
 
 
 def test_every_answer_has_its_counts_and_its_stamp():

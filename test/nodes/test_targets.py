@@ -59,7 +59,7 @@ def parsed(sentence):
     return pynmea2.parse(sentence, check=True)
 
 
-def heard(listening):
+def sentences(listening):
     """All sentences that have arrived, parsed, their sums checked."""
     found = []
     listening.setblocking(False)
@@ -123,7 +123,7 @@ PLACES = [(54.25, 10.5), (-33.9999999, -151.25), (0.01, 179.9999999)]
 def test_latitude_and_longitude_arrive(plotter, latitude, longitude):
     origin = Origin(latitude, longitude)
     targets(plotter).send(divers(states=(2,)), origin)
-    (sentence,) = heard(plotter)
+    (sentence,) = sentences(plotter)
     expected = origin.geodetic(np.array([100.0, -50.0, -8.0]))
     assert sentence.sentence_type == 'TLL'
     assert sentence.latitude == pytest.approx(expected[0], abs=2e-7)
@@ -136,7 +136,7 @@ def test_distance_and_bearing_are_over_ground_and_clockwise(plotter):
     """Ten degrees to port is 350 clockwise from the bow; 5 m away and 3 m below is 4 m over
     ground."""
     targets(plotter, 'ttm').send(obstacles(np.radians(10.0), (0.0, -2.0)), None)
-    (sentence,) = heard(plotter)
+    (sentence,) = sentences(plotter)
     assert sentence.sentence_type == 'TTM'
     assert float(sentence.distance) * 1852.0 == pytest.approx(4.0, abs=0.1)
     assert sentence.data[2:10] == ['350.0', 'R', '3.9', '180.0', 'T', '0.1000', '1.5', 'N']
@@ -147,7 +147,7 @@ def test_distance_and_bearing_are_over_ground_and_clockwise(plotter):
 def test_what_is_not_known_stays_empty(plotter):
     unknown = obstacles(0.0, (np.nan, np.nan), np.nan)
     targets(plotter, 'ttm').send(unknown, None)
-    (sentence,) = heard(plotter)
+    (sentence,) = sentences(plotter)
     assert sentence.data[4:6] == ['', '']
     assert float(sentence.distance) * 1852.0 == pytest.approx(5.0, abs=0.1)
 
@@ -157,7 +157,7 @@ def test_a_diver_is_a_virtual_special_mark_of_ais(plotter, latitude, longitude):
     """Of which AIS knows a ten thousandth of a minute, and that it is better than 10 m."""
     origin = Origin(latitude, longitude)
     targets(plotter, 'ais').send(divers(), origin)
-    (message,) = heard(plotter)
+    (message,) = sentences(plotter)
     expected = origin.geodetic(np.array([100.0, -50.0, -8.0]))
     assert (message.msg_type, message.virtual_aid, message.accuracy) == (21, True, True)
     assert message.lat == pytest.approx(expected[0], abs=1.5e-6)
@@ -176,7 +176,7 @@ def test_an_obstacle_is_an_isolated_danger_with_an_identity_of_its_own(plotter):
         Targets(address(plotter), 'ais', 1.0, 'OBSTACLE', print, name).send(
             uncertain, Origin(54.0, 10.0)
         )
-    found = heard(plotter)
+    found = sentences(plotter)
     assert {m.aid_type for m in found} == {pyais.constants.NavAid.ISOLATED_DANGER}
     assert {(m.name, m.accuracy) for m in found} == {('OBSTACLE112', False)}
     identities = [f'{m.mmsi:09d}' for m in found]
@@ -189,7 +189,7 @@ def test_ais_falls_silent_about_a_track_that_is_over(plotter):
     for ids in ((3, 4), (4,), ()):
         sender.send(divers(ids, (1,) * len(ids)), Origin(54.0, 10.0))
     sender.close()
-    assert [m.name for m in heard(plotter)] == ['DIVER3', 'DIVER4', 'DIVER4']
+    assert [m.name for m in sentences(plotter)] == ['DIVER3', 'DIVER4', 'DIVER4']
 
 
 def test_ais_without_its_library_is_a_sentence(make_bench, monkeypatch):
@@ -207,7 +207,7 @@ def test_a_track_that_is_over_is_sent_once_as_lost(plotter, monkeypatch):
     for ids in ((3, 4), (4,), (4,), ()):
         sender.send(divers(ids, (1,) * len(ids)), origin)
         now[0] += 1.0
-    found = [(s.target_name, s.data[-2]) for s in heard(plotter)]
+    found = [(s.target_name, s.data[-2]) for s in sentences(plotter)]
     assert found == [
         *[('DIVER3', 'T'), ('DIVER4', 'T')],
         *[('DIVER4', 'T'), ('DIVER3', 'L')],
@@ -223,7 +223,7 @@ def test_rounds_keep_their_distance_and_tentative_tracks_stay_at_home(plotter, m
     for _ in range(40):  # 4 s at 10 Hz
         sender.send(divers((1, 2), (0, 1)), Origin(54.0, 10.0))
         now[0] += 0.1
-    assert [s.target_name for s in heard(plotter)] == ['DIVER2'] * 4
+    assert [s.target_name for s in sentences(plotter)] == ['DIVER2'] * 4
 
 
 def test_all_are_lost_when_the_tracker_starts_afresh(plotter):
@@ -231,13 +231,13 @@ def test_all_are_lost_when_the_tracker_starts_afresh(plotter):
     sender.send(divers(), Origin(54.0, 10.0))
     sender.forget()
     sender.close()
-    assert [s.data[-2] for s in heard(plotter)] == ['T', 'L']
+    assert [s.data[-2] for s in sentences(plotter)] == ['T', 'L']
 
 
 @pytest.mark.parametrize('form', ['tll', 'ais'])
 def test_without_an_origin_nothing_is_sent(plotter, form):
     targets(plotter, form).send(divers(), None)
-    assert heard(plotter) == []
+    assert sentences(plotter) == []
 
 
 def test_who_does_not_listen_is_said_once_and_found_when_he_comes():
@@ -254,7 +254,7 @@ def test_who_does_not_listen_is_said_once_and_found_when_he_comes():
         listening.bind(where)
         sender.send(divers(), origin)
         sender.send(divers(), origin)
-        assert 'DIVER3' in {s.target_name for s in heard(listening)}
+        assert 'DIVER3' in {s.target_name for s in sentences(listening)}
     assert not sender.trouble
     sender.close()
 
@@ -302,7 +302,7 @@ def test_a_node_sends_its_divers_to_a_plotter(make_bench, plotter):
         )
         publisher.publish(write_geodetic(fix, make))
         bench.spin_until(lambda step=step: node.answer()['messages'] > step)
-        found += heard(plotter)
+        found += sentences(plotter)
         # Many fixes come in a period: what is there was sent when the diver was further back.
         if step >= 29 and found:
             east, north, _ = origin.local(found[-1].latitude, found[-1].longitude)
@@ -312,7 +312,7 @@ def test_a_node_sends_its_divers_to_a_plotter(make_bench, plotter):
         pytest.fail(f'{len(found)} targets, none of them where the diver was')
     assert not node.work_report()['warnings']
     node.release()
-    assert [s.data[-2] for s in heard(plotter)][-1:] == ['L']
+    assert [s.data[-2] for s in sentences(plotter)][-1:] == ['L']
 
 
 def test_a_type_that_is_not_installed_is_a_sentence(make_bench):

@@ -51,16 +51,16 @@ def test_the_best_weight_is_that_of_a_grid(seed: int) -> None:
 
 def test_weights_at_the_ends_and_in_the_middle() -> None:
     same, wide = np.eye(2), 4.0 * np.eye(2)
-    zero, one = np.zeros(2), np.ones(2)
-    assert covariance_intersection(zero, same, one, wide).weight == 1.0
-    assert covariance_intersection(zero, wide, one, same).weight == 0.0
-    twice = covariance_intersection(zero, same, one, same)
+    zero, unit = np.zeros(2), np.ones(2)
+    assert covariance_intersection(zero, same, unit, wide).weight == 1.0
+    assert covariance_intersection(zero, wide, unit, same).weight == 0.0
+    twice = covariance_intersection(zero, same, unit, same)
     assert twice.weight == 0.5
     # Twice the same is not twice as sure.
     assert twice.P == pytest.approx(same) and twice.x == pytest.approx([0.5, 0.5])
     assert best_weight(np.array([4.0, 0.25])) == pytest.approx(0.5)
     with pytest.raises(np.linalg.LinAlgError):
-        covariance_intersection(zero, same, one, -same)
+        covariance_intersection(zero, same, unit, -same)
 
 
 @pytest.mark.parametrize('correlation', [-1.0, -0.9, -0.5, 0.0, 0.5, 0.9, 1.0])
@@ -212,8 +212,8 @@ def test_two_runs_are_one_that_can_be_scored(
 ) -> None:
     out = runs / 'both'
     assert main(['fuse', str(runs / 'a'), str(runs / 'b'), str(out), '--json']) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said['pairs'] == [[1, 1]] and said['fused_rows'] > 50
+    content = json.loads(capsys.readouterr().out)
+    assert content['pairs'] == [[1, 1]] and content['fused_rows'] > 50
     scores = {}
     for name in ('a', 'b', 'both'):
         assert main(['evaluate', str(runs / name)]) in (0, 1)
@@ -226,8 +226,8 @@ def test_two_runs_are_one_that_can_be_scored(
 def test_the_same_command_writes_the_same_bytes(runs: Path) -> None:
     for name in ('one', 'two'):
         assert main(['fuse', str(runs / 'a'), str(runs / 'b'), str(runs / name)]) == 0
-    one, two = ((runs / name / 'estimate.csv').read_bytes() for name in ('one', 'two'))
-    assert one == two
+    item, two = ((runs / name / 'estimate.csv').read_bytes() for name in ('one', 'two'))
+    assert item == two
 
 
 def test_what_does_not_fit_is_said(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

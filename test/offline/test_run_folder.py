@@ -56,7 +56,7 @@ def test_the_csv_has_the_columns_of_the_contract_and_exact_numbers(folder):
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ['stamp_ns', *ESTIMATES[0].columns()]
     assert int(rows[0]['stamp_ns']) == START_NS
-    assert [float(row['px']) for row in rows] == [one.state[0, 0] for one in ESTIMATES]
+    assert [float(row['px']) for row in rows] == [estimate.state[0, 0] for estimate in ESTIMATES]
     assert rows[0]['track_id'] == '7'
 
 

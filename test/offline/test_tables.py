@@ -41,9 +41,9 @@ def test_parquet_has_the_columns_types_and_numbers_of_the_csv(tmp_path):
         CsvTable(tmp_path / 'table.csv') as text,
         ParquetTable(tmp_path / 'table.parquet', {'system': 'diver'}) as table,
     ):
-        for one in ESTIMATES:
+        for estimate in ESTIMATES:
             for each in (text, table):
-                each.write(one.stamp_ns, one.columns())
+                each.write(estimate.stamp_ns, estimate.columns())
         with pytest.raises(ValueError, match='columns change'):
             table.write(2, {'b': np.zeros(2)})
     read = parquet.read_table(tmp_path / 'table.parquet')

@@ -31,8 +31,10 @@ def made(seconds, x=0.0):
     return estimate_at(START_NS + round(seconds * SECOND), [[x, 0.0, 0.0, 0.0]], [1])
 
 
-def told(estimates):
-    return [((one.stamp_ns - START_NS) / SECOND, one.state[0, 0]) for one in estimates]
+def seconds_and_px(estimates):
+    return [
+        ((estimate.stamp_ns - START_NS) / SECOND, estimate.state[0, 0]) for estimate in estimates
+    ]
 
 
 def test_the_last_word_on_a_stamp_wins_and_stamps_come_in_order():
@@ -40,12 +42,12 @@ def test_the_last_word_on_a_stamp_wins_and_stamps_come_in_order():
     final = revisions.add([made(1, 1.0)]) + revisions.add([made(3, 1.0)])
     final += revisions.add([made(2, 5.0), made(3, 2.0)])
     assert final == []
-    assert told(revisions.finish()) == [(1, 1.0), (2, 5.0), (3, 2.0)]
+    assert seconds_and_px(revisions.finish()) == [(1, 1.0), (2, 5.0), (3, 2.0)]
 
 
 def test_what_can_no_longer_change_is_let_go():
     revisions = Revisions(2 * SECOND)
-    final = [told(revisions.add([made(k)])) for k in range(5)]
+    final = [seconds_and_px(revisions.add([made(k)])) for k in range(5)]
     assert final == [[], [], [], [(0, 0.0)], [(1, 0.0)]]
 
 
@@ -58,8 +60,13 @@ def test_memory_does_not_grow_with_the_recording():
 
 def test_a_restarted_clock_begins_anew_and_loses_nothing():
     revisions = Revisions(2 * SECOND)
-    final = [one for k in (100, 101, 5, 6) for one in revisions.add([made(k)])]
-    assert told([*final, *revisions.finish()]) == [(100, 0.0), (101, 0.0), (5, 0.0), (6, 0.0)]
+    final = [item for k in (100, 101, 5, 6) for item in revisions.add([made(k)])]
+    assert seconds_and_px([*final, *revisions.finish()]) == [
+        (100, 0.0),
+        (101, 0.0),
+        (5, 0.0),
+        (6, 0.0),
+    ]
 
 
 def test_shuffled_input_gives_the_same_estimates_as_sorted(tmp_path):
@@ -130,9 +137,9 @@ def test_the_smoother_is_nearer_to_the_truth(tmp_path):
             estimates = list(
                 OfflineRun(bag, DIVER, CONFIG, InputOptions(smooth=smooth)).estimates()
             )
-        rows = [one for one in estimates if len(one)]
-        times = np.array([(one.stamp_ns - START_NS) / SECOND for one in rows])
-        place = np.array([one.state[0, :2] for one in rows])
+        rows = [estimate for estimate in estimates if len(estimate)]
+        times = np.array([(row.stamp_ns - START_NS) / SECOND for row in rows])
+        place = np.array([row.state[0, :2] for row in rows])
         truth = legs(np.arange(120) * 1.0)[np.rint(times).astype(int), :2]
         errors[smooth] = np.sqrt(np.mean(np.sum((place - truth) ** 2, axis=1)))
     assert errors[True] < 0.9 * errors[False]
@@ -147,5 +154,5 @@ def test_what_a_live_tracker_published_ends_as_the_offline_run(tmp_path):
             published += tracker.process(measurement)
     assert len(published) > len(offline)
     live = final_estimates(published, CONFIG)
-    assert [one.stamp_ns for one in live] == [one.stamp_ns for one in offline]
+    assert [item.stamp_ns for item in live] == [item.stamp_ns for item in offline]
     assert all((a.state == b.state).all() for a, b in zip(live, offline))

@@ -54,12 +54,12 @@ def walk(cells, parts, step, reach):
     return matrix
 
 
-def transition(states, one, two, birth, end, anywhere, cells):
+def transition(states, single, two, birth, end, anywhere, cells):
     """Chance (N, N) from a state, row, to a state, column."""
     matrix = np.zeros((len(states), len(states)))
     for (a, before), (b, after) in itertools.product(enumerate(states), repeat=2):
         if len(before) == len(after) == 1:
-            moved = (1.0 - anywhere) * one[before[0], after[0]] + anywhere / cells
+            moved = (1.0 - anywhere) * single[before[0], after[0]] + anywhere / cells
             matrix[a, b] = (1.0 - birth) * moved
         elif len(before) == len(after) == 2:
             moved = (1.0 - anywhere) * two[before[0], after[0]] * two[before[1], after[1]]

@@ -109,12 +109,12 @@ def test_a_damaged_chunk_is_named_and_costs_only_itself(long, tmp_path):
     for start, after in zip(starts, [*starts[1:], end]):
         for at in (0, 1, 9 + 16, 9 + 24, 9 + 28, (after - start) // 2):
             file.write_bytes(flipped(data, 8 * (start + at)))
-            (_, found), (said,) = content(file)
+            (_, found), (message,) = content(file)
             assert 0.5 * len(whole) < len(found) <= len(whole)
             assert [item for item in whole if item in set(found)] == found
-            assert f'at byte {start}' in said or len(found) == len(whole), said
+            assert f'at byte {start}' in message or len(found) == len(whole), message
             if len(found) < len(whole):
-                assert f'{len(found)} of {len(whole)} messages were recovered' in said
+                assert f'{len(found)} of {len(whole)} messages were recovered' in message
 
 
 def test_damage_beside_the_messages_costs_none(long, tmp_path):
@@ -124,9 +124,9 @@ def test_damage_beside_the_messages_costs_none(long, tmp_path):
     file = tmp_path / 'spoilt.mcap'
     for at in (12, 30, summary - 30, summary - 2, summary + 20, len(data) - 15, len(data) - 3):
         file.write_bytes(flipped(data, 8 * at))
-        found, (said,) = content(file)
+        found, (message,) = content(file)
         assert found[1] == whole[1], at
-        assert f'beside its messages; all {len(whole[1])} messages were recovered' in said
+        assert f'beside its messages; all {len(whole[1])} messages were recovered' in message
 
 
 def test_a_chunk_is_checked_where_the_file_as_a_whole_has_no_checksum(long, tmp_path):
@@ -139,10 +139,10 @@ def test_a_chunk_is_checked_where_the_file_as_a_whole_has_no_checksum(long, tmp_
     file = tmp_path / 'spoilt.mcap'
     file.write_bytes(flipped(data, 8 * (starts[1] + 5000)))
     RosbagsSource(file).close()  # nothing is noticed at the start
-    (_, found), (said,) = content(file)
+    (_, found), (message,) = content(file)
     assert 0.5 * len(whole) < len(found) < len(whole) and set(found) < set(whole)
     assert found == sorted(found, key=lambda item: item[1])
-    assert f'at byte {starts[1]}' in said
+    assert f'at byte {starts[1]}' in message
     with pytest.raises(BagError, match='checksum|damaged'), BagReader(file, strict=True) as bag:
         list(bag.messages())
 

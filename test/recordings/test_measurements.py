@@ -79,18 +79,21 @@ def test_inputs_are_found_by_type_and_last_name(mixed):
 
 def test_measurements_and_rejections_come_in_recorded_order(mixed):
     with BagReader(mixed) as bag:
-        heard = list(measurements_of(bag, 'diver'))
-        assert [(item.topic, item.log_ns) for item in heard] == [
+        received = list(measurements_of(bag, 'diver'))
+        assert [(item.topic, item.log_ns) for item in received] == [
             ('/usbl/fix', 1),
             ('/usbl/fix', 2),
             ('/usbl/fix', 3),
             ('/usbl/fix', 4),
             ('/arrivals', 5),
         ]
-        kinds = [type(item.measurement) for item in heard]
+        kinds = [type(item.measurement) for item in received]
         assert kinds == [Fix, Fix, Rejection, Fix, Arrivals]
-        assert heard[2].measurement.reason == 'bad_covariance'
-        assert heard[1].measurement.covariance is None and heard[3].measurement.covariance is None
+        assert received[2].measurement.reason == 'bad_covariance'
+        assert (
+            received[1].measurement.covariance is None
+            and received[3].measurement.covariance is None
+        )
         assert bag.problems == [
             'topic /usbl/fix: 1 messages have a covariance of zeros, which is taken as unknown'
         ]
@@ -98,8 +101,8 @@ def test_measurements_and_rejections_come_in_recorded_order(mixed):
 
 def test_a_topic_map_chooses(mixed):
     with BagReader(mixed) as bag:
-        heard = list(measurements_of(bag, 'diver', {'/pose': 'fix'}, world_frame='ned'))
-        assert len(heard) == 1 and heard[0].measurement.position.tolist() == [2.0, 5.0, 0.0]
+        received = list(measurements_of(bag, 'diver', {'/pose': 'fix'}, world_frame='ned'))
+        assert len(received) == 1 and received[0].measurement.position.tolist() == [2.0, 5.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -138,5 +141,5 @@ def test_one_topic_with_two_types_is_rejected_message_by_message(tmp_path, fix_m
         bag.write('/fix', fix_message(0), 1)
         bag.write('/fix', ros_message('std_msgs/msg/String'), 2)
     with BagReader(tmp_path / 'bag') as bag:
-        heard = [item.measurement for item in measurements_of(bag, 'diver')]
-    assert isinstance(heard[0], Fix) and heard[1].reason == 'bad_type'
+        received = [item.measurement for item in measurements_of(bag, 'diver')]
+    assert isinstance(received[0], Fix) and received[1].reason == 'bad_type'

@@ -47,8 +47,8 @@ def test_drawn_cross_spectra_have_no_window():
     # The length of a snapshot, which the tracker would choose by itself, is part of the scene.
     common = {'snapshot_seconds': 1.4, 'sound_speed_std': 0.0}
     assert unusual(fathometer_scenario('drift_traces').instruments(), config) == common
-    told = unusual(fathometer_scenario('drift_spectra').instruments(), config)
-    assert told == common | {'window': 'rectangular', 'overlap': 0.0}
+    given = unusual(fathometer_scenario('drift_spectra').instruments(), config)
+    assert given == common | {'window': 'rectangular', 'overlap': 0.0}
 
 
 def test_the_file_is_one_of_ros(tmp_path):
@@ -129,8 +129,8 @@ def test_a_sweep_knows_the_instruments_of_its_scene(tmp_path):
         )
         == 0
     )
-    told = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
-    assert told['sonar_lever'] == [2.0, 0.0, -0.3]
+    given = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
+    assert given['sonar_lever'] == [2.0, 0.0, -0.3]
 
 
 # -- the limit ------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def write_bag(path, records):
     """A bag as its recorder writes it: with the definitions of its types."""
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {}
-        for stamp_ns, topic, message in sorted(records, key=lambda one: one[0]):
+        for stamp_ns, topic, message in sorted(records, key=lambda item: item[0]):
             name = message.__msgtype__
             if topic not in links:
                 links[topic] = writer.add_connection(topic, name, typestore=typestore())
@@ -124,7 +124,7 @@ def test_a_driver_without_its_package_is_tracked_from_the_vessel(tmp_path, kind)
     assert last.stamp_ns == (START + 19) * SECOND
     assert last.state[0, :2] == pytest.approx([10.0, 20.0], abs=0.3)
     with BagReader(bag) as reader:
-        found = {one['name']: one['suits'] for one in inspect(reader)['topics']}
+        found = {item['name']: item['suits'] for item in inspect(reader)['topics']}
     assert found['/usbl/relative'] == ['diver relative'] and 'diver nav' in found['/nav']
 
 
@@ -154,14 +154,14 @@ def geo(k, topic='/fix', status=0, x=None, frame_id='gps'):
 def test_navsatfix_is_tracked_and_what_says_nothing_is_named_and_counted(tmp_path):
     records = [geo(k, status=-1 if k % 5 == 0 else 0) for k in range(1, 30)]
     polls = [geo(k, x=0.7 * 7) for k in (8,)]
-    records = [one for one in records if one[0] != polls[0][0]] + polls
+    records = [record for record in records if record[0] != polls[0][0]] + polls
     run, estimates = tracked(
         write_bag(tmp_path / 'bag', records),
         tmp_path / 'run',
         origin_latitude=59.0,
         origin_longitude=10.0,
     )
-    assert {reason: one['count'] for reason, one in run['refused'].items()} == {
+    assert {reason: item['count'] for reason, item in run['refused'].items()} == {
         'no_fix': 5,
         'repeated': 1,
     }
@@ -175,13 +175,13 @@ def test_navsatfix_is_tracked_and_what_says_nothing_is_named_and_counted(tmp_pat
 def test_the_gps_of_a_vessel_is_not_taken_for_a_diver(tmp_path):
     def fix(k):
         position = (0.5 * k, 0.1, 0.0)
-        one = Fix(
+        item = Fix(
             stamp_ns=(START + k) * SECOND,
             position=position,
             covariance=0.04 * np.eye(2),
             frame_id='map',
         )
-        return one.stamp_ns, '/usbl/fix', write_fix(one, ros_message)
+        return item.stamp_ns, '/usbl/fix', write_fix(item, ros_message)
 
     records = [fix(k) for k in range(1, 10)] + [geo(k, '/gps/fix') for k in range(1, 10)]
     bag = write_bag(tmp_path / 'bag', records)
@@ -212,8 +212,10 @@ def test_tags_by_topic_and_frame_have_their_own_tracks(tmp_path):
 
 def test_sensors_by_topic_have_their_own_numbers(tmp_path):
     def scan(k, sensor):
-        one = Fixes(stamp_ns=(START + k) * SECOND, position=[[0.4 * k, 0.0, 0.0]], frame_id='map')
-        return one.stamp_ns, f'/{sensor}/fixes', write_scan(one, ros_message)
+        fixes = Fixes(
+            stamp_ns=(START + k) * SECOND, position=[[0.4 * k, 0.0, 0.0]], frame_id='map'
+        )
+        return fixes.stamp_ns, f'/{sensor}/fixes', write_scan(fixes, ros_message)
 
     spread = {}
     for sensor in ('radar', 'lidar'):
@@ -255,7 +257,7 @@ def at(seconds, longitude, latitude, when):
     """Longitude and latitude `when`, s after the start, by fixes at `seconds`."""
     stamps = (START + np.array(seconds)) * SECOND
     positions = Positions(stamps, np.array(longitude), np.array(latitude))
-    return positions.at(np.array([round((START + one) * SECOND) for one in when]))
+    return positions.at(np.array([round((START + item) * SECOND) for item in when]))
 
 
 def test_a_place_between_two_fixes_goes_the_short_way_over_the_date_line():

@@ -293,8 +293,8 @@ class TestDamage:
                 bag.write_raw(topic, FIX, bytes(raw), i)
         items, problems = read(tmp_path / 'bag')
         assert [item.index for item in items] == [0, 2]
-        told = '/fix: 2 messages could not be decoded (the first: message 1,'
-        assert problems[0].startswith(f'topic {told}')
+        given = '/fix: 2 messages could not be decoded (the first: message 1,'
+        assert problems[0].startswith(f'topic {given}')
         assert problems[1].startswith('topic /other: 1 message could not be decoded')
         with pytest.raises(BagError, match='message 1'):
             read(tmp_path / 'bag', strict=True)
@@ -392,7 +392,7 @@ class TestTypes:
 
 
 @pytest.mark.parametrize(
-    'place, value, told',
+    'place, value, sentence',
     [
         (('topics_with_message_count', 0, 'message_count'), 'many', 'count that is no number'),
         (('topics_with_message_count', 0, 'topic_metadata', 'name'), [5], 'is no text'),
@@ -400,7 +400,9 @@ class TestTypes:
         (('files',), 'none', 'a list of files that is none'),
     ],
 )
-def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(write_fixes, place, value, told):
+def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(
+    write_fixes, place, value, sentence
+):
     path = write_fixes(3)
     metadata = yaml.safe_load((path / 'metadata.yaml').read_text())
     inside = metadata['rosbag2_bagfile_information']
@@ -410,4 +412,4 @@ def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(write_fixes, p
     (path / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
     items, problems = read(path)
     assert len(items) == 3
-    assert told in problems[0]
+    assert sentence in problems[0]

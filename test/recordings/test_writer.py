@@ -47,7 +47,9 @@ def test_a_compressed_bag_is_smaller_and_says_the_same(write_fixes):
     def content(path):
         with BagReader(path) as bag:
             assert not bag.problems
-            return [(one.topic, one.log_ns, bytes(one.raw)) for one in bag.messages()]
+            return [
+                (message.topic, message.log_ns, bytes(message.raw)) for message in bag.messages()
+            ]
 
     assert content(plain) == content(packed) and len(content(plain)) == 200
     sizes = [(path / f'{path.name}.mcap').stat().st_size for path in (plain, packed)]
@@ -65,12 +67,12 @@ def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_a_bag_is_there_as_a_whole_or_not_at_all(tmp_path, fix_message, storage):
-    told = {'diver': {'gate_probability': 0.9}}
+    values = {'diver': {'gate_probability': 0.9}}
     with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / 'bag', storage=storage) as bag:
         bag.write('/fix', fix_message(0), 5)
         raise KeyboardInterrupt
     assert not any(tmp_path.iterdir())
-    with BagWriter(tmp_path / 'bag', storage=storage, parameters=told) as bag:
+    with BagWriter(tmp_path / 'bag', storage=storage, parameters=values) as bag:
         bag.write('/fix', fix_message(0), 5)
         assert not (tmp_path / 'bag').exists()
     assert (tmp_path / 'bag' / 'parameters.yaml').is_file()

@@ -202,11 +202,11 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
     Ear(link, Float64, '/other')
     looks = []
 
-    def heard(publishers):
+    def subscribed(publishers):
         looks.append(publishers)
         return {p.topic_name for p in publishers if p.topic_name == '/fix' or len(looks) > 5}
 
-    monkeypatch.setattr(step, '_subscribed', heard)
+    monkeypatch.setattr(step, '_subscribed', subscribed)
     assert player._meet(15.0) == {'/fix', '/other'}
 
 
@@ -214,19 +214,19 @@ def test_a_step_waits_until_the_estimates_of_the_message_are_here(link):
     """The answer and the estimates come on two topics: which is first, nobody says."""
     recorder = []
     step = LockStep(link, '/walker', recorder=recorder)
-    said = []
+    lengths = []
 
     def spin(seconds):
-        said.append(len(recorder))
-        if len(said) == 1:
+        lengths.append(len(recorder))
+        if len(lengths) == 1:
             step._counts = Counts(messages=1, refused=0, estimates=2)
         else:
             recorder.append(b'an estimate')
 
     link.spin = spin
-    step._lost = lambda: 'the step never ends' if len(said) > 9 else None
+    step._lost = lambda: 'the step never ends' if len(lengths) > 9 else None
     step.follow(1, '/fix', 0.0)
-    assert said == [0, 0, 1] and len(step.delays) == 1
+    assert lengths == [0, 0, 1] and len(step.delays) == 1
 
 
 def test_recorded_estimates_read_back(link, start, stepping):

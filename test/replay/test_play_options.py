@@ -46,11 +46,11 @@ def test_a_file_of_qualities_of_service_says_what_it_says_and_the_rest_is_reliab
         '/rest: {}',
     )
     profiles = profiles_of('\n'.join(lines))
-    told = {
-        topic: (one.history.name, one.reliability.name, one.durability.name)
-        for topic, one in profiles.items()
+    values = {
+        topic: (profile.history.name, profile.reliability.name, profile.durability.name)
+        for topic, profile in profiles.items()
     }
-    assert told == {
+    assert values == {
         '/all': ('KEEP_ALL', 'RELIABLE', 'VOLATILE'),
         '/quick': ('KEEP_LAST', 'BEST_EFFORT', 'VOLATILE'),
         '/rest': ('KEEP_LAST', 'RELIABLE', 'VOLATILE'),

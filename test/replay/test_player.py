@@ -46,7 +46,7 @@ def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
     assert result.problems == ()
     positions = ear.positions(COUNT)
     np.testing.assert_array_equal(positions, [np.nan if k == 3 else k for k in range(COUNT)])
-    stamp = ear.heard[-1].header.stamp
+    stamp = ear.received[-1].header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == START + (COUNT - 1) * STEP
 
 
@@ -81,8 +81,8 @@ def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link
         assert link.wait_for(ear.subscription.get_publisher_count, 60.0)
         player.run()
         assert player.result().published == 11
-    link.wait_for(lambda: len(ear.heard) == 11, 5.0)
-    assert [round(message.pose.pose.position.x) for message in ear.heard] == list(range(5, 16))
+    link.wait_for(lambda: len(ear.received) == 11, 5.0)
+    assert [round(message.pose.pose.position.x) for message in ear.received] == list(range(5, 16))
 
 
 def test_the_pace_follows_the_log_times(bag, link, domain):
@@ -111,8 +111,8 @@ def test_the_clock_runs_along(bag, link, domain):
     ear = Ear(link, Clock, '/clock')
     Ear(link, PoseWithCovarianceStamped, '/fix')
     play(bag, PlayOptions(clock=100.0, topics=('/fix',)), domain_id=domain)
-    link.wait_for(lambda: len(ear.heard) >= 5, 10.0)
-    ticks = [tick.clock.sec * 10**9 + tick.clock.nanosec for tick in ear.heard]
+    link.wait_for(lambda: len(ear.received) >= 5, 10.0)
+    ticks = [tick.clock.sec * 10**9 + tick.clock.nanosec for tick in ear.received]
     assert ticks == sorted(ticks)
     assert START <= ticks[0] <= ticks[-1] <= START + COUNT * STEP
 
@@ -152,7 +152,7 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     thread.start()
     client = link.node.create_client(Trigger, f'/{NAME}/resume')
     assert link.wait_for(client.service_is_ready, 120.0)
-    assert not ear.heard
+    assert not ear.received
     future = client.call_async(Trigger.Request())
     assert link.wait_for(future.done, 120.0)
     thread.join(120.0)
@@ -201,8 +201,8 @@ def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
             writer.write(topic, (100 + k) * 10**9, types.serialize_ros1(message, name))
     ear = Ear(link, PointStamped, '/fix')
     assert play(tmp_path / 'old.bag', PlayOptions(rate=100.0), domain_id=domain).published == 3
-    assert link.wait_for(lambda: len(ear.heard) == 3, 10.0)
-    assert [(m.header.stamp.sec, m.header.frame_id, m.point.x) for m in ear.heard] == [
+    assert link.wait_for(lambda: len(ear.received) == 3, 10.0)
+    assert [(m.header.stamp.sec, m.header.frame_id, m.point.x) for m in ear.received] == [
         (100, 'map', 0.0),
         (101, 'map', 1.0),
         (102, 'map', 2.0),

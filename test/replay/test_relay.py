@@ -33,13 +33,13 @@ class Rig:
 
     def __init__(self, talker, link, topics=()):
         self.talker = talker.node
-        self.offered, self.gone, self.heard, self.watching = {}, [], [], set()
+        self.offered, self.gone, self.arrived, self.watching = {}, [], [], set()
         self.relay = Relay(
             link,
             topics,
             appeared=lambda name, kind, text: self.offered.update({name: (kind, text)}),
             vanished=self.gone.append,
-            received=lambda *message: self.heard.append(message),
+            received=lambda *message: self.arrived.append(message),
             watched=self.watching.__contains__,
         )
 
@@ -76,8 +76,8 @@ def test_a_topic_is_heard_only_while_it_is_watched(make_rig):
     rig.until(publisher.get_subscription_count)
     message = String(data='hello')
     publisher.publish(message)
-    rig.until(lambda: rig.heard)
-    ((name, _, raw),) = rig.heard
+    rig.until(lambda: rig.arrived)
+    ((name, _, raw),) = rig.arrived
     assert (name, raw) == ('/talk', serialize_message(message))
     rig.watching.clear()
     rig.until(lambda: not publisher.get_subscription_count())
@@ -90,7 +90,7 @@ def test_what_was_sent_before_and_is_kept_is_heard(make_rig):
     rig = make_rig('/kept')
     rig.talker.create_publisher(String, '/kept', latched_qos()).publish(String(data='early'))
     rig.watching.add('/kept')
-    rig.until(lambda: rig.heard)
+    rig.until(lambda: rig.arrived)
     assert list(rig.offered) == ['/kept']  # nothing but what was asked for
 
 

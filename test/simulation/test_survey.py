@@ -102,12 +102,12 @@ def test_neighbours_of_a_swath_share_a_third_of_their_noise():
 
 def test_the_same_seed_is_the_same_survey():
     config = scenario('survey', {'lines': 2, 'cross_lines': 1, 'length': 60.0})
-    one, again, other = simulate(config, 3), simulate(config, 3), simulate(config, 4)
-    for first, second in zip(one.points, again.points):
+    item, again, other = simulate(config, 3), simulate(config, 3), simulate(config, 4)
+    for first, second in zip(item.points, again.points):
         assert first['z'].tobytes() == second['z'].tobytes()
-    assert one.points[0]['z'].tobytes() != other.points[0]['z'].tobytes()
-    assert one.fish[1].sum() > 50 and (one.bad[1] >= one.fish[1]).all()
-    assert 0.005 < np.concatenate(one.bad[:1]).mean() < 0.1
+    assert item.points[0]['z'].tobytes() != other.points[0]['z'].tobytes()
+    assert item.fish[1].sum() > 50 and (item.bad[1] >= item.fish[1]).all()
+    assert 0.005 < np.concatenate(item.bad[:1]).mean() < 0.1
 
 
 def test_the_command_writes_lines_and_truth(tmp_path, capsys):

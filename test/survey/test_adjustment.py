@@ -176,11 +176,11 @@ def test_the_level_is_that_of_the_priors():
     assert found.value[offsets].sum() == pytest.approx(0.0, abs=1e-3)
     # Lines 0.2 m apart come together, whatever their level.
     assert np.diff(found.value[offsets]) == pytest.approx(-0.2, abs=0.06)
-    told = described(found, ['a', 'b', 'c'])
-    level = told['not_told'][0]
+    given = described(found, ['a', 'b', 'c'])
+    level = given['not_told'][0]
     assert level['share'] > 0.99
-    assert {row['line'] for row in told['parameters']} == {'', 'a', 'b', 'c'}
-    pitch = next(row for row in told['parameters'] if row['name'] == 'pitch_deg')
+    assert {row['line'] for row in given['parameters']} == {'', 'a', 'b', 'c'}
+    pitch = next(row for row in given['parameters'] if row['name'] == 'pitch_deg')
     assert pitch['told'] == pytest.approx(0.0, abs=1e-6)  # the floor is level: nothing tells it
 
 

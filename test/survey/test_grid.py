@@ -195,6 +195,7 @@ def test_the_vectors_with_the_corrections_of_the_prototype():
     assert both.sum() > 90 and np.nanmedian(near) < 0.45
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize(
     'terrain, slope, cell', [('flat', 0.0, 1.0), ('flat', 0.0, 5.0), ('slope', 0.1, 1.0)]
 )
@@ -218,8 +219,8 @@ def test_two_sigma_hold_the_truth_of_one_run(terrain, slope, cell):
 
 def test_the_budget_is_that_of_the_run():
     assert budget_of({}) == (BUDGET, 1500.0)
-    told = {'parameters': {'heave_std': 0.2, 'sound_speed': 1480.0, 'system': 'other'}}
-    found, speed = budget_of(told)
+    values = {'parameters': {'heave_std': 0.2, 'sound_speed': 1480.0, 'system': 'other'}}
+    found, speed = budget_of(values)
     assert found.heave == 0.2 and found.attitude == BUDGET.attitude and speed == 1480.0
 
 

@@ -40,8 +40,8 @@ LIMITS = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_the_hardest_message_of_each_kind_is_bounded(name):
-    told = measured(name)
+    given = measured(name)
     seconds, megabytes = LIMITS[name]
-    assert not told['refused']
-    assert 0.0 < told['cpu_s'] < seconds
-    assert told['memory_mb'] < megabytes
+    assert not given['refused']
+    assert 0.0 < given['cpu_s'] < seconds
+    assert given['memory_mb'] < megabytes

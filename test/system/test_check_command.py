@@ -122,7 +122,7 @@ def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bag, capsys, monkeypat
 
 
 def children(pid):
-    return [int(one) for one in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+    return [int(item) for item in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
 @pytest.mark.parametrize('how', [signal.SIGTERM, signal.SIGHUP])
@@ -138,6 +138,6 @@ def test_a_check_that_is_ended_takes_its_node_along(bag, how):
         assert check.poll() is None and time.monotonic() < limit
         time.sleep(0.01)
     check.send_signal(how)
-    _, said = check.communicate(timeout=300.0)
-    assert check.returncode == 128 + how and 'Traceback' not in said
+    _, printed = check.communicate(timeout=300.0)
+    assert check.returncode == 128 + how and 'Traceback' not in printed
     assert not any(Path(f'/proc/{node}').exists() for node in nodes)

@@ -40,16 +40,18 @@ def write_bag(path, alone):
     """Encounters with the place of the sonar on /tf_static: in a TFMessage, or, where tf2 is not
     installed, `alone` as a TransformStamped."""
     pose = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))
-    said = StaticTransforms(poses={'sonar': ('base_link', pose)})
-    message = write_transforms(said, ros_message)
-    entries = {one.measurement: one for one in inputs_of('obstacle')}
+    printed = StaticTransforms(poses={'sonar': ('base_link', pose)})
+    message = write_transforms(printed, ros_message)
+    entries = {item.measurement: item for item in inputs_of('obstacle')}
     received = simulate(scenario('approach', {}), 1).measurements[:300]
     with BagWriter(path, compressed=False, custom_data={}) as bag:
         first_ns = received[0].received_ns - 1
         bag.write('/tf_static', message.transforms[0] if alone else message, first_ns)
-        for one in received:
-            entry = entries[type(one.measurement)]
-            bag.write(f'/{entry.name}', entry.write(one.measurement, ros_message), one.received_ns)
+        for each in received:
+            entry = entries[type(each.measurement)]
+            bag.write(
+                f'/{entry.name}', entry.write(each.measurement, ros_message), each.received_ns
+            )
 
 
 def numbers(path):
@@ -65,14 +67,14 @@ def test_a_recorded_mounting_is_that_of_the_parameters(alone, tmp_path, capsys):
     bag = tmp_path / 'bag'
     write_bag(bag, alone)
     frames = ['--set', 'vehicle_frame=base_link', '--set', 'sonar_frame=sonar']
-    lever, rpy = (json.dumps(list(one)) for one in (LEVER, RPY))
+    lever, rpy = (json.dumps(list(item)) for item in (LEVER, RPY))
     by_hand = ['--set', f'sonar_lever={lever}', '--set', f'sonar_mount_rpy_deg={rpy}']
     deaf = ['--set', 'use_tf_static=false']
-    for name, told in (('told', frames), ('by_hand', by_hand), ('plain', deaf)):
-        assert main(['track', str(bag), str(tmp_path / name), '--system', 'obstacle', *told]) == 0
-    said = [numbers(tmp_path / name / 'estimate.csv') for name in ('told', 'by_hand', 'plain')]
-    assert said[0] == pytest.approx(np.array(said[1]), rel=1e-6, abs=1e-6)
-    assert np.shape(said[2]) != np.shape(said[0]) or not np.allclose(said[2], said[0])
+    for name, given in (('told', frames), ('by_hand', by_hand), ('plain', deaf)):
+        assert main(['track', str(bag), str(tmp_path / name), '--system', 'obstacle', *given]) == 0
+    tables = [numbers(tmp_path / name / 'estimate.csv') for name in ('told', 'by_hand', 'plain')]
+    assert tables[0] == pytest.approx(np.array(tables[1]), rel=1e-6, abs=1e-6)
+    assert np.shape(tables[2]) != np.shape(tables[0]) or not np.allclose(tables[2], tables[0])
     run = json.loads((tmp_path / 'told' / 'run.json').read_text())
     assert run['topics']['/tf_static'] == 'tf_static'
     assert run['mounting']['sonar_lever'] == list(LEVER)

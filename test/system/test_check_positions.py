@@ -34,8 +34,8 @@ pytestmark = pytest.mark.system
 @pytest.mark.parametrize('scene', ['usbl', 'geodetic'])
 def test_live_equals_offline(scene, tmp_path, capsys):
     bag = tmp_path / scene
-    told = ['--scenario', scene, '--seed', '3', '--set', 'duration=20']
-    assert main(['simulate', 'diver', str(bag), *told]) == 0
+    given = ['--scenario', scene, '--seed', '3', '--set', 'duration=20']
+    assert main(['simulate', 'diver', str(bag), *given]) == 0
     capsys.readouterr()
     out = tmp_path / 'out'
     wanted = ['--bag', str(bag), '--limit', '3', '--out', str(out), '--json']
@@ -48,22 +48,22 @@ def test_live_equals_offline(scene, tmp_path, capsys):
 
 def test_a_start_that_was_recorded_counts_live_and_offline(tmp_path, capsys):
     scene = simulate(scenario('irregular', {'duration': 30.0}), 3)
-    told = []
-    for k, one in enumerate(scene.measurements):
+    given = []
+    for k, item in enumerate(scene.measurements):
         if k in (4, 9):
-            place = one.measurement.position + ([0.2, 0.1, 0.0] if k == 4 else [400.0, 0.0, 0.0])
-            stamp, frame = one.measurement.stamp_ns, one.measurement.frame_id
+            place = item.measurement.position + ([0.2, 0.1, 0.0] if k == 4 else [400.0, 0.0, 0.0])
+            stamp, frame = item.measurement.stamp_ns, item.measurement.frame_id
             start = Start(stamp_ns=stamp, position=place, covariance=np.eye(2), frame_id=frame)
-            told.append(evolve(one, measurement=start))
-        told.append(one)
+            given.append(evolve(item, measurement=start))
+        given.append(item)
     bag, out = tmp_path / 'told', tmp_path / 'out'
-    write_scene(evolve(scene, measurements=tuple(told)), bag, provenance={})
+    write_scene(evolve(scene, measurements=tuple(given)), bag, provenance={})
     wanted = ['--bag', str(bag), '--limit', '1000', '--out', str(out), '--json']
     assert main(['check', 'diver', *wanted]) == 0
     (outcome,) = json.loads(capsys.readouterr().out)
     assert outcome['good']
     run = json.loads((out / 'told' / 'offline' / 'run.json').read_text())
-    assert run['topics']['/initial'] == 'initial' and run['counts']['used'] == len(told)
+    assert run['topics']['/initial'] == 'initial' and run['counts']['used'] == len(given)
     with (out / 'told' / 'offline' / 'estimate.csv').open() as lines:
         ids = {row['track_id']: float(row['px']) for row in csv.DictReader(lines)}
     assert len(ids) >= 2 and max(ids.values()) > 300.0  # the second start, 400 m away

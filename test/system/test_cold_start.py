@@ -33,7 +33,7 @@ ANSWER = 2.0
 """Seconds in which a service is answered."""
 
 
-@pytest.mark.parametrize('system', ['diver', 'bathymetry', 'obstacle'])
+@pytest.mark.parametrize('system', ['diver', 'obstacle'])
 def test_a_node_answers_and_reports_while_it_compiles(system, tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
     with contextlib.ExitStack() as stack:

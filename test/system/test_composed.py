@@ -68,15 +68,15 @@ def test_two_robots_in_one_process_have_their_own_parameters_and_end_cleanly(
                 assert process.poll() is None and time.monotonic() < end, log.read_text()
                 time.sleep(0.05)
             with Link('asker', domain_id=domain) as link:
-                told = [parameters(link, name) for name in nodes]
+                given = [parameters(link, name) for name in nodes]
             process.send_signal(how)
             assert process.wait(240.0) == 0, log.read_text()
         finally:
             if process.poll() is None:
                 process.kill()
-    assert told == [('harbour', 7.5), ('pier', 7.5), ('', 7.5)]
-    said = own_words(log.read_text())
-    assert 'Traceback' not in said and 'has no effect' not in said
+    assert given == [('harbour', 7.5), ('pier', 7.5), ('', 7.5)]
+    message = own_words(log.read_text())
+    assert 'Traceback' not in message and 'has no effect' not in message
 
 
 def parameters(link, name):

@@ -77,11 +77,11 @@ def offline(path, **parameters):
     tracker = system.build(system.config_type()(**parameters))
     guard, estimates = KnownFrames(), []
     with BagReader(path) as reader:
-        for heard in measurements_of(reader, 'diver'):
+        for received in measurements_of(reader, 'diver'):
             try:
-                if not isinstance(heard.measurement, Rejection):
-                    guard.admit(heard.measurement)
-                    estimates += tracker.process(heard.measurement)
+                if not isinstance(received.measurement, Rejection):
+                    guard.admit(received.measurement)
+                    estimates += tracker.process(received.measurement)
             except Rejection:
                 pass
     return estimates
@@ -152,8 +152,8 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
     ):
         assert node.process.wait(120.0) == 2
         own = ('[rcl]', 'kernels for ')
-        said = own_words(node.log()).splitlines()
-        lines = [line for line in said if not any(word in line for word in own)]
+        message = own_words(node.log()).splitlines()
+        lines = [line for line in message if not any(word in line for word in own)]
     assert len(lines) == 1
     assert sentence in lines[0]
 
@@ -163,8 +163,8 @@ def assert_clean_end(nodes, how):
         node.process.send_signal(how)
     for node in nodes:
         assert node.process.wait(120.0) == 0, node.log()
-        said = own_words(node.log())
-        assert 'Traceback' not in said and 'Error' not in said
+        message = own_words(node.log())
+        assert 'Traceback' not in message and 'Error' not in message
 
 
 def test_sigterm_ends_the_diver_node_cleanly():
@@ -175,16 +175,15 @@ def test_sigterm_ends_the_diver_node_cleanly():
 
 
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_end_a_node_cleanly_eight_times(how, monkeypatch):
+def test_signals_end_nodes_cleanly(how, monkeypatch):
     # the light tracker of the node tests starts fast; `run` is the same
     monkeypatch.setenv('PYTHONPATH', str(Path(__file__).parents[1]))
-    for _ in range(2):
-        with reserved_domain_id() as domain:
-            nodes = [
-                NodeProcess('walker', domain_id=domain, module='helpers.walker') for _ in range(4)
-            ]
-            wait_until_ready(nodes)
-            assert_clean_end(nodes, how)
+    with reserved_domain_id() as domain:
+        nodes = [
+            NodeProcess('walker', domain_id=domain, module='helpers.walker') for _ in range(4)
+        ]
+        wait_until_ready(nodes)
+        assert_clean_end(nodes, how)
 
 
 def test_a_node_under_nohup_outlives_its_terminal():
@@ -207,8 +206,10 @@ def test_modules_of_the_nodes_load_neither_scipy_nor_numba():
         'import sys, sonar_imm.nodes.diver; '
         'print([m for m in ("numba", "scipy", "rosbags", "plotly") if m in sys.modules])'
     )
-    said = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == '[]'
+    printed = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True
+    )
+    assert printed.stdout.strip() == '[]'
 
 
 def test_help_is_said_without_starting():

@@ -69,18 +69,20 @@ def test_estimates_are_found_and_shown(playing):
         'truth': command(playing, 'echo', '/truth/estimate', '--once', '--timeout', '60'),
         'other': command(playing, 'echo', '/fix', '--timeout', '60'),
     }
-    told = {name: (*one.communicate(timeout=120), one.returncode) for name, one in echoes.items()}
-    lines = told['lines'][0].splitlines()
-    assert told['lines'][2] == 0 and lines[0].startswith('/diver/estimate  20')
+    values = {
+        name: (*echo.communicate(timeout=120), echo.returncode) for name, echo in echoes.items()
+    }
+    lines = values['lines'][0].splitlines()
+    assert values['lines'][2] == 0 and lines[0].startswith('/diver/estimate  20')
     assert 'frame map  1 row' in lines[0] and lines[1].split()[2:4] == ['px', 'py']
     assert '±' in lines[2] and re.search(r'(heading_\d{3}|hover|lively_\w+|quiet) +\d+%', lines[2])
-    tables = [json.loads(line) for line in told['json'][0].splitlines()]
-    assert told['json'][2] == 0 and len(tables) == 3
-    assert {one['topic'] for one in tables} == {'/diver/estimate'}
-    assert len({one['stamp_ns'] for one in tables}) == 3 and tables[0]['types']['px'] == 'f8'
-    assert told['truth'][2] == 0 and told['truth'][0].startswith('/truth/estimate')
-    assert told['other'][2] == 1 and told['other'][1].count('\n') == 1
-    assert 'PoseWithCovarianceStamped and no table; ros2 topic echo /fix' in told['other'][1]
+    tables = [json.loads(line) for line in values['json'][0].splitlines()]
+    assert values['json'][2] == 0 and len(tables) == 3
+    assert {table['topic'] for table in tables} == {'/diver/estimate'}
+    assert len({table['stamp_ns'] for table in tables}) == 3 and tables[0]['types']['px'] == 'f8'
+    assert values['truth'][2] == 0 and values['truth'][0].startswith('/truth/estimate')
+    assert values['other'][2] == 1 and values['other'][1].count('\n') == 1
+    assert 'PoseWithCovarianceStamped and no table; ros2 topic echo /fix' in values['other'][1]
 
 
 def test_silence_is_told(monkeypatch):
@@ -89,12 +91,12 @@ def test_silence_is_told(monkeypatch):
         wait_until_ready([node])
         alone = command(domain, 'echo', '/divr/estimate', '--timeout', '25')
         silent = command(domain, 'echo', '--timeout', '25')
-        said = alone.communicate(timeout=90)[1]
-        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 25 s' in said
-        assert "did you mean '/diver/estimate'" in said
-        said = silent.communicate(timeout=90)[1]
+        message = alone.communicate(timeout=90)[1]
+        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 25 s' in message
+        assert "did you mean '/diver/estimate'" in message
+        message = silent.communicate(timeout=90)[1]
         assert silent.returncode == 1
-        assert own_words(said).splitlines() == [
+        assert own_words(message).splitlines() == [
             'listening to /diver/estimate',
             'sonar-imm: nothing was published on /diver/estimate within 25 s',
         ]

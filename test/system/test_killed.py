@@ -141,9 +141,9 @@ def test_a_worker_that_is_killed_costs_a_survey_its_job_only(tmp_path):
 
 
 def _workers(command_id):
-    """The processes that share the work of the command."""
-    task = Path(f'/proc/{command_id}/task/{command_id}/children')
-    children = [int(word) for word in task.read_text().split()]
-    return [
-        child for child in children if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()
-    ]
+    """The processes that share the work of the command: forks of one that it has started."""
+    return [worker for child in _children(command_id) for worker in _children(child)]
+
+
+def _children(pid):
+    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]

@@ -79,11 +79,11 @@ def test_launched_nodes_get_ready_in_their_namespace_and_end_on_ctrl_c(ros2, nam
             if launch.poll() is None:
                 os.killpg(launch.pid, signal.SIGKILL)
                 launch.wait()
-        said = output.rest()
-    assert launch.returncode in (0, 1), said  # launch itself answers Ctrl-C with 1
-    assert 'process has died' not in said
-    assert 'Traceback' not in said
-    assert said.count('process has finished cleanly') == len(nodes)
+        rest = output.rest()
+    assert launch.returncode in (0, 1), rest  # launch itself answers Ctrl-C with 1
+    assert 'process has died' not in rest
+    assert 'Traceback' not in rest
+    assert rest.count('process has finished cleanly') == len(nodes)
 
 
 class Output:

@@ -76,9 +76,9 @@ def test_what_cannot_be_secured_does_not_start(keystore, enclave):
             )
         except subprocess.TimeoutExpired:
             pytest.skip('this Fast DDS has the security plugins, and the node runs')
-    said = own_words(done.stderr)
-    assert done.returncode == 2 and 'Traceback' not in said and 'ready' not in said
+    message = own_words(done.stderr)
+    assert done.returncode == 2 and 'Traceback' not in message and 'ready' not in message
     if enclave.endswith('nobody'):
-        assert "nobody' does not exist" in said
+        assert "nobody' does not exist" in message
     else:
-        assert "doesn't have the security libraries" in said
+        assert "doesn't have the security libraries" in message

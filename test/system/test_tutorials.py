@@ -50,14 +50,14 @@ LONGEST = 300.0
 def blocks(page: str) -> list[tuple[str, str]]:
     """Commands and what they print, which is '' where the page does not show it."""
     found = re.findall(r'^```(bash|text)\n(.*?)^```$', page, re.MULTILINE | re.DOTALL)
-    told: list[tuple[str, str]] = []
+    given: list[tuple[str, str]] = []
     for kind, text in found:
         if kind == 'bash':
-            told.append((text, ''))
+            given.append((text, ''))
         else:
-            assert told and not told[-1][1], 'output without the command before it'
-            told[-1] = (told[-1][0], text)
-    return told
+            assert given and not given[-1][1], 'output without the command before it'
+            given[-1] = (given[-1][0], text)
+    return given
 
 
 def same(shown: str, printed: str) -> bool:
@@ -81,7 +81,7 @@ def missing(shown: str, printed: str) -> str | None:
     """The first line that was shown and not printed after those before it."""
     lines = iter(printed.splitlines())
     for line in filter(str.strip, shown.splitlines()):
-        if line.strip() != '...' and not any(same(line, one) for one in lines):
+        if line.strip() != '...' and not any(same(line, item) for item in lines):
             return line
     return None
 
@@ -89,10 +89,10 @@ def missing(shown: str, printed: str) -> str | None:
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: f'{path.parent.name}/{path.stem}')
 def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')
-    told = blocks(page.read_text(encoding='utf-8'))
+    given = blocks(page.read_text(encoding='utf-8'))
     mark = '=== block'
     script = '\n'.join(
-        f'echo "{mark} {number}"\n{commands}' for number, (commands, _) in enumerate(told)
+        f'echo "{mark} {number}"\n{commands}' for number, (commands, _) in enumerate(given)
     )
     environment = {
         **os.environ,
@@ -122,7 +122,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
                 os.killpg(shell.pid, signal.SIGKILL)
     printed = output.read_text(encoding='utf-8')
     assert status == 0, printed
-    for part, (_, shown) in zip(re.split(rf'^{mark} \d+\n', printed, flags=re.M)[1:], told):
+    for part, (_, shown) in zip(re.split(rf'^{mark} \d+\n', printed, flags=re.M)[1:], given):
         assert missing(shown, part) is None, f'not printed: {missing(shown, part)}\n{part}'
 
 

@@ -53,11 +53,11 @@ def viewing(*arguments, **environment):
         env={**os.environ, **environment},
     )
     try:
-        said = ''
-        while not (url := re.search(r'ws://127\.0\.0\.1:\d+', said)):
+        message = ''
+        while not (url := re.search(r'ws://127\.0\.0\.1:\d+', message)):
             line = process.stdout.readline()
             assert line, process.communicate()[1]
-            said += line
+            message += line
         with Viewer(url[0]) as viewer:
             yield viewer
         process.send_signal(signal.SIGINT)
@@ -101,11 +101,15 @@ def test_running_nodes_are_shown_live(monkeypatch):
                 viewer.channels['/diver/estimate']['schemaName'] == 'sensor_msgs/msg/PointCloud2'
             )
             viewer.subscribe('/diver/estimate', '/diagnostics')
-            viewer.wait(lambda: any(one[0] == '/diagnostics' for one in viewer.messages), LIMIT)
+            viewer.wait(
+                lambda: any(message[0] == '/diagnostics' for message in viewer.messages), LIMIT
+            )
             # In lock-step, which waits for the node's inputs and loses nothing.
             played = play(
                 BAG, PlayOptions(topics=('/arrivals',), lockstep='/diver'), domain_id=domain
             )
             assert played.problems == ()
-            viewer.wait(lambda: any(one[0] == '/diver/estimate' for one in viewer.messages), LIMIT)
+            viewer.wait(
+                lambda: any(message[0] == '/diver/estimate' for message in viewer.messages), LIMIT
+            )
             assert node.process.poll() is None

@@ -57,8 +57,8 @@ BILLION = 10**9 * SECOND
 FIGURES = Figures('metamorphic')
 
 
-def note(system, how, moved, tolerance, told):
-    FIGURES.add({'system': system, 'how': how, 'moved': moved}, tolerance=tolerance, **told)
+def note(system, how, moved, tolerance, given):
+    FIGURES.add({'system': system, 'how': how, 'moved': moved}, tolerance=tolerance, **given)
 
 
 # -- divers ---------------------------------------------------------------------------------------
@@ -70,10 +70,10 @@ def test_divers(name, association):
     motion = MOTIONS[name]
     plain = run('diver', divers(Motion()), association=association)
     moved = run('diver', divers(motion), association=association)
-    assert max(len(one) for one in plain) == 2
+    assert max(len(item) for item in plain) == 2
     tolerance = 0.0 if name == 'later' else 1e-5
-    told = same_divers(plain, moved, motion, tolerance)
-    note('diver', association, name, tolerance, told)
+    given = same_divers(plain, moved, motion, tolerance)
+    note('diver', association, name, tolerance, given)
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_divers(name, association):
 )
 def test_divers_and_receivers_in_another_order(name, other):
     plain, moved = run('diver', divers(Motion())), run('diver', divers(Motion(), **other))
-    told = same_divers(plain, moved, Motion(), 1e-6)
-    note('diver', 'gnn', name, 1e-6, told)
+    given = same_divers(plain, moved, Motion(), 1e-6)
+    note('diver', 'gnn', name, 1e-6, given)
 
 
 # -- obstacles ------------------------------------------------------------------------------------
@@ -99,21 +99,21 @@ def test_obstacles(name, behaviours):
     order turns with those axes."""
     motion = MOTIONS[name]
     plain = run('obstacle', obstacles(Motion()), behaviours=behaviours)
-    assert max(len(one) for one in plain) == 2
+    assert max(len(item) for item in plain) == 2
     moved = run('obstacle', obstacles(motion), behaviours=behaviours)
     tolerance = 1e-5 if behaviours == ['fixed'] else 2e-4
     tolerance = 0.0 if name == 'later' else tolerance
-    told = same_obstacles(plain, moved, motion, tolerance)
+    given = same_obstacles(plain, moved, motion, tolerance)
     how = 'fixed ones' if behaviours == ['fixed'] else 'all behaviours'
-    note('obstacle', how, name, tolerance, told)
+    note('obstacle', how, name, tolerance, given)
 
 
 def test_obstacles_in_another_order():
     plain = run('obstacle', obstacles(Motion()))
     moved = run('obstacle', obstacles(Motion(), order=(1, 0)))
-    told = same_obstacles(plain, moved, Motion(), 1e-6)
+    given = same_obstacles(plain, moved, Motion(), 1e-6)
     name = 'echoes in another order'
-    note('obstacle', 'all behaviours', name, 1e-6, told)
+    note('obstacle', 'all behaviours', name, 1e-6, given)
 
 
 # -- the sea floor --------------------------------------------------------------------------------
@@ -130,8 +130,8 @@ def test_the_sea_floor(name):
     side = 'port' if motion.sign < 0.0 else 'starboard'
     moved = run('bathymetry', pings(motion, side), **{**SWATH, 'side': side})
     tolerance = 0.0 if name == 'later' else 1e-6
-    told = same_floor(plain, moved, motion, tolerance, 1e-6)
-    note('bathymetry', 'grid', name, tolerance, told)
+    given = same_floor(plain, moved, motion, tolerance, 1e-6)
+    note('bathymetry', 'grid', name, tolerance, given)
 
 
 @pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
@@ -154,7 +154,7 @@ def test_places_keep_millimetres_in_messages_and_displays(system):
     )
     if system == 'obstacle':
         poses = write_poses(read, range(len(read)), ros_message).poses
-        drawn = [[one.position.x, one.position.y, one.position.z] for one in poses]
+        drawn = [[pose.position.x, pose.position.y, pose.position.z] for pose in poses]
         np.testing.assert_allclose(drawn, wanted, rtol=0, atol=1e-4)
         first = write_markers(read, [0], ros_message).markers[1].pose.position
         assert abs(first.y - wanted[0, 1]) < 1e-4
@@ -174,45 +174,45 @@ FEW = {'particles': 2000, 'order_max': 4, 'pulse': 'gaussian', 'pulse_width': 0.
 
 
 def found_reflectors(estimates):
-    return [one.state[one.extras['existence'] > 0.5] for one in estimates]
+    return [estimate.state[estimate.extras['existence'] > 0.5] for estimate in estimates]
 
 
 def test_reflectors_twice_as_loud():
     """Powers of two change no digit."""
     plain = run('fathometer', traces(), **FEW)
-    assert all(len(one) == 2 for one in found_reflectors(plain)[1:])
-    told = {}
-    for one, other in zip(plain, run('fathometer', traces(louder=1024.0), **FEW), strict=True):
-        agree(told, 'states', other.state, one.state * [1, 1024], 0.0)
+    assert all(len(item) == 2 for item in found_reflectors(plain)[1:])
+    values = {}
+    for first, other in zip(plain, run('fathometer', traces(louder=1024.0), **FEW), strict=True):
+        agree(values, 'states', other.state, first.state * [1, 1024], 0.0)
         scale = np.outer([1, 1024], [1, 1024])
-        agree(told, 'covariances', other.covariance, one.covariance * scale, 0.0)
-        agree(told, 'probabilities', other.probabilities, one.probabilities, 0.0)
-    note('fathometer', 'particles', '1024 times as loud', 0.0, told)
+        agree(values, 'covariances', other.covariance, first.covariance * scale, 0.0)
+        agree(values, 'probabilities', other.probabilities, first.probabilities, 0.0)
+    note('fathometer', 'particles', '1024 times as loud', 0.0, values)
 
 
 def test_reflectors_deeper():
     """Deeper depths have fewer digits behind the point: a particle or two is drawn otherwise."""
     plain = run('fathometer', traces(), **FEW)
-    told = {}
-    for one, other in zip(plain, run('fathometer', traces(deeper=100.0), **FEW), strict=True):
-        std = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
-        agree(told, 'states', (other.state - one.state - [100.0, 0.0]) / std, 0.0 * std, 0.1)
-        agree(told, 'probabilities', other.probabilities, one.probabilities, 0.02)
-    note('fathometer', 'particles', '100 m deeper', 0.1, told)
+    values = {}
+    for first, other in zip(plain, run('fathometer', traces(deeper=100.0), **FEW), strict=True):
+        std = np.sqrt(np.diagonal(first.covariance, axis1=1, axis2=2))
+        agree(values, 'states', (other.state - first.state - [100.0, 0.0]) / std, 0.0 * std, 0.1)
+        agree(values, 'probabilities', other.probabilities, first.probabilities, 0.02)
+    note('fathometer', 'particles', '100 m deeper', 0.1, values)
 
 
 def test_reflectors_at_another_time():
     """Other random numbers: the same within a posterior standard deviation."""
     plain = run('fathometer', traces(), **FEW)
     later = run('fathometer', traces(late_ns=LATER), **FEW)
-    assert [one.stamp_ns + LATER for one in plain] == [other.stamp_ns for other in later]
-    told = {}
-    for one, other in zip(plain[1:], later[1:], strict=True):
-        assert len(one) == len(other) == 2
-        std = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
-        agree(told, 'states', (other.state - one.state) / std, 0.0 * std, 1.0)
-    agree(told, 'probabilities', later[-1].probabilities, plain[-1].probabilities, 0.2)
-    note('fathometer', 'particles', 'later', 1.0, told)
+    assert [item.stamp_ns + LATER for item in plain] == [other.stamp_ns for other in later]
+    values = {}
+    for first, other in zip(plain[1:], later[1:], strict=True):
+        assert len(first) == len(other) == 2
+        std = np.sqrt(np.diagonal(first.covariance, axis1=1, axis2=2))
+        agree(values, 'states', (other.state - first.state) / std, 0.0 * std, 1.0)
+    agree(values, 'probabilities', later[-1].probabilities, plain[-1].probabilities, 0.2)
+    note('fathometer', 'particles', 'later', 1.0, values)
 
 
 # -- a billion seconds ----------------------------------------------------------------------------
@@ -226,17 +226,17 @@ def test_a_billion_seconds_later_every_bit_is_the_same():
         ('obstacle', obstacles, {}),
         ('bathymetry', pings, SWATH),
     ):
-        early = [evolve(one, stamp_ns=one.stamp_ns - T0 + SECOND) for one in scene(Motion())]
-        late = [evolve(one, stamp_ns=one.stamp_ns + BILLION) for one in early]
+        early = [evolve(item, stamp_ns=item.stamp_ns - T0 + SECOND) for item in scene(Motion())]
+        late = [evolve(item, stamp_ns=item.stamp_ns + BILLION) for item in early]
         pair = run(system, early, **parameters), run(system, late, **parameters)
         assert len(pair[0]) == len(pair[1]) > 2
-        told = {}
-        for one, other in zip(*pair):
-            assert other.stamp_ns == one.stamp_ns + BILLION
+        values = {}
+        for first, other in zip(*pair):
+            assert other.stamp_ns == first.stamp_ns + BILLION
             for kind, name in (names | {'probabilities': 'probabilities'}).items():
-                agree(told, kind, getattr(other, name), getattr(one, name), 0.0)
+                agree(values, kind, getattr(other, name), getattr(first, name), 0.0)
         name = 'later by 1e9 s'
-        note(system, 'defaults', name, 0.0, told)
+        note(system, 'defaults', name, 0.0, values)
 
 
 def test_single_fixes_far_from_the_origin_keep_their_digits():

@@ -96,7 +96,7 @@ def test_a_parameter_may_change_in_all_systems_or_in_none():
             continue
         for spec in specs:
             flags.setdefault(spec.name, set()).add(spec.read_only)
-    assert {name for name, told in flags.items() if len(told) > 1} == APART
+    assert {name for name, flag in flags.items() if len(flag) > 1} == APART
 
 
 # A contract gives the name to a gap in the navigation there, in a tracker without late pings.

@@ -63,10 +63,10 @@ def test_arrays_come_back_as_they_were(tmp_path):
     extras = {'arrays': [*arrays, arrays[0]], 'odd': odd}
     write_state(tmp_path / 'state', run.saved(run.until(0), extras=extras))
     back = read_state(tmp_path / 'state').extras
-    for one, other in zip(arrays, back['arrays']):
-        assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes())
-        assert one.flags.writeable == other.flags.writeable
-        assert one.flags.f_contiguous == other.flags.f_contiguous or one.strides == (16,)
+    for first, other in zip(arrays, back['arrays']):
+        assert (first.dtype, first.tobytes()) == (other.dtype, other.tobytes())
+        assert first.flags.writeable == other.flags.writeable
+        assert first.flags.f_contiguous == other.flags.f_contiguous or first.strides == (16,)
         assert other.flags.aligned
     assert back['arrays'][0] is back['arrays'][-1]
     assert back['odd'][0] == np.float32(0.1) and type(back['odd'][0]) is np.float32
@@ -202,4 +202,4 @@ def test_a_state_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
     with pytest.raises(OSError, match='No space'):
         write_state(path, run.saved(run.until(6)))
     assert path.read_bytes() == before
-    assert [one.name for one in tmp_path.iterdir()] == ['state']
+    assert [path.name for path in tmp_path.iterdir()] == ['state']

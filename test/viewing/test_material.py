@@ -52,15 +52,15 @@ def bags(tmp_path):
 @pytest.fixture
 def show(bags):
     """Makes the material of both recordings."""
-    with BagReader(bags[0]) as one, BagReader(bags[1]) as two:
-        yield lambda *topics: Material([Recording(one), Recording(two)], topics)
+    with BagReader(bags[0]) as item, BagReader(bags[1]) as two:
+        yield lambda *topics: Material([Recording(item), Recording(two)], topics)
 
 
 def shown(material, seconds=None):
     from_ns = None if seconds is None else START + round(seconds * 1e9)
     return [
-        (one.topic, (one.log_ns - START) // 10**9, one.raw[8:-1].decode())
-        for one in material.messages(from_ns)
+        (message.topic, (message.log_ns - START) // 10**9, message.raw[8:-1].decode())
+        for message in material.messages(from_ns)
     ]
 
 
@@ -119,25 +119,25 @@ def test_a_run_is_shown_with_its_drawings_and_its_recording(run):
     with BagReader(run / 'estimate') as bag:
         estimates = [read_estimate(item.message) for item in bag.messages(['/diver/estimate'])]
     drawn = [
-        decode_cdr(typestore(), 'nav_msgs/msg/Odometry', one.raw)
-        for one in messages
-        if one.topic == '/diver/odometry'
+        decode_cdr(typestore(), 'nav_msgs/msg/Odometry', message.raw)
+        for message in messages
+        if message.topic == '/diver/odometry'
     ]
     confirmed = [
-        (one.stamp_ns, *state[:2])
-        for one in estimates
-        for state in one.state[one.extras['track_state'] >= 1]
+        (estimate.stamp_ns, *state[:2])
+        for estimate in estimates
+        for state in estimate.state[estimate.extras['track_state'] >= 1]
     ]
-    places = [one.pose.pose.position for one in drawn]
-    assert [(stamp_ns(one), at.x, at.y) for one, at in zip(drawn, places)] == confirmed
+    places = [item.pose.pose.position for item in drawn]
+    assert [(stamp_ns(item), at.x, at.y) for item, at in zip(drawn, places)] == confirmed
     assert len(confirmed) > 50
 
 
 def test_a_run_whose_recording_is_gone_is_shown_alone(run, tmp_path):
     alone = tmp_path / 'alone'
     shutil.copytree(run, alone)
-    told = json.loads((run / 'run.json').read_text())
-    (alone / 'run.json').write_text(json.dumps({**told, 'bag': str(tmp_path / 'gone')}))
+    content = json.loads((run / 'run.json').read_text())
+    (alone / 'run.json').write_text(json.dumps({**content, 'bag': str(tmp_path / 'gone')}))
     with opened(alone) as (material, problems):
         assert problems == [f'{tmp_path / "gone"} is gone: only the estimates are shown']
         assert '/arrivals' not in material.channels and '/diver/odometry' in material.channels
@@ -147,8 +147,8 @@ def test_both_sides_of_a_sonar_are_shown_each_below_its_name(tmp_path):
     scene = ['simulate', 'bathymetry', str(tmp_path / 'bag'), '--scenario', 'moving_two_sides']
     small = ['--set', 'pings=2', '--set', 'last_range=20', '--set', 'bin_width=0.2']
     assert main([*scene, *small]) == 0
-    told = ['--set', 'particles_per_model=20']
-    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *told]) == 0
+    given = ['--set', 'particles_per_model=20']
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *given]) == 0
     with opened(tmp_path / 'run') as (material, problems):
         assert problems == []
         assert any(name.endswith('/bathymetry/estimate') for name in material.channels)

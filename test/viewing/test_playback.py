@@ -33,14 +33,14 @@ class Played:
 
     def __init__(self, **options):
         self.playback = Playback(TIMES[0], TIMES[-1], **options)
-        self.heard, self.states, self.times = [], [], []
+        self.received, self.states, self.times = [], [], []
         self._thread = threading.Thread(
             target=self.playback.run,
             args=(messages, self._hear, self.times.append, self.states.append),
         )
 
     def _hear(self, shown):
-        self.heard.append((shown.log_ns, time.monotonic()))
+        self.received.append((shown.log_ns, time.monotonic()))
 
     def __enter__(self):
         self._thread.start()
@@ -59,7 +59,7 @@ class Played:
 
     @property
     def stamps(self):
-        return [stamp for stamp, _ in self.heard]
+        return [stamp for stamp, _ in self.received]
 
 
 def messages(from_ns):
@@ -71,7 +71,7 @@ def messages(from_ns):
 def test_nothing_is_played_before_it_is_asked_for():
     with Played() as played:
         time.sleep(0.1)
-        assert played.heard == [] and played.states == []
+        assert played.received == [] and played.states == []
 
 
 def test_it_plays_in_order_and_never_early():
@@ -81,7 +81,7 @@ def test_it_plays_in_order_and_never_early():
         assert (state.status, state.now_ns, state.jumped) == (Status.PLAYING, FIRST, False)
         played.wait(lambda: played.states)
     assert played.stamps == TIMES
-    for stamp, when in played.heard:
+    for stamp, when in played.received:
         assert when - begin >= (stamp - FIRST) / 1e9 - 1e-3
     assert played.states[-1].status is Status.ENDED and played.states[-1].now_ns == TIMES[-1]
     assert played.times == sorted(played.times) and played.times[-1] <= TIMES[-1]
@@ -104,19 +104,19 @@ def test_at_any_rate_messages_are_on_time():
             begin = time.monotonic()
             played.playback.change(play=True)
             played.wait(lambda: played.states)
-        late.append(max(when - begin - (t - FIRST) / 1e10 for t, when in played.heard))
+        late.append(max(when - begin - (t - FIRST) / 1e10 for t, when in played.received))
     assert min(late) < 0.02
 
 
 def test_a_pause_holds_the_time():
     with Played() as played:
         played.playback.change(play=True)
-        played.wait(lambda: len(played.heard) > 3)
+        played.wait(lambda: len(played.received) > 3)
         paused = played.playback.change(play=False)
         assert paused.status is Status.PAUSED
-        count = len(played.heard)
+        count = len(played.received)
         time.sleep(0.15)
-        assert len(played.heard) <= count + 1  # one may have been on its way
+        assert len(played.received) <= count + 1  # one may have been on its way
         assert played.playback.change(play=False).now_ns == paused.now_ns
         played.playback.change(play=True, rate=100.0)
         played.wait(lambda: played.states)
@@ -127,7 +127,7 @@ def test_a_jump_shows_the_newest_before_also_while_paused():
     with Played() as played:
         state = played.playback.change(play=False, seek_ns=TIMES[7] + 1)
         assert (state.now_ns, state.jumped, state.status) == (TIMES[7] + 1, True, Status.PAUSED)
-        played.wait(lambda: played.heard)
+        played.wait(lambda: played.received)
         time.sleep(0.05)
         assert played.stamps == [TIMES[7]]
         played.playback.change(play=True, rate=100.0)

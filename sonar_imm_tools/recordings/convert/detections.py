@@ -73,16 +73,16 @@ class Clocks(NamedTuple):
     std: float
     used: int
 
-    def right(self, heard: Heard) -> tuple[IntArray, BoolArray]:
+    def right(self, received: Heard) -> tuple[IntArray, BoolArray]:
         """Stamps (n,) by one clock, and whether (n,) they could be told."""
-        seconds = (heard.stamp_ns - self.begin_ns) / SECOND
+        seconds = (received.stamp_ns - self.begin_ns) / SECOND
         late = np.zeros(len(seconds))
-        for receiver in np.unique(heard.receiver):
-            own = heard.receiver == receiver
+        for receiver in np.unique(received.receiver):
+            own = received.receiver == receiver
             late[own] = np.interp(seconds[own], self.knots, self.offset[receiver])
         known = np.isfinite(late)
         shift = np.round(np.where(known, late, 0.0) * SECOND).astype(np.int64)
-        return heard.stamp_ns - shift, known
+        return received.stamp_ns - shift, known
 
 
 def convert_detections(
@@ -114,33 +114,38 @@ def convert_detections(
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))
     number = {tag: k for k, tag in enumerate(tags)}
-    heard = Heard(
+    received = Heard(
         np.array([receiver for receiver, _, _ in rows], np.int64),
         np.array([number[tag] for _, tag, _ in rows], np.int64),
         np.array([stamp for _, _, stamp in rows], np.int64),
     )
-    stamps, known, std = heard.stamp_ns, np.ones(len(rows), bool), how.toa_std
+    stamps, known, std = received.stamp_ns, np.ones(len(rows), bool), how.toa_std
     if fixed:
         at = np.array([fixed.get(tag, (np.nan,) * 3) for tag in tags]).reshape(-1, 3)
         clocks = compare_clocks(
-            heard, np.array(list(places.values())), at, how.sound_speed, how.clock_interval * HOUR
+            received,
+            np.array(list(places.values())),
+            at,
+            how.sound_speed,
+            how.clock_interval * HOUR,
         )
-        stamps, known = clocks.right(heard)
+        stamps, known = clocks.right(received)
         std = std or (None if np.isnan(clocks.std) else max(clocks.std, LEAST))
         _note(report, clocks, names)
         for k in np.flatnonzero(~known)[:1]:
             report.problems.append(
                 f'{int((~known).sum())} detections have no common time, the first of receiver '
-                f'{names[heard.receiver[k]]}: it shares no ping of a fixed tag with the others'
+                f'{names[received.receiver[k]]}: it shares no ping of a fixed tag with the others'
             )
     pings: dict[tuple[object, str], list[Arrival]] = {}
     for tag in tags:
         if tag in fixed:
             continue
-        own = np.flatnonzero((heard.tag == number[tag]) & known)
-        for ping, members in enumerate(gather(heard.receiver[own], stamps[own], how.window)):
+        own = np.flatnonzero((received.tag == number[tag]) & known)
+        for ping, members in enumerate(gather(received.receiver[own], stamps[own], how.window)):
             pings[ping, tag] = [
-                _arrival(int(stamps[k]), names[heard.receiver[k]], tag, std) for k in own[members]
+                _arrival(int(stamps[k]), names[received.receiver[k]], tag, std)
+                for k in own[members]
             ]
     if not pings and fixed:
         report.problems.append('there is no tag beside the fixed ones')
@@ -188,18 +193,18 @@ def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArr
 
 
 def compare_clocks(
-    heard: Heard, receivers: FloatArray, tags: FloatArray, sound_speed: float, interval: float
+    received: Heard, receivers: FloatArray, tags: FloatArray, sound_speed: float, interval: float
 ) -> Clocks:
     """Compare the clocks of receivers (R, 3) by tags (T, 3), NaN for those that move; m, s.
 
     interval: seconds from knot to knot. The offsets are against the first of the receivers that
     are connected with the most others.
     """
-    begin_ns = int(heard.stamp_ns.min()) if len(heard.stamp_ns) else 0
-    seconds = (heard.stamp_ns - begin_ns) / SECOND
+    begin_ns = int(received.stamp_ns.min()) if len(received.stamp_ns) else 0
+    seconds = (received.stamp_ns - begin_ns) / SECOND
     spans = max(1, int(np.ceil(seconds.max(initial=0.0) / interval)))
     knots = np.linspace(0.0, max(seconds.max(initial=0.0), 1.0), spans + 1)
-    groups, reduced = _sync_groups(heard, seconds, receivers, tags, sound_speed)
+    groups, reduced = _sync_groups(received, seconds, receivers, tags, sound_speed)
     nothing = np.full((len(receivers), len(knots)), np.nan)
     if not groups:
         return Clocks(begin_ns, knots, nothing, np.nan, 0)
@@ -207,9 +212,9 @@ def compare_clocks(
     ping = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     keep = np.ones(len(row), bool)
     for _ in range(ROUNDS):
-        offset = _solve(heard.receiver[row[keep]], seconds[row[keep]], reduced[row[keep]],
+        offset = _solve(received.receiver[row[keep]], seconds[row[keep]], reduced[row[keep]],
                         ping[keep], knots, len(receivers))  # fmt: skip
-        rest = reduced[row] - _at(offset, knots, heard.receiver[row], seconds[row])
+        rest = reduced[row] - _at(offset, knots, received.receiver[row], seconds[row])
         rest = rest - _medians(rest, ping)
         sigma = max(1.4826 * float(np.median(np.abs(rest[keep]))), LEAST)
         better = np.abs(rest) <= FAR * sigma
@@ -217,7 +222,7 @@ def compare_clocks(
         if (better == keep).all() or better.sum() < 2:
             break
         keep = better
-    linked = _connected(heard.receiver[row[keep]], ping[keep], len(receivers))
+    linked = _connected(received.receiver[row[keep]], ping[keep], len(receivers))
     offset[~linked] = np.nan
     offset -= offset[np.flatnonzero(linked)[0]]
     free = keep.sum() - len(np.unique(ping[keep])) - linked.sum() * len(knots) + len(knots)
@@ -227,23 +232,27 @@ def compare_clocks(
 
 
 def _sync_groups(
-    heard: Heard, seconds: FloatArray, receivers: FloatArray, tags: FloatArray, sound_speed: float
+    received: Heard,
+    seconds: FloatArray,
+    receivers: FloatArray,
+    tags: FloatArray,
+    sound_speed: float,
 ) -> tuple[list[IntArray], FloatArray]:
     """Rows of the transmissions of fixed tags that two or more receivers detected, and the times
     (n,) without the travel from the tag."""
-    distance = np.linalg.norm(tags[heard.tag] - receivers[heard.receiver], axis=1)
+    distance = np.linalg.norm(tags[received.tag] - receivers[received.receiver], axis=1)
     reduced = seconds - distance / sound_speed
     groups: list[IntArray] = []
     for tag in np.flatnonzero(np.isfinite(tags).all(axis=1)):
-        own = np.flatnonzero(heard.tag == tag)
+        own = np.flatnonzero(received.tag == tag)
         steps = [
-            np.diff(np.sort(seconds[own[heard.receiver[own] == receiver]]))
-            for receiver in np.unique(heard.receiver[own])
+            np.diff(np.sort(seconds[own[received.receiver[own] == receiver]]))
+            for receiver in np.unique(received.receiver[own])
         ]
         every = np.concatenate(steps) if steps else np.empty(0)
         window = min(LONGEST_SYNC, 0.5 * float(np.median(every))) if len(every) else LONGEST_SYNC
         stamps = np.round(reduced[own] * SECOND).astype(np.int64)
-        groups += [own[found] for found in gather(heard.receiver[own], stamps, window)]
+        groups += [own[found] for found in gather(received.receiver[own], stamps, window)]
     return [group for group in groups if len(group) > 1], reduced
 
 
@@ -316,6 +325,6 @@ def _connected(receiver: IntArray, ping: IntArray, receivers: int) -> BoolArray:
     size = receivers + pings
     graph = coo_array((np.ones(len(receiver)), (receiver, receivers + ping)), (size, size))
     label = connected_components(graph, directed=False)[1][:receivers]
-    heard = np.isin(np.arange(receivers), receiver)
-    largest = np.bincount(label[heard]).argmax()
-    return np.asarray((label == largest) & heard)
+    received = np.isin(np.arange(receivers), receiver)
+    largest = np.bincount(label[received]).argmax()
+    return np.asarray((label == largest) & received)

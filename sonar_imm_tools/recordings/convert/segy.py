@@ -190,10 +190,10 @@ def _instrument(
         return {}, None
     width, noise = (float(f'{value:.3g}') for value in measured)
     sigma, window = noise_by_depth(amplitude, stack, noise), spacing * amplitude.shape[1]
-    said = f'{noise:g}'
+    described = f'{noise:g}'
     if sigma is not None:
-        said, noise = f'{sigma[0]:.3g} to {sigma[-1]:.3g}, growing with the depth', 0.0
-    report.notes['pulse'] = f'of an envelope, {width:g} m; noise {said}; see parameters.yaml'
+        described, noise = f'{sigma[0]:.3g} to {sigma[-1]:.3g}, growing with the depth', 0.0
+    report.notes['pulse'] = f'of an envelope, {width:g} m; noise {described}; see parameters.yaml'
     return envelope_parameters(width, noise, window), sigma
 
 

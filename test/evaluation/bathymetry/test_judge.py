@@ -135,7 +135,7 @@ def test_two_sides_are_tracked_in_one_run_or_one_by_choice(tmp_path, capsys):
     )
     assert run('track', tmp_path / 'both', tmp_path / 'two') == 0
     estimates = RunFolder(tmp_path / 'two').read_estimates()
-    assert [one.source for one in estimates] == [0, 1]
+    assert [estimate.source for estimate in estimates] == [0, 1]
     assert (estimates[0].xyz[:, 1] >= 0.0).all() and (estimates[1].xyz[:, 1] <= 0.0).all()
     scored = judge(RunFolder(tmp_path / 'two'), JudgeOptions()).metrics
     assert scored['scored_pings'] == 2 and scored['height']['all']['rmse_m'] < 0.25

@@ -82,9 +82,9 @@ def test_the_chart_puts_the_middle_of_each_cell_in_its_place_north_up():
 
 
 def test_errors_by_place_and_the_share_inside_the_band():
-    one = profile()
-    one.height[PATCH] = 0.3
-    metrics = score(swath(one))
+    ground = profile()
+    ground.height[PATCH] = 0.3
+    metrics = score(swath(ground))
     assert metrics['height']['smooth']['rmse_m'] == pytest.approx(0.1)
     assert metrics['height']['patch']['rmse_m'] == pytest.approx(0.3)
     assert metrics['height']['all']['n'] == N
@@ -185,10 +185,10 @@ def test_both_heights_are_compared_with_the_nearest_surface():
     unsure = np.zeros(N, bool)
     unsure[15] = True
     upper = np.where(two, 2.6, np.nan), np.where(two, 0.15, np.nan)
-    one = evolve(
+    item = evolve(
         profile(valid=~unsure), truth=truth, height=height, two=two, upper=upper, unsure=unsure
     )
-    metrics = score(swath(one))
+    metrics = score(swath(item))
     scores = metrics['layover']
     assert (scores['bins'], scores['found'], scores['lost']) == (4, 1.0, 0.0)
     assert scores['heights']['n'] == 8
@@ -200,6 +200,6 @@ def test_both_heights_are_compared_with_the_nearest_surface():
     assert metrics['heard_share'] == 1.0
     words = dict(lines(METRICS, metrics))
     assert words['two surfaces: found / single bins taken for two'] == '100 % / 0.0 %'
-    names = [trace.name for trace in profile_figure(one).data]
+    names = [trace.name for trace in profile_figure(item).data]
     assert 'upper surface' in names and 'truth, second surface' in names
     assert 'one surface or two: no sounding' in names

@@ -154,10 +154,10 @@ def test_no_verdict_is_given_that_pairs_beyond_the_cutoff_would_change():
     assert within_10['consistency']['verdict'] is None
     assert within_10['consistency']['nees_position']['believable'] is None
     assert within_10['beyond_cutoff'] == {'n': 80, 'share': 0.2}
-    said = summary_sentence(within_10)
-    assert said.startswith('The divers are found 80 % of the time, within 10 m; then ')
-    assert 'cannot be said: 20 % of the estimates' in said
-    assert 'cautious' not in said and 'removes' not in said
+    sentence = summary_sentence(within_10)
+    assert sentence.startswith('The divers are found 80 % of the time, within 10 m; then ')
+    assert 'cannot be said: 20 % of the estimates' in sentence
+    assert 'cautious' not in sentence and 'removes' not in sentence
     assert lines(METRICS, within_10)[0][0] == 'divers found'
     within_50 = scored(estimates, truth, fixes=fixes, cutoff=50.0)
     assert within_50['consistency']['verdict'] == 'overconfident'

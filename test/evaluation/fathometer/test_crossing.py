@@ -96,16 +96,18 @@ def crossed(lines, a, b, position_std=3.0):
 
 def test_where_lines_cross_their_horizons_agree(lines):
     metrics = crossed(lines, 'we', 'sn')
-    [one] = metrics['crossings']
-    assert one['longitude'] == pytest.approx(LON - 8.0 * METRE / np.cos(np.radians(LAT)), abs=1e-7)
-    assert one['latitude'] == pytest.approx(LAT + 5.0 * METRE, abs=1e-7)
-    assert one['angle_deg'] == pytest.approx(90.0, abs=0.1)
-    assert one['stamp_a_ns'] == 1016 * SECOND and one['stamp_b_ns'] == 1022 * SECOND
-    assert one['only_a'] == one['only_b'] == 0
-    for horizon, true in zip(one['horizons'], floor(-8.0, 5.0)):
+    [crossing] = metrics['crossings']
+    assert crossing['longitude'] == pytest.approx(
+        LON - 8.0 * METRE / np.cos(np.radians(LAT)), abs=1e-7
+    )
+    assert crossing['latitude'] == pytest.approx(LAT + 5.0 * METRE, abs=1e-7)
+    assert crossing['angle_deg'] == pytest.approx(90.0, abs=0.1)
+    assert crossing['stamp_a_ns'] == 1016 * SECOND and crossing['stamp_b_ns'] == 1022 * SECOND
+    assert crossing['only_a'] == crossing['only_b'] == 0
+    for horizon, true in zip(crossing['horizons'], floor(-8.0, 5.0)):
         assert horizon['depth_a_m'] == pytest.approx(true, abs=0.25)
         assert abs(horizon['difference_m']) < 0.3 and abs(horizon['sigmas']) < 2.5
-    assert [horizon['bottom'] for horizon in one['horizons']] == [True, False]
+    assert [horizon['bottom'] for horizon in crossing['horizons']] == [True, False]
 
 
 def test_misties_are_drawn_by_horizon(lines, tmp_path):
@@ -150,32 +152,32 @@ def test_below_a_floor_that_is_cut_nothing_is_judged(lines, capsys):
     """The traces of one line begin at 12 m, below the floor there: what they show at their first
     depth is no depth of the floor."""
     metrics = crossed(lines, 'we', 'cut')
-    [one] = metrics['crossings']
-    assert one['floor_cut'] and len(one['horizons']) == 2
-    assert [h['cut'] for h in one['horizons']] == [True, False]
-    assert not any(h['judged'] for h in one['horizons'])
+    [crossing] = metrics['crossings']
+    assert crossing['floor_cut'] and len(crossing['horizons']) == 2
+    assert [h['cut'] for h in crossing['horizons']] == [True, False]
+    assert not any(h['judged'] for h in crossing['horizons'])
     assert metrics['matched'] == 2 and metrics['judged'] == 0
-    assert np.isnan(metrics['rms_sigmas']) and 'shift_m' not in one
+    assert np.isnan(metrics['rms_sigmas']) and 'shift_m' not in crossing
     assert main(['evaluate', str(lines['we']), str(lines['cut']), '--crossing']) == 0
-    said = capsys.readouterr().out
-    assert 'bottom, cut' in said and 'not judged' in said
+    output = capsys.readouterr().out
+    assert 'bottom, cut' in output and 'not judged' in output
 
 
 def test_what_was_not_seen_at_the_crossing_is_not_compared(lines):
     """This line has the lower layer from 9 m beyond the crossing on."""
-    [one] = crossed(lines, 'we', 'late')['crossings']
-    assert [h['bottom'] for h in one['horizons']] == [True]
+    [crossing] = crossed(lines, 'we', 'late')['crossings']
+    assert [h['bottom'] for h in crossing['horizons']] == [True]
     # Where places may be wrong by so much it is.
     assert len(crossed(lines, 'we', 'late', 10.0)['crossings'][0]['horizons']) == 2
 
 
 @pytest.mark.parametrize('first, second, bottom', [(0.6, 0.9, True), (0.9, 0.5, False)])
 def test_a_pair_is_the_floor_where_both_lines_rather_take_it_for_it(first, second, bottom):
-    one, other = (
+    first, other = (
         Horizon(1, 20.0, 0.1, 0.0, is_bottom=share, multiple=0.0, cut=False)
         for share in (first, second)
     )
-    for pair in ([one], [other]), ([other], [one]):
+    for pair in ([first], [other]), ([other], [first]):
         [horizon] = compared(*pair, 1.0, np.eye(2), 0.0)['horizons']
         assert horizon['bottom'] == bottom
 
@@ -188,9 +190,9 @@ def test_shift_and_spread_of_differences_that_are_known():
     for _ in range(2000):
         off = 0.5 + std * rng.standard_normal(4)
         rows = [{'difference_m': d, 'std_m': s, 'sigmas': d / s} for d, s in zip(off, std)]
-        one = common_shift(rows)
-        shifts.append((one['shift_m'] - 0.5) / one['shift_std_m'])
-        chi2.append(one['residual_rms_sigmas'] ** 2)
+        shift = common_shift(rows)
+        shifts.append((shift['shift_m'] - 0.5) / shift['shift_std_m'])
+        chi2.append(shift['residual_rms_sigmas'] ** 2)
         missing.append(off)
     assert np.mean(shifts) == pytest.approx(0.0, abs=0.08)
     assert np.std(shifts) == pytest.approx(1.0, abs=0.06)

@@ -73,14 +73,14 @@ def test_ospa_in_closed_form():
     assert pair(np.array([10.0]), np.array([10.3]), 2.0).ospa == pytest.approx(0.3)
     assert pair(np.array([10.0]), np.array([15.0]), 2.0).ospa == pytest.approx(2.0)
     assert pair(np.array([]), np.array([15.0, 16.0]), 2.0).ospa == pytest.approx(2.0)
-    one = pair(np.array([10.0, 20.0, 30.0]), np.array([10.3, 20.0]), 2.0)
-    assert one.ospa == pytest.approx(((0.3**2 + 2.0**2) / 3.0) ** 0.5)
-    assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
+    paired = pair(np.array([10.0, 20.0, 30.0]), np.array([10.3, 20.0]), 2.0)
+    assert paired.ospa == pytest.approx(((0.3**2 + 2.0**2) / 3.0) ** 0.5)
+    assert list(paired.found) == [0, 1] and list(paired.true) == [0, 1]
 
 
 def test_partners_are_near_and_as_many_as_can_be():
-    one = pair(np.array([10.0, 10.3]), np.array([9.7, 10.2]), 2.0)
-    assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
+    paired = pair(np.array([10.0, 10.3]), np.array([9.7, 10.2]), 2.0)
+    assert list(paired.found) == [0, 1] and list(paired.true) == [0, 1]
     assert not len(pair(np.array([10.0]), np.array([10.41]), 2.0).found)
 
 
@@ -166,7 +166,7 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
 
 def test_the_image_is_what_the_tracker_saw(run):
     content = run.read_run()
-    traces = [one for one in read_measurements(content) if isinstance(one, Trace)]
+    traces = [item for item in read_measurements(content) if isinstance(item, Trace)]
     image = response_image(content)
     assert image.value.shape == (len(traces[0]), len(traces))
     expected = traces[5].amplitude / traces[5].sigma
@@ -198,10 +198,10 @@ def test_other_estimates_and_other_truth_are_one_sentence(run):
     import attrs
 
     some = run.read_estimates()
-    bare = [attrs.evolve(one, extras={}) for one in some]
+    bare = [attrs.evolve(item, extras={}) for item in some]
     with pytest.raises(BagError, match='not estimates of reflectors'):
         records_of(bare)
-    divers = [attrs.evolve(one, state_names=('px', 'py')) for one in some]
+    divers = [attrs.evolve(item, state_names=('px', 'py')) for item in some]
     with pytest.raises(BagError, match='truth is not that of reflectors'):
         records_of(some, divers)
 

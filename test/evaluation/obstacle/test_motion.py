@@ -32,7 +32,7 @@ SECOND = 10**9
 
 def estimate(second, distance, risk, velocity=(0.0, 0.0), does=(1.0, 0.0, 0.0, 0.0)):
     """One confirmed track at bearing and offset 0, with a variance of 0.01 of its velocity."""
-    one = np.ones(1)
+    unit = np.ones(1)
     return Estimate(
         stamp_ns=second * SECOND,
         frame_id='odom',
@@ -43,18 +43,18 @@ def estimate(second, distance, risk, velocity=(0.0, 0.0), does=(1.0, 0.0, 0.0, 0
         model_names=('above', 'below'),
         probabilities=np.full((1, 2), 0.5),
         extras={
-            **{f'prob_{name}': share * one for name, share in zip(BEHAVIOURS, does)},
-            'vx': velocity[0] * one,
-            'vy': velocity[1] * one,
-            'vel_cov_x_x': 0.01 * one,
-            'vel_cov_x_y': 0.0 * one,
-            'vel_cov_y_y': 0.01 * one,
-            'collision_probability': risk * one,
+            **{f'prob_{name}': share * unit for name, share in zip(BEHAVIOURS, does)},
+            'vx': velocity[0] * unit,
+            'vy': velocity[1] * unit,
+            'vel_cov_x_x': 0.01 * unit,
+            'vel_cov_x_y': 0.0 * unit,
+            'vel_cov_y_y': 0.01 * unit,
+            'collision_probability': risk * unit,
             'track_id': np.ones(1, np.uint32),
             'track_state': np.ones(1, np.uint8),
-            'vertical_offset_lo': -one,
-            'vertical_offset_hi': one,
-            'nis': 2.0 * one,
+            'vertical_offset_lo': -unit,
+            'vertical_offset_hi': unit,
+            'nis': 2.0 * unit,
         },
     )
 
@@ -64,8 +64,8 @@ def path(distances, offset=0.0, velocity=(0.0, 0.0), does=0):
     n = len(distances)
     seen = np.column_stack([distances, np.zeros(n), np.full(n, offset)])
     stamps = np.arange(1, n + 1) * SECOND
-    told = np.tile(velocity, (n, 1)), np.full(n, does)
-    return TruePath(1, stamps, seen, np.ones(n, bool), *told)
+    given = np.tile(velocity, (n, 1)), np.full(n, does)
+    return TruePath(1, stamps, seen, np.ones(n, bool), *given)
 
 
 def matched(estimates, truth):
@@ -133,8 +133,8 @@ def test_forecasts_as_often_right_as_stated_lie_on_the_diagonal():
     stated = rng.uniform(0.0, 1.0, 20_000)
     scores = forecast_scores(stated, rng.uniform(size=20_000) < stated)
     assert scores['brier'] == pytest.approx(1.0 / 6.0, abs=0.01)
-    for one in scores['bins'].values():
-        assert one['came_true'] == pytest.approx(one['stated'], abs=0.04)
+    for score in scores['bins'].values():
+        assert score['came_true'] == pytest.approx(score['stated'], abs=0.04)
 
 
 def test_what_was_not_told_is_not_scored():

@@ -33,8 +33,8 @@ NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
 def echoes(name):
     config = ObstacleConfig(sonar_lever=lever(name))
     measurements = approach(name)
-    pings = [one for one in measurements if isinstance(one, Detections) and len(one)]
-    navigation = [one for one in measurements if isinstance(one, Navigation)]
+    pings = [item for item in measurements if isinstance(item, Detections) and len(item)]
+    navigation = [item for item in measurements if isinstance(item, Navigation)]
     poses, known = sonar_poses(navigation, np.array([ping.stamp_ns for ping in pings]), config)
     assert known.all()
     return np.array([[ping.range[0], -ping.bearing[0]] for ping in pings]), poses, config
@@ -80,7 +80,7 @@ def test_refitting_the_first_echo_helps():
 
 def test_poses_are_not_invented():
     name = NOISE_FREE[0]
-    navigation = [one for one in approach(name) if isinstance(one, Navigation)]
+    navigation = [item for item in approach(name) if isinstance(item, Navigation)]
     config = ObstacleConfig(max_navigation_gap=0.6)
     first, last = navigation[0].stamp_ns, navigation[-1].stamp_ns
     stamps = np.array([first - 1, first, first + 10**8, last, last + 1])
@@ -115,10 +115,10 @@ def test_the_paper_looks_below_the_sonar_alone():
 def test_curves_of_the_papers_encounters(body, echo):
     """The same pings read by eye and by a noisy detector: curves computed elsewhere."""
     with np.load(SECTION5) as file:
-        told = {key.removeprefix(f'{body}/'): file[key] for key in file.files if body in key}
-    z = np.column_stack([told[f'{echo}_range'], told[f'{echo}_azimuth']])
+        values = {key.removeprefix(f'{body}/'): file[key] for key in file.files if body in key}
+    z = np.column_stack([values[f'{echo}_range'], values[f'{echo}_azimuth']])
     seen = np.isfinite(z).all(axis=1)
-    poses = Pose(told['sonar_p_ned'][seen], told['sonar_R_ned'][seen])
-    found = deferred(z[seen], poses, ObstacleConfig(), offsets=told['d_st'])
-    np.testing.assert_allclose(found.rmsd, told[f'{echo}_rmsd'], rtol=1e-9)
-    assert found.best == pytest.approx(float(told[f'{echo}_estimate']), abs=0.05)
+    poses = Pose(values['sonar_p_ned'][seen], values['sonar_R_ned'][seen])
+    found = deferred(z[seen], poses, ObstacleConfig(), offsets=values['d_st'])
+    np.testing.assert_allclose(found.rmsd, values[f'{echo}_rmsd'], rtol=1e-9)
+    assert found.best == pytest.approx(float(values[f'{echo}_estimate']), abs=0.05)

@@ -93,7 +93,7 @@ class Case:
     @property
     def period(self) -> float:
         """Seconds between two messages of the primary input."""
-        stamps = [one.origin_ns for one in self.messages() if one.primary]
+        stamps = [message.origin_ns for message in self.messages() if message.primary]
         return (stamps[-1] - stamps[0]) / (len(stamps) - 1) / SECOND
 
     def messages(self) -> tuple[Message, ...]:
@@ -103,7 +103,7 @@ class Case:
     def thirds(self) -> tuple[list[Message], list[Message], list[Message]]:
         """The messages before, during and after a fault, as many of the primary input each."""
         messages = self.messages()
-        places = [k for k, one in enumerate(messages) if one.primary]
+        places = [k for k, message in enumerate(messages) if message.primary]
         first, second = places[len(places) // 3], places[2 * len(places) // 3]
         return list(messages[:first]), list(messages[first:second]), list(messages[second:])
 
@@ -124,14 +124,14 @@ def _messages(case: Case) -> tuple[Message, ...]:
             )
             for item in bag.messages([*inputs])
         ]
-    stamps = [one.stamp_ns for one in recorded if one.primary]
+    stamps = [item.stamp_ns for item in recorded if item.primary]
     length = stamps[-1] - stamps[0] + (stamps[-1] - stamps[0]) // (len(stamps) - 1)
     played: list[Message] = []
     for turn in range(case.repeat):
-        for one in recorded:
-            again = one.moved(turn * length / SECOND)
+        for each in recorded:
+            again = each.moved(turn * length / SECOND)
             played.append(evolve(again, origin_ns=again.stamp_ns))
-            if sum(one.primary for one in played) == case.count:
+            if sum(item.primary for item in played) == case.count:
                 return tuple(played)
     raise ValueError(f'{case.bag} holds less than {case.count} messages on {case.primary}')
 

@@ -63,9 +63,9 @@ class Figures:
         self.rows = [row for row in self.rows if not _is_of(row, key)] + [{**key, **values}]
         if self._path:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            told = json.dumps(self.rows, indent=1, sort_keys=True)
+            text = json.dumps(self.rows, indent=1, sort_keys=True)
             whole = self._path.with_suffix('.tmp')
-            whole.write_text(told + '\n', encoding='utf-8')
+            whole.write_text(text + '\n', encoding='utf-8')
             whole.replace(self._path)
 
 

@@ -93,12 +93,12 @@ class Diagnostics:
 
     def counts(self) -> Counter[str]:
         """All values that count something."""
-        told: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for key, value in self.values.items():
             if re.match(r'(count|refused|doubtful|lost|gap|dropped)\b|.*(received|dropped)', key):
                 with contextlib.suppress(ValueError):
-                    told[key] = int(float(value))
-        return told
+                    counts[key] = int(float(value))
+        return counts
 
 
 class Rig:
@@ -117,7 +117,7 @@ class Rig:
 
     def _start(self, arguments: list[str]) -> None:
         case, enter = self.case, self._stack.enter_context
-        topics = dict.fromkeys(one.topic for one in case.messages())
+        topics = dict.fromkeys(message.topic for message in case.messages())
         for name in (*(topics if self._lossless else ()), f'{case.system}/estimate'):
             end = 'publisher' if name.endswith('estimate') else 'subscription'
             for policy in ('history:=keep_all', 'reliability:=reliable'):
@@ -133,7 +133,7 @@ class Rig:
             DiagnosticArray, '/diagnostics', self.diagnostics, lockstep_qos()
         )
         self.clock = self.link.node.create_publisher(Clock, '/clock', 10)
-        self._classes = {one.topic: type(one.content) for one in case.messages()}
+        self._classes = {message.topic: type(message.content) for message in case.messages()}
         self.lockstep = LockStep(
             self.link, f'/{case.system}', recorder=self.recorder, trouble=self.node.trouble
         )
@@ -161,8 +161,8 @@ class Rig:
         """Send messages without waiting, and then wait for all answers."""
         sent = time.monotonic()
         messages = list(messages)
-        for one in messages:
-            self.publishers[one.topic].publish(one.content)
+        for message in messages:
+            self.publishers[message.topic].publish(message.content)
         self.lockstep.follow(len(messages), 'all', sent)
 
     def new_publishers(self) -> None:
@@ -200,12 +200,14 @@ class Rig:
 
     def set_parameters(self, atomically: bool = False, **values: Any) -> list[Any]:
         """Set parameters from outside; gives a result each, or one when `atomically`."""
-        told = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
         if atomically:
-            atomic = SetParametersAtomically.Request(parameters=told)
+            atomic = SetParametersAtomically.Request(parameters=parameters)
             name = 'set_parameters_atomically'
             return [self.call(SetParametersAtomically, name, atomic).result]
-        request = SetParameters.Request(parameters=told)
+        request = SetParameters.Request(parameters=parameters)
         return list(self.call(SetParameters, 'set_parameters', request).results)
 
     def parameters(self, *names: str) -> list[Any]:
@@ -272,7 +274,9 @@ class Rig:
         found = first_words(self.play(rest))
         self.fresh_diagnostics()
         origins = {
-            one.stamp_ns: one.origin_ns for one in rest if isinstance(one, Message) and one.primary
+            step.stamp_ns: step.origin_ns
+            for step in rest
+            if isinstance(step, Message) and step.primary
         }
         held = [
             stamp in found and agrees(found[stamp], expected[origin])
@@ -294,17 +298,17 @@ class Rig:
     def _advertise(self) -> None:
         self.publishers = {topic: self.peer(topic, lockstep_qos()) for topic in self._classes}
         if self.lockstep.counts.messages:
-            heard = self.wait_for(
+            stamps = self.wait_for(
                 lambda: all(p.get_subscription_count() for p in self.publishers.values())
             )
-            assert heard
+            assert stamps
 
 
 def first_words(estimates: Iterable[Estimate]) -> dict[int, Estimate]:
     """What was published first for each stamp: what somebody at sea acts upon."""
     found: dict[int, Estimate] = {}
-    for one in estimates:
-        found.setdefault(one.stamp_ns, one)
+    for estimate in estimates:
+        found.setdefault(estimate.stamp_ns, estimate)
     return found
 
 
@@ -330,7 +334,7 @@ def agrees(found: Estimate, expected: Estimate) -> bool:
     """Whether nearly every row of each has its like in the other: inside of what both say of their
     errors, and what is found is as sure of itself as what was expected, or nearly so. Rows that
     nobody would use yet, as tentative tracks, do not count."""
-    a, b = (_certain(one) for one in (found, expected))
+    a, b = (_certain(item) for item in (found, expected))
     if not len(a.state) or not len(b.state):
         return len(a.state) == len(b.state)
     near = _near(a, b)
@@ -344,7 +348,7 @@ def _near(a: Estimate, b: Estimate) -> np.ndarray:
     n = apart.shape[-1]
     weighed = np.linalg.solve(covariance + 1e-12 * np.eye(n), apart[..., None])[..., 0]
     inside = np.einsum('...i,...i->...', apart, weighed) <= chi2.ppf(GATE, n)
-    spread_a, spread_b = (np.diagonal(one.covariance, axis1=1, axis2=2) for one in (a, b))
+    spread_a, spread_b = (np.diagonal(item.covariance, axis1=1, axis2=2) for item in (a, b))
     quick = [k for k, name in enumerate(a.state_names) if name not in SLOW]
     sure = (spread_a[:, None] <= WIDER**2 * spread_b[None] + 1e-12)[..., quick].all(axis=2)
     near: np.ndarray = inside & sure

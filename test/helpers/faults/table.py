@@ -36,13 +36,13 @@ Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
 def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
     """Make a disturbance of a function of the messages during it; what it was given else stays."""
 
-    def told(*arguments: Any) -> Disturbance:
+    def disturbance(*arguments: Any) -> Disturbance:
         def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
             return [*before, *change(during, *arguments)], list(after)
 
         return disturb
 
-    return functools.wraps(change)(told)
+    return functools.wraps(change)(disturbance)
 
 
 # -- what is sent: messages lost, repeated, moved in time or spoilt -------------------------------
@@ -51,19 +51,19 @@ def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
 @middle
 def each(during: list[Message], change: Callable[[Message], Message]) -> list[Step]:
     """Every message on the primary input changed."""
-    return [change(one) if one.primary else one for one in during]
+    return [change(step) if step.primary else step for step in during]
 
 
 @middle
 def dropped(during: list[Message], topic: str) -> list[Step]:
     """An input that is silent for a while."""
-    return [one for one in during if one.topic != topic]
+    return [step for step in during if step.topic != topic]
 
 
 @middle
 def twice(during: list[Message]) -> list[Step]:
     """Every message comes two times."""
-    return [one for one in during for _ in range(2)]
+    return [step for step in during for _ in range(2)]
 
 
 @middle
@@ -72,12 +72,12 @@ def late(during: list[Message], places: int = 3) -> list[Step]:
     held: list[tuple[int, Message]] = []
     sent: list[Step] = []
     count = 0
-    for one in during:
-        count += one.primary
-        if one.primary and count % 4 == 0:
-            held.append((count + places, one))
+    for step in during:
+        count += step.primary
+        if step.primary and count % 4 == 0:
+            held.append((count + places, step))
         else:
-            sent.append(one)
+            sent.append(step)
         sent += [message for due, message in held if due <= count]
         held = [(due, message) for due, message in held if due > count]
     return sent + [message for _, message in held]
@@ -88,10 +88,10 @@ def shuffled(during: list[Message], size: int = 4) -> list[Step]:
     """Messages in any order inside of blocks with `size` of the primary input each."""
     rng = np.random.default_rng(5)
     blocks: list[list[Message]] = [[]]
-    for one in during:
+    for step in during:
         if sum(message.primary for message in blocks[-1]) == size:
             blocks.append([])
-        blocks[-1].append(one)
+        blocks[-1].append(step)
     return [block[k] for block in blocks for k in rng.permutation(len(block))]
 
 
@@ -99,7 +99,7 @@ def clock_set(seconds: float) -> Disturbance:
     """The clock of the sensors is set anew after the first third."""
 
     def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
-        return list(before), [one.moved(seconds) for one in [*during, *after]]
+        return list(before), [step.moved(seconds) for step in [*during, *after]]
 
     return disturb
 
@@ -113,12 +113,12 @@ def looped(before: list[Message], during: list[Message], after: list[Message]) -
 @middle
 def second_publisher(during: list[Message], seconds: float) -> list[Step]:
     """Every message comes again from a sender whose clock is late."""
-    return [step for one in during for step in (one, one.moved(-seconds))]
+    return [step for item in during for step in (item, item.moved(-seconds))]
 
 
 def frame(name: str) -> Callable[[Message], Message]:
     """Another frame_id."""
-    return lambda one: one.changed(lambda content: setattr(content.header, 'frame_id', name))
+    return lambda item: item.changed(lambda content: setattr(content.header, 'frame_id', name))
 
 
 def columns(**factors: float) -> Callable[[Message], Message]:
@@ -134,7 +134,7 @@ def columns(**factors: float) -> Callable[[Message], Message]:
         content.fields, content.data = made.fields, made.data
         content.point_step, content.row_step = made.point_step, made.row_step
 
-    return lambda one: one.changed(change)
+    return lambda item: item.changed(change)
 
 
 # -- what is done to a node between its messages --------------------------------------------------
@@ -186,7 +186,9 @@ def parameter_storm(during: list[Message]) -> list[Step]:
         (back,) = rig.set_parameters(atomically=True, stale_after=before[0], max_wait=before[1])
         assert back.successful
 
-    return [step for one in during for step in ([one, Action(storm)] if one.primary else [one])]
+    return [
+        step for item in during for step in ([item, Action(storm)] if item.primary else [item])
+    ]
 
 
 @middle
@@ -196,9 +198,9 @@ def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
     def publish(rig: Any) -> None:
         peer = rig.peer(rig.case.primary, qos)
         try:
-            for one in during:
-                if one.primary:
-                    peer.publish(one.moved(0.001).content)
+            for step in during:
+                if step.primary:
+                    peer.publish(step.moved(0.001).content)
             rig.heard_of('quality of service')
         finally:
             rig.link.node.destroy_publisher(peer)
@@ -209,15 +211,15 @@ def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
 def simulated_clock(seconds: float) -> Disturbance:
     """/clock follows the stamps, and jumps with them after the first third."""
 
-    def told(message: Message) -> list[Step]:
+    def split(message: Message) -> list[Step]:
         return [Action(lambda rig: rig.tell_clock(message.stamp_ns)), message]
 
     def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
-        rest = [one.moved(seconds) for one in [*during, *after]]
+        rest = [step.moved(seconds) for step in [*during, *after]]
         first = Action(lambda rig: rig.wait_for_clock(rest[0].stamp_ns, back=seconds < 0.0))
         return (
-            [step for one in before for step in told(one)],
-            [first, *(step for one in rest for step in told(one))],
+            [step for item in before for step in split(item)],
+            [first, *(step for item in rest for step in split(item))],
         )
 
     return disturb

@@ -122,12 +122,12 @@ def main():
     parser.add_argument('--systems', nargs='*', default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument('--jobs', type=int, default=2)
     parser.add_argument('--json', type=Path, help='write the numbers here')
-    told = parser.parse_args()
-    with ProcessPoolExecutor(told.jobs) as pool:
+    given = parser.parse_args()
+    with ProcessPoolExecutor(given.jobs) as pool:
         coming = {
-            system: pool.submit(_all, system, told.cases, told.draws) for system in told.systems
+            system: pool.submit(_all, system, given.cases, given.draws) for system in given.systems
         }
-        results = {system: one.result() for system, one in coming.items()}
+        results = {system: item.result() for system, item in coming.items()}
     failed = False
     for system, result in results.items():
         hostile, extreme = result['messages'], result['parameters']
@@ -140,8 +140,8 @@ def main():
         )
         for failure in hostile['failures'] + extreme['failures']:
             print(failure)
-    if told.json:
-        told.json.write_text(json.dumps(results, indent=1) + '\n')
+    if given.json:
+        given.json.write_text(json.dumps(results, indent=1) + '\n')
     return int(failed)
 
 

@@ -94,14 +94,14 @@ def _tracker(system, variant):
     tracker.warm()
     settings = config.as_dict()
     readers = {
-        (one.name, type_name): one.reader(type_name, 'enu', settings, one.name)
-        for one in inputs_of(system)
-        for type_name in one.readers
+        (item.name, type_name): item.reader(type_name, 'enu', settings, item.name)
+        for item in inputs_of(system)
+        for type_name in item.readers
     }
     images = DetectedImages(system, IMAGES, settings) if made_inputs(system) else None
-    for one in made_inputs(system):
-        for type_name in one.readers:
-            readers[one.name, type_name] = images.reader(one, type_name)
+    for each in made_inputs(system):
+        for type_name in each.readers:
+            readers[each.name, type_name] = images.reader(each, type_name)
     good = [readers[name, kind](message) for name, kind, message in stream(system, variant)]
     return tracker, readers, good
 
@@ -148,7 +148,7 @@ def _read(system, bad, readers, stamp_ns, tally):
     message = _at(message, stamp_ns + int(rng.integers(10**8)))
     message = mutated(message, MUTATIONS[bad.mutation], rng)
     if rng.random() < 0.05:  # on another input of the same type
-        name = rng.choice([one for one, kind in readers if kind == type_name])
+        name = rng.choice([reader for reader, kind in readers if kind == type_name])
     tally.cases += 1
     start = process_time()
     try:
@@ -201,11 +201,11 @@ def _check_nothing_lost(tracker, kept, estimates):
             continue
         assert found is not None and estimates[i] is not None
         assert len(found) == len(estimates[i])
-        for one, other in zip(found, estimates[i]):
-            assert one.stamp_ns == other.stamp_ns
-            np.testing.assert_array_equal(one.state, other.state)
-            np.testing.assert_array_equal(one.covariance, other.covariance)
-            np.testing.assert_array_equal(one.probabilities, other.probabilities)
+        for first, other in zip(found, estimates[i]):
+            assert first.stamp_ns == other.stamp_ns
+            np.testing.assert_array_equal(first.state, other.state)
+            np.testing.assert_array_equal(first.covariance, other.covariance)
+            np.testing.assert_array_equal(first.probabilities, other.probabilities)
 
 
 def _at(message, stamp_ns):

@@ -61,9 +61,9 @@ def make(type_name, **values):
 def clone(value):
     """A copy that shares nothing that can change."""
     if isinstance(value, SimpleNamespace):
-        return SimpleNamespace(**{name: clone(one) for name, one in vars(value).items()})
+        return SimpleNamespace(**{name: clone(member) for name, member in vars(value).items()})
     if isinstance(value, list):
-        return [clone(one) for one in value]
+        return [clone(item) for item in value]
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
@@ -76,8 +76,8 @@ def leaves(message):
             continue
         yield message, name, node
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.NAME:
-            for one in getattr(message, name)[:3]:
-                yield from leaves(one)
+            for item in getattr(message, name)[:3]:
+                yield from leaves(item)
 
 
 def number_type(node):

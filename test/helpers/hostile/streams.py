@@ -244,14 +244,14 @@ def templates(system):
                 continue
             table = type_name.endswith('PointCloud2')
             message = (
-                clone(next(one for (_, kind), one in found.items() if kind == type_name))
+                clone(next(item for (_, kind), item in found.items() if kind == type_name))
                 if table
                 else plausible(type_name)
             )
             if hasattr(message, 'header'):
                 message.header.frame_id = FRAMES.get((system, entry.name), 'map')
             found[entry.name, type_name] = message
-    return tuple((name, type_name, one) for (name, type_name), one in found.items())
+    return tuple((name, type_name, item) for (name, type_name), item in found.items())
 
 
 SPECIAL = {

@@ -143,7 +143,7 @@ def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
     pings = pings_of(report.path)
     assert sum(len(ping) for ping in pings) == 2008 and all(ping.passive for ping in pings)
     fixes = np.loadtxt(folder / 'fixes.csv', delimiter=',', skiprows=1)
-    ping = min(pings, key=lambda one: abs(one.stamp_ns * 1e-9 - fixes[5, 0]))
+    ping = min(pings, key=lambda item: abs(item.stamp_ns * 1e-9 - fixes[5, 0]))
 
     def residuals(unknown):
         where = np.array([unknown[0], unknown[1], -1.0])
@@ -167,6 +167,6 @@ def test_a_tag_that_is_named_keeps_its_number(tmp_path):
     assert report.messages == {'/arrivals': 4}
     assert report.notes['tag'] == 'amy is 1, bob is 2'
     with BagReader(tmp_path / 'bag') as bag:
-        pings = [read_arrivals(one.message) for one in bag.messages()]
+        pings = [read_arrivals(item.message) for item in bag.messages()]
     assert sorted(ping.tx_id[0] for ping in pings) == [1, 1, 2, 2]
     assert all(ping.passive and len(set(ping.tx_id.tolist())) == 1 for ping in pings)

@@ -87,14 +87,14 @@ def test_two_sensors_have_a_topic_each_with_their_empty_scans(convert):
     report = convert(records, sensors=('radar', 'lidar'), time_offset_ns=-500_000_000)
     assert report.messages == {'/radar/fixes': 2, '/lidar/fixes': 1}
     scans = fixes_of(report.path)
-    assert [one.stamp_ns for one in scans] == [500_000_000, 1_000_000_000, 1_500_000_000]
-    assert [len(one) for one in scans] == [1, 0, 0]
+    assert [scan.stamp_ns for scan in scans] == [500_000_000, 1_000_000_000, 1_500_000_000]
+    assert [len(scan) for scan in scans] == [1, 0, 0]
 
 
 def test_each_sensor_may_be_late_by_itself(convert):
     records = [record(2.0, [[1.0], [2.0]]), record(2.0, [[1.0], [2.0]], sensor=1)]
     report = convert(records, sensors=('radar', 'lidar'), time_offset_ns={'radar': -1_500_000_000})
-    stamps = sorted(one.stamp_ns for one in fixes_of(report.path))
+    stamps = sorted(fix.stamp_ns for fix in fixes_of(report.path))
     assert stamps == [500_000_000, 2_000_000_000]
 
 

@@ -90,17 +90,17 @@ def test_images_become_pings_also_empty_ones_and_navigation_comes_along(bag, tmp
         )
         == 0
     )
-    told = json.loads(capsys.readouterr().out)
-    assert told['messages'] == {'/detections': 5, '/nav': 6} and told['bad_rows'] == 1
-    assert '/fls/image #' in told['problems'][0]
+    content = json.loads(capsys.readouterr().out)
+    assert content['messages'] == {'/detections': 5, '/nav': 6} and content['bad_rows'] == 1
+    assert '/fls/image #' in content['problems'][0]
     with BagReader(out) as reader:
-        heard = [one.measurement for one in measurements_of(reader, 'obstacle')]
-    assert not any(isinstance(one, Rejection) for one in heard)
-    pings = [one for one in heard if isinstance(one, Detections)]
+        received = [item.measurement for item in measurements_of(reader, 'obstacle')]
+    assert not any(isinstance(item, Rejection) for item in received)
+    pings = [item for item in received if isinstance(item, Detections)]
     assert [len(ping) for ping in pings] == [1, 1, 1, 0, 1]
     assert [ping.range[0] for ping in pings if len(ping)] == [31.5, 31.0, 30.5, 29.5]
     assert pings[0].bearing[0] == pytest.approx(BEARINGS[5]) and BEARINGS[5] > 0.0
-    assert sum(isinstance(one, Navigation) for one in heard) == 6
+    assert sum(isinstance(item, Navigation) for item in received) == 6
 
 
 def test_a_bag_without_images_and_a_wrong_setting_are_one_sentence(bag, tmp_path, capsys):
@@ -178,7 +178,7 @@ def test_pings_of_an_oculus_in_a_bag_become_detections(tmp_path, capsys):
     assert main(['convert', 'images', str(bag), str(out), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['messages'] == {'/detections': 3}
     with BagReader(out) as reader:
-        found = [one.measurement for one in measurements_of(reader, 'obstacle')]
+        found = [item.measurement for item in measurements_of(reader, 'obstacle')]
     for ping in found:
         assert ping.range == pytest.approx([25.25], abs=0.1)
         assert ping.bearing == pytest.approx([-np.radians(10.0)], abs=0.01)
@@ -194,10 +194,10 @@ def test_directions_of_a_ping360_in_a_bag_are_gathered_into_sweeps(tmp_path, cap
     bag, out = write(tmp_path / 'bag', echoes), tmp_path / 'out'
     settings = ['--set', 'beam_width_deg=2', '--set', 'range_resolution=0.4']
     assert main(['convert', 'images', str(bag), str(out), *settings, '--json']) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told['messages'] == {'/detections': 2} and told['rows'] == len(scan)
+    content = json.loads(capsys.readouterr().out)
+    assert content['messages'] == {'/detections': 2} and content['rows'] == len(scan)
     with BagReader(out) as reader:
-        found = [one.measurement for one in measurements_of(reader, 'obstacle')]
+        found = [item.measurement for item in measurements_of(reader, 'obstacle')]
     for ping in found:
         assert ping.range == pytest.approx([10.1], abs=0.2)
         assert ping.bearing == pytest.approx([0.2], abs=0.02)
@@ -214,7 +214,7 @@ def test_several_topics_of_images_have_to_be_chosen_from(tmp_path, capsys):
 
 
 def test_what_the_sonar_says_beside_its_images_is_used_from_its_message_on(tmp_path, capsys):
-    said = marine.driver_message(
+    message = marine.driver_message(
         'marine_interfaces/msg/SonarInfo',
         header=marine.header(),
         intensity_quantity=3,
@@ -223,10 +223,10 @@ def test_what_the_sonar_says_beside_its_images_is_used_from_its_message_on(tmp_p
         tx_signal_types=np.zeros(0, np.uint8),
     )
     pings = [('/oculus/ping', oculus(k), k * 10**9) for k in range(1, 4)]
-    bag = write(tmp_path / 'bag', [*pings, ('/oculus/sonar_info', said, 25 * 10**8)])
+    bag = write(tmp_path / 'bag', [*pings, ('/oculus/sonar_info', message, 25 * 10**8)])
     with BagReader(bag) as reader:
-        heard = [one.measurement for one in measurements_of(reader, 'obstacle')]
-    strengths = [one.intensity[0] for one in heard if isinstance(one, Detections)]
+        received = [item.measurement for item in measurements_of(reader, 'obstacle')]
+    strengths = [item.intensity[0] for item in received if isinstance(item, Detections)]
     assert strengths == pytest.approx([200.0, 200.0, np.sqrt(200.0)])
     out = tmp_path / 'out'
     assert main(['convert', 'images', str(bag), str(out), '--json']) == 0

@@ -39,7 +39,7 @@ SCENE = scenario(
     {'pings': 2, 'staves': 2, 'spacing_wavelengths': 2.5, 'first_range': 20.0, 'last_range': 40.0},
 )
 SCENE_TRUTH = simulate(SCENE, 1)
-PINGS = [one.measurement for one in SCENE_TRUTH.measurements]
+PINGS = [item.measurement for item in SCENE_TRUTH.measurements]
 
 
 def image(ping, samples, dtype='f4', **raw):
@@ -92,7 +92,7 @@ def test_complex_samples_come_back():
     assert made.range == pytest.approx(ping.range) and made.sample_rate == RATE
     assert made.frequency == 450e3 and made.sound_speed == 1500.0 and made.frame_id == 'sss'
     turns = [np.ascontiguousarray(ping.iq[:, p]).view(np.float32) for p in range(2)]
-    assert np.array_equal(snapshot_of_staves([image(ping, one) for one in turns]).iq, ping.iq)
+    assert np.array_equal(snapshot_of_staves([image(ping, turn) for turn in turns]).iq, ping.iq)
 
 
 @pytest.mark.parametrize('dtype, counts', [('f4', None), ('i2', 65536), ('u1', 256)])
@@ -175,7 +175,7 @@ def converted(*arguments, capsys):
 def snapshots_in(bag):
     with BagReader(bag) as reader:
         found = measurements_of(reader, 'bathymetry')
-        return [one.measurement for one in found if isinstance(one.measurement, Snapshot)]
+        return [item.measurement for item in found if isinstance(item.measurement, Snapshot)]
 
 
 def height_error(snapshots, **values):
@@ -183,8 +183,8 @@ def height_error(snapshots, **values):
     tracker = BathymetryTracker(
         BathymetryConfig(element_spacing_wavelengths=spacing, noise_variance=1.0, **values)
     )
-    found = [tracker.process(one)[0].state[:, 0] for one in snapshots]
-    truth = [one.height for one in SCENE_TRUTH.truth]
+    found = [tracker.process(snapshot)[0].state[:, 0] for snapshot in snapshots]
+    truth = [item.height for item in SCENE_TRUTH.truth]
     return float(np.sqrt(np.mean(np.square(np.array(found) - truth)))), tracker
 
 
@@ -203,11 +203,13 @@ def test_from_images_to_a_floor(tmp_path, capsys):
         capsys=capsys,
     )
     assert report['messages'] == {'/port/snapshot': 2} and report['bad_rows'] == 0
-    found = sorted(snapshots_in(tmp_path / 'out'), key=lambda one: one.stamp_ns)
+    found = sorted(snapshots_in(tmp_path / 'out'), key=lambda item: item.stamp_ns)
     assert found[0].side == 'port'
     error, tracker = height_error(found)
     assert error < 0.15 and tracker.counts['bins_silent'] < 0.1 * tracker.counts['bins']
-    staves = {f'/stave_{p}': [image(one, in_two(one.iq[:, p])) for one in PINGS] for p in range(2)}
+    staves = {
+        f'/stave_{p}': [image(ping, in_two(ping.iq[:, p])) for ping in PINGS] for p in range(2)
+    }
     converted(
         write(tmp_path / 'iq', staves),
         tmp_path / 'out2',
@@ -252,9 +254,9 @@ def test_fields_are_found_by_the_names_that_are_told(tmp_path, capsys):
     )
     bag = write(tmp_path / 'bag', {'/sss': [message]})
     names = {'amplitude': 'strength', 'phase': 'turn', 'sample_rate': 'fs', 'sound_speed': 'c'}
-    told = [part for pair in names.items() for part in ('--field', '='.join(pair))]
+    given = [part for pair in names.items() for part in ('--field', '='.join(pair))]
     converted(
-        bag, tmp_path / 'out', '--amplitude', '/sss', '--phase', '/sss', *told, capsys=capsys
+        bag, tmp_path / 'out', '--amplitude', '/sss', '--phase', '/sss', *given, capsys=capsys
     )
     found = snapshots_in(tmp_path / 'out')[0]
     assert phase_of(found.iq) == pytest.approx(phase_of(ping.iq), abs=2e-4)
@@ -276,5 +278,5 @@ def test_mistakes_of_the_user_are_one_sentence(tmp_path, capsys, arguments, word
     bag = write(tmp_path / 'bag', {name: [image(PINGS[0], np.ones(8))] for name in ('/a', '/p')})
     command = ['convert', 'interferometer', str(bag), str(tmp_path / 'out'), *arguments]
     assert main(command) == 2
-    said = capsys.readouterr().err
-    assert word in said and said.count('\n') == 1
+    errors = capsys.readouterr().err
+    assert word in errors and errors.count('\n') == 1

@@ -77,8 +77,8 @@ def test_the_pulse_and_the_noise_are_measured():
 def test_an_impossible_spacing_is_said():
     stated = np.full(T, 12.8)
     assert doubted_spacing(ECHO, 0.4, 0.0, stated) is None
-    said = doubted_spacing(ECHO, 0.05, 0.0, stated)
-    assert '0.4 m a sample would fit' in said and '12.8 m of water' in said
+    message = doubted_spacing(ECHO, 0.05, 0.0, stated)
+    assert '0.4 m a sample would fit' in message and '12.8 m of water' in message
     # Samples that were left out before count as way.
     assert doubted_spacing(ECHO[:, 10:], 0.4, 4.0, stated) is None
     assert doubted_spacing(ECHO, 0.05, 0.0, np.zeros(T)) is None

@@ -33,13 +33,13 @@ def convert(tmp_path):
         out = tmp_path / 'bag'
         report = convert_snapshots(tmp_path / 'pings.npz', out, **(options or {}))
         with BagReader(out) as bag:
-            heard = [one.measurement for one in measurements_of(bag, 'bathymetry')]
+            received = [item.measurement for item in measurements_of(bag, 'bathymetry')]
             truth = [
-                read_estimate(one.message)
-                for one in bag.messages()
-                if one.topic == '/truth/estimate'
+                read_estimate(item.message)
+                for item in bag.messages()
+                if item.topic == '/truth/estimate'
             ]
-        return report, heard, truth
+        return report, received, truth
 
     return run
 
@@ -54,31 +54,31 @@ RANGE = 17.0 + 0.25 * np.arange(10)
 
 def test_one_ping(convert):
     iq = samples(10, 4)
-    report, (one,), truth = convert(
+    report, (item,), truth = convert(
         iq=iq, range=RANGE, sound_speed=1500.0, frequency=450e3, spacing_wavelengths=0.5
     )
     assert KINDS['snapshots'] is convert_snapshots and report.messages == {'/snapshot': 1}
-    assert (one.iq == iq).all() and (one.range == RANGE).all() and not truth
-    assert one.spacing_wavelengths == pytest.approx(0.5, rel=1e-6)
-    assert one.element_spacing == pytest.approx(1500.0 / 900e3, rel=1e-6)
+    assert (item.iq == iq).all() and (item.range == RANGE).all() and not truth
+    assert item.spacing_wavelengths == pytest.approx(0.5, rel=1e-6)
+    assert item.element_spacing == pytest.approx(1500.0 / 900e3, rel=1e-6)
 
 
 def test_many_pings_with_stamps_and_own_variances(convert):
     iq, noise = samples(3, 10, 4), np.array([1.0, 2.0, 3.0])[:, None] * np.ones(10)
-    report, heard, _ = convert(
+    report, received, _ = convert(
         iq=iq, range=RANGE, stamp=[5.0, 6.5, 7.0], noise_variance=noise, snr=np.arange(1.0, 11.0)
     )
     assert report.rows == 3
-    assert [one.stamp_ns for one in heard] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
-    for k, one in enumerate(heard):
-        assert (one.iq == iq[k]).all() and (one.noise_variance == k + 1.0).all()
-        assert np.allclose(one.signal_variance, (k + 1.0) * np.arange(1.0, 11.0))
+    assert [item.stamp_ns for item in received] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
+    for k, entry in enumerate(received):
+        assert (entry.iq == iq[k]).all() and (entry.noise_variance == k + 1.0).all()
+        assert np.allclose(entry.signal_variance, (k + 1.0) * np.arange(1.0, 11.0))
 
 
 def test_without_stamps_pings_follow_the_rate(convert):
-    _, heard, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
-    assert np.diff([one.stamp_ns for one in heard]).tolist() == [250_000_000] * 2
-    assert np.allclose(heard[0].range, RANGE)
+    _, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    assert np.diff([item.stamp_ns for item in received]).tolist() == [250_000_000] * 2
+    assert np.allclose(received[0].range, RANGE)
 
 
 def test_the_truth_of_a_test_vector(convert):
@@ -97,15 +97,15 @@ def test_the_truth_of_a_test_vector(convert):
 
 def test_channels_are_added_up_to_staves(convert):
     iq = samples(10, 4)
-    _, (one,), _ = convert({'staves': [[0, 3], [1, 2]]}, quadrants=iq, range_m=RANGE)
-    assert np.allclose(one.iq, np.stack([iq[:, 0] + iq[:, 3], iq[:, 1] + iq[:, 2]], axis=1))
+    _, (item,), _ = convert({'staves': [[0, 3], [1, 2]]}, quadrants=iq, range_m=RANGE)
+    assert np.allclose(item.iq, np.stack([iq[:, 0] + iq[:, 3], iq[:, 1] + iq[:, 2]], axis=1))
 
 
 def test_bad_pings_are_left_out_and_named(convert):
     iq = samples(3, 10, 4)
     iq[1] = np.nan
-    report, heard, _ = convert(iq=iq, range=RANGE)
-    assert len(heard) == 2 and report.bad_rows == 1 and 'ping 1' in report.problems[0]
+    report, received, _ = convert(iq=iq, range=RANGE)
+    assert len(received) == 2 and report.bad_rows == 1 and 'ping 1' in report.problems[0]
 
 
 @pytest.mark.parametrize(

@@ -307,13 +307,13 @@ class TestEk80:
         """An echo 40 samples deep, of a chirp that scipy made, has its range and its phase."""
         count, step = round(PULSE * RATE), int(np.prod([each for _, each in FILTERS]))
         sent = signal.chirp(np.arange(count) / RATE, BAND[0], PULSE, BAND[1])
-        heard = np.zeros(200 * step)
-        heard[40 * step : 40 * step + count] = sent * signal.windows.tukey(count, 2 * SLOPE)
+        received = np.zeros(200 * step)
+        received[40 * step : 40 * step + count] = sent * signal.windows.tukey(count, 2 * SLOPE)
         for coefficients, every in FILTERS:
-            heard = np.convolve(heard, coefficients)[::every]
+            received = np.convolve(received, coefficients)[::every]
         turn = np.exp(0.4j)
         sectors = np.array([turn, turn.conj(), turn.conj(), turn])
-        path = ek80(tmp_path / 'a.raw', (heard[:, None] * sectors)[None], chirp=True)
+        path = ek80(tmp_path / 'a.raw', (received[:, None] * sectors)[None], chirp=True)
         convert_ek80(path, tmp_path / 'bag')
         (snapshot,) = read(tmp_path / 'bag', 'bathymetry', Snapshot)
         size = np.abs(snapshot.iq[:, 0])

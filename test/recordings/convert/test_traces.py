@@ -31,9 +31,9 @@ ONES = np.ones((3, 40))
 SECOND = 10**9
 
 
-def heard(path):
+def traces_in(path):
     with BagReader(path) as bag:
-        return [one.measurement for one in measurements_of(bag, 'fathometer')]
+        return [item.measurement for item in measurements_of(bag, 'fathometer')]
 
 
 @pytest.fixture
@@ -59,14 +59,16 @@ def test_an_archive_with_truth(archive):
     )
     report = KINDS['traces'](path, out)
     assert report.messages == {'/trace': 3, '/truth/estimate': 3}
-    traces = heard(out)
-    assert [one.stamp_ns for one in traces] == [5 * SECOND, 65 * SECOND // 10, 7 * SECOND]
-    assert [one.reference_depth for one in traces] == [70.0, None, 71.0]
+    traces = traces_in(out)
+    assert [trace.stamp_ns for trace in traces] == [5 * SECOND, 65 * SECOND // 10, 7 * SECOND]
+    assert [trace.reference_depth for trace in traces] == [70.0, None, 71.0]
     assert (traces[1].sigma == 2.0).all() and np.allclose(traces[1].amplitude, np.sin(DEPTH))
     with BagReader(out) as bag:
-        truth = [read_estimate(one.message).columns() for one in bag.messages(['/truth/estimate'])]
+        truth = [
+            read_estimate(item.message).columns() for item in bag.messages(['/truth/estimate'])
+        ]
     # The second is there with 0.6 and more of its greatest, the first no longer with 0.39.
-    assert [list(one['track_id']) for one in truth] == [[1, 2], [1, 2], []]
+    assert [list(item['track_id']) for item in truth] == [[1, 2], [1, 2], []]
     assert list(truth[1]['depth']) == [121.1, 125.1]
 
 
@@ -76,7 +78,7 @@ def test_bad_traces_are_left_out_by_name(archive):
     path, out = archive(depth=DEPTH, amplitude=amplitude)
     report = convert_traces(path, out, rate=2.0)
     assert report.bad_rows == 1 and 'trace 1: ' in report.problems[0]
-    stamps = [one.stamp_ns for one in heard(out)]
+    stamps = [item.stamp_ns for item in traces_in(out)]
     assert stamps[1] - stamps[0] == SECOND
 
 
@@ -110,7 +112,7 @@ def test_a_table_has_a_row_a_sample(tmp_path):
     (tmp_path / 'in.csv').write_text('\n'.join(lines))
     report = convert_traces(tmp_path / 'in.csv', tmp_path / 'bag')
     assert report.rows == 80 and report.bad_rows == 1 and 'line 51' in report.problems[0]
-    first, second = heard(tmp_path / 'bag')
+    first, second = traces_in(tmp_path / 'bag')
     assert len(first) == 40 and len(second) == 39 and (first.sigma == 0.5).all()
 
 
@@ -138,12 +140,12 @@ def line(tmp_path):
 
 def test_segy_traces_have_their_depth_and_time(line, tmp_path):
     report = convert_segy(line, tmp_path / 'bag', depth_offset=2.0)
-    traces = heard(tmp_path / 'bag')
+    traces = traces_in(tmp_path / 'bag')
     assert report.messages == {'/trace': 7}
     assert np.allclose(traces[0].depth, 2.0 + 15.0 + 0.075 * np.arange(30), atol=1e-5)
     assert list(traces[3].amplitude) == list(300.0 + np.arange(30))
     start = 1520982684 * SECOND  # 2018-03-13 23:11:24 UTC
-    assert [one.stamp_ns - start for one in traces[:5]] == [
+    assert [trace.stamp_ns - start for trace in traces[:5]] == [
         0,
         SECOND // 4,
         SECOND // 2,
@@ -154,7 +156,7 @@ def test_segy_traces_have_their_depth_and_time(line, tmp_path):
 
 def test_segy_traces_are_cut_and_stacked(line, tmp_path):
     convert_segy(line, tmp_path / 'bag', sample_spacing=0.376, first_sample=12, samples=8, stack=3)
-    traces = heard(tmp_path / 'bag')
+    traces = traces_in(tmp_path / 'bag')
     assert len(traces) == 2 and len(traces[0]) == 8
     assert np.allclose(traces[0].depth[0], 15.0 + 12 * 0.376)
     assert list(traces[1].amplitude) == list(400.0 + np.arange(12, 20))

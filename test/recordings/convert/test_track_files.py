@@ -126,10 +126,10 @@ def test_a_file_gives_the_fixes_of_a_csv(tmp_path, name):
         report = convert_fixes(tmp_path / file, tmp_path / f'{file}.bag', origin=(54.1, 10.1))
         assert report.bad_rows == 0 and report.notes['id'] == 'anna is 1, bert is 2'
         found.append(fixes_of(report.path))
-    for one, other in zip(*found, strict=True):
-        assert one.stamp_ns == other.stamp_ns
-        assert one.position.tolist() == other.position.tolist()
-        assert list(one.target_id) == list(other.target_id)
+    for first, other in zip(*found, strict=True):
+        assert first.stamp_ns == other.stamp_ns
+        assert first.position.tolist() == other.position.tolist()
+        assert list(first.target_id) == list(other.target_id)
 
 
 def test_truth_and_ignored_columns(tmp_path):

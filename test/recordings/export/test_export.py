@@ -35,33 +35,33 @@ def points(n=300, seed=2):
 
 
 def test_xyz_is_read_by_numpy(tmp_path):
-    one = points()
-    write_xyz(tmp_path / 'a.xyz', one)
+    item = points()
+    write_xyz(tmp_path / 'a.xyz', item)
     table = np.loadtxt(tmp_path / 'a.xyz')
     for k, name in enumerate('xyz'):
-        assert table[:, k] == pytest.approx(one[name], abs=5.1e-4)
-    assert table[:, 3] == pytest.approx(np.sqrt(one['vertical_uncertainty']), abs=5.1e-4)
+        assert table[:, k] == pytest.approx(item[name], abs=5.1e-4)
+    assert table[:, 3] == pytest.approx(np.sqrt(item['vertical_uncertainty']), abs=5.1e-4)
 
 
 @pytest.mark.parametrize('name', ['a.las', 'a.laz'])
 def test_las_is_read_by_laspy(tmp_path, name):
     laspy = pytest.importorskip('laspy')
-    one = points().moved((500_000.0, 6_000_000.0, 0.0))
-    write_las(tmp_path / name, one, 32632)
+    item = points().moved((500_000.0, 6_000_000.0, 0.0))
+    write_las(tmp_path / name, item, 32632)
     las = laspy.read(tmp_path / name)
     for axis in 'xyz':
-        assert np.asarray(las[axis]) == pytest.approx(one[axis], abs=5.1e-4)
+        assert np.asarray(las[axis]) == pytest.approx(item[axis], abs=5.1e-4)
     for extra in ('vertical_uncertainty', 'horizontal_uncertainty', 'beam_angle', 'range'):
-        assert np.asarray(las[extra]) == pytest.approx(one[extra].astype(np.float32))
-    assert np.asarray(las.user_data) == pytest.approx(one['label'])
-    assert np.asarray(las.point_source_id) == pytest.approx(one['side'])
-    decibels = np.asarray(las.intensity) / 100.0 + one['intensity'].min()
-    assert decibels == pytest.approx(one['intensity'], abs=0.0051)
+        assert np.asarray(las[extra]) == pytest.approx(item[extra].astype(np.float32))
+    assert np.asarray(las.user_data) == pytest.approx(item['label'])
+    assert np.asarray(las.point_source_id) == pytest.approx(item['side'])
+    decibels = np.asarray(las.intensity) / 100.0 + item['intensity'].min()
+    assert decibels == pytest.approx(item['intensity'], abs=0.0051)
     assert set(las.classification) == {40}
     wkt = [vlr for vlr in las.header.vlrs if 'Wkt' in type(vlr).__name__]
     assert 'UTM zone 32N' in wkt[0].string and las.header.global_encoding.wkt
     if name.endswith('laz'):
-        write_las(tmp_path / 'b.las', one, 32632)
+        write_las(tmp_path / 'b.las', item, 32632)
         assert (tmp_path / name).stat().st_size < (tmp_path / 'b.las').stat().st_size
 
 

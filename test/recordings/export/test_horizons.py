@@ -123,10 +123,10 @@ def test_points_along_the_track(tracked):
     content = json.loads((tracked / 'h.geojson').read_text())
     assert content['type'] == 'FeatureCollection'
     assert len(content['features']) == len(estimates(tracked))
-    for one in content['features']:
-        east, north, up = one['geometry']['coordinates']
-        assert one['geometry']['type'] == 'Point' and -91.65 < east < -91.63
-        assert up == -one['properties']['depth_m'] and north == pytest.approx(17.13, abs=1e-5)
+    for item in content['features']:
+        east, north, up = item['geometry']['coordinates']
+        assert item['geometry']['type'] == 'Point' and -91.65 < east < -91.63
+        assert up == -item['properties']['depth_m'] and north == pytest.approx(17.13, abs=1e-5)
 
 
 def test_segy_read_by_segyio_and_by_hand(tracked):
@@ -176,7 +176,7 @@ def test_what_cannot_be_exported_is_one_sentence(tracked, capsys, name, options,
         with segyio.open(str(other), 'r+', ignore_geometry=True) as file:
             for k in range(T):
                 file.header[k].update({segyio.TraceField.HourOfDay: 5})
-    options = [tracked / one if str(one).endswith('.seg') else one for one in options]
+    options = [tracked / option if str(option).endswith('.seg') else option for option in options]
     assert export(tracked, name, *options) == 2
     error = capsys.readouterr().err
     assert words in error and 'Traceback' not in error
@@ -216,8 +216,8 @@ def test_places_by_navigation(tracked, tmp_path, capsys):
                 orientation=np.array([0.0, 0.0, 0.0, 1.0]),
             )
             out.write('/nav', write_navigation(here, ros_message), stamp)
-    told = (tracked / 'bag' / 'parameters.yaml').read_text()
-    (tmp_path / 'bag' / 'parameters.yaml').write_text(told)
+    text = (tracked / 'bag' / 'parameters.yaml').read_text()
+    (tmp_path / 'bag' / 'parameters.yaml').write_text(text)
     run = 'track', tmp_path / 'bag', tmp_path / 'run', '--system', 'fathometer'
     assert main([*map(str, run), '--set', 'particles=500']) == 0
     capsys.readouterr()
@@ -225,6 +225,6 @@ def test_places_by_navigation(tracked, tmp_path, capsys):
     assert '--origin' in capsys.readouterr().err
     where = '--epsg', 32615, '--origin', '850000,1890000'
     assert export(tmp_path, 'n.geojson', *where) == 0
-    for one in json.loads((tmp_path / 'n.geojson').read_text())['features']:
-        longitude, latitude, _ = one['geometry']['coordinates']
+    for landmark in json.loads((tmp_path / 'n.geojson').read_text())['features']:
+        longitude, latitude, _ = landmark['geometry']['coordinates']
         assert -91.65 < longitude < -91.63 and latitude == pytest.approx(17.13, abs=1e-5)

@@ -36,7 +36,7 @@ SIGNAL = NOISE * 10.0**0.9
 
 def run(pings=10, seed=1, **overrides):
     scene = simulate(scenario('paper', {**ODD, 'pings': pings, **overrides}), seed)
-    return [(one.measurement, true) for one, true in zip(scene.measurements, scene.truth)]
+    return [(item.measurement, true) for item, true in zip(scene.measurements, scene.truth)]
 
 
 def phases(true, wavelengths=SPACING, staves=STAVES):
@@ -119,10 +119,10 @@ def test_stamps_and_what_the_snapshot_says_of_the_sonar():
 
 def test_what_the_snapshot_says_of_the_signal_is_what_it_holds():
     pings = run(pings=60, state_signal=True, shadows=[30.0, 35.0], patch_std=0.0)
-    told = pings[0][0].signal_variance
+    given = pings[0][0].signal_variance
     dark = (pings[0][1].range >= 30.0) & (pings[0][1].range < 35.0)
-    assert np.isnan(told[dark]).all()  # no signal is none to state
-    assert told[~dark] == pytest.approx(SIGNAL)
+    assert np.isnan(given[dark]).all()  # no signal is none to state
+    assert given[~dark] == pytest.approx(SIGNAL)
     power = np.mean([np.abs(snapshot.iq) ** 2 for snapshot, _ in pings], axis=(0, 2))
     assert power[dark].mean() == pytest.approx(NOISE, rel=0.1)
     assert power[~dark].mean() == pytest.approx(SIGNAL + NOISE, rel=0.05)
@@ -130,6 +130,6 @@ def test_what_the_snapshot_says_of_the_signal_is_what_it_holds():
 
 def test_the_first_pings_do_not_depend_on_how_many_follow():
     few, many = run(pings=2), run(pings=4)
-    for (one, true), (other, same_true) in zip(few, many):
-        assert np.array_equal(one.iq, other.iq) and np.array_equal(true.height, same_true.height)
+    for (first, true), (other, same_true) in zip(few, many):
+        assert np.array_equal(first.iq, other.iq) and np.array_equal(true.height, same_true.height)
     assert not np.array_equal(few[0][0].iq, few[1][0].iq)

@@ -35,9 +35,9 @@ def exact(**more):
 
 def poses(scene):
     nav = [
-        one.measurement for one in scene.measurements if isinstance(one.measurement, Navigation)
+        item.measurement for item in scene.measurements if isinstance(item.measurement, Navigation)
     ]
-    stamps = np.array([one.stamp_ns for one in nav])
+    stamps = np.array([item.stamp_ns for item in nav])
     return stamps, np.array([n.position for n in nav]), np.array([n.orientation for n in nav])
 
 
@@ -128,7 +128,7 @@ def test_what_the_navigation_says_differs_from_the_truth_by_its_errors():
     off = wrong[1] - right[1]
     assert np.std(off[:, 2]) == pytest.approx(0.05, rel=0.25) and (off[:, :2] == 0.0).all()
     angles = [
-        geometry.euler_angles(geometry.rotation_of_quaternion(one[2])) for one in (right, wrong)
+        geometry.euler_angles(geometry.rotation_of_quaternion(item[2])) for item in (right, wrong)
     ]
     assert np.degrees(np.std(angles[1] - angles[0], axis=0)[:2]) == pytest.approx(
         [0.5, 0.5], rel=0.3
@@ -139,14 +139,14 @@ def test_what_the_navigation_says_differs_from_the_truth_by_its_errors():
 
 def test_the_sides_look_apart():
     scene = simulate(scenario('moving_two_sides', {'pings': 1, 'bin_width': 1.0}), 1)
-    assert sorted({one.namespace for one in scene.measurements}) == ['', 'port', 'starboard']
+    assert sorted({item.namespace for item in scene.measurements}) == ['', 'port', 'starboard']
     port, starboard = (
         next(t for t in scene.truth if t.namespace == s) for s in ('port', 'starboard')
     )
     course = np.radians(30.0)
     left = np.array([-np.sin(course), np.cos(course), 0.0])
     assert (port.xyz @ left > 0.0).all() and (starboard.xyz @ left < 0.0).all()
-    snapshots = [one for one in scene.measurements if isinstance(one.measurement, Snapshot)]
+    snapshots = [item for item in scene.measurements if isinstance(item.measurement, Snapshot)]
     assert len(snapshots) == 2
 
 

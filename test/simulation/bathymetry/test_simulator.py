@@ -24,8 +24,8 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, SCENARIOS,
 
 def run(name='paper', seed=1, **overrides):
     scene = simulate(scenario(name, {'pings': 4, **overrides}), seed)
-    heard = [one.measurement for one in scene.measurements]
-    snapshots = [one for one in heard if isinstance(one, Snapshot)]
+    received = [item.measurement for item in scene.measurements]
+    snapshots = [item for item in received if isinstance(item, Snapshot)]
     return list(zip(snapshots, scene.truth))
 
 
@@ -126,10 +126,10 @@ def test_surface_echoes_come_from_the_surface_and_the_mirrored_floor():
 
 def test_both_sides_have_names_and_one_frame():
     scene = simulate(scenario('two_sides', {'pings': 2}), 1)
-    assert [one.namespace for one in scene.measurements] == ['port', 'starboard'] * 2
+    assert [item.namespace for item in scene.measurements] == ['port', 'starboard'] * 2
     assert [true.namespace for true in scene.truth] == ['port', 'starboard'] * 2
     alone = simulate(scenario('paper', {'pings': 1}), 1)
-    assert {one.namespace for one in (*alone.measurements, *alone.truth)} == {''}
+    assert {item.namespace for item in (*alone.measurements, *alone.truth)} == {''}
     port, starboard = scene.truth[:2]
     assert (port.xyz[:, 1] > 0.0).all() and (starboard.xyz[:, 1] < 0.0).all()
     assert port.frame_id == starboard.frame_id == scene.frame_id
@@ -190,7 +190,7 @@ def test_other_laws_of_echoes_and_of_rough_floor():
         true.height
         for _, true in run(roughness_law='fractal', pings=60, patch_end=77, patch_start=17)
     ]
-    spectrum = np.mean([np.square(np.abs(np.fft.rfft(one))) for one in fractal], axis=0)
+    spectrum = np.mean([np.square(np.abs(np.fft.rfft(item))) for item in fractal], axis=0)
     low, high = spectrum[4:8].mean(), spectrum[40:80].mean()
     assert low / high == pytest.approx(100.0, rel=0.4)
     assert np.std(fractal) == pytest.approx(0.5, rel=0.05)

@@ -48,9 +48,9 @@ def test_fixes_are_as_accurate_as_they_say():
     squared = []
     for seed in range(20):
         scene = simulate(scenario('table1'), seed)
-        for one, place in zip(scene.measurements, scene.truth[0].position):
-            error = one.measurement.position[:2] - place[:2]
-            squared.append(error @ np.linalg.solve(one.measurement.covariance[:2, :2], error))
+        for item, place in zip(scene.measurements, scene.truth[0].position):
+            error = item.measurement.position[:2] - place[:2]
+            squared.append(error @ np.linalg.solve(item.measurement.covariance[:2, :2], error))
     assert np.mean(squared) == pytest.approx(2.0, abs=0.15)
 
 
@@ -65,10 +65,10 @@ def test_arrivals_are_transmitter_diver_receiver():
         },
     )
     scene = simulate(config, 2)
-    for one, place in zip(scene.measurements, scene.truth[0].position):
+    for item, place in zip(scene.measurements, scene.truth[0].position):
         path = np.linalg.norm(place - TRANSMITTER) + np.linalg.norm(place - RECEIVERS, axis=1)
-        np.testing.assert_allclose(one.measurement.toa * 1500.0, path, atol=1e-4)
-        np.testing.assert_array_equal(one.measurement.rx, RECEIVERS)
+        np.testing.assert_allclose(item.measurement.toa * 1500.0, path, atol=1e-4)
+        np.testing.assert_array_equal(item.measurement.rx, RECEIVERS)
 
 
 @pytest.mark.statistics
@@ -79,8 +79,8 @@ def test_misses_clutter_and_outliers_come_as_often_as_asked():
     assert len(cluttered.measurements) == pytest.approx(4.0 * 401, abs=150)
     scene = simulate(scenario('table1', {'outlier_probability': 0.1, 'duration': 2000.0}), 7)
     error = [
-        np.hypot(*(one.measurement.position - place)[:2])
-        for one, place in zip(scene.measurements, scene.truth[0].position)
+        np.hypot(*(item.measurement.position - place)[:2])
+        for item, place in zip(scene.measurements, scene.truth[0].position)
     ]
     # A bearing error of 2 degrees is never 8 times its size; most outliers are far off.
     far = np.linalg.norm(scene.truth[0].position[:, :2], axis=1) * np.deg2rad(16.0)
@@ -89,12 +89,12 @@ def test_misses_clutter_and_outliers_come_as_often_as_asked():
 
 def test_late_scans_are_received_late_and_out_of_order():
     scene = simulate(scenario('irregular'), 8)
-    received = [one.received_ns for one in scene.measurements]
-    delay = np.array([one.received_ns - one.measurement.stamp_ns for one in scene.measurements])
+    received = [item.received_ns for item in scene.measurements]
+    delay = np.array([item.received_ns - item.measurement.stamp_ns for item in scene.measurements])
     assert received == sorted(received)
     assert (delay >= 0).all() and delay.max() <= 3e9
     assert np.mean(delay > 0) == pytest.approx(0.25, abs=0.12)
-    assert (np.diff([one.measurement.stamp_ns for one in scene.measurements]) < 0).any()
+    assert (np.diff([item.measurement.stamp_ns for item in scene.measurements]) < 0).any()
 
 
 def test_a_turned_scene_keeps_its_distances():
@@ -113,7 +113,7 @@ def test_several_divers_are_several():
     starts = np.array([track.position[0, :2] for track in scene.truth])
     gaps = np.linalg.norm(starts[:, None] - starts, axis=-1) + 1e9 * np.eye(4)
     assert gaps.min() > 10.0
-    assert all(isinstance(one.measurement, Fix) for one in scene.measurements)
+    assert all(isinstance(item.measurement, Fix) for item in scene.measurements)
 
 
 @pytest.mark.parametrize(
@@ -134,8 +134,9 @@ def test_positions_on_earth_lie_where_the_truth_does():
     truth = dict(zip(scene.truth[0].stamp_ns.tolist(), scene.truth[0].position))
     error = np.array(
         [
-            ORIGIN.local(one.latitude, one.longitude, one.height)[:2] - truth[one.stamp_ns][:2]
-            for one in (item.measurement for item in scene.measurements)
+            ORIGIN.local(entry.latitude, entry.longitude, entry.height)[:2]
+            - truth[entry.stamp_ns][:2]
+            for entry in (item.measurement for item in scene.measurements)
         ]
     )
     np.testing.assert_allclose(error.std(axis=0), 0.5, rtol=0.25)
@@ -147,7 +148,7 @@ def test_what_a_vessel_sees_is_consistent_where_it_is_placed():
     for seed in range(4):
         scene = simulate(config, seed)
         truth = {
-            one.track_id: dict(zip(one.stamp_ns.tolist(), one.position)) for one in scene.truth
+            item.track_id: dict(zip(item.stamp_ns.tolist(), item.position)) for item in scene.truth
         }
         georeferencer = Georeferencer(DiverConfig(**config.instruments()), Counter())
         for item in scene.measurements:
@@ -169,8 +170,11 @@ def arrivals(scene):
     """(arrivals, where the divers are (n, 3)) of each ping."""
     at = {int(stamp): k for k, stamp in enumerate(scene.truth[0].stamp_ns)}
     return [
-        (one.measurement, [track.position[at[one.measurement.stamp_ns]] for track in scene.truth])
-        for one in scene.measurements
+        (
+            item.measurement,
+            [track.position[at[item.measurement.stamp_ns]] for track in scene.truth],
+        )
+        for item in scene.measurements
     ]
 
 
@@ -199,13 +203,13 @@ def test_receivers_miss_and_hear_reflections_each_for_itself():
         toa_std=1e-7,
         duration=1500.0,
     )
-    heard, late = np.zeros(4), []
+    received, late = np.zeros(4), []
     for ping, (place,) in arrivals(scene):
         for receiver, toa in zip(ping.rx_id, ping.toa):
-            heard[receiver] += 1
+            received[receiver] += 1
             direct = np.linalg.norm(place) + np.linalg.norm(place - RECEIVERS[receiver])
             late.append(toa * 1500.0 - direct)
-    assert heard / 1501 == pytest.approx([0.6] * 4, abs=0.05)
+    assert received / 1501 == pytest.approx([0.6] * 4, abs=0.05)
     late = np.array(late)
     reflected = late > 1.0
     assert reflected.mean() == pytest.approx(0.2, abs=0.03)
@@ -231,8 +235,8 @@ def test_polar_fixes_have_the_errors_of_a_polar_sonar():
     for seed in range(8):
         scene = run('still', seed, range_std=0.3, bearing_std_deg=1.5, start=(-60.0, 25.0))
         place = scene.truth[0].position[0, :2]
-        for one in scene.measurements:
-            error = one.measurement.position[:2] - place
+        for item in scene.measurements:
+            error = item.measurement.position[:2] - place
             along.append(error @ place / 65.0)
             across.append((error[1] * place[0] - error[0] * place[1]) / 65.0**2)
     n = len(along)
@@ -248,9 +252,9 @@ def test_fixes_from_arrivals_are_as_accurate_as_they_say():
     for seed in range(5):
         scene = run('multistatic_fixes', seed)
         at = dict(zip(scene.truth[0].stamp_ns.tolist(), scene.truth[0].position[:, :2]))
-        for one in scene.measurements:
-            error = one.measurement.position[:2] - at[one.measurement.stamp_ns]
-            squared.append(error @ np.linalg.solve(one.measurement.covariance[:2, :2], error))
+        for item in scene.measurements:
+            error = item.measurement.position[:2] - at[item.measurement.stamp_ns]
+            squared.append(error @ np.linalg.solve(item.measurement.covariance[:2, :2], error))
     assert len(squared) > 450
     assert np.mean(squared) == pytest.approx(2.0, abs=4.0 * 2.0 / np.sqrt(len(squared)))
 
@@ -258,7 +262,7 @@ def test_fixes_from_arrivals_are_as_accurate_as_they_say():
 def test_clutter_fills_the_square_evenly():
     scene = run('table1', detection_probability=0.0, clutter=5.0, clutter_range=50.0,
                 duration=300.0, range_std=1e-3, bearing_std_deg=1e-3)  # fmt: skip
-    points = np.array([one.measurement.position[:2] for one in scene.measurements])
+    points = np.array([item.measurement.position[:2] for item in scene.measurements])
     assert len(points) == pytest.approx(1505, abs=160)
     counts, _, _ = np.histogram2d(*points.T, bins=3, range=[[-50, 50], [-50, 50]])
     assert counts.sum() >= len(points) - 2

@@ -37,7 +37,7 @@ def test_every_scenario_can_be_made_small(name):
     config, scene = smaller_scene(SYSTEMS['fathometer'], name, 1)
     assert len(scene.truth) == config.records <= 2
     assert scene.truth[-1].stamp_ns == scene.measurements[-1].measurement.stamp_ns
-    kinds = {type(one.measurement) for one in scene.measurements}
+    kinds = {type(item.measurement) for item in scene.measurements}
     assert kinds <= {CrossSpectra, Trace, Pressure, ArrayDepth}
 
 
@@ -92,20 +92,20 @@ def test_pressure_in_whole_numbers_has_the_steps_it_was_told():
     changes = {'records': 1, 'record_seconds': 1.0, 'block_seconds': 0.3}
     coarse = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 2.5}), 1)
     fine = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 0.0}), 1)
-    a = np.concatenate([one.measurement.pressure for one in coarse.measurements])
-    b = np.concatenate([one.measurement.pressure for one in fine.measurements])
-    (scale,) = {one.measurement.scale for one in coarse.measurements}
-    assert [len(one.measurement) for one in coarse.measurements] == [1800, 1800, 1800, 600]
+    a = np.concatenate([item.measurement.pressure for item in coarse.measurements])
+    b = np.concatenate([item.measurement.pressure for item in fine.measurements])
+    (scale,) = {item.measurement.scale for item in coarse.measurements}
+    assert [len(item.measurement) for item in coarse.measurements] == [1800, 1800, 1800, 600]
     assert scale == pytest.approx(b.std() / 2.5, rel=1e-3)
     assert np.abs(a - b).max() <= 0.5001 * scale
     assert np.abs(a / scale - np.round(a / scale)).max() < 1e-4
-    assert {one.measurement.scale for one in fine.measurements} == {0.0}
+    assert {item.measurement.scale for item in fine.measurements} == {0.0}
 
 
 def test_what_a_tracker_is_told_of_pressure_leaves_its_snapshots_to_it():
-    told = scenario('pressure').instruments()
-    assert 'snapshot_seconds' not in told
-    assert (told['depth_min'], told['depth_max']) == (42.0, 74.0)
+    given = scenario('pressure').instruments()
+    assert 'snapshot_seconds' not in given
+    assert (given['depth_min'], given['depth_max']) == (42.0, 74.0)
     assert scenario('small').instruments()['window'] == 'rectangular'
 
 
@@ -116,8 +116,8 @@ def test_whitened_spectra_are_even():
         for white in (False, True)
     )
     ratio = [
-        np.einsum('fmm->f', one.csdm).real[10] / (np.einsum('fmm->f', one.csdm).real[-10])
-        for one in (red, even)
+        np.einsum('fmm->f', item.csdm).real[10] / (np.einsum('fmm->f', item.csdm).real[-10])
+        for item in (red, even)
     ]
     assert ratio[0] > 20.0 and 0.5 < ratio[1] < 2.0
 
@@ -142,8 +142,8 @@ LAYERS = np.array([9.0, 12.5]), np.array([0.4, 0.2])
 
 
 def floor(heights, amplitudes, array_depth=60.0):
-    one = np.array([array_depth])
-    return Drift(array_depth + heights[None], amplitudes[None], amplitudes[None] > 0.0, one, one)
+    item = np.array([array_depth])
+    return Drift(array_depth + heights[None], amplitudes[None], amplitudes[None] > 0.0, item, item)
 
 
 def expected(frequency, config, heights, amplitudes, ships=True):
@@ -244,7 +244,7 @@ def test_pressure_has_the_spectra_of_the_plane_waves():
         },
     )
     scene = simulate(config, 3)
-    p = np.concatenate([one.measurement.pressure for one in scene.measurements])
+    p = np.concatenate([item.measurement.pressure for item in scene.measurements])
     assert p.shape == (round(9.8 * 4000.0), 4)
     height = scene.truth[0].depth - scene.measurements[0].measurement.reference_depth
     frequency = np.arange(100.0, 1000.0, 20.0)
@@ -301,8 +301,8 @@ def test_the_truth_names_what_is_there():
     assert first.track_id.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
     assert len(middle.track_id) == 7 and set(middle.track_id) < set(first.track_id)
     assert last.track_id[-1] == 9 and len(last.track_id) == 8
-    assert [one.stamp_ns for one in scene.truth] == [
-        one.measurement.stamp_ns for one in scene.measurements
+    assert [item.stamp_ns for item in scene.truth] == [
+        item.measurement.stamp_ns for item in scene.measurements
     ]
-    steps = np.diff([one.stamp_ns for one in scene.truth])
+    steps = np.diff([item.stamp_ns for item in scene.truth])
     np.testing.assert_allclose(steps, 89.6e9, atol=1.0)

@@ -33,11 +33,11 @@ def sonar(seed=0, **values):
     return ImageSonar(config, np.random.default_rng(seed))
 
 
-def powers(one, count, places=(), pose=LEVEL):
+def powers(imager, count, places=(), pose=LEVEL):
     """Mean power over images, in units of the noise."""
-    gain = one.config.image_gain
+    gain = imager.config.image_gain
     return np.mean(
-        [np.square(one.image(pose, list(places), 1.0) / gain) for _ in range(count)], axis=0
+        [np.square(imager.image(pose, list(places), 1.0) / gain) for _ in range(count)], axis=0
     )
 
 
@@ -72,8 +72,8 @@ def test_bins_and_beams_fill_range_and_sector():
 
 
 def test_noise_is_rayleigh_speckle_as_wide_as_a_beam_and_as_long_as_the_pulse():
-    one = sonar(**NOWHERE)
-    images = [np.square(one.image(LEVEL, [], 1.0) / 40.0) for _ in range(6)]
+    imager = sonar(**NOWHERE)
+    images = [np.square(imager.image(LEVEL, [], 1.0) / 40.0) for _ in range(6)]
     power = np.concatenate(images, axis=0)
     assert power.mean() == pytest.approx(1.0, abs=0.01)
     assert power.std() == pytest.approx(1.0, abs=0.03)  # exponential
@@ -86,23 +86,23 @@ def test_noise_is_rayleigh_speckle_as_wide_as_a_beam_and_as_long_as_the_pulse():
 
 
 def test_water_scatters_back_by_the_square_of_the_range():
-    one = sonar(**{**NOWHERE, 'reverberation': 30.0, 'image_gain': 20.0})
-    mean = powers(one, 30).mean(axis=1)
-    wanted = 1.0 + 30.0 * np.square(10.0 / one.range)
-    far = one.range > 15.0
+    imager = sonar(**{**NOWHERE, 'reverberation': 30.0, 'image_gain': 20.0})
+    mean = powers(imager, 30).mean(axis=1)
+    wanted = 1.0 + 30.0 * np.square(10.0 / imager.range)
+    far = imager.range > 15.0
     assert mean[far] / wanted[far] == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_point_is_as_strong_wide_and_long_as_told():
-    one = sonar(**{**NOWHERE, 'target_snr_db': 26.0, 'image_gain': 8.0})
-    d, b = one.range[300], -one.bearing[100]
+    imager = sonar(**{**NOWHERE, 'target_snr_db': 26.0, 'image_gain': 8.0})
+    d, b = imager.range[300], -imager.bearing[100]
     place = np.array([d * np.cos(b), d * np.sin(b), 20.0])
-    power = powers(one, 20, [place])
+    power = powers(imager, 20, [place])
     row, beam = np.unravel_index(np.argmax(power), power.shape)
-    assert abs(one.range[row] - d) < 0.1 and beam == 100
+    assert abs(imager.range[row] - d) < 0.1 and beam == 100
     peak = power[row, beam] - 1.0
     assert 10.0 * np.log10(peak) == pytest.approx(26.0, abs=0.6)
-    step = np.degrees(one.bearing[0] - one.bearing[1])
+    step = np.degrees(imager.bearing[0] - imager.bearing[1])
     wide = step * np.count_nonzero(power[row] > 0.5 * peak)
     assert wide == pytest.approx(1.0, abs=0.2)
     beyond = np.abs(np.arange(256) - 100) * step > 1.6
@@ -112,19 +112,19 @@ def test_a_point_is_as_strong_wide_and_long_as_told():
 
 @pytest.mark.parametrize('sound', [0.96, 1.04])
 def test_an_error_of_the_sound_speed_stretches_all_ranges(sound):
-    one = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
-    d = one.range[300]
-    image = one.image(LEVEL, [LEVEL.position + np.array([d, 0.0, 0.0])], sound)
-    assert one.range[image.max(axis=1).argmax()] == pytest.approx(sound * d, abs=0.1)
+    imager = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
+    d = imager.range[300]
+    image = imager.image(LEVEL, [LEVEL.position + np.array([d, 0.0, 0.0])], sound)
+    assert imager.range[image.max(axis=1).argmax()] == pytest.approx(sound * d, abs=0.1)
 
 
 def test_what_lies_above_or_below_the_axis_is_fainter():
     assert vertical_pattern(np.array([0.0]), 0.26) == 1.0
     assert vertical_pattern(np.array([0.13]), 0.26) == pytest.approx(0.25, rel=0.01)
-    one = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
+    imager = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
     edge = np.array([np.cos(0.1309), 0.0, np.sin(0.1309)])
     level, low = (
-        powers(one, 8, [LEVEL.position + one.range[300] * way]).max()
+        powers(imager, 8, [LEVEL.position + imager.range[300] * way]).max()
         for way in (np.array([1.0, 0.0, 0.0]), edge)
     )
     assert 10.0 * np.log10(level / low) == pytest.approx(6.0, abs=1.0)
@@ -133,40 +133,40 @@ def test_what_lies_above_or_below_the_axis_is_fainter():
 @pytest.mark.statistics
 def test_a_fading_point_is_rayleigh_and_glints_wander():
     small = {**NOWHERE, 'image_bins': 240, 'image_beams': 128, 'horizontal_fov_deg': 22.5}
-    one = sonar(**{**small, 'target_fading': 'rayleigh', 'image_gain': 4.0})
+    imager = sonar(**{**small, 'target_fading': 'rayleigh', 'image_gain': 4.0})
     place = [np.array([50.0, 0.0, 20.0])]
-    peaks = np.array([powers(one, 1, place)[116:124, 56:72].max() for _ in range(60)])
+    peaks = np.array([powers(imager, 1, place)[116:124, 56:72].max() for _ in range(60)])
     assert 0.6 < peaks.std() / peaks.mean() < 1.4
     chain = sonar(**{**small, 'target': 'chain', 'target_size': 10.0})
     images = [powers(chain, 1, place) for _ in range(30)]
     weights = [np.where(image > 8.0, image, 0.0).sum(axis=0) for image in images]
-    centres = [np.average(chain.bearing, weights=one) for one in weights if one.any()]
+    centres = [np.average(chain.bearing, weights=weight) for weight in weights if weight.any()]
     assert np.std(centres) > 0.005
 
 
 def test_a_wreck_is_the_outline_of_a_hull():
     small = {**NOWHERE, 'image_bins': 240, 'image_beams': 128, 'horizontal_fov_deg': 22.5}
     wreck = {'target': 'wreck', 'target_size': 12.0, 'target_snr_db': 30.0}
-    one = sonar(**{**small, **wreck, 'image_gain': 4.0})
-    one.heading = 0.0  # bow away from the sonar
-    power = powers(one, 12, [np.array([40.0, 0.0, 20.0])])
-    row = np.searchsorted(one.range, 40.0)
-    beams = [np.argmin(np.abs(one.bearing - side / 40.0)) for side in (-1.44, 0.0, 1.44)]
+    imager = sonar(**{**small, **wreck, 'image_gain': 4.0})
+    imager.heading = 0.0  # bow away from the sonar
+    power = powers(imager, 12, [np.array([40.0, 0.0, 20.0])])
+    row = np.searchsorted(imager.range, 40.0)
+    beams = [np.argmin(np.abs(imager.bearing - side / 40.0)) for side in (-1.44, 0.0, 1.44)]
     port, inside, starboard = power[row - 2 : row + 3][:, beams].mean(axis=0)
     assert min(port, starboard) > 4.0 * inside
     # As long as asked for: 7 m from the middle, beyond bow and stern, there is nothing.
     along = power.max(axis=1)
-    near, far = (np.abs(one.range - 40.0) < limit for limit in (5.0, 7.0))
+    near, far = (np.abs(imager.range - 40.0) < limit for limit in (5.0, 7.0))
     assert along[near].min() > 3.0 * along[~far].max()
 
 
 def test_the_sea_floor_is_patchy_and_its_patches_stay_in_the_world():
     values = {**NOWHERE, 'altitude': 6.0, 'seabed_shape': 0.5, 'image_gain': 8.0}
-    one = sonar(**values)
-    here = powers(one, 25)
+    imager = sonar(**values)
+    here = powers(imager, 25)
     moved = Pose(np.array([3.0, 0.0, 20.0]), np.eye(3))
-    there = powers(one, 25, pose=moved)
-    step = one.range[1] - one.range[0]
+    there = powers(imager, 25, pose=moved)
+    step = imager.range[1] - imager.range[0]
     shift = round(3.0 / step)
     ahead = slice(118, 138)  # straight ahead a patch comes nearer by 3 m
     first, second = here[350:500, ahead], there[350 - shift : 500 - shift, ahead]
@@ -181,13 +181,15 @@ def test_images_take_the_place_of_detections_and_the_rest_stays():
     plain = simulate(scenario('approach', values), seed=3)
     scene = simulate(scenario('approach', {**values, 'images': True}), seed=3)
     again = simulate(scenario('approach', {**values, 'images': True}), seed=3)
-    images = [one.measurement for one in scene.measurements if hasattr(one.measurement, 'delay')]
+    images = [
+        item.measurement for item in scene.measurements if hasattr(item.measurement, 'delay')
+    ]
     assert len(images) == 14 and isinstance(images[0], SonarImage)
     assert images[0].amplitude.shape == (200, 64)
-    same = [one.measurement for one in again.measurements if hasattr(one.measurement, 'delay')]
+    same = [item.measurement for item in again.measurements if hasattr(item.measurement, 'delay')]
     assert all((a.amplitude == b.amplitude).all() for a, b in zip(images, same))
     np.testing.assert_array_equal(scene.truth[0].vertical_offset, plain.truth[0].vertical_offset)
-    others = [len(one.measurements) - 14 for one in (scene, plain)]
+    others = [len(item.measurements) - 14 for item in (scene, plain)]
     assert others[0] == others[1]
 
 

@@ -40,7 +40,7 @@ EXACT = {
 
 
 def of(scene, kind):
-    return [one.measurement for one in scene.measurements if isinstance(one.measurement, kind)]
+    return [item.measurement for item in scene.measurements if isinstance(item.measurement, kind)]
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
@@ -68,7 +68,7 @@ def test_detections_point_at_the_obstacle_from_the_navigation(model):
     )
     scene = simulate(config, 1)
     truth = scene.truth[0]
-    poses = {one.stamp_ns: one for one in of(scene, Navigation)}
+    poses = {pose.stamp_ns: pose for pose in of(scene, Navigation)}
     roll, pitch, yaw = np.radians(config.sonar_mount_rpy_deg)
     checked = 0
     for ping in of(scene, Detections):
@@ -113,7 +113,7 @@ def test_the_beam_has_the_stated_size():
     truth = scene.truth[0]
     assert not truth.in_beam[truth.range < 40.0].any()  # sin(7.5 deg) = 6 / 46, less pitch
     assert truth.in_beam[truth.range > 70.0].all()
-    echoes = {one.stamp_ns: len(one) for one in of(scene, Detections)}
+    echoes = {ping.stamp_ns: len(ping) for ping in of(scene, Detections)}
     assert [echoes[int(stamp)] for stamp in truth.stamp_ns] == truth.in_beam.astype(int).tolist()
 
 
@@ -122,7 +122,7 @@ def test_swings_have_the_stated_size():
     rolls = []
     for seed in range(12):
         poses = of(simulate(scenario('rolling', EXACT), seed), Navigation)
-        R = geometry.rotation_of_quaternion([one.orientation for one in poses])
+        R = geometry.rotation_of_quaternion([pose.orientation for pose in poses])
         rolls.append(np.std(geometry.euler_angles(R)[:, 0]))
     assert np.degrees(np.mean(rolls)) == pytest.approx(4.0, abs=0.4)
 
@@ -133,7 +133,7 @@ def test_twist_is_the_derivative_of_the_pose():
         dt = (after.stamp_ns - before.stamp_ns) * 1e-9
         R = geometry.rotation_of_quaternion(now.orientation)
         assert_allclose(R @ now.velocity, (after.position - before.position) / dt, atol=2e-3)
-        R0, R1 = (geometry.rotation_of_quaternion(one.orientation) for one in (before, after))
+        R0, R1 = (geometry.rotation_of_quaternion(item.orientation) for item in (before, after))
         turned = (R.T @ R1 - R.T @ R0) / dt
         skew = 0.5 * (turned - turned.T)
         assert_allclose(now.turn_rate, [skew[2, 1], skew[0, 2], skew[1, 0]], atol=2e-3)
@@ -150,20 +150,20 @@ def test_navigation_drifts_as_told():
 
 
 def test_the_altimeter_measures_the_sea_floor():
-    altitudes = [one.altitude for one in of(simulate(scenario('approach'), 1), Altitude)]
+    altitudes = [item.altitude for item in of(simulate(scenario('approach'), 1), Altitude)]
     assert np.mean(altitudes) == pytest.approx(15.0, abs=0.3)
-    relief = [one.altitude for one in of(simulate(scenario('rough_seabed'), 1), Altitude)]
+    relief = [item.altitude for item in of(simulate(scenario('rough_seabed'), 1), Altitude)]
     assert np.std(relief) > np.std(altitudes) + 0.1
     assert not of(simulate(scenario('approach', {'altimeter': False}), 1), Altitude)
 
 
 def test_clutter_misses_and_gaps():
-    counts = [len(one) for one in of(simulate(scenario('six'), 1), Detections)]
+    counts = [len(ping) for ping in of(simulate(scenario('six'), 1), Detections)]
     assert 7.0 < np.mean(counts[:40]) < 12.0
     stress = simulate(scenario('stress'), 2)
     assert len(of(stress, Detections)) < 112
     config = scenario('stress', {'navigation_gaps': 4.0})
-    steps = np.diff([one.stamp_ns for one in of(simulate(config, 1), Navigation)]) * 1e-9
+    steps = np.diff([pose.stamp_ns for pose in of(simulate(config, 1), Navigation)]) * 1e-9
     assert steps.max() > 2.9
 
 
@@ -192,9 +192,9 @@ class Vehicle:
     def __init__(self, scene):
         poses = of(scene, Navigation)
         self.first = poses[0].stamp_ns
-        self.t = np.array([(one.stamp_ns - self.first) * 1e-9 for one in poses])
-        self.place = np.array([one.position for one in poses])
-        self.turn = Slerp(self.t, Rotation.from_quat([one.orientation for one in poses]))
+        self.t = np.array([(pose.stamp_ns - self.first) * 1e-9 for pose in poses])
+        self.place = np.array([pose.position for pose in poses])
+        self.turn = Slerp(self.t, Rotation.from_quat([pose.orientation for pose in poses]))
         # Extrinsic x, y, z: roll first, yaw last, about axes that stand still.
         self.mount = Rotation.from_euler('xyz', MOUNT, degrees=True)
 
@@ -242,10 +242,10 @@ def test_the_two_ways_to_time_a_ping_differ_by_half_the_way_travelled():
                'yaw_rms_deg': 0.0, 'heave_rms': 0.0, 'sway_rms': 0.0})
         for timing in ('instant', 'two_way')
     )  # fmt: skip
-    for one, other in zip(of(at_once, Detections), of(later, Detections)):
-        if len(one) and len(other) and one.range[0] > 40.0:
-            shorter = one.range[0] - other.range[0]
-            assert shorter == pytest.approx(1.5 * one.range[0] / 1500.0, rel=0.05)
+    for ping, other in zip(of(at_once, Detections), of(later, Detections)):
+        if len(ping) and len(other) and ping.range[0] > 40.0:
+            shorter = ping.range[0] - other.range[0]
+            assert shorter == pytest.approx(1.5 * ping.range[0] / 1500.0, rel=0.05)
 
 
 def test_a_beam_is_a_box_of_elevation_azimuth_and_range():
@@ -268,14 +268,14 @@ def test_a_beam_is_a_box_of_elevation_azimuth_and_range():
 
 @pytest.mark.statistics
 def test_errors_of_echoes_are_as_large_as_told():
-    told = {**TURNED, 'range_std': 0.2, 'bearing_std_deg': 0.4, 'roll_rms_deg': 0.0}
+    values = {**TURNED, 'range_std': 0.2, 'bearing_std_deg': 0.4, 'roll_rms_deg': 0.0}
     range_errors, bearing_errors = [], []
     for seed in range(12):
-        exact, noisy = run(seed=seed, **{**TURNED, 'roll_rms_deg': 0.0}), run(seed=seed, **told)
-        for one, other in zip(of(exact, Detections), of(noisy, Detections), strict=True):
-            if len(one):
-                range_errors.append(other.range[0] - one.range[0])
-                bearing_errors.append(np.degrees(other.bearing[0] - one.bearing[0]))
+        exact, noisy = run(seed=seed, **{**TURNED, 'roll_rms_deg': 0.0}), run(seed=seed, **values)
+        for ping, other in zip(of(exact, Detections), of(noisy, Detections), strict=True):
+            if len(ping):
+                range_errors.append(other.range[0] - ping.range[0])
+                bearing_errors.append(np.degrees(other.bearing[0] - ping.bearing[0]))
     n = len(range_errors)
     assert n > 400
     assert np.std(range_errors) == pytest.approx(0.2, rel=0.1)
@@ -300,9 +300,9 @@ def test_a_wrong_sound_speed_scales_all_ranges_of_a_run_alike():
         right = run(seed=seed, **TURNED, last_range=80.0)
         wrong = run(seed=seed, **{**TURNED, 'sound_speed_error': 0.02}, last_range=80.0)
         ratio = [
-            other.range[0] / one.range[0]
-            for one, other in zip(of(right, Detections), of(wrong, Detections))
-            if len(one) and len(other)
+            other.range[0] / ping.range[0]
+            for ping, other in zip(of(right, Detections), of(wrong, Detections))
+            if len(ping) and len(other)
         ]
         assert np.ptp(ratio) < 1e-12
         scales.append(ratio[0] - 1.0)
@@ -356,7 +356,7 @@ SILENT = {
 def path(seed, **errors):
     """Positions (n, 3) that the navigation states along a course of 70 degrees."""
     scene = run(seed=seed, course_deg=70.0, navigation_rate=4.0, **errors)
-    return np.array([one.position for one in of(scene, Navigation)])
+    return np.array([pose.position for pose in of(scene, Navigation)])
 
 
 @cache
@@ -419,13 +419,13 @@ def test_white_errors_of_the_attitude_are_normal_and_as_large_as_told():
 def test_attitudes_and_depths_have_the_errors_told():
     angles, depths = [], []
     for seed in range(30):
-        told = {**SILENT, 'attitude_bias_deg': 0.5, 'yaw_bias_deg': 0.8, 'depth_std': 0.1}
-        noisy, ideal = run(seed=seed, **told), run(seed=seed, ideal_navigation=True)
+        values = {**SILENT, 'attitude_bias_deg': 0.5, 'yaw_bias_deg': 0.8, 'depth_std': 0.1}
+        noisy, ideal = run(seed=seed, **values), run(seed=seed, ideal_navigation=True)
         pairs = list(zip(of(noisy, Navigation), of(ideal, Navigation)))
         off = turned(pairs[::20])
         assert np.ptp(off, axis=0).max() < 1e-6  # a bias stays
         angles.append(off[0])
-        depths += [one.position[2] - other.position[2] for one, other in pairs]
+        depths += [pair.position[2] - other.position[2] for pair, other in pairs]
     assert np.std(angles, axis=0) == pytest.approx([0.5, 0.5, 0.8], rel=0.4)
     assert np.std(depths) == pytest.approx(0.1, rel=0.05)
 
@@ -433,11 +433,11 @@ def test_attitudes_and_depths_have_the_errors_told():
 def test_poses_may_be_late_by_stamp_and_by_radio():
     plain = run(ideal_navigation=True)
     late = run(ideal_navigation=True, navigation_delay=0.2, navigation_latency=0.7)
-    one, other = (
+    first, other = (
         [each for each in scene.measurements if isinstance(each.measurement, Navigation)]
         for scene in (plain, late)
     )
-    for a, b in zip(one, other, strict=True):
+    for a, b in zip(first, other, strict=True):
         assert np.array_equal(a.measurement.position, b.measurement.position)
         assert b.measurement.stamp_ns - a.measurement.stamp_ns == 200_000_000
         assert b.received_ns - b.measurement.stamp_ns == 700_000_000
@@ -446,8 +446,8 @@ def test_poses_may_be_late_by_stamp_and_by_radio():
 
 def test_the_altitude_is_that_above_the_floor_below():
     scene = run(**{**TURNED, 'depth': 30.0, 'altitude': 12.0}, dive=2.0)
-    heights = {one.stamp_ns: one.position[2] for one in of(scene, Navigation)}
-    pairs = [(one.altitude, heights[one.stamp_ns]) for one in of(scene, Altitude)]
+    heights = {pose.stamp_ns: pose.position[2] for pose in of(scene, Navigation)}
+    pairs = [(item.altitude, heights[item.stamp_ns]) for item in of(scene, Altitude)]
     assert len(pairs) > 50 and np.ptp([z for _, z in pairs]) > 2.0
     for altitude, z in pairs:
         assert altitude == pytest.approx(z + 42.0, abs=1e-9)

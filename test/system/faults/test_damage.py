@@ -37,17 +37,17 @@ SIGNALS_OF_DAMAGE = ('damaged', 'checksum', 'CRC', 'truncated', 'index', 'not re
 
 def run(*words):
     """The command in this process: exit code, and what it said."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         code = main([str(word) for word in words])
-    return code, said.getvalue()
+    return code, output.getvalue()
 
 
 def tracked(bag, out):
     """What became of `track`: exit code, words, and the estimates as bytes, None without."""
-    code, said = run('track', bag, out, '--system', CASES_BY_BAG[Path(bag).name])
+    code, message = run('track', bag, out, '--system', CASES_BY_BAG[Path(bag).name])
     estimates = out / 'estimate.csv'
-    return code, said, estimates.read_bytes() if estimates.exists() else None
+    return code, message, estimates.read_bytes() if estimates.exists() else None
 
 
 CASES_BY_BAG = {case.bag: system for system, case in CASES.items()}
@@ -78,13 +78,15 @@ def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
         bag = tmp_path / f'{turn}' / name
         shutil.copytree(BAGS / name, bag)
         damage(bag, kind, rng)
-        code, said, estimates = tracked(bag, tmp_path / f'out_{turn}')
-        if code not in (0, 2) or 'Traceback' in said or (code == 2) == (estimates is not None):
-            failed.append((turn, code, said[-300:]))
-        problem = code == 2 or said.count('problem') or any(w in said for w in SIGNALS_OF_DAMAGE)
+        code, message, estimates = tracked(bag, tmp_path / f'out_{turn}')
+        if code not in (0, 2) or 'Traceback' in message or (code == 2) == (estimates is not None):
+            failed.append((turn, code, message[-300:]))
+        problem = (
+            code == 2 or message.count('problem') or any(w in message for w in SIGNALS_OF_DAMAGE)
+        )
         said_so += bool(problem)
         if not problem and estimates != whole[name][2]:
-            silent.append((turn, said[-300:]))
+            silent.append((turn, message[-300:]))
     figures.add({'what': kind}, tried=tries, said=said_so, silent=len(silent), failed=len(failed))
     assert not failed and not silent
 
@@ -121,11 +123,11 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_pat
 
 def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
     # /sys belongs to the kernel: not even root makes a folder there
-    code, said = run('track', BAGS / 'diver_table1', '/sys/sonar_imm')
+    code, message = run('track', BAGS / 'diver_table1', '/sys/sonar_imm')
     figures.add(
         {'what': 'read-only folder'}, tried=1, said=int(code == 2), silent=0, failed=code != 2
     )
-    *before, sentence = said.splitlines()
+    *before, sentence = message.splitlines()
     assert code == 2 and '/sys/sonar_imm' in sentence
-    said = ('using the parameters of the recording', 'diver <- ')
-    assert all(line.startswith(said) for line in before)
+    message = ('using the parameters of the recording', 'diver <- ')
+    assert all(line.startswith(message) for line in before)

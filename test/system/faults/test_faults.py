@@ -50,7 +50,9 @@ def rigs():
         assert code == 0 and 'Traceback' not in log and not children
 
 
-@pytest.mark.parametrize('fault, system', list(pairs()), ids=lambda one: getattr(one, 'name', one))
+@pytest.mark.parametrize(
+    'fault, system', list(pairs()), ids=lambda item: getattr(item, 'name', item)
+)
 def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     figures.skip_if_measured(fault=fault.name, system=system)
     key = system, *fault.arguments
@@ -72,7 +74,7 @@ def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     assert 'Traceback' not in outcome.words
     assert outcome.answered
     assert outcome.recovered is not None and outcome.recovered <= limit, outcome
-    found = [key for key in outcome.losses for one in fault.counted if re.search(one, key)]
+    found = [key for key in outcome.losses for item in fault.counted if re.search(item, key)]
     assert bool(found) == bool(fault.counted), outcome.losses
     assert max(map(LEVELS.index, outcome.levels)) >= LEVELS.index(fault.level), outcome
     assert re.search(fault.says, outcome.words), outcome.words

@@ -79,28 +79,32 @@ def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flo
         rig.play(case.messages())
         stream = endless(case)
         start = time.monotonic()
-        for one in itertools.islice(stream, _USUAL):
-            rig.send(one)
+        for entry in itertools.islice(stream, _USUAL):
+            rig.send(entry)
         usual = (time.monotonic() - start) / _USUAL
         many = list(itertools.islice(stream, int(seconds * times / usual) + 1))
-        told = Told(rig)
-        before = told.counts()
+        given = Told(rig)
+        before = given.counts()
         start = time.monotonic()
-        for k, one in enumerate(many):
-            told.send(one)
+        for k, entry in enumerate(many):
+            given.send(entry)
             rig.link.wait_for(lambda: False, start + (k + 1) * usual / times - time.monotonic())
         ended = time.monotonic()
         recovered = next(
-            (told.sent[one.stamp_ns] - ended for one in stream if told.soon(one, 5.0 * usual)),
+            (
+                given.sent[item.stamp_ns] - ended
+                for item in stream
+                if given.soon(item, 5.0 * usual)
+            ),
             np.inf,
         )
         rig.fresh_diagnostics()
-        after = told.counts() - before
-        waits = np.array([*told.latency.values()])
+        after = given.counts() - before
+        waits = np.array([*given.latency.values()])
         return Flood(
             capacity=1.0 / usual,
             rate=len(many) / (ended - start),
-            sent=len(told.sent),
+            sent=len(given.sent),
             used=after['received'] - after['dropped'],
             dropped=after['dropped'],
             lost=after['lost'],
@@ -124,24 +128,24 @@ class Told:
         rig.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
         rig.diagnostics.forget()
 
-    def send(self, one: Message) -> None:
-        self.sent[one.stamp_ns] = time.monotonic()
-        self._rig.publishers[one.topic].publish(one.content)
+    def send(self, item: Message) -> None:
+        self.sent[item.stamp_ns] = time.monotonic()
+        self._rig.publishers[item.topic].publish(item.content)
 
-    def soon(self, one: Message, limit: float) -> bool:
+    def soon(self, item: Message, limit: float) -> bool:
         """Whether the answer to a message comes within `limit`; waits for that time at least."""
-        self.send(one)
-        self._rig.link.wait_for(lambda: one.stamp_ns in self.latency, limit)
-        return one.stamp_ns in self.latency
+        self.send(item)
+        self._rig.link.wait_for(lambda: item.stamp_ns in self.latency, limit)
+        return item.stamp_ns in self.latency
 
     def counts(self) -> Counter[str]:
         """Messages on the primary input so far: received, and of these dropped; lost."""
         self._rig.fresh_diagnostics()
-        told, topic = self._rig.diagnostics.counts(), self._rig.case.primary
+        given, topic = self._rig.diagnostics.counts(), self._rig.case.primary
         return Counter(
-            received=told[f'{topic} received'],
-            dropped=told[f'{topic} dropped, waited too long'],
-            lost=told[f'lost on {topic}'] + told[f'lost on /{topic}'],
+            received=given[f'{topic} received'],
+            dropped=given[f'{topic} dropped, waited too long'],
+            lost=given[f'lost on {topic}'] + given[f'lost on /{topic}'],
         )
 
     def _heard(self, message: PointCloud2) -> None:
@@ -156,4 +160,4 @@ def endless(case: Case) -> Iterator[Message]:
     messages = case.messages()
     length = (messages[-1].stamp_ns - messages[0].stamp_ns) / SECOND + case.period
     for turn in itertools.count(1):
-        yield from (one.moved(turn * length) for one in messages)
+        yield from (message.moved(turn * length) for message in messages)

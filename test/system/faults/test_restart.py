@@ -44,14 +44,14 @@ that was set back."""
 def messages_of(case):
     """Its messages, those of a slow sensor closer together."""
     sooner = max(0.0, case.period - CLOSEST)
-    primary = itertools.accumulate(one.primary for one in case.messages())
-    return [one.moved(-k * sooner) for k, one in zip(primary, case.messages())]
+    primary = itertools.accumulate(message.primary for message in case.messages())
+    return [message.moved(-k * sooner) for k, message in zip(primary, case.messages())]
 
 
 def final(system, estimates):
     """The last word on each stamp."""
-    told = final_estimates(estimates, SYSTEMS[system].config_type()())
-    return {one.stamp_ns: one for one in told}
+    given = final_estimates(estimates, SYSTEMS[system].config_type()())
+    return {item.stamp_ns: item for item in given}
 
 
 def saved_after(path, stamp_ns):
@@ -70,8 +70,8 @@ def killed(case, arguments, path, messages, at_once, rng):
         estimates = rig.play(messages)
         stamp_ns = messages[-round(AGAIN * len(case.messages()))].stamp_ns
         assert rig.wait_for(lambda: saved_after(path, stamp_ns))
-        for one in at_once:
-            rig.publishers[one.topic].publish(one.content)
+        for item in at_once:
+            rig.publishers[item.topic].publish(item.content)
         time.sleep(0.1 * rng.random())
         rig.node.process.kill()
         assert rig.node.process.wait(120.0) == -9
@@ -93,12 +93,12 @@ def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
     case, rng = CASES[system], np.random.default_rng(4)
     messages = messages_of(case)
     again = round(AGAIN * len(messages))
-    told, equal, forgotten, wrong = 0, 0, 0, []
+    given, equal, forgotten, wrong = 0, 0, 0, []
     whole = final(system, undisturbed.play(messages))
     for turn in range(TURNS):
         path = tmp_path / f'state_{turn}'
         arguments = '-p', f'state_file:={path}', '-p', 'state_interval:=0.1'
-        stop, cut = (int(rng.integers(*one)) for one in ((again, len(messages) - 6), (2, 6)))
+        stop, cut = (int(rng.integers(*item)) for item in ((again, len(messages) - 6), (2, 6)))
         cut += stop
         first = killed(case, arguments, path, messages[:stop], messages[stop:cut], rng)
         assert final(system, first).keys() <= whole.keys()
@@ -107,10 +107,10 @@ def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
             second = final(system, rig.play(messages[stop - again + 1 :]))
             assert rig.node.stop() == 0 and 'Traceback' not in rig.node.log()
         assert 'goes on from the state' in log, log
-        after = {s: one for s, one in whole.items() if s >= messages[cut].stamp_ns}
+        after = {s: item for s, item in whole.items() if s >= messages[cut].stamp_ns}
         assert after.keys() <= second.keys() <= whole.keys()
-        told += len(second)
-        good = [same(one, whole[stamp]) for stamp, one in second.items()]
+        given += len(second)
+        good = [same(item, whole[stamp]) for stamp, item in second.items()]
         equal += sum(good)
         wrong += [(turn, stop, stamp) for stamp, ok in zip(second, good) if not ok]
         undisturbed.reset()  # what a node makes of it without the file
@@ -120,7 +120,7 @@ def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
         {'system': system},
         tried=TURNS,
         again=again - 1,
-        estimates=told,
+        estimates=given,
         equal=equal,
         changed_without=forgotten,
         wrong=wrong,

@@ -95,8 +95,8 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
             node.process.send_signal(ASKING[turn % 3])  # as launch and a terminal do together
             unclean += reason_unclean(node, 0)
             lines = own_words(node.log()).splitlines()
-            said = [line for line in lines if '[INFO]' not in line]
-            unclean += [(system, line) for line in said]
+            message = [line for line in lines if '[INFO]' not in line]
+            unclean += [(system, line) for line in message]
     figures.add(
         {'system': system, 'signal': STARTING},
         tried=moments,
@@ -136,13 +136,13 @@ class Running:
 
     def send(self, system: str, messages: int) -> None:
         """Publish the first messages of a case and wait for none of them."""
-        for one in CASES[system].messages()[:messages]:
-            self._publishers[system, one.topic].publish(one.content)
+        for message in CASES[system].messages()[:messages]:
+            self._publishers[system, message.topic].publish(message.content)
 
     def step(self, system: str) -> None:
         """Send one message, and wait for its answer."""
-        one = CASES[system].messages()[0]
-        self._lockstep[system].step(self._publishers[system, one.topic], one.content)
+        item = CASES[system].messages()[0]
+        self._lockstep[system].step(self._publishers[system, item.topic], item.content)
 
     def start_again(self) -> None:
         """Start all nodes anew, under the names of those that were killed, with a new link and in
@@ -192,22 +192,22 @@ def reason_unclean(node: NodeProcess, expected: int) -> list[tuple[str, str]]:
     try:
         code = node.process.wait(END_LIMIT)
     except subprocess.TimeoutExpired:
-        told = f'it did not end within {END_LIMIT:g} s: {_doing(node.process.pid)}, {node.log()}'
-        return [(node.system, told[-1000:])]
+        given = f'it did not end within {END_LIMIT:g} s: {_doing(node.process.pid)}, {node.log()}'
+        return [(node.system, given[-1000:])]
     if code != expected:
         return [(node.system, f'exit code {code}: {node.log()[-500:]}')]
-    said = own_words(node.log())
-    words = [word for word in ('Traceback', 'Error', 'terminate called') if word in said]
-    return [(node.system, f'{words}: {said[-500:]}')] if words else []
+    message = own_words(node.log())
+    words = [word for word in ('Traceback', 'Error', 'terminate called') if word in message]
+    return [(node.system, f'{words}: {message[-500:]}')] if words else []
 
 
 def _doing(pid: int) -> str:
     """State and CPU seconds of each thread: whether a process hangs or only gets no processor."""
-    told = []
+    given = []
     for task in Path(f'/proc/{pid}/task').iterdir():
         words = (task / 'stat').read_text().rpartition(')')[2].split()
-        told.append(f'{words[0]} {(int(words[11]) + int(words[12])) / 100.0:g} s')
-    return ', '.join(told)
+        given.append(f'{words[0]} {(int(words[11]) + int(words[12])) / 100.0:g} s')
+    return ', '.join(given)
 
 
 def heeds_signals(process: subprocess.Popen[bytes]) -> bool:
@@ -229,7 +229,7 @@ def ended(limit: float = END_LIMIT) -> bool:
 
 def _children() -> list[int]:
     path = Path('/proc/self/task')
-    return [int(pid) for one in path.iterdir() for pid in (one / 'children').read_text().split()]
+    return [int(pid) for item in path.iterdir() for pid in (item / 'children').read_text().split()]
 
 
 def _alive(pid: int) -> bool:

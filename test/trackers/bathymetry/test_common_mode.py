@@ -35,7 +35,7 @@ def shared(snapshot, level_db, seed=5):
     return evolve(snapshot, iq=(snapshot.iq + both).astype(np.complex64))
 
 
-def said(snapshot, **values):
+def lines_and_health(snapshot, **values):
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     tracker.process(snapshot)
     return [line for line in tracker.warnings() if 'same phase' in line], tracker.health()
@@ -45,9 +45,9 @@ def said(snapshot, **values):
 @pytest.mark.parametrize('P', [2, 4, 8])
 def test_a_signal_common_to_the_staves_is_said(P, values):
     clean = floor(0.0, snr_db=10.0, P=P, ranges=15.5 + 0.05 * np.arange(600))
-    loud, health = said(shared(clean, 30.0), **values)
+    loud, health = lines_and_health(shared(clean, 30.0), **values)
     assert len(loud) == 1 and health['common_mode'] > 0.5
-    quiet, health = said(clean, **values)
+    quiet, health = lines_and_health(clean, **values)
     assert not quiet and health['common_mode'] < 0.1
 
 
@@ -56,20 +56,20 @@ def test_so_is_what_the_staves_of_one_card_share():
     cards = [
         shared(clean, 30.0, seed).iq[:, part] for seed, part in ((5, np.s_[:4]), (6, np.s_[4:]))
     ]
-    lines, _ = said(evolve(clean, iq=np.hstack(cards)), shadow_gate=False)
+    lines, _ = lines_and_health(evolve(clean, iq=np.hstack(cards)), shadow_gate=False)
     assert len(lines) == 1
 
 
 def test_a_weak_one_under_a_floor_is_not():
     clean = floor(0.0, snr_db=25.0)
-    lines, health = said(shared(clean, 0.0))
+    lines, health = lines_and_health(shared(clean, 0.0))
     assert not lines and health['common_mode'] < 0.1
 
 
 @pytest.mark.parametrize('tilt_deg', [0.0, 3.0, 30.0, 60.0, 90.0])
 def test_a_flat_floor_is_a_floor_wherever_the_array_looks(tilt_deg):
     ranges = 15.1 + 0.05 * np.arange(1200)
-    lines, _ = said(floor(0.0, tilt_deg=tilt_deg, ranges=ranges), tilt_deg=tilt_deg)
+    lines, _ = lines_and_health(floor(0.0, tilt_deg=tilt_deg, ranges=ranges), tilt_deg=tilt_deg)
     assert not lines
 
 

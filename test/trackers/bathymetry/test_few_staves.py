@@ -159,7 +159,7 @@ def test_a_few_loud_bins_are_no_evidence():
 def test_a_transmit_pulse_in_the_water_column_is_no_noise(staves):
     scene = {'staves': staves, 'spacing_wavelengths': 0.5, 'last_range': 45.0, 'pings': 2}
     config = scenario('water_column', scene)
-    heard, health = [], []
+    received, health = [], []
     for pulse in (0.0, 1e3):
         tracker = BathymetryTracker(BathymetryConfig())
         for each in simulate(config, 1).measurements:
@@ -167,10 +167,10 @@ def test_a_transmit_pulse_in_the_water_column_is_no_noise(staves):
             iq = ping.iq.copy()
             iq[:40] += pulse
             made = tracker.process(evolve(ping, iq=iq))[0]
-            heard.append(made.extras['valid'][ping.range > 16.0].mean())
+            received.append(made.extras['valid'][ping.range > 16.0].mean())
             health.append(tracker.health()['noise_variance'])
         assert not tracker.warnings()
-    assert min(heard) > 0.85
+    assert min(received) > 0.85
     assert health[2:] == pytest.approx(health[:2], rel=0.1)
 
 

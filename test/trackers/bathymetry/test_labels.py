@@ -179,13 +179,13 @@ def test_smooth_is_said_only_where_rough_would_be_seen():
 def test_told_is_never_smooth_beyond_what_is_detectable(model_set):
     (estimate,), _ = made(BathymetryConfig(model_set=model_set), pings=1)
     table = estimate.columns()
-    told, detectable, confidence = (
+    given, detectable, confidence = (
         table[name] for name in ('told', 'detectable_std', 'label_confidence')
     )
-    assert told.dtype == np.uint8 and detectable.dtype == confidence.dtype == np.float32
-    assert (detectable[told == 0] <= 0.3).all() and (confidence[told < 2] > 0.9).all()
-    assert (told == 0).sum() > 200 and (told[table['range'] > 60.0] != 0).all()
-    assert (told[table['valid'] == 0] == 2).all() and (table['valid'] == 0).any()
+    assert given.dtype == np.uint8 and detectable.dtype == confidence.dtype == np.float32
+    assert (detectable[given == 0] <= 0.3).all() and (confidence[given < 2] > 0.9).all()
+    assert (given == 0).sum() > 200 and (given[table['range'] > 60.0] != 0).all()
+    assert (given[table['valid'] == 0] == 2).all() and (table['valid'] == 0).any()
     assert detectable[table['range'] < 20.0].max() < 0.06
     assert detectable[table['range'] > 70.0].min() > 0.7
 
@@ -203,10 +203,10 @@ def test_told_is_never_smooth_beyond_what_is_detectable(model_set):
 def test_roughness_is_found_on_slopes_and_undulations(changes, least):
     estimates, truth = made(BANK, pings=3, seed=21, **changes)
     rough = np.concatenate([each.extras['rough'] > 0.5 for each in estimates])
-    told = np.concatenate([each.extras['told'] for each in estimates])
+    given = np.concatenate([each.extras['told'] for each in estimates])
     patch = np.concatenate([each.patch for each in truth])
     assert (rough & patch).sum() / (rough | patch).sum() > least
-    assert (told[~patch] == 1).mean() < 0.03 and patch[told == 1].mean() > 0.9
+    assert (given[~patch] == 1).mean() < 0.03 and patch[given == 1].mean() > 0.9
 
 
 def test_a_slope_is_smooth_floor_and_scatter_is_rough():

@@ -62,9 +62,9 @@ def test_likelihoods_are_those_of_normal_echoes_in_noise(P, spacing):
     sines = np.sort(rng.uniform(-0.4, 0.2, G))
     sines[5] = np.nan
     y = bins(1, P, rng)[0]
-    one, pairs = np.empty(G), np.zeros((G, G))
+    single, pairs = np.empty(G), np.zeros((G, G))
     work, price = np.empty((8, G)), np.empty((G, G))
-    assert two.pair_likelihoods(y, v, sines, spacing, gap, work, price, one, pairs)
+    assert two.pair_likelihoods(y, v, sines, spacing, gap, work, price, single, pairs)
     states = oracle.states_of(G, gap)
     wanted = np.array(
         [
@@ -72,11 +72,11 @@ def test_likelihoods_are_those_of_normal_echoes_in_noise(P, spacing):
             for state in states
         ]
     )
-    found = np.array([one[s[0]] if len(s) == 1 else pairs[s] for s in states])
+    found = np.array([single[s[0]] if len(s) == 1 else pairs[s] for s in states])
     wanted = np.exp(wanted - wanted.max())
     np.testing.assert_allclose(found / found.max(), wanted, rtol=1e-7, atol=1e-30)
     sines[:] = np.nan
-    assert not two.pair_likelihoods(y, v, sines, spacing, gap, work, price, one, pairs)
+    assert not two.pair_likelihoods(y, v, sines, spacing, gap, work, price, single, pairs)
 
 
 def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
@@ -98,8 +98,8 @@ def test_the_smoother_is_that_of_one_matrix_over_all_heights_and_pairs():
 
     states = oracle.states_of(G, 3)
     reach = len(moves.walk) - 1
-    one, pair = (oracle.walk(G, w, two.STEP, reach) for w in (two.WALK, two.WALK_OF_TWO))
-    step_matrix = oracle.transition(states, one, pair, 0.02, 0.1, 0.03, G)
+    single, pair = (oracle.walk(G, w, two.STEP, reach) for w in (two.WALK, two.WALK_OF_TWO))
+    step_matrix = oracle.transition(states, single, pair, 0.02, 0.1, 0.03, G)
     weights = np.zeros((n, len(states)))
     for t in np.flatnonzero(usable):
         depth = (15.0 - cells) / ranges[first + t]

@@ -181,11 +181,11 @@ def test_scale_of_the_stated_covariances(stated):
     tracker = DiverTracker(config())
     estimates = run(tracker, path(300, std=1.0, scale=stated))
     scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
-    said = ' '.join(tracker.warnings())
+    warned = ' '.join(tracker.warnings())
     if stated < 1.0:
-        assert 3.0 < scale < 10.0 and 'times as far as they state' in said
+        assert 3.0 < scale < 10.0 and 'times as far as they state' in warned
     else:
-        assert 1.0 <= scale < 1.6 and 'times as far as they state' not in said
+        assert 1.0 <= scale < 1.6 and 'times as far as they state' not in warned
 
 
 def test_scales_below_one_find_out_what_is_stated_too_large():

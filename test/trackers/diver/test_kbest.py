@@ -178,9 +178,9 @@ def test_few_hypotheses_are_the_likeliest_of_many():
             trackers[count].process(scan(second, (0.0, 0.4 * second), (1.0, 0.4 * second)))
     few = trackers[3]._stream.state.hypotheses
     assert np.bincount(few.cluster).max() <= 3
-    one, other = (trackers[count].process(scan(6, (0.0, 2.4), (1.0, 2.4))) for count in (3, 300))
-    assert len(one[-1]) == len(other[-1]) == 2
-    assert one[-1].state == pytest.approx(other[-1].state, abs=0.05)
+    first, other = (trackers[count].process(scan(6, (0.0, 2.4), (1.0, 2.4))) for count in (3, 300))
+    assert len(first[-1]) == len(other[-1]) == 2
+    assert first[-1].state == pytest.approx(other[-1].state, abs=0.05)
 
 
 # -- what it is for -------------------------------------------------------------------------------
@@ -266,8 +266,8 @@ def test_shuffled_scans_give_the_bits_of_sorted_ones(model_set, density):
     )
     scans = crossing(duration=15.0)
     late = [scans[k] for k in (0, 2, 1, 5, 4, 3, *range(6, len(scans)))]
-    for one, other in zip(run(DiverTracker(config), scans), run(DiverTracker(config), late)):
-        assert same(one, other)
+    for estimate, other in zip(run(DiverTracker(config), scans), run(DiverTracker(config), late)):
+        assert same(estimate, other)
 
 
 @pytest.mark.parametrize('density', [10 / 160.0**2, 0.0])
@@ -288,8 +288,8 @@ def test_a_tracker_goes_on_from_its_state(tmp_path, density):
     write_state(tmp_path / 'state', saved)
     again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['diver'], config)
     for item in scans[25:]:
-        one, other = tracker.process(item), again.process(item)
-        assert len(one) == len(other) and all(map(same, one, other))
+        first, other = tracker.process(item), again.process(item)
+        assert len(first) == len(other) and all(map(same, first, other))
 
 
 def test_reset_is_a_fresh_tracker():
@@ -358,11 +358,11 @@ def test_every_row_is_in_a_hypothesis_and_weights_sum_to_one():
 def test_arrivals_are_paired_as_ever():
     scene = simulate(scenario('multistatic', {'duration': 20.0}), 1)
     pings = [item.measurement for item in scene.measurements]
-    one, other = (
+    first, other = (
         run(DiverTracker(DiverConfig(association=name, max_tracks=1)), pings)
         for name in ('gnn', 'kbest')
     )
-    for a, b in zip(one, other):
+    for a, b in zip(first, other):
         assert a.state == pytest.approx(b.state, abs=1e-9)
 
 
@@ -398,9 +398,9 @@ def test_the_past_that_led_to_the_end_is_smoothed():
 
 
 def test_fixes_in_another_order_are_the_same_tracks():
-    one, other = DiverTracker(CROSSING), DiverTracker(CROSSING)
+    first, other = DiverTracker(CROSSING), DiverTracker(CROSSING)
     for item in crossing(duration=15.0):
-        a = one.process(item)[-1]
+        a = first.process(item)[-1]
         order = np.arange(len(item))[::-1]
         b = other.process(
             Fixes(

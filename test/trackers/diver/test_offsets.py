@@ -36,13 +36,13 @@ def legs(place, tag=False):
     return reach if tag else reach + np.hypot(*place)
 
 
-def evidence(places, heard, errors, tag=False, **stated):
+def evidence(places, received, errors, tag=False, **stated):
     """The evidence of pings of a diver at `places` (k, 2) whose arrivals, those that were `heard`
     (k, 4), have the errors (k, 4), m of path."""
     config = DiverConfig(**stated)
     models, found = build_models(config), Offsets()
     layout = Instruments().layout(config, models)
-    for place, rows, error in zip(places, heard, errors):
+    for place, rows, error in zip(places, received, errors):
         n, tx = int(rows.sum()), [np.nan if tag else 0.0] * 3
         ping = Arrivals(
             stamp_ns=1,
@@ -65,20 +65,20 @@ def scene(pings=60, seed=1):
     """A diver who jumps as nobody can: places, which arrivals were heard, and their noise, m."""
     rng = np.random.default_rng(seed)
     places = rng.uniform(-40.0, 60.0, (pings, 2))
-    heard = rng.uniform(size=(pings, 4)) < 0.9
-    return places, heard, SPEED * STD * rng.normal(size=(pings, 4))
+    received = rng.uniform(size=(pings, 4)) < 0.9
+    return places, received, SPEED * STD * rng.normal(size=(pings, 4))
 
 
 @pytest.mark.parametrize('tag', [False, True])
 def test_the_evidence_is_what_least_squares_gains_by_an_error_of_each_pair(tag, monkeypatch):
     monkeypatch.setattr(offsets, 'MEMORY', 1e12)
     monkeypatch.setattr(offsets, 'CAPPED', 1e12)
-    places, heard, noise = scene()
+    places, received, noise = scene()
     errors = noise + np.array([0.0, 0.8, -0.5, 0.3])
-    found, config = evidence(places, heard, errors, tag)
+    found, config = evidence(places, received, errors, tag)
     # All unknowns at once: k of each ping and four errors.
     k, rows, residual = 3 if tag else 2, [], []
-    for at, (place, seen, error) in enumerate(zip(places, heard, errors)):
+    for at, (place, seen, error) in enumerate(zip(places, received, errors)):
         if seen.sum() <= k:
             continue
         slope = [(legs(place + d, tag) - legs(place - d, tag)) / 2e-3 for d in 1e-3 * np.eye(2)]
@@ -103,16 +103,16 @@ def test_the_evidence_is_what_least_squares_gains_by_an_error_of_each_pair(tag, 
 
 def test_noise_alone_is_no_evidence_even_where_more_of_it_than_stated():
     for seed in range(5):
-        places, heard, noise = scene(seed=seed)
+        places, received, noise = scene(seed=seed)
         for times in (1.0, 3.0):
-            found, config = evidence(places, heard, times * noise)
+            found, config = evidence(places, received, times * noise)
             assert found.warnings(config) == []
 
 
 def test_what_is_stated_of_instruments_is_expected_and_no_more():
-    places, heard, noise = scene()
+    places, received, noise = scene()
     late = noise + np.array([0.0, 0.8, -0.5, 0.3])
-    found, config = evidence(places, heard, late)
+    found, config = evidence(places, received, late)
     (warning,) = found.warnings(config)
     assert 'receiver_clock_std' in warning and 'target_z' in warning
     assert found.warnings(DiverConfig(receiver_clock_std=5e-4)) == []
@@ -121,19 +121,19 @@ def test_what_is_stated_of_instruments_is_expected_and_no_more():
 
 
 def test_a_single_cause_that_explains_it_all_is_named():
-    places, heard, noise = scene()
+    places, received, noise = scene()
     deep = np.array([np.linalg.norm(RECEIVERS - [*p, -10.0], axis=1) for p in places])
     deep += np.hypot(np.hypot(*places.T), 10.0)[:, None] - np.array([legs(p) for p in places])
-    found, config = evidence(places, heard, noise + deep)
+    found, config = evidence(places, received, noise + deep)
     assert 'target_z (or dimensions: 3) would explain it' in found.warnings(config)[0]
     slow = 0.01 * np.array([legs(place) for place in places])
-    found, config = evidence(places, heard, noise + slow)
+    found, config = evidence(places, received, noise + slow)
     assert 'sound_speed would explain it' in found.warnings(config)[0]
     assert found.warnings(DiverConfig(sound_speed_std=15.0)) == []
 
 
 def test_pings_that_any_place_explains_say_nothing():
-    places, heard, noise = scene()
-    heard[:, 2:] = False
-    found, config = evidence(places, heard, noise + 1.0)
+    places, received, noise = scene()
+    received[:, 2:] = False
+    found, config = evidence(places, received, noise + 1.0)
     assert found.freedom == 0.0 and found.warnings(config) == []

@@ -31,16 +31,28 @@ from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 OFF = {'receiver_position_std': 1.0, 'receiver_clock_std': 5e-4, 'sound_speed_std': 5.0}
 
 
-def judged(name, scene, config, seeds=range(4), smooth=False):
+def judged(name, scene, config, seeds=range(4)):
     """Horizontal RMSE and NEES from 10 s on, and the estimates of the last run."""
-    squared, nees, estimates = [], [], []
+    runs = [run for run, _ in runs_of(name, scene, config, seeds)]
+    return *scores(runs), runs[-1][1]
+
+
+def runs_of(name, scene, config, seeds, smooth=False):
+    """For each seed the true path with the final estimates, and with those by looking back."""
     for seed in seeds:
         made = simulate(scenario(name, {'duration': 60.0, **scene}), seed)
         tracker, final = SmoothingDiverTracker(DiverConfig(max_tracks=1, **config)), {}
         for scan in made.measurements:
             final.update((e.stamp_ns, e) for e in tracker.process(scan.measurement))
-        estimates = tracker.smoothed() if smooth else [final[stamp] for stamp in sorted(final)]
-        track = made.truth[0]
+        estimates = [final[stamp] for stamp in sorted(final)]
+        back = tracker.smoothed() if smooth else []
+        yield (made.truth[0], estimates), (made.truth[0], back)
+
+
+def scores(runs):
+    """Horizontal RMSE and NEES from 10 s on."""
+    squared, nees = [], []
+    for track, estimates in runs:
         at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
         for estimate in estimates:
             rows = np.flatnonzero(estimate.extras['track_state'] > 0)
@@ -48,7 +60,7 @@ def judged(name, scene, config, seeds=range(4), smooth=False):
                 error = estimate.state[rows[0], :2] - track.position[at[estimate.stamp_ns], :2]
                 squared.append(error @ error)
                 nees.append(error @ np.linalg.solve(estimate.covariance[rows[0], :2, :2], error))
-    return np.sqrt(np.mean(squared)), np.mean(nees), estimates
+    return np.sqrt(np.mean(squared)), np.mean(nees)
 
 
 def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
@@ -137,8 +149,7 @@ def test_lasting_errors_of_fixes_are_in_the_covariance():
     ],
 )
 def test_looking_back_is_better_and_as_true(name, config):
-    forward = judged(name, {}, config, seeds=range(3))
-    back = judged(name, {}, config, seeds=range(3), smooth=True)
+    forward, back = map(scores, zip(*runs_of(name, {}, config, range(3), smooth=True)))
     assert back[0] < forward[0] and back[1] < 2.6
 
 

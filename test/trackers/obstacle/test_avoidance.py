@@ -125,9 +125,9 @@ def test_the_tracker_says_what_an_independent_one_does():
     for name, number in ENCOUNTERS:
         data = encounter(name, number)
         estimates = track(data)
-        told = np.flatnonzero(np.isfinite(data['ref_collision']))
+        given = np.flatnonzero(np.isfinite(data['ref_collision']))
         for key, reference in zip(off, ('cpa_distance', 'cpa_time', 'collision')):
-            off[key].extend(column(estimates, key, told) - data[f'ref_{reference}'][told])
+            off[key].extend(column(estimates, key, given) - data[f'ref_{reference}'][given])
     rms = {key: float(np.sqrt(np.mean(np.square(values)))) for key, values in off.items()}
     assert len(off['cpa_time']) == 15
     assert rms['cpa_distance'] < 0.4

@@ -62,8 +62,8 @@ def test_movers_are_followed_through_clutter():
         errors += velocity_errors(scene, final, len(scene.truth[0].stamp_ns) - 12)
         ids = {
             int(number)
-            for one in final.values()
-            for number in one.extras['track_id'][one.extras['track_state'] > 0]
+            for item in final.values()
+            for number in item.extras['track_id'][item.extras['track_state'] > 0]
         }
         tracks, obstacles = tracks + len(ids), obstacles + len(scene.truth)
     assert len(errors) >= 5
@@ -76,13 +76,16 @@ def test_movers_that_cross_keep_their_tracks():
     from helpers.obstacle_crossing import crossing
 
     estimates, true = crossing()
-    ids = [set(one.extras['track_id'][one.extras['track_state'] > 0]) for one in estimates[12:]]
-    assert all(one == ids[0] and len(one) == 2 for one in ids)
+    ids = [
+        set(estimate.extras['track_id'][estimate.extras['track_state'] > 0])
+        for estimate in estimates[12:]
+    ]
+    assert all(item == ids[0] and len(item) == 2 for item in ids)
     for row in range(2):
         before, after = estimates[30], estimates[-1]
         assert np.sign(before.extras['vy'][row]) == np.sign(after.extras['vy'][row])
         stated = [after.extras['vx'][row], after.extras['vy'][row]]
-        assert min(np.linalg.norm(np.array(stated) - one) for one in true) < 0.1
+        assert min(np.linalg.norm(np.array(stated) - item) for item in true) < 0.1
 
 
 def test_crossing_in_clutter_while_another_is_born():
@@ -97,7 +100,7 @@ def test_crossing_in_clutter_while_another_is_born():
 
     two = confirmed(estimates[25])
     assert len(two) == 2
-    assert sum(two <= confirmed(one) for one in estimates[25:]) == len(estimates[25:])
+    assert sum(two <= confirmed(estimate) for estimate in estimates[25:]) == len(estimates[25:])
     born = confirmed(estimates[50]) - two
     assert len(born) == 1
     last = estimates[-1]
@@ -119,16 +122,16 @@ def test_a_drifting_navigation_is_said():
     scene = simulate(scenario('six', {'clutter': 0.0, 'detection_probability': 1.0}), 1)
 
     def run(v):
-        tracker, first, said = ObstacleTracker(ObstacleConfig()), None, []
-        for one in scene.measurements:
-            measurement = one.measurement
+        tracker, first, message = ObstacleTracker(ObstacleConfig()), None, []
+        for item in scene.measurements:
+            measurement = item.measurement
             if isinstance(measurement, Navigation):
                 first = first or measurement.stamp_ns
                 seconds = (measurement.stamp_ns - first) * 1e-9
                 measurement = evolve(measurement, position=measurement.position + seconds * v)
             tracker.process(measurement)
-            said.append(tracker.health()['moving_alike'])
-        return max(said), tracker.health()['pings_moving_alike']
+            message.append(tracker.health()['moving_alike'])
+        return max(message), tracker.health()['pings_moving_alike']
 
     assert run(drift)[0] == 1 and run(drift)[1] > 10
     assert run(0.0 * drift) == (0, 0)
@@ -144,9 +147,9 @@ def test_behaviours_that_make_no_sense_are_refused(behaviours, word):
 
 
 def test_the_order_of_the_behaviours_does_not_matter():
-    _, one = track_scene('swaying', 1, {'last_range': 70.0}, behaviours=('fixed', 'swaying'))
+    _, first = track_scene('swaying', 1, {'last_range': 70.0}, behaviours=('fixed', 'swaying'))
     _, other = track_scene('swaying', 1, {'last_range': 70.0}, behaviours=('swaying', 'fixed'))
-    for a, b in zip(one.values(), other.values(), strict=True):
+    for a, b in zip(first.values(), other.values(), strict=True):
         assert list(a.columns()) == list(b.columns())
         for name, values in a.columns().items():
             assert np.array_equal(values, b.columns()[name], equal_nan=True)

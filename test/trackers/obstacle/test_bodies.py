@@ -38,11 +38,11 @@ def stated(std_range, std_across, z=Z):
 
 
 def test_an_echo_is_as_uncertain_as_those_of_its_track_were():
-    bodies, told = Bodies.unknown(1), np.array([True])
+    bodies, given = Bodies.unknown(1), np.array([True])
     used = []
     for k in range(200):
         # Every other echo looks like that of a point.
-        bodies, R = bodies.seen(told, Z, stated(*((0.2, 0.4) if k % 2 else (0.02, 0.04))), OWN)
+        bodies, R = bodies.seen(given, Z, stated(*((0.2, 0.4) if k % 2 else (0.02, 0.04))), OWN)
         used.append(np.sqrt(np.diagonal(R[0])) * [1.0, Z[0, 0]])
     assert_allclose(used[0], [(0.15 + 0.02) / 2.0, (0.004 * 40.0 + 0.04) / 2.0])
     assert_allclose(np.mean(used[100:], axis=0), [0.11, 0.22], rtol=0.02)
@@ -59,10 +59,10 @@ def test_detections_without_extent_are_as_uncertain_as_they_say():
 
 
 def test_the_size_is_kept_in_metres_while_the_range_closes():
-    bodies, told = Bodies.unknown(1), np.array([True])
+    bodies, given = Bodies.unknown(1), np.array([True])
     for distance in np.linspace(50.0, 10.0, 60):
         z = np.array([[distance, 0.0]])
-        bodies, R = bodies.seen(told, z, stated(0.1, 0.3, z), OWN)
+        bodies, R = bodies.seen(given, z, stated(0.1, 0.3, z), OWN)
     assert_allclose(np.sqrt(R[0, 1, 1]) * 10.0, 0.3, rtol=0.05)
 
 
@@ -134,7 +134,7 @@ def image_run(setting, seed):
     """NEES of range, bearing and offset alone, of all together over 3, and coverage, of the track
     through the images of a scene."""
     scene = simulate(setting, seed)
-    given = [one.measurement for one in scene.measurements]
+    given = [item.measurement for item in scene.measurements]
     row = tracked(setting, scene, detected(setting, given))
     alone = [row[f'NEES {name}'] for name in ('range', 'bearing', 'offset')]
     return (*alone, row['NEES state'] / 3.0, row['cover'])

@@ -189,7 +189,7 @@ def beams(angles, start_ns=10**9, step_ns=10**8, target=(0.1, 20.0), rows=100, *
 
 def sweeps(images, **parameters):
     detector = ImageDetector(DetectorConfig(beam_width_deg=2.0, **parameters))
-    return [one for image in images if (one := detector.process(image)) is not None]
+    return [item for image in images if (item := detector.process(image)) is not None]
 
 
 def test_directions_of_a_full_turn_are_gathered_into_what_lies_ahead():
@@ -226,18 +226,18 @@ def test_a_sweep_ends_where_it_does_not_go_on(spoil):
     rows = 90 if spoil == 'ranges' else 100
     more = list(beams(np.arange(0.0, 0.5, STEP), start_ns=late, rows=rows))
     if spoil == 'frame':
-        more = [evolve(one, frame_id='other') for one in more]
+        more = [evolve(item, frame_id='other') for item in more]
     if spoil == 'back':
-        more = [evolve(one, stamp_ns=one.stamp_ns - 5 * 10**9 // 2) for one in more]
+        more = [evolve(item, stamp_ns=item.stamp_ns - 5 * 10**9 // 2) for item in more]
     detector = ImageDetector(DetectorConfig(beam_width_deg=2.0))
-    answers = [detector.process(one) for one in first + more]
-    assert sum(one is not None for one in answers) == 1
+    answers = [detector.process(item) for item in first + more]
+    assert sum(answer is not None for answer in answers) == 1
     assert answers[len(first)] is not None
 
 
 def test_memory_is_bounded_whatever_comes():
     detector = ImageDetector(DetectorConfig(sweep_sector_deg=360.0))
     angles = 1e-5 * np.arange(3000)
-    for one in beams(angles, rows=20):
-        detector.process(one)
+    for beam in beams(angles, rows=20):
+        detector.process(beam)
     assert len(detector._sweep) <= 1000

@@ -145,15 +145,15 @@ def test_the_newest_pings_are_those_that_are_kept():
     stamps = []
     for stamp_ns in (last + 1, last + 2):
         pose = Navigation(stamp_ns=stamp_ns, position=[0, 0, -5], orientation=[0, 0, 0, 1])
-        stamps += [one.stamp_ns for one in tracker.process(pose)]
+        stamps += [estimate.stamp_ns for estimate in tracker.process(pose)]
     assert not stamps and tracker.health()['pings_skipped'] == MOST_WAITING
     assert tracker.health()['navigation_missing'] == 3
 
 
 def test_the_seafloor_method_needs_an_altitude():
-    measurements = [one for one in approach(NAME) if not isinstance(one, Altitude)]
+    measurements = [item for item in approach(NAME) if not isinstance(item, Altitude)]
     tracker = ObstacleTracker(ObstacleConfig(method='seafloor', sonar_lever=lever(NAME)))
-    assert all(len(one) == 0 for one in run(tracker, measurements).values())
+    assert all(len(estimate) == 0 for estimate in run(tracker, measurements).values())
 
 
 @pytest.mark.parametrize('age, begins', [(0.0, True), (1.9, True), (2.1, False), (60.0, False)])
@@ -232,7 +232,9 @@ def test_nonsense_gives_finite_numbers(method, model, timing):
             var_bearing=10 ** rng.uniform(-14.0, 2.0, D),
         )
         height = Altitude(stamp_ns=k * SECOND, altitude=float(10 ** rng.uniform(-3.0, 4.0)))
-        estimates += [one for item in (height, pose, ping) for one in tracker.process(item)]
+        estimates += [
+            estimate for item in (height, pose, ping) for estimate in tracker.process(item)
+        ]
     assert sum(map(len, estimates)) > 100
     for estimate in estimates:
         for name, column in estimate.columns().items():

@@ -98,12 +98,12 @@ def test_a_detection_without_intensity_changes_nothing():
     levels = level_db(np.array([np.nan, 0.0, -1.0, np.inf, 10.0]))
     assert np.isnan(levels[:4]).all() and levels[4] == pytest.approx(20.0)
     mu = np.array([[0.3, 0.7], [0.5, 0.5]])
-    told = {'dt': 1.0, 'width': WIDTH, 'fading_db': 6.0, 'weight': 0.5}
+    values = {'dt': 1.0, 'width': WIDTH, 'fading_db': 6.0, 'weight': 0.5}
     elevation = np.array([[0.1, np.nan], [0.1, -0.1]])
-    new, strengths = weighed(mu, Strengths.unknown(2, 2), elevation, np.full(2, np.nan), **told)
+    new, strengths = weighed(mu, Strengths.unknown(2, 2), elevation, np.full(2, np.nan), **values)
     np.testing.assert_allclose(new, mu)
     assert np.isfinite(strengths.variance).all()
-    new, _ = weighed(mu, Strengths.unknown(2, 2), elevation, np.array([1e6, -1e6]), **told)
+    new, _ = weighed(mu, Strengths.unknown(2, 2), elevation, np.array([1e6, -1e6]), **values)
     assert np.isfinite(new).all() and new.sum(axis=1) == pytest.approx([1.0, 1.0])
 
 

@@ -25,7 +25,7 @@ SETTLED = 30
 
 
 def tracks_of(estimates):
-    return {int(number) for one in estimates for number in one.extras['track_id']}
+    return {int(number) for estimate in estimates for number in estimate.extras['track_id']}
 
 
 @pytest.mark.parametrize('name, number', ENCOUNTERS)
@@ -43,7 +43,7 @@ def test_answers_are_those_of_an_independent_filter(name, number):
     begins = name == 'starts_moving'
     assert_allclose(probability, data['ref_prob'][pings], atol=0.1 if begins else 0.05)
     assert_allclose(probability.sum(axis=-1), 1.0, atol=1e-9)
-    velocity = np.stack([column(estimates, one, pings) for one in ('vx', 'vy')], -1)
+    velocity = np.stack([column(estimates, item, pings) for item in ('vx', 'vy')], -1)
     assert_allclose(velocity, data['ref_v'][pings], atol=0.05 if begins else 0.01)
     assert_allclose(column(estimates, 'prob_above', pings), data['ref_above'][pings], atol=0.05)
     for end in ('lo', 'hi'):

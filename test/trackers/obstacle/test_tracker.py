@@ -44,8 +44,8 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 NAME = 'approach_dst+3_noisy'
 
 
-def same_runs(one, other):
-    return list(one) == list(other) and all(same(one[stamp], other[stamp]) for stamp in one)
+def same_runs(first, other):
+    return list(first) == list(other) and all(same(first[stamp], other[stamp]) for stamp in first)
 
 
 # -- the contract ------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_a_level_path_says_half_and_half():
 def test_a_dive_does_not_disturb():
     """What stays is the obstacle's depth, not its offset from a vehicle that dives."""
     scenes = (track_scene('diving', seed, {'dive': 5.0}, **FIXED) for seed in range(4))
-    error, variance, *_ = np.array([offset_at(*one, 30.0) for one in scenes], float).T
+    error, variance, *_ = np.array([offset_at(*scene, 30.0) for scene in scenes], float).T
     assert np.sqrt(np.mean(error**2)) < 1.0
     assert np.mean(error**2 / variance) < 3.0
 
@@ -249,10 +249,10 @@ def test_a_track_outlives_the_beam():
 def test_an_obstacle_that_is_gone_is_given_up():
     name = 'approach_dst+0.5_noisefree'
     gone = [
-        Detections(stamp_ns=one.stamp_ns, range=[], bearing=[])
-        if isinstance(one, Detections) and one.stamp_ns > 31 * SECOND
-        else one
-        for one in approach(name)
+        Detections(stamp_ns=item.stamp_ns, range=[], bearing=[])
+        if isinstance(item, Detections) and item.stamp_ns > 31 * SECOND
+        else item
+        for item in approach(name)
     ]
     final = list(run(ObstacleTracker(ObstacleConfig(sonar_lever=lever(name))), gone).values())
     assert len(final[60]) == 1
@@ -261,7 +261,7 @@ def test_an_obstacle_that_is_gone_is_given_up():
 
 def test_clutter_alone_confirms_nothing():
     scene, final = track_scene('approach', 1, {'detection_probability': 0.0, 'clutter': 8.0})
-    confirmed = [int((one.extras['track_state'] > 0).sum()) for one in final.values()]
+    confirmed = [int((item.extras['track_state'] > 0).sum()) for item in final.values()]
     assert np.mean(confirmed) < 0.2
 
 
@@ -271,9 +271,9 @@ def test_clutter_alone_confirms_nothing():
 def test_a_ping_waits_for_the_pose_after_it():
     scene = simulate(scenario('approach', {'ping_jitter': 0.5}), 1)
     tracker = ObstacleTracker(ObstacleConfig(sonar_lever=(2.0, 0.0, -0.3)))
-    for one in scene.measurements[:100]:
-        estimates = tracker.process(one.measurement)
-        if isinstance(one.measurement, Detections):
+    for item in scene.measurements[:100]:
+        estimates = tracker.process(item.measurement)
+        if isinstance(item.measurement, Detections):
             assert not estimates
             assert tracker.health()['pings_waiting'] == 1
         elif estimates:
@@ -292,15 +292,15 @@ def test_extrapolation_stops_at_its_limit():
 
 def test_pings_in_a_gap_of_the_navigation_are_skipped():
     measurements = [
-        one
-        for one in approach(NAME)
-        if not (isinstance(one, Navigation) and 20 * SECOND < one.stamp_ns < 23 * SECOND)
+        item
+        for item in approach(NAME)
+        if not (isinstance(item, Navigation) and 20 * SECOND < item.stamp_ns < 23 * SECOND)
     ]
     tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
     final = run(tracker, measurements)
     assert tracker.health()['pings_skipped'] == 5
     assert not [stamp for stamp in final if 20 * SECOND < stamp < 23 * SECOND]
-    identities = {int(i) for one in final.values() for i in one.extras['track_id']}
+    identities = {int(i) for item in final.values() for i in item.extras['track_id']}
     assert identities == {1}
 
 
@@ -309,20 +309,20 @@ def test_shuffled_input_gives_the_same_bits(name):
     config = scenario(name, {'ping_jitter': 0.3, 'last_range': 60.0, 'first_range': 80.0})
     scene = simulate(config, 8)
     tracker = ObstacleTracker(ObstacleConfig(sonar_lever=config.sonar_lever))
-    ordered = sorted(scene.measurements, key=lambda one: one.measurement.stamp_ns)
-    straight = run(tracker, [one.measurement for one in ordered])
+    ordered = sorted(scene.measurements, key=lambda item: item.measurement.stamp_ns)
+    straight = run(tracker, [item.measurement for item in ordered])
     rng = np.random.default_rng(1)
-    key = [one.measurement.stamp_ns + rng.uniform(0.0, 3.0) * SECOND for one in ordered]
+    key = [item.measurement.stamp_ns + rng.uniform(0.0, 3.0) * SECOND for item in ordered]
     shuffled = [ordered[i].measurement for i in np.argsort(key)]
     again = ObstacleTracker(tracker.config)
     assert same_runs(run(again, shuffled), straight)
     assert again.counts['late'] > 10
     tracker.reset()
-    assert same_runs(run(tracker, [one.measurement for one in ordered]), straight)
+    assert same_runs(run(tracker, [item.measurement for item in ordered]), straight)
 
 
 def test_what_comes_twice_counts_once():
-    doubled = [one for one in approach(NAME)[:150] for _ in range(2)]
+    doubled = [item for item in approach(NAME)[:150] for _ in range(2)]
     tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
     plain = ObstacleTracker(tracker.config)
     assert same_runs(run(tracker, doubled), run(plain, approach(NAME)[:150]))
@@ -334,8 +334,8 @@ def test_a_restarted_clock_begins_anew():
     first = run(tracker, approach(NAME))
     again = run(tracker, approach(NAME))
     assert tracker.counts['restarts'] == 1
-    used = {int(i) for one in first.values() for i in one.extras['track_id']}
-    new = {int(i) for one in list(again.values())[20:] for i in one.extras['track_id']}
+    used = {int(i) for item in first.values() for i in item.extras['track_id']}
+    new = {int(i) for item in list(again.values())[20:] for i in item.extras['track_id']}
     assert new and not used & new
 
 

@@ -106,9 +106,9 @@ def test_nor_can_it_with_all_behaviours(kind):
     """The sea floor lies on one side only; it is ruled out soon, and does not last."""
     name = f'approach_level_mirror_{kind}'
     moving = track_approach(name, max_tracks=1, behaviours=('fixed', 'swaying', 'moving'))
-    assert_allclose([one.probabilities[0, 0] for one in moving], 0.5, atol=0.005)
+    assert_allclose([item.probabilities[0, 0] for item in moving], 0.5, atol=0.005)
     everything = track_approach(name, max_tracks=1)
-    assert_allclose([one.probabilities[0, 0] for one in everything[24:]], 0.5, atol=0.01)
+    assert_allclose([item.probabilities[0, 0] for item in everything[24:]], 0.5, atol=0.01)
     assert everything[-1].extras['vertical_offset_lo'][0] < -3.0
     assert everything[-1].extras['vertical_offset_hi'][0] > 3.0
 
@@ -150,7 +150,7 @@ def test_a_wrong_roll_sign_turns_the_answer_over_and_nis_does_not_see_it():
     """Why the exact posterior is a test, and NIS alone is none."""
     name = 'approach_dst+3_noisy'
     config = ObstacleConfig(sonar_lever=lever(name), **FAITHFUL)
-    wrong = [mistaken(one, lambda r, p, y: (-r, p, y)) for one in approach(name)]
+    wrong = [mistaken(item, lambda r, p, y: (-r, p, y)) for item in approach(name)]
     final = list(run(ObstacleTracker(config), wrong).values())
     assert final[60].state[0, 2] < -1.5
     nis = np.nanmean([estimate.extras['nis'][0] for estimate in final])
@@ -169,14 +169,14 @@ def test_a_wrong_direction_shows_in_the_innovations(mistake):
     side, change = MISTAKES[mistake]
     name = 'approach_dst+3_noisy'
     config = ObstacleConfig(sonar_lever=lever(name), **FIXED)
-    wrong = [mistaken(one, change, side) for one in approach(name)]
+    wrong = [mistaken(item, change, side) for item in approach(name)]
     assert follow(wrong, config)[0].mean() > 30.0
     right = follow(approach(name), config)[0]
     assert 1.5 < right.mean() < 2.3
     # In the tracker nothing is followed for long: tracks come and go.
     tracks, lasting = (
-        {int(i) for one in run(ObstacleTracker(config), measurements).values()
-         for i in one.extras['track_id']}
+        {int(i) for estimate in run(ObstacleTracker(config), measurements).values()
+         for i in estimate.extras['track_id']}
         for measurements in (wrong, approach(name))
     )  # fmt: skip
     assert len(tracks) > 5 > len(lasting)
@@ -200,13 +200,13 @@ def with_outliers(measurements, seed):
     rng = np.random.default_rng(seed)
     return [
         Detections(
-            stamp_ns=one.stamp_ns,
-            range=one.range + rng.uniform(-8.0, 8.0),
-            bearing=one.bearing + np.radians(rng.uniform(-6.0, 6.0)),
+            stamp_ns=item.stamp_ns,
+            range=item.range + rng.uniform(-8.0, 8.0),
+            bearing=item.bearing + np.radians(rng.uniform(-6.0, 6.0)),
         )
-        if isinstance(one, Detections) and i > 9 and rng.uniform() < 0.125
-        else one
-        for i, one in enumerate(measurements)
+        if isinstance(item, Detections) and i > 9 and rng.uniform() < 0.125
+        else item
+        for i, item in enumerate(measurements)
     ]
 
 
