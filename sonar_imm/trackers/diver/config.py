@@ -41,7 +41,7 @@ BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 """The single-direction sets and how many models they have."""
 
 TARGETS: dict[str, dict[str, Any]] = {
-    'diver': {},
+    'diver': {'velocity_std': 2.0},
     'rov': {
         'speed_mean': 0.4,
         'speed_std': 0.3,
@@ -80,7 +80,8 @@ TARGETS: dict[str, dict[str, Any]] = {
         'acceleration_noise': (0.03, 0.3, 0.01),
     },
 }
-"""What takes the place of the defaults for each kind of target, in the units of the parameters."""
+"""What takes the place of the defaults for each kind of target, in the units of the parameters. Of
+a diver it is that a boat begins no other way, which costs a diver nothing."""
 
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate')
@@ -162,9 +163,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     speed_std: float = parameter(0.4, 'm/s',
         'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
         'families)', range=(1e-3, 20.0))
-    velocity_std: float = parameter(2.0, 'm/s',
+    velocity_std: float = parameter(0.7, 'm/s',
         'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
-        'velocity state)', range=(1e-3, 20.0))
+        'velocity state; families: 2 for target diver, that of boats, too)', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
         'random walk of the speed over a reference step (heading_speed sets, families)',
         range=(0.0, 10.0))

@@ -34,9 +34,11 @@ COLUMNS = [f'family_{name}' for name in FAMILIES] + ['hover', 'covariance_scale'
 
 
 def config(**values):
-    # The prototype's velocities at the start, which are those of swimmers.
-    at_first = {'model_set': 'families', 'max_tracks': 1, 'velocity_std': 0.7}
-    return DiverConfig(**at_first | values)
+    # The prototype's velocities at the start, those of swimmers; what is at its default gives way.
+    swimmers = np.nextafter(0.7, 1.0)
+    return DiverConfig(
+        **{'model_set': 'families', 'max_tracks': 1, 'velocity_std': swimmers, **values}
+    )
 
 
 @pytest.fixture(scope='module')
