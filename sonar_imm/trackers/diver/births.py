@@ -35,6 +35,7 @@ from ...acoustics.localisation import Localisation, localise
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import Arrivals, NOBODY, Start
+from . import families
 from .config import DiverConfig
 from .heights import begin
 from .pings import begin_from_ping, FAR
@@ -219,6 +220,11 @@ def new_tracks(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """x (B, M, n + q), P (B, M, n + q, n + q) and mu (B, M) of tracks that begin."""
     x, P, mu = _new_tracks(births, models, layout, config)
+    at_fix = np.array([birth.ping is None and birth.measured for birth in births])
+    if at_fix.any():
+        wide = P[at_fix]
+        families.with_velocities_at_fix(wide, models, config)
+        P[at_fix] = wide
     if models.height >= 0:
         for row, birth in enumerate(births):
             if birth.height is not None:

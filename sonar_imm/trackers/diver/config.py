@@ -41,7 +41,7 @@ BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 """The single-direction sets and how many models they have."""
 
 TARGETS: dict[str, dict[str, Any]] = {
-    'diver': {'velocity_std': 2.0},
+    'diver': {},
     'rov': {
         'speed_mean': 0.4,
         'speed_std': 0.3,
@@ -80,8 +80,11 @@ TARGETS: dict[str, dict[str, Any]] = {
         'acceleration_noise': (0.03, 0.3, 0.01),
     },
 }
-"""What takes the place of the defaults for each kind of target, in the units of the parameters. Of
-a diver it is that a boat begins no other way, which costs a diver nothing."""
+"""What takes the place of the defaults for each kind of target, in the units of the parameters."""
+
+AFLOAT = 2.0
+"""Standard deviation on each axis of the velocity of what a fix shows, m/s, where nothing is said
+of it. A boat is tracked no other way, and it costs a diver nothing."""
 
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate')
@@ -165,7 +168,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families)', range=(1e-3, 20.0))
     velocity_std: float = parameter(0.7, 'm/s',
         'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
-        'velocity state; families: 2 for target diver, that of boats, too)', range=(1e-3, 20.0))
+        'velocity state; families: 2 at a fix of a diver, so that boats begin, too)',
+        range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
         'random walk of the speed over a reference step (heading_speed sets, families)',
         range=(0.0, 10.0))
@@ -494,6 +498,14 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         if self.association != 'auto':
             return self.association
         return 'jipda' if self.model_set == 'families' else 'gnn'
+
+    @property
+    def velocity_std_at_fix(self) -> float:
+        """`velocity_std` of a track that begins at a fix, in m/s. Positions from arrival times
+        have ghosts, which a wide one would let move."""
+        usual = next(spec.default for spec in self.specs() if spec.name == 'velocity_std')
+        anything = self.model_set == 'families' and self.target == 'diver'
+        return AFLOAT if anything and self.velocity_std == usual else self.velocity_std
 
     @property
     def usual_clutter(self) -> float:

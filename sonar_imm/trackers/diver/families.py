@@ -88,6 +88,15 @@ REACH = 13.8
 # -- the models ----------------------------------------------------------------------------------
 
 
+def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
+    """Give P (B, K M, n, n) of tracks that begin at a fix the velocities that such a track may
+    have, in place."""
+    if models.mixing is None:
+        return
+    moving = np.flatnonzero(np.tile(models.mixing.kind == VELOCITY, models.copies))
+    P[:, moving, 2, 2] = P[:, moving, 3, 3] = config.velocity_std_at_fix**2
+
+
 def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet:
     """The four families, of which two are `heading_speed` sets with two noises of the speed."""
     noises = config.acceleration_noise or (*LIVELY, *QUIET)
@@ -460,6 +469,7 @@ def _anew(
     fix z (2,), R (2, 2) does not agree, or two false fixes may well do."""
     stamp, px, py, xx, xy, yy = refused.tolist()
     x, P, mu = models.new_tracks(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
+    with_velocities_at_fix(P, models, fixes.config)
     x, P = layout.widened(x, P)
     row = np.arange(len(now.x)) == track
     alone = now.only(row)._replace(x=x, P=P, mu=mu)
