@@ -22,7 +22,7 @@ from helpers.tracked import as_bytes, published, RUNS, tracked
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import Navigation, Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
 from sonar_imm.trackers.state_values import freeze
@@ -117,11 +117,14 @@ def test_an_unknown_type_is_counted_and_changes_nothing(run):
 
 
 def test_the_measurements_of_other_systems_are_strangers():
-    kinds = {name.split('_')[0]: tracked(name).input[-1] for name in RUNS}
+    kinds = {
+        name.split('_')[0]: next(m for m in tracked(name).input if not isinstance(m, Navigation))
+        for name in RUNS
+    }
     for name, system in SYSTEMS.items():
         tracker = system.build(system.config_type()())
         for other, measurement in kinds.items():
-            if other != name and type(measurement).__name__ != 'Navigation':
+            if other != name:
                 assert tracker.process(measurement) == []
         assert tracker.counts['unknown_type'] >= 2
 
@@ -172,9 +175,11 @@ CLOCKS = {
 @pytest.mark.parametrize('clock', CLOCKS)
 def test_any_clock_gives_estimates_or_reasons(run, clock):
     """No sum of stamps leaves 64 bits, and no time between measurements is too short or long."""
-    stamps = CLOCKS[clock]([m.stamp_ns for m in run.input])
+    # What has the stamp of others is replayed with all of them.
+    taken = run.input[:40] if clock == 'standing still' else run.input
+    stamps = CLOCKS[clock]([m.stamp_ns for m in taken])
     tracker, rows = run.build(), 0
-    for measurement, stamp_ns in zip(run.input, stamps):
+    for measurement, stamp_ns in zip(taken, stamps):
         for estimate in tracker.process(attrs.evolve(measurement, stamp_ns=stamp_ns)):
             check_numbers(estimate)
             assert estimate.stamp_ns in stamps

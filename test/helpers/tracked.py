@@ -28,6 +28,8 @@ from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
+MOST = {'bathymetry': 120, 'diver': 80, 'fathometer': 80, 'obstacle': 80}
+"""Measurements of a recording; of a ship most are navigation."""
 RUNS = {
     'diver_table1': {},
     'diver_multistatic': {},
@@ -47,14 +49,15 @@ RUNS = {
 class Tracked:
     """A shipped recording, the parameters for it, and what an uninterrupted run makes of it."""
 
-    def __init__(self, name, most=80):
+    def __init__(self, name):
         self.system = SYSTEMS[name.split('_')[0]]
         bag = BAGS / name
         self.config = load_config(self.system, own_parameters(bag), RUNS[name])[0]
         with BagReader(bag) as reader:
             read = measurements_of(reader, self.system.name, settings=self.config.as_dict())
             found = [item.measurement for item in read]
-        self.input = [m for m in found if m is not None and not isinstance(m, Rejection)][:most]
+        self.input = [m for m in found if m is not None and not isinstance(m, Rejection)]
+        self.input = self.input[: MOST[self.system.name]]
         tracker = self.build()
         self.whole = [published(tracker, m) for m in self.input]
         self.counts = tracker.counts

@@ -233,7 +233,10 @@ def _children() -> list[int]:
 
 
 def _alive(pid: int) -> bool:
+    """Whether it runs, and is none of those that multiprocessing keeps for later."""
     try:
+        if b'from multiprocessing' in Path(f'/proc/{pid}/cmdline').read_bytes():
+            return False
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
     except FileNotFoundError:
         return False
