@@ -459,8 +459,8 @@ def _explain(
     amplitude: FloatArray,
     scratch: Scratch,
 ) -> float:
-    """Log likelihood of the set i, whose row of `amplitude` is written. Scatter begins at the first
-    member, or as probably at the second where that is louder and well below."""
+    """Log likelihood of the set i, whose row of `amplitude` is written. Scatter begins at the
+    first member, or as probably at the second where that is louder and well below."""
     cell, apart = sets.cell[i], scatter.apart
     if scatter.level.shape[0] == 0 or sets.order[i] < 2 or cell[1] - cell[0] < apart:
         return _explain_from(0, i, b, amplitudes, scatter, sets, amplitude, scratch)

@@ -190,9 +190,9 @@ class FathometerConfig(StampParameters):
         'treatment of amplitudes: marginal (integrated out), or the best ones with a penalty of '
         'log(N)/2 (bic_half) or log(N) (paper) for each', choices=PRIORS)
     amplitude_std_sigmas: float = parameter(7.5, '',
-        'amplitude_prior marginal: standard deviation of amplitudes, in units of the noise; a third '
-        'of it with processor conventional, whose echoes stand out by a third, unless amplitudes '
-        'have a memory',
+        'amplitude_prior marginal: standard deviation of amplitudes, in units of the noise; a '
+        'third of it with processor conventional, whose echoes stand out by a third, unless '
+        'amplitudes have a memory',
         range=(0.01, 1e6))
     amplitude_memory: float = parameter(0.0, '',
         'amplitude_prior marginal: share of its amplitude that a reflector keeps from record to '
