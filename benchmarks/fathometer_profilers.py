@@ -26,9 +26,9 @@ floors that is another layer, so `rules_agree` says how often it picks the same 
 edge, and `older_lost_below_edge` in how many of them its pick lies less than 1 m below the edge,
 up to 2.5 m (the same arrival, a broad one) and more (another layer). `sounder`: what the
 instrument itself wrote into the headers as depth of the water, against edge and peak (median, m),
-where it goes with either within 2 m; it is often wrong by far more. `at_twice_the_floor`: reflectors
-within 1 m of that, of which so many are marked as multiples; `marked`: share of all reflectors, in
-the scene of primaries.
+where it goes with either within 2 m; it is often wrong by far more. `at_twice_the_floor`:
+reflectors within 1 m of that, of which so many are marked as multiples; `marked`: share of all
+reflectors, in the scene of primaries.
 
 Crossings are those of the default rows. L3 and L9 cross where the floor is at 4 m, above the
 first sample that is taken (4.5 m), so that this crossing is made once more from the end of the
@@ -153,7 +153,7 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         'older_lost_below_edge': [int(n) for n in np.histogram(below, (-99, 1, 2.5, 99))[0]],
         'sounder': sounder(stated, edge, arrival),
         'reflectors': round(float(np.mean(number)), 2),
-        'at_twice_the_floor': sum(twice),
+        'at_twice_the_floor': int(np.sum(twice)),
         'of_these_marked': int(np.sum(np.array(twice) & np.array(marked))),
         'marked': share(marked),
     }
