@@ -26,7 +26,9 @@ floors that is another layer, so `rules_agree` says how often it picks the same 
 edge, and `older_lost_below_edge` in how many of them its pick lies less than 1 m below the edge,
 up to 2.5 m (the same arrival, a broad one) and more (another layer). `sounder`: what the
 instrument itself wrote into the headers as depth of the water, against edge and peak (median, m),
-where it goes with either within 2 m; it is often wrong by far more.
+where it goes with either within 2 m; it is often wrong by far more. `at_twice_the_floor`:
+reflectors within 1 m of that, of which so many are marked as multiples; `marked`: share of all
+reflectors, in the scene of primaries.
 
 Crossings are those of the default rows. L3 and L9 cross where the floor is at 4 m, above the
 first sample that is taken (4.5 m), so that this crossing is made once more from the end of the
@@ -121,6 +123,8 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
     edge = SPACING * (FIRST + arrival_edges(amplitude))
     stated = np.median(read_segy(path).water_depth[: STACK * count].reshape(count, STACK), axis=1)
     hits, by_bottom, by_old, by_edge, ids, number = [], [], [], [], set(), []
+    twice: list[bool] = []
+    marked: list[bool] = []
     for estimate, depth, older, first in zip(run.read_estimates(), arrival, old, edge):
         columns = estimate.columns()
         away = np.abs(np.nan_to_num(columns['depth'], nan=1e9) - depth)
@@ -130,7 +134,11 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         by_bottom.append(away[np.argmax(columns['is_bottom'])] < NEAR)
         by_edge.append((np.abs(columns['depth'] - first) < NEAR).any())
         by_old.append((np.abs(columns['depth'] - older) < NEAR).any())
-        number.append(np.isfinite(columns['depth']).sum())
+        there = np.isfinite(columns['depth'])
+        number.append(there.sum())
+        double = 2.0 * columns['depth'][np.argmax(columns['is_bottom'])]
+        twice += list(np.abs(columns['depth'][there] - double) < NEAR)
+        marked += list(columns['multiple_probability'][there] > 0.5)
     lost = ~np.array(by_old)
     below = (old - edge)[lost]
     return {
@@ -145,6 +153,9 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         'older_lost_below_edge': [int(n) for n in np.histogram(below, (-99, 1, 2.5, 99))[0]],
         'sounder': sounder(stated, edge, arrival),
         'reflectors': round(float(np.mean(number)), 2),
+        'at_twice_the_floor': int(np.sum(twice)),
+        'of_these_marked': int(np.sum(np.array(twice) & np.array(marked))),
+        'marked': share(marked),
     }
 
 
@@ -189,6 +200,7 @@ def scene_rows(runs: int) -> dict[str, Any]:
 
 def _score(estimates: Any, truth: Any) -> dict[str, float]:
     order, apart, bottom, error, inside, ids = [], [], [], [], [], set()
+    marked: list[bool] = []
     for estimate, record, true in zip(estimates, records_of(estimates), truth):
         columns = estimate.columns()
         found = pair(record.found.depth, true.depth, 2.0)
@@ -197,6 +209,7 @@ def _score(estimates: Any, truth: Any) -> dict[str, float]:
         row = int(np.argmax(columns['is_bottom']))
         bottom.append(abs(columns['depth'][row] - true.depth.min()) < NEAR)
         ids.add(int(columns['track_id'][row]))
+        marked += list(columns['multiple_probability'] > 0.5)
         off = record.found.depth[found.found] - true.depth[found.true]
         error += list(off)
         inside += list(np.abs(off) <= 2.0 * record.depth_std[found.found])
@@ -207,6 +220,7 @@ def _score(estimates: Any, truth: Any) -> dict[str, float]:
         'bottom_ids': float(len(ids)),
         'depth_rmse_m': float(np.sqrt(np.mean(np.square(error)))),
         'inside_2_sigma': float(np.mean(inside)),
+        'marked': float(np.mean(marked)),
     }
 
 

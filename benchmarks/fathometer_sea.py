@@ -151,13 +151,22 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
 
 def main(runs: int = 8, particles: int = 4000, rows: Sequence[str] = ()) -> Parts:
     yield {'particles': particles}
-    for name, (level, scene, changes) in ROWS.items():
-        if rows and not any(word in name for word in rows):
-            continue
-        count = runs if name.startswith('8 s') else max(1, runs // 2)
-        given = {'particles': particles, **changes}
-        found = [run(level, scene, [given], seed)[0] for seed in range(count)]
-        yield {'table': {name: {'runs': count, **row_of(found)}}}
+    wanted = [name for name in ROWS if not rows or any(word in name for word in rows)]
+    # Rows of one level and scene see the same noise, which is drawn once.
+    alike: list[list[str]] = []
+    for name in wanted:
+        group = next((g for g in alike if ROWS[g[0]][:2] == ROWS[name][:2]), None)
+        if group:
+            group.append(name)
+        else:
+            alike.append([name])
+    for group in alike:
+        level, scene, _ = ROWS[group[0]]
+        count = runs if group[0].startswith('8 s') else max(1, runs // 2)
+        options = [{'particles': particles, **ROWS[name][2]} for name in group]
+        found = [run(level, scene, options, seed) for seed in range(count)]
+        for name, each in zip(group, zip(*found)):
+            yield {'table': {name: {'runs': count, **row_of(list(each))}}}
 
 
 if __name__ == '__main__':

@@ -319,9 +319,13 @@ class SetFilter:
         if shift is None or path is None or not step.resampled:
             return step
         u = _generator(record.key, _MOVE).random((self.particles, 2))
-        low, high = kernels.free(sets, self.model.cells)
+        # By how much all members of a set can be lowered and stay on the lattice.
+        last = self.model.cells - 1
+        lowest = sets.cell[np.arange(len(sets.order)), np.maximum(sets.order - 1, 0)]
+        low = np.where(sets.order > 0, lowest - last, -last - 1)
+        high = np.where(sets.order > 0, sets.cell[:, 0], last + 1)
         d, path = path.draw(shift, sets.shift, (low, high), u)
-        moved = sets._replace(cell=kernels.lowered(sets, d), shift=sets.shift + d)
+        moved = sets._replace(cell=sets.cell - d[:, None], shift=sets.shift + d)
         return evolve(step, after=step.after._replace(sets=moved, path=path))
 
     def summarise(self, step: SetStep) -> Summary:

@@ -459,12 +459,39 @@ def _explain(
     amplitude: FloatArray,
     scratch: Scratch,
 ) -> float:
-    """Log likelihood of the set i, whose row of `amplitude` is written. Cholesky: A = L L',
+    """Log likelihood of the set i, whose row of `amplitude` is written. Scatter begins at the
+    first member, or as probably at the second where that is louder and well below."""
+    cell, apart = sets.cell[i], scatter.apart
+    if scatter.level.shape[0] == 0 or sets.order[i] < 2 or cell[1] - cell[0] < apart:
+        return _explain_from(0, i, b, amplitudes, scatter, sets, amplitude, scratch)
+    second = _explain_from(1, i, b, amplitudes, scatter, sets, amplitude, scratch)
+    louder = second > -math.inf and amplitude[i, 1] > amplitude[i, 0]
+    first = _explain_from(0, i, b, amplitudes, scatter, sets, amplitude, scratch)
+    if not louder:
+        return first
+    if second > first:
+        _explain_from(1, i, b, amplitudes, scatter, sets, amplitude, scratch)
+    best = max(first, second)
+    return best + math.log(0.5 * (1.0 + math.exp(min(first, second) - best)))
+
+
+@kernel
+def _explain_from(
+    begins: int,
+    i: int,
+    b: FloatArray,
+    amplitudes: AmplitudeModel,
+    scatter: ScatterFit,
+    sets: Sets,
+    amplitude: FloatArray,
+    scratch: Scratch,
+) -> float:
+    """`_explain` where the scatter begins at the member of that number. Cholesky: A = L L',
     y = L^-1 h, a = L'^-1 y."""
     order, cell, mean, variance, sign, shift = sets
     L, y, scale = scratch
     gram, memory, m = amplitudes.gram, amplitudes.memory > 0.0, order[i]
-    scattered, begin = scatter.level.shape[0] > 0, cell[i, 0] + shift[i]
+    scattered, begin = scatter.level.shape[0] > 0, cell[i, begins] + shift[i]
     value = scatter.evidence[begin] if scattered and m > 0 else 0.0
     for r in range(m):
         z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
@@ -531,28 +558,6 @@ def remember(
             after = 1.0 / (amplitudes.gram[0] + 1.0 / sets.prior_variance[i, k])
             sets.prior_mean[i, k] = phi * amplitude[i, k]
             sets.prior_variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
-
-
-@kernel
-def free(sets: Sets, cells: int) -> tuple[IntArray, IntArray]:
-    """The least and the greatest offset (N,), in cells, by which all members of a set can be
-    lowered and stay on the lattice of so many cells."""
-    low, high = np.full(len(sets.order), -cells), np.full(len(sets.order), cells)
-    for i in range(len(sets.order)):
-        if sets.order[i] > 0:
-            low[i] = sets.cell[i, sets.order[i] - 1] - (cells - 1)
-            high[i] = sets.cell[i, 0]
-    return low, high
-
-
-@kernel
-def lowered(sets: Sets, offset: IntArray) -> IntArray:
-    """The cells (N, J), those of each set less by its offset (N,)."""
-    cell = sets.cell.copy()
-    for i in range(len(sets.order)):
-        for k in range(sets.order[i]):
-            cell[i, k] -= offset[i]
-    return cell
 
 
 @kernel

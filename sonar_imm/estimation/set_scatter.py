@@ -34,7 +34,10 @@ at once. Levels and decays are tried on a grid, also the level 0:
     level, decay   the best of the grid for that k: members are seen against this background, as
                    ``(b - v D) / s`` in place of b, ``s^2 = 1 + (spread v D)^2``.
 
-A set without members has no background. As s changes little within a pulse, the pulses of members
+A set without members has no background. What is faint may lie before what scatters, such as a soft
+floor above a hard layer: where the second member is louder than the first and `window` cells or
+more below it, the scatter begins at either with the same probability, and a set has the mean of
+both. As s changes little within a pulse, the pulses of members
 keep their form.
 
 The idea is that of the sonar equation: reverberation is a noise whose level is known once its
@@ -82,14 +85,16 @@ class Scatter:
 
 class ScatterFit(NamedTuple):
     """The background of one record for each cell k that the first member may have: evidence (n,);
-    level (n,) in units of the noise; row (n,) of `profile` (D, 2 n - 1); spread. Without scatter
-    all are empty."""
+    level (n,) in units of the noise; row (n,) of `profile` (D, 2 n - 1); spread; apart: cells from
+    which on a second member can be told from the breadth of the first. Without scatter all are
+    empty."""
 
     evidence: FloatArray
     level: FloatArray
     row: IntArray
     profile: FloatArray
     spread: float
+    apart: int
 
 
 def decaying_profile(pulse: FloatArray, decays: FloatArray) -> FloatArray:
@@ -109,7 +114,7 @@ def decaying_profile(pulse: FloatArray, decays: FloatArray) -> FloatArray:
     return np.array(rows)
 
 
-NO_SCATTER = ScatterFit(np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 1)), 0.0)
+NO_SCATTER = ScatterFit(np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 1)), 0.0, 0)
 
 
 def fit_scatter(scatter: Scatter, b: FloatArray) -> ScatterFit:
@@ -142,7 +147,7 @@ def fit_scatter(scatter: Scatter, b: FloatArray) -> ScatterFit:
             level[above], row[above] = v, which
     tried = 1 + len(levels) * len(D)
     evidence = best + np.log1p(np.maximum(total, 0.0)) - math.log(tried)
-    return ScatterFit(evidence, level, row, D, scatter.spread)
+    return ScatterFit(evidence, level, row, D, scatter.spread, scatter.window)
 
 
 def without_peaks(b: FloatArray, window: int) -> FloatArray:

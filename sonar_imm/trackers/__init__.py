@@ -172,8 +172,8 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
-            kernels={'records': (15, 515)},
-            all_kernels=(15, 515),
+            kernels={'records': (16, 540)},
+            all_kernels=(16, 540),
         ),
         System(
             name='obstacle',

@@ -220,6 +220,22 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
     """log likelihood (N,) of the record against that of an empty one, -inf where
     an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
     in units of the noise."""
+    first, amplitude = _weigh_from(0, model, b, sets)
+    if not model.scatter:
+        return first, amplitude
+    # Scatter begins at the first member, or at the second where that is louder and well below.
+    second, other = _weigh_from(1, model, b, sets)
+    either = (sets.order > 1) & (np.diff(sets.cell[:, :2])[:, 0] >= model.scatter.window)
+    either &= np.isfinite(second) & (other[:, 1] > other[:, 0])
+    amplitude = np.where((either & (second > first))[:, None], other, amplitude)
+    return np.where(either, np.logaddexp(first, second) - math.log(2.0), first), amplitude
+
+
+def _weigh_from(
+    begins: int, model: SetModel, b: FloatArray, sets: Sets
+) -> tuple[FloatArray, FloatArray]:
+    """`weigh` with scatter that begins at the member of that number, at the last if there are
+    fewer."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     fit = background(model, b)
@@ -234,7 +250,7 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
         place = z + sets.shift[at, None]
         seen, scale = b[place], np.ones(z.shape)
         if model.scatter:
-            k = place[:, :1]
+            k = place[:, min(begins, m - 1), None]
             mean = fit.level[k] * fit.profile[fit.row[k], len(b) - 1 + place - k]
             scale = np.sqrt(1.0 + np.square(fit.spread * mean))
             seen = (seen - mean) / scale
@@ -248,7 +264,7 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             value -= 0.5 * np.sum(precision * np.square(expected), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
         if model.scatter:
-            value += fit.evidence[place[:, 0]]
+            value += fit.evidence[k[:, 0]]
         amplitude[at, :m] = scale * a
         log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude

@@ -556,7 +556,7 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         walk=gaussian_walk(config.depth_std / step),
         gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells, dtype=np.float64))),
         amplitude_prior=config.amplitude_prior,
-        amplitude_std=config.amplitude_std_sigmas,
+        amplitude_std=config.amplitude_std,
         independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
         amplitude_memory=config.amplitude_memory,
         negative_probability=config.negative_share,

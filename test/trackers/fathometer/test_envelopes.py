@@ -69,6 +69,24 @@ def test_the_floor_is_followed_under_one_identity(scene):
     assert np.mean(right) >= 0.9
 
 
+def test_a_faint_floor_is_not_lost_to_what_scatters_below_it(scene):
+    """A soft floor, a third of the loudest, 5 m above where the scatter begins: by the rule that
+    scatter begins with the first reflector it has no place."""
+    faint = []
+    for each, true in zip(scene.measurements[:25], scene.truth):
+        trace = each.measurement
+        floor = true.depth.min() - 5.0
+        width = stated().pulse_width
+        echo = 0.35 * trace.amplitude.max()
+        echo *= np.exp(-0.5 * np.square((trace.depth - floor) / width))
+        faint.append((evolve(trace, amplitude=trace.amplitude + echo), floor))
+    tracker, right = FathometerTracker(stated()), []
+    for trace, floor in faint:
+        columns = tracker.process(trace)[0].columns()
+        right.append(abs(columns['depth'][np.argmax(columns['is_bottom'])] - floor) < 0.5)
+    assert np.mean(right) >= 0.9
+
+
 def test_the_first_return_keeps_its_name_on_a_wall():
     config = evolve(stated(), depth_std=0.3, min_separation=1.0)
     first, ids = Identities().name(np.array([10.0, 14.0]), np.array([1.0, 0.0]), config)

@@ -16,6 +16,7 @@
 
 from pathlib import Path
 
+from attrs import evolve
 from helpers.fathometer_runs import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -386,3 +387,11 @@ def test_states_are_finite_however_strange_the_numbers(scale, sigma, seed, prior
             assert np.isfinite(estimate.state[there]).all()
             assert np.isfinite(estimate.covariance[there]).all()
             assert np.isfinite(estimate.probabilities).all()
+
+
+def test_conventional_amplitudes_are_a_third_unless_they_are_remembered():
+    """As its echoes stand out by a third; phantoms that are remembered would be too cheap."""
+    assert FathometerConfig().amplitude_std == 7.5
+    conventional = FathometerConfig(processor='conventional')
+    assert conventional.amplitude_std == 2.5
+    assert evolve(conventional, amplitude_memory=0.9).amplitude_std == 7.5
