@@ -36,6 +36,7 @@ offset holds the truth, over the fixed obstacles of `approaches` scenes per offs
 the tenth of the obstacles of which it holds least, `width` its mean width. `beam` is the same for
 obstacles 4 m above and below, where the beam is not as high as the tracker was told:
 
+    python -m benchmarks.obstacle_calibration --cases band
     python -m benchmarks.obstacle_calibration --cases beam --approaches 2
 """
 
@@ -61,8 +62,8 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, Tr
 ALTITUDES = (6.0, 25.0)
 DRAWN = {
     'within 8 m': (8.0, ALTITUDES),
-    'over the beam': (11.5, (15.0,)),
     'near the sonar': (5.0, (15.0,)),
+    'over the beam': (11.5, (15.0,)),
 }
 """Greatest vertical offset of the obstacles, m, and altitudes of the vehicle, m."""
 AT = (60.0, 45.0, 30.0, 20.0, 10.0)
@@ -243,10 +244,10 @@ def _held(runs: list[tuple[TrueObstacle, dict[int, Estimate]]]) -> dict[str, flo
 
 
 def main(
-    scenes: int = 14,
+    scenes: int = 28,
     approaches: int = 5,
     first: int = 300000,
-    cases: Sequence[str] = ('within 8 m', 'band', 'near the sonar', 'over the beam'),
+    cases: Sequence[str] = tuple(DRAWN),
     tracker: Sequence[str] = (),
 ) -> Parts:
     yield {'obstacles': OBSTACLES * scenes, 'approaches': OBSTACLES * approaches, 'first': first}

@@ -74,10 +74,9 @@ def main() -> None:
 
 
 def draw_calibration() -> None:
-    """Reliability diagrams, two binomial standard errors to either side of what happened."""
+    """Reliability diagrams, two standard errors to either side of what happened."""
     found = json.loads(CALIBRATION.read_text(encoding='utf-8'))
     cases = list(found['evidence'])
-    cases.remove('band')
     figure, axes = plt.subplots(
         1, len(cases), figsize=(3.4 * len(cases), 3.6), layout='constrained', sharey=True
     )
