@@ -24,8 +24,10 @@ is that by one over the variance; its uncertainty is that of soundings whose pin
 `adjustment`: the scene `survey`, twelve lines and three across with biases, tides, an error of the
 sound speed, fish and false echoes: errors of the corrections, and as multiples of their stated
 standard deviations. `grid`: the charts of it in 1 m cells over the middle, about the median of
-their errors, since no crossing tells the level; `inside` with the level. `walls`: the sides of the
-wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections, as the grid is and with other choices.
+their errors, since no crossing tells the level: `level_inside` is the share within two stated
+deviations less that of the level (`Adjustment.levels`), `inside` with the level. `walls`: the
+sides of the wreck, 40 x 8 x 4 m, in 1 m cells with the true corrections, as the grid is and with
+other choices.
 """
 
 from __future__ import annotations
@@ -145,14 +147,16 @@ def survey(seed: int, interval: float) -> tuple[dict[str, float], dict[str, dict
     true = [line.corrected(c) for line, c in zip(lines, scene.corrections)]
     moved = [line.corrected(c) for line, c in zip(lines, found.corrections)]
     covariance = found.of_lines(range(n))
-    for name, parts, C, left in (
-        ('adjusted', moved, covariance, 0.0),
-        ('truth applied', true, None, 0.0),
-        ('not adjusted', lines, None, found.rms[0]),
+    (_, common), *_ = found.levels()
+    corrections['level_stated'] = float(level / common)
+    for name, parts, C, left, level_std in (
+        ('adjusted', moved, covariance, 0.0, common),
+        ('truth applied', true, None, 0.0, 0.0),
+        ('not adjusted', lines, None, found.rms[0], 0.0),
     ):
         number = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
         soundings = Soundings(joined_lines(parts), number)
-        charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, left)
+        charts[f'looks, {name}'] = looks_scores(scene.floor, soundings, own, C, left, level_std)
         whole = soundings.line
         x, y = whole.xy.T
         points = Points(whole.stamp_ns, {'x': x, 'y': y, 'z': whole.z})
@@ -169,6 +173,7 @@ def looks_scores(
     errors: ErrorBudget,
     covariance: FloatArray | None,
     crossing_rms: float,
+    level_std: float,
 ) -> dict[str, float]:
     """Of the grid of looks over the middle."""
     first, last = MIDDLE
@@ -176,13 +181,14 @@ def looks_scores(
     nodes = grid_of_looks(soundings, 1.0, box, errors, covariance, crossing_rms)
     place = np.asarray(np.column_stack([nodes.ix, nodes.iy]) + 0.5, np.float64)
     competing = float(np.mean(nodes.hypotheses > 1))
-    return {**about_level(floor, place, nodes.z, nodes.sd), 'competing': competing}
+    return {**about_level(floor, place, nodes.z, nodes.sd, level_std), 'competing': competing}
 
 
 def about_level(
-    floor: Floor, place: FloatArray, z: FloatArray, sd: FloatArray
+    floor: Floor, place: FloatArray, z: FloatArray, sd: FloatArray, level_std: float = 0.0
 ) -> dict[str, float]:
     """As `scores`, errors about their median; `inside` with the level, `level_inside` about it."""
+    relative = np.sqrt(np.maximum(np.square(sd) - level_std**2, 0.0))
     error = z - floor.at(place[:, 0], place[:, 1])
     off = error - np.median(error)
     return {
@@ -190,7 +196,8 @@ def about_level(
         'median': float(np.median(np.abs(off))),
         'beyond': float(np.mean(np.abs(off) > 0.5)),
         'inside': float(np.mean(np.abs(error) < 2.0 * sd)),
-        'level_inside': float(np.mean(np.abs(off) < 2.0 * sd)),
+        'level_inside': float(np.mean(np.abs(off) < 2.0 * relative)),
+        'relative_sd': float(np.median(relative)),
         'sd': float(np.median(sd)),
     }
 

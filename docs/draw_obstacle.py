@@ -74,23 +74,24 @@ def main() -> None:
 
 
 def draw_calibration() -> None:
-    """Reliability diagrams, two binomial standard errors to either side of what happened."""
+    """Reliability diagrams, two standard errors to either side of what happened."""
     found = json.loads(CALIBRATION.read_text(encoding='utf-8'))
-    cases = list(found['evidence'])
-    cases.remove('band')
+    table = {misses: found[misses]['within 8 m'] for misses in ('ignored', 'evidence')}
+    names = {'reliability': 'all', 'early': 'at 60 and 45 m', 'late': 'from 30 m on'}
     figure, axes = plt.subplots(
-        1, len(cases), figsize=(3.4 * len(cases), 3.6), layout='constrained', sharey=True
+        1, len(names), figsize=(3.4 * len(names), 3.6), layout='constrained', sharey=True
     )
-    for ax, case in zip(axes, cases):
+    for ax, (name, title) in zip(axes, names.items()):
         ax.plot([0.0, 1.0], [0.0, 1.0], color=INK, lw=0.8)
         for misses, colour, side in (('ignored', RED, -0.01), ('evidence', BLUE, 0.01)):
-            rows = found[misses][case]['reliability'].values()
+            rows = table[misses][name].values()
             stated, happened, error = (
-                np.array([row[name] for row in rows]) for name in ('stated', 'happened', 'error')
+                np.array([row[column] for row in rows])
+                for column in ('stated', 'happened', 'error')
             )
             style = {'color': colour, 'capsize': 2, 'label': f'misses: {misses}'}
             ax.errorbar(stated + side, happened, 2.0 * error, fmt='o', ms=4, lw=1, **style)
-        ax.set(title=case, xlabel='stated', xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect='equal')
+        ax.set(title=title, xlabel='stated', xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect='equal')
     axes[0].set_ylabel('happened')
     axes[0].legend(frameon=False, loc='upper left')
     figure.savefig(OUT / 'obstacle_calibration.png', dpi=130)

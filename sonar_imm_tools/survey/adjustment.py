@@ -52,6 +52,9 @@ from .line import PARAMETERS, partials
 from .looks import gradients, Looks, MAD, runs_of, strips
 
 NU, REWEIGHTINGS = 4.0, 8
+CLOSE = 3e-3
+"""Rms change of the unknowns, in deviations of their priors, after which weights are left as they
+are: by then each correction is within .03 of its stated deviation of where more would take it."""
 ROUNDS = 3
 BLOCK_SECONDS, LONGEST_BLOCK = 10.0, 160.0
 DRIFT_SECONDS = 60.0
@@ -94,7 +97,7 @@ class Adjustment:
     owner (P,): number of the line, -1 the survey; kind (P,): index into `PARAMETERS`; value, std,
     prior_std (P,); covariance (P, P); information (P, P) of the data alone; corrections (L, 6):
     total of each line; rms: of looks about their cells, robust, before the first round and after
-    each.
+    each; group (L,): number of the group of lines that overlap, of each line.
     """
 
     owner: IntArray
@@ -106,7 +109,7 @@ class Adjustment:
     information: FloatArray
     corrections: FloatArray
     rms: tuple[float, ...]
-    groups: int
+    group: IntArray
 
     def known_share(self) -> FloatArray:
         """`told` of each unknown (P,): the share of the prior variance that is gone."""
@@ -118,6 +121,19 @@ class Adjustment:
         K = len(PARAMETERS)
         full = T @ (T @ self.covariance).T
         return np.asarray(full).reshape(len(lines), K, len(lines), K)
+
+    def levels(self) -> list[tuple[IntArray, float]]:
+        """The lines of each group, and the standard deviation of their common level, m: the least
+        that any weighted mean of their offsets has. All heights of a group share that error; what
+        is stated of a height less this, in squares, is how sure it is beside the others."""
+        found = []
+        offset = np.flatnonzero(self.kind == 3)
+        for number in range(int(self.group.max()) + 1):
+            lines = np.flatnonzero(self.group == number)
+            own = offset[np.isin(self.owner[offset], lines)]
+            weights = np.linalg.solve(self.covariance[np.ix_(own, own)], np.ones(len(own)))
+            found.append((lines, float(1.0 / np.sqrt(weights.sum()))))
+        return found
 
     def not_known(self) -> list[tuple[FloatArray, float]]:
         """Combinations (P,) of unknowns, in their priors, of which the data say less than the
@@ -157,11 +173,11 @@ def adjust(
         if number:
             note(number, history[-1])
         if number < ROUNDS:
-            value = equations.solve(states)
+            value = equations.solve(states, value)
             corrections = unknowns.totals(value)
             del found, equations  # before the next ones are made
     # The last step moved no place by much: the equations of the last statistics are those of it.
-    equations.reweight(value)
+    equations.reweight(equations.J, value)
     covariance, information = equations.covariance(states)
     # To first order only the mean over the column counts; what a second layer adds is common.
     bent = np.where(unknowns.kind == 4, SECOND_ORDER * value, 0.0)
@@ -176,7 +192,7 @@ def adjust(
         information=information,
         corrections=corrections,
         rms=tuple(history),
-        groups=groups_of(found, count),
+        group=groups_of(found, count),
     )
 
 
@@ -268,11 +284,11 @@ def _crossing(looks: Looks, inside: BoolArray, sound_speed: float) -> Crossing:
     )
 
 
-def groups_of(found: Crossing, count: int) -> int:
-    """How many groups of lines there are that do not overlap each other."""
+def groups_of(found: Crossing, count: int) -> IntArray:
+    """The number of the group (L,) of each line; groups do not overlap each other."""
     shape = found.cells, count
     see = csr_array((np.ones(len(found.cell)), (found.cell, found.line)), shape=shape)
-    return int(connected_components(see.T @ see, directed=False)[0])
+    return np.asarray(connected_components(see.T @ see, directed=False)[1], np.int64)
 
 
 @frozen
@@ -387,9 +403,9 @@ class _Equations:
         mean = (self.in_cell @ (self.w * z)) / (self.in_cell @ self.w)
         return np.asarray(z - mean[self.cell])
 
-    def reweight(self, value: FloatArray) -> None:
-        """Student weights of the residuals at a solution."""
-        u = self._off_cell(self.y + self.J @ value) / np.sqrt(self.v)
+    def reweight(self, J: csr_array, value: FloatArray) -> None:
+        """Student weights of the residuals at a solution for the unknowns of J."""
+        u = self._off_cell(self.y + J @ value) / np.sqrt(self.v)
         self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
 
     def normal(self, J: csr_array) -> tuple[csc_array, FloatArray]:
@@ -438,18 +454,20 @@ class _Equations:
         columns, information = self.states(self._affordable())
         return hstack([self.J, columns]).tocsr(), np.concatenate([prior, information])
 
-    def solve(self, states: bool) -> FloatArray:
-        """The unknowns (P,), by iterated Student weights."""
+    def solve(self, states: bool, start: FloatArray) -> FloatArray:
+        """The unknowns (P,), by iterated Student weights, from those of the round before; 0 in the
+        first one."""
         J, prior = self._system(states)
-        size = len(self.unknowns.owner)
-        value = np.zeros(len(prior))
+        size = len(start)
+        value = np.concatenate([start, np.zeros(len(prior) - size)])
         scale = 1.0 / np.sqrt(prior)
+        if start.any():
+            self.reweight(J, value)
         for _ in range(REWEIGHTINGS):
             N, rhs = self.normal(J)
             before, value = value, _factored(N, prior, scale)(rhs)
-            u = self._off_cell(self.y + J @ value) / np.sqrt(self.v)
-            self.w = (NU + 1.0) / (NU + np.square(u)) / self.v
-            if np.max(np.abs(value - before)[:size] / scale[:size]) < 1e-5:
+            self.reweight(J, value)
+            if np.sqrt(np.mean(np.square((value - before) / scale)[:size])) < CLOSE:
                 break
         return np.asarray(value[:size])
 
@@ -537,7 +555,7 @@ def _factored(
 
 
 def described(adjustment: Adjustment, names: Sequence[str]) -> dict[str, Any]:
-    """The parameters and what could not be told, as adjustment.json has them."""
+    """The parameters, what could not be told, and levels, as adjustment.json has them."""
 
     def label(k: int) -> tuple[str, str]:
         owner = int(adjustment.owner[k])
@@ -564,4 +582,8 @@ def described(adjustment: Adjustment, names: Sequence[str]) -> dict[str, Any]:
             if abs(vector[k]) > 0.05
         ]
         combinations.append({'combination': ' '.join(words), 'share': share})
-    return {'parameters': parameters, 'not_told': combinations}
+    levels = [
+        {'lines': [names[k] for k in lines.tolist()], 'std_m': std}
+        for lines, std in adjustment.levels()
+    ]
+    return {'parameters': parameters, 'not_told': combinations, 'levels': levels}

@@ -443,9 +443,9 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
 
 def _warnings_of(found: Adjustment) -> list[str]:
     warnings = []
-    if found.groups > 1:
+    if groups := int(found.group.max()):
         warnings.append(
-            f'the lines are {found.groups} groups that do not overlap: levels between groups are '
+            f'the lines are {groups + 1} groups that do not overlap: levels between groups are '
             'those of the priors alone'
         )
     speed = found.kind == 4

@@ -146,7 +146,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
         'rms_after': survey.adjustment.rms[-1] if survey.adjustment else None,
     }
     names = [unit.name for unit in survey.units]
-    adjustment: dict[str, Any] = {'parameters': [], 'not_told': []}
+    adjustment: dict[str, Any] = {'parameters': [], 'not_told': [], 'levels': []}
     if survey.adjustment is not None:
         adjustment = described(survey.adjustment, names)
     write_json(out / ADJUSTMENT, {**adjustment, 'crossings': crossings})
@@ -393,6 +393,8 @@ def _summary(survey: Survey, chart: Chart) -> str:
     if survey.adjustment is not None:
         rms = survey.adjustment.rms
         words.append(f'Misties {rms[0]:.3f} m rms before the adjustment, {rms[-1]:.3f} m after.')
+        levels = ', '.join(f'{std:.2f}' for _, std in survey.adjustment.levels()[:5])
+        words.append(f'The common level has a standard deviation of {levels} m, in every one.')
     elif survey.crossing_cells:
         words.append(
             f'Not adjusted: misties of {survey.rms_before:.3f} m rms are in the uncertainty.'

@@ -25,6 +25,9 @@ from sonar_imm.measurements import Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle import avoidance, avoidance_kernels
 from sonar_imm.trackers.obstacle.avoidance_kernels import Safety
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.ping_kernels import slope
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, Swing
 
 GOLDEN = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'cpa_golden.npz'
 
@@ -119,12 +122,26 @@ def test_the_course_is_the_line_and_not_the_swing():
     assert np.isnan(avoidance.course(buffer, 2 * stamp, 10.0)).all()
 
 
+def test_the_course_is_as_sure_as_its_default_says():
+    """The sway of the simulated vehicle, and of the study's, is what makes a course wrong."""
+    setting = scenario('approach')
+    across = []
+    for seed in range(60):
+        sway = Swing(setting.sway_rms, setting.sway_period, np.random.default_rng(seed))
+        t = np.arange(0.0, 10.05, 0.1)
+        across.append(slope(t - t[-1], np.column_stack([t, sway(t), 0.0 * t]))[1])
+    assert np.sqrt(np.mean(np.square(across))) == pytest.approx(
+        ObstacleConfig().course_std, rel=0.2
+    )
+
+
 def test_the_tracker_says_what_an_independent_one_does():
-    """At the pings for which it told; its course is made a little differently."""
+    """At the pings for which it told, with its `course_std`; its course is made a little
+    differently."""
     off = {'cpa_distance': [], 'cpa_time': [], 'collision_probability': []}
     for name, number in ENCOUNTERS:
         data = encounter(name, number)
-        estimates = track(data)
+        estimates = track(data, course_std=0.05)
         given = np.flatnonzero(np.isfinite(data['ref_collision']))
         for key, reference in zip(off, ('cpa_distance', 'cpa_time', 'collision')):
             off[key].extend(column(estimates, key, given) - data[f'ref_{reference}'][given])
