@@ -25,7 +25,6 @@ from ..threads import one_blas_thread
 from . import NO_ROS
 from .stopping import stopper
 
-
 OF_ROS, MESSAGES = ('rclpy', 'std_srvs'), ('_msgs', '_interfaces')
 """Modules of ROS 2 that nodes import, and how those with messages end."""
 
