@@ -172,7 +172,7 @@ def ais(path, spots):
     path.write_text('\r\n'.join(lines) + '\r\n')
 
 
-def heard(spots):
+def receptions(spots):
     """Seconds at which each station hears each ping."""
     for k, each in enumerate(spots):
         place = np.array(each.place or (0.0, 0.0))
@@ -187,13 +187,15 @@ def stations(folder):
 
 def telemetry(path, spots):
     stations(path.parent)
-    rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in heard(spots)]
+    rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in receptions(spots)]
     path.write_text('\n'.join(['time_utc,receiver,tag', *rows]) + '\n')
 
 
 def arrivals(path, spots):
     stations(path.parent)
-    rows = [f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in heard(spots)]
+    rows = [
+        f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in receptions(spots)
+    ]
     path.write_text('\n'.join(['ping,receiver,arrival_s,tag', *rows]) + '\n')
 
 

@@ -143,14 +143,15 @@ def map_section(
     if not (len(way) and len(series)):
         return
     figure = go.Figure()
-    add_line(figure, *way[thin(len(way), MOST_POINTS)].T, 'vehicle', INK, 2)
+    x, y = way[thin(len(way), MOST_POINTS)].T
+    add_line(figure, x, y, 'vehicle', INK, 2)
     for name, colour, track in _by_track(series):
-        place = track.place[thin(len(track), MOST_POINTS)]
-        words = {'hovertemplate': f'{name}: x %{{x:.1f}}, y %{{y:.1f}}', 'mode': 'markers'}
-        add_line(figure, *place.T, name, colour, marker={'size': 4, 'color': colour}, **words)
+        x, y = track.place[thin(len(track), MOST_POINTS)].T
+        add_points(figure, x, y, name, colour)
+        figure.data[-1].hovertemplate = f'{name}: x %{{x:.1f}}, y %{{y:.1f}}'
     x_range, y_range = view_of(np.concatenate([way, series.place]))
-    y = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
-    styled(figure, 480, {'title': 'x [m]', 'range': x_range}, y)
+    along = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
+    styled(figure, 480, {'title': 'x [m]', 'range': x_range}, along)
     yield Section(
         'Map',
         'Seen from above: the way of the vehicle, and where each track has its obstacle.',
