@@ -54,8 +54,8 @@ EXPECTED = {
     'line.all': [TIMES, SHIP, TWO],
     'frames': [TIMES, SHIP],
 }
-"""What is printed of a file with all that; each name of `READ` but the bags, whose reader has its own
-tests and whose gaps ``info`` shows."""
+"""What is printed of a file with all that; each name of `READ` but the bags, whose reader has its
+own tests and whose gaps ``info`` shows."""
 
 
 def content_of(path):
