@@ -19,8 +19,9 @@
 
 The diver node hears scans of four divers in clutter (`simulate diver --scenario crossing --set
 clutter=3`), the obstacle node detections of two obstacles with navigation and altitudes
-(`simulate obstacle --scenario rolling --set ping_rate=10`). Each scan or ping goes to the node,
-and to a plain rclpy node that answers with a PointCloud2 without fields, of as many bytes as the
+(`simulate obstacle --scenario rolling --set ping_rate=10`), the bathymetry node the pings of the
+paper, the fathometer node traces (`--scenario drift_traces`). Each of them goes to the node, and
+to a plain rclpy node that answers with a PointCloud2 without fields, of as many bytes as the
 estimate had: what is left is the cost of the middleware and of Python. Which of the two is asked
 first changes every time. `--rates`: so many such pairs a second, or one after the other (0). Needs
 ROS 2. The load is that of the machine in the last minute, jobs that run or wait; with more of them
@@ -55,7 +56,9 @@ from sonar_imm.nodes.qos import lockstep_qos, output_qos
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
 from sonar_imm_tools.replay.link import Link, LinkError
+from sonar_imm_tools.simulation.bathymetry import simulator as bathymetry
 from sonar_imm_tools.simulation.diver import simulator as diver
+from sonar_imm_tools.simulation.fathometer import simulator as fathometer
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
 LIMIT = 90.0
@@ -77,6 +80,13 @@ def case_of(system: str, count: int) -> Case:
     if system == 'diver':
         scene: Any = diver.scenario('crossing', {'duration': count - 1.0, 'clutter': 3.0})
         simulated, timed = diver.simulate(scene, 0), 'fixes'
+    elif system == 'bathymetry':
+        scene = bathymetry.scenario('paper', {'pings': count})
+        simulated, timed = bathymetry.simulate(scene, 0), 'snapshot'
+    elif system == 'fathometer':
+        changes = {'records': count, 'appearing': (), 'fading': ()}
+        scene = fathometer.scenario('drift_traces', changes)
+        simulated, timed = fathometer.simulate(scene, 0), 'trace'
     else:
         # Pings until the range is down to `last_range`: slow enough for as many as are wanted.
         speed = 80.0 / (0.1 * count)
@@ -263,6 +273,6 @@ if __name__ == '__main__':
         main,
         digits=2,
         rates={'help': 'messages a second; 0: no pause'},
-        system={'choices': ('diver', 'obstacle'), 'help': 'only that node'},
+        system={'choices': tuple(SYSTEMS), 'help': 'only that node'},
         echo={'help': 'be the node that only answers'},
     )

@@ -32,7 +32,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
 from .headers import Make, make_header, make_pose, stamp_ns
-from .table import decode_table, layout_of, packed_table, require_columns
+from .table import decode_table, is_finite, layout_of, packed_table, require_columns
 
 NOT_ESTIMATED = 1.0
 """Variance of a z or a vertical speed that is not estimated, m^2 and m^2/s^2: it says nothing, but
@@ -62,20 +62,21 @@ def _packed(estimate: Estimate, make: Make) -> tuple[NDArray, tuple[Any, ...], b
     whole['block'] = np.concatenate([estimate.state, upper, estimate.probabilities], axis=1)
     for name, column in extras.items():
         packed[name] = column
-    finite = np.isfinite(whole['block']).all() and np.isfinite(whole['xyz']).all()
-    finite = finite and all(np.isfinite(extras[name]).all() for name in plan.inexact)
-    return packed, plan.fields, bool(finite)
+    columns = [whole['xyz'], whole['block'], *(extras[name] for name in plan.inexact)]
+    return packed, plan.fields, is_finite(packed, columns, flat=plan.flat)
 
 
 class _Plan(NamedTuple):
     """Where the columns of estimates lie. pieces: the same rows as xyz, one block, and the rest;
-    upper: rows and columns of the covariances sent; inexact: extras that may hold NaN."""
+    upper: rows and columns of the covariances sent; inexact: extras that may hold NaN; flat: no
+    column has several numbers."""
 
     dtype: np.dtype
     fields: tuple[Any, ...]
     pieces: np.dtype
     upper: tuple[NDArray, NDArray]
     inexact: tuple[str, ...]
+    flat: bool
 
 
 @lru_cache(maxsize=64)
@@ -110,7 +111,8 @@ def _plan(
         }
     )
     inexact = tuple(name for name, kind, _ in extras if kind.kind == 'f')
-    return _Plan(dtype, fields, pieces, upper, inexact)
+    flat = not any(shape for _, _, shape in extras)
+    return _Plan(dtype, fields, pieces, upper, inexact, flat)
 
 
 def read_estimate(message: Any) -> Estimate:

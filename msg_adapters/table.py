@@ -118,7 +118,8 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
             raise ValueError(f"column '{name}' has {len(array)} rows, '{layout[0][0]}' has {rows}")
         packed[name] = array
     header = make_header(stamp_ns, frame_id, make)
-    return packed_table(packed, fields, _is_finite(packed, arrays), header, make)
+    flat = all(array.ndim == 1 for array in arrays)
+    return packed_table(packed, fields, is_finite(packed, arrays, flat), header, make)
 
 
 def packed_table(
@@ -181,9 +182,10 @@ def layout_of(
     return packed, fields
 
 
-def _is_finite(packed: NDArray, arrays: list[NDArray]) -> bool:
-    """Whether no number is NaN or infinite. For few rows Python is quicker than numpy."""
-    if len(packed) <= 4 and all(array.ndim == 1 for array in arrays):
+def is_finite(packed: NDArray, arrays: list[NDArray], flat: bool) -> bool:
+    """Whether no number of rows, packed and column by column, is NaN or infinite; flat: no column
+    has several. For few rows Python is quicker than numpy."""
+    if flat and len(packed) <= 4:
         return all(map(math.isfinite, chain.from_iterable(packed.tolist())))
     return all(bool(np.isfinite(array).all()) for array in arrays)
 

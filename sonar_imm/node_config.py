@@ -68,6 +68,10 @@ class NodeConfig(Config):
         'this from the first measurement', range=(0.0, 1e6))
     # fmt: on
 
+    def origin(self) -> Origin | None:
+        """Where the frame of the navigation lies on Earth, None where that is not stated."""
+        return None
+
 
 @frozen(kw_only=True)
 class PlacedNodeConfig(NodeConfig):

@@ -426,28 +426,35 @@ def test_every_package_says_what_is_public() -> None:
     assert "dict.fromkeys(PACKAGES, ['py.typed'])" in (ROOT / 'setup.py').read_text()
 
 
-def test_a_node_without_ros_says_what_to_install() -> None:
+@pytest.mark.parametrize(
+    'missing, advice',
+    [
+        *dict.fromkeys(
+            ('rclpy', 'lifecycle_msgs'),
+            "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        ).items(),
+        ('numpy', 'pip install sonar_imm brings it.'),
+    ],
+)
+def test_a_node_says_what_is_missing(missing: str, advice: str) -> None:
     program = """
 import sys
 from sonar_imm.nodes.commands import main
 
 class NoRos:
     def find_spec(self, name, path=None, target=None):
-        if name == 'rclpy':
+        if name == sys.argv[1]:
             raise ModuleNotFoundError(name=name)
 
 sys.meta_path.insert(0, NoRos())
-sys.argv = ['/opt/lib/sonar_imm/diver_node']
+sys.argv[0] = '/opt/lib/sonar_imm/diver_node'
 sys.exit(main())
 """
     done = subprocess.run(
-        [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, '-c', program, missing], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        'diver_node: rclpy is not here. ROS 2 is not found: source a Jazzy workspace, or pip '
-        "install 'sonar_imm[ros]'"
-    ]
+    assert done.stderr.splitlines() == [f'diver_node: {missing} is not here. {advice}']
 
 
 def test_the_page_of_commands_names_every_subcommand() -> None:

@@ -54,6 +54,11 @@ class Origin:
         there = enu2geodetic(east, north, up, self.latitude, self.longitude, self.height)
         return np.stack([np.asarray(part, np.float64) for part in there], axis=-1)
 
+    def degrees(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Longitude and latitude (n,) of places (n, 2), metres east and north at height 0."""
+        latitude, longitude, _ = self.geodetic(np.pad(places, ((0, 0), (0, 1)))).T
+        return longitude, latitude
+
     def axes(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin: the
         convergence of the meridians and the tilt of the vertical."""

@@ -88,10 +88,10 @@ class Detections:
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
+        unknown = column(np.full(len(self.range), np.nan))
         for name in OPTIONAL_COLUMNS:
             given = getattr(self, name)
-            values = np.full(len(self.range), np.nan) if given is None else given
-            object.__setattr__(self, name, column(values))
+            object.__setattr__(self, name, unknown if given is None else column(given))
         for name in ('bearing', *OPTIONAL_COLUMNS):
             rows = len(getattr(self, name))
             if rows != len(self):

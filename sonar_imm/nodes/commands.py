@@ -25,16 +25,22 @@ from ..threads import one_blas_thread
 from . import NO_ROS
 from .stopping import stopper
 
+OF_ROS, MESSAGES = ('rclpy', 'std_srvs'), ('_msgs', '_interfaces')
+"""Modules of ROS 2 that nodes import, and how those with messages end."""
+
 
 def main() -> int:
     """Start the node that this program is called after, e.g. ``diver_node``. Gives its exit code,
-    2 where ROS 2 is not installed."""
+    2 where a module is not installed."""
     stopper.listen()
     one_blas_thread()  # before the node's module imports numpy
     program = Path(sys.argv[0]).stem
     try:
         node = import_module(f'{__package__}.{program.removesuffix("_node")}')
     except ModuleNotFoundError as error:
-        print(f'{program}: {error.name} is not here. {NO_ROS}', file=sys.stderr)
+        missing = (error.name or '').partition('.')[0]
+        of_ros = missing in OF_ROS or missing.endswith(MESSAGES)
+        advice = NO_ROS if of_ros else 'pip install sonar_imm brings it.'
+        print(f'{program}: {error.name} is not here. {advice}', file=sys.stderr)
         return stopper.end(2)
     return stopper.end(int(node.main()))

@@ -22,6 +22,7 @@ from typing import Any
 
 import click
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.files import whole
 
 from .common import example, json_option, place_options, print_json, say
@@ -188,7 +189,11 @@ def _export_tracks(
     from ..recordings.export.tracks import tracks_of, write_tracks
 
     degrees = None if epsg is None else _to_degrees(epsg, origin)
-    tracks = tracks_of(RunFolder(run).read_estimates(), degrees)
+    folder = RunFolder(run)
+    record = folder.read_run()
+    if degrees is None and record['system'] == 'obstacle' and (stated := record.get('origin')):
+        degrees = Origin(**stated).degrees
+    tracks = tracks_of(folder.read_estimates(), degrees)
     with whole(out) as unfinished:
         left_out = write_tracks(unfinished, tracks, kind, run.name)
     result = {'out': str(out), 'rows': len(tracks), 'left_out': left_out}

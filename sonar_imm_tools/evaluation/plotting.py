@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 import plotly.graph_objects as go
 from scipy.stats import chi2
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from .. import SECOND
@@ -178,3 +179,54 @@ def styled(figure: go.Figure, height: int, x: dict[str, Any], y: dict[str, Any])
     figure.update_xaxes(x | axis)
     figure.update_yaxes(y | axis)
     return figure
+
+
+def in_degrees(figure: go.Figure, origin: Origin) -> go.Figure:
+    """A map in metres drawn in latitude and longitude, north up, with a scale bar; at its
+    middle a metre is as long to the east as to the north."""
+
+    def geodetic(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        east, north = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        return origin.degrees(np.column_stack([east, north]))
+
+    x_range, y_range = (figure.layout[name].range for name in ('xaxis', 'yaxis'))
+    for trace in figure.data:
+        trace.x, trace.y = geodetic(trace.x, trace.y)
+        if trace.hovertemplate is not None:
+            ends = trace.hovertemplate.partition(': x ')[0]
+            trace.hovertemplate = f'{ends}: latitude %{{y:.6f}}, longitude %{{x:.6f}}'
+    shape = 1.0 / np.cos(np.radians(origin.latitude))
+    degrees = {'tickformat': '.5~f', 'ticksuffix': '\u00b0'}
+    figure.update_xaxes(title='longitude', nticks=6, **degrees)
+    figure.update_yaxes(title='latitude', scaleratio=shape, **degrees)
+    if x_range is None:
+        return figure
+    longitude, latitude = geodetic(x_range, y_range)
+    figure.update_xaxes(range=longitude.tolist())
+    figure.update_yaxes(range=latitude.tolist())
+    width = x_range[1] - x_range[0]
+    bar = scale_length(width / 4.0)
+    start, height = x_range[0] + 0.04 * width, y_range[0] + 0.04 * (y_range[1] - y_range[0])
+    at = geodetic([start, start + bar], [height, height])
+    name = f'{bar / 1000:g} km' if bar >= 1000.0 else f'{bar:g} m'
+    add_line(figure, *at, name, INK, 4, hoverinfo='skip', showlegend=False)
+    figure.add_annotation(
+        x=at[0][0], y=at[1][0], text=name, showarrow=False, yshift=12, xanchor='left'
+    )
+    return figure
+
+
+def scale_length(longest: float) -> float:
+    """The longest of 1, 2 and 5 times a power of ten that is at most `longest`."""
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest))
+
+
+def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]:
+    """Ranges of x and y with a margin around `points` (n, 2); None, None without points."""
+    if not len(points):
+        return None, None
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.08 * max(float((high - low).max()), 1.0)
+    x, y = ([float(a - margin), float(b + margin)] for a, b in zip(low, high))
+    return x, y

@@ -34,6 +34,7 @@ import numpy as np
 
 from msg_adapters.inputs import inputs_of
 from sonar_imm import __version__
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
@@ -59,7 +60,8 @@ class InputOptions:
     topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
     later input too, which takes memory in proportion to the recording. jobs: processes that share
     the work where a tracker can share it; the estimates do not depend on it. detector: parameters
-    of the detector of images that are not the default.
+    of the detector of images that are not the default. origin: where the frame of the navigation
+    lies on Earth.
     """
 
     topics: Mapping[str, str] | None = None
@@ -70,6 +72,7 @@ class InputOptions:
     smooth: bool = False
     jobs: int = 1
     detector: Mapping[str, Any] = field(factory=dict)
+    origin: Origin | None = None
 
 
 @define
@@ -281,7 +284,7 @@ class OfflineRun:
 
     def origin(self) -> dict[str, Any]:
         """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
-        origin = getattr(self.tracker, 'origin', None)
+        origin = getattr(self.tracker, 'origin', None) or self.options.origin
         return {} if origin is None else {'origin': asdict(origin)}
 
     def landmarks(self) -> dict[str, Any]:

@@ -17,7 +17,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+import math
 from pathlib import Path
 from typing import Any, TypeVar
 import zipfile
@@ -28,8 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.inputs import InputTopic
-from sonar_imm.measurements import Rejection
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.measurements import Rejection, VesselFix
 
+from .. import SECOND
 from .csv_table import BadRow, Row, Table
 from .mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from .messages import ros_message
@@ -41,6 +44,14 @@ T = TypeVar('T')
 Record = tuple[int, str, Any]
 """(stamp in ns, topic, rosbags message)"""
 
+JUMP = 3600 * SECOND
+"""A clock that goes further than this from one ping to the next is off, or was set."""
+PAUSE = 30 * 24 * JUMP
+"""Tables may pause for longer than `JUMP`; a longer pause than this is told."""
+MOST_OFF = 0.1
+"""Of more records than this share that seem off, it is the order of the file that is another."""
+FASTEST, NEAR = 100.0, 1000.0
+"""No ship is faster, m/s, or jumps further, m."""
 MOST_NAMED = 20
 """At most this many bad rows are listed; all are counted."""
 
@@ -78,6 +89,8 @@ class ConversionReport:
         for row in table:
             self.rows += 1
             try:
+                if row.line == table.cut_line:
+                    raise BadRow('the line is cut off', 'cut off')
                 yield row, parse(row)
             except (BadRow, Rejection) as error:
                 self.bad_row(table.path, f'line {row.line}', error)
@@ -87,8 +100,65 @@ class ConversionReport:
         """Note which columns of a file were taken for what, and which were not."""
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken
+        self.problems += table.problems
         if left:
             self.notes[f'ignored columns of {table.path.name}'] = left
+
+
+@define
+class Leaps:
+    """How often a ship was where it cannot have come to: of two ships, every other time."""
+
+    count: int = 0
+    last: tuple[int, float, float] | None = None
+
+    def saw(self, stamp_ns: int, east: float, north: float) -> None:
+        """east, north: metres."""
+        if self.last is not None:
+            seconds = abs(stamp_ns - self.last[0]) / SECOND
+            way = math.hypot(east - self.last[1], north - self.last[2])
+            self.count += way > NEAR + FASTEST * seconds
+        self.last = stamp_ns, east, north
+
+    def saw_all(self, fixes: Iterable[VesselFix]) -> None:
+        origin = None
+        for fix in fixes:
+            origin = origin or Origin(fix.latitude, fix.longitude)
+            self.saw(fix.stamp_ns, *origin.local(fix.latitude, fix.longitude)[:2].tolist())
+
+    def tell(self, path: Path, report: ConversionReport) -> None:
+        if self.count:
+            report.problems.append(
+                f'{path.name}: {self.count} times the vessel was further from its last position '
+                f'than {FASTEST:g} m/s would bring it; does the file hold two vessels? They are '
+                'kept'
+            )
+
+
+def _wrong_stamps(
+    streams: Mapping[str, Sequence[int]], source: str, report: ConversionReport
+) -> set[int]:
+    """Stamps, ns, at which a clock is off for itself, since the ones before and after agree. A
+    clock that was set is followed, and said."""
+    off: set[int] = set()
+    for name, ordered in streams.items():
+        stamps = np.array(ordered, np.int64)
+        before, there, after = stamps[:-2], stamps[1:-1], stamps[2:]
+        alone = (np.abs(after - before) <= JUMP) & (np.abs(there - before) > JUMP)
+        alone &= np.abs(there - after) > JUMP
+        if alone.sum() > max(1, MOST_OFF * len(stamps)):
+            continue
+        off |= set(there[alone].tolist())
+        steps = np.diff(stamps[~np.isin(stamps, there[alone])])
+        for step in steps[(steps < -JUMP) | (steps > PAUSE)][:1].tolist():
+            report.problems.append(
+                f'{source}: the clock jumps by {step / SECOND:g} s and stays there'
+                + (f' ({name})' if name else '')
+            )
+    for stamp in sorted(off):
+        why = BadRow('its clock is off', 'clock off')
+        report.bad_row(Path(source), f'{stamp / SECOND:.3f} s', why)
+    return off
 
 
 def write_bag(
@@ -99,13 +169,24 @@ def write_bag(
     source: str,
     storage: str = 'mcap',
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    streams: Mapping[str, Sequence[int]] | None = None,
 ) -> ConversionReport:
-    """Write `records` in time order into a new bag at `out`; log time = stamp.
+    """Write `records` in time order into a new bag at `out`; log time = stamp. Those whose clock
+    is off for itself are left out and counted.
 
-    parameters: those of its instruments, by the names of nodes. Raises `BagError` when there is
-    nothing to write or the bag cannot be made.
+    parameters: those of its instruments, by the names of nodes; streams: stamps in the order in
+    which each clock of the file said them, by default those of each topic. Raises `BagError`
+    when there is nothing to write or the bag cannot be made.
     """
-    ordered = sorted(records, key=lambda record: record[0])
+    records = list(records)
+    if streams is None:
+        topics = dict.fromkeys(topic for _, topic, _ in records if 'truth/' not in topic)
+        streams = {
+            each: [stamp for stamp, topic, _ in records if topic == each] for each in topics
+        }
+    off = _wrong_stamps(streams, source, report)
+    kept = (record for record in records if record[0] not in off)
+    ordered = sorted(kept, key=lambda record: record[0])
     if not ordered:
         first = f' (the first problem: {report.problems[0]})' if report.problems else ''
         raise BagError(f'{source} has nothing that could be converted{first}')

@@ -299,6 +299,8 @@ class Table:
         self.headers = list(headers)
         self.index = self._find_columns()
         self.used: set[str] = set()
+        self.problems: list[str] = []
+        self.cut_line = 0
         self._from_zero: dict[str, bool] = {}
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
@@ -397,9 +399,16 @@ class CsvTable(Table):
         super().__init__(path, options, headers)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
+        ended, width, header_seen = True, 0, False
+
+        def lines(file: TextIO) -> Iterator[str]:
+            nonlocal ended
+            for line in file:
+                ended = line.endswith(('\n', '\r'))
+                yield line
+
         with self._open() as file:
-            reader = csv.reader(file, **self._dialect)
-            header_seen = False
+            reader = csv.reader(lines(file), **self._dialect)
             while True:
                 try:
                     cells = next(reader)
@@ -414,6 +423,9 @@ class CsvTable(Table):
                 if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
                     continue
                 if header_seen:
+                    if len(cells) < width and not ended:
+                        self.cut_line = reader.line_num
+                    width = len(cells)
                     yield reader.line_num, cells
                 header_seen = True
 

@@ -52,6 +52,7 @@ DEGREES, METRES = 3, 0
 """What positions of XTF are given in."""
 POWER_STEP = 10.0 * math.log10(2.0) / 256.0
 """Decibels of a count of the power of an EK60."""
+CUT = 'a datagram is cut off'
 MOST_WAITING = 200
 """Pings that wait for a position of the ship."""
 
@@ -231,6 +232,14 @@ def _simrad(path: str) -> Iterator[Record]:
             **_placed(ping),
         }
         ping.release()
+    # Of a datagram that is cut off the library says nothing. Its length stands at both ends.
+    with open(path, 'rb') as file:
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(end - 4, 0))
+        length = int.from_bytes(file.read(4), 'little')
+        file.seek(max(end - length - 8, 0))
+        if int.from_bytes(file.read(4), 'little') != length:
+            raise ValueError(CUT)
 
 
 def _ek60(path: str) -> Iterator[Record]:
@@ -279,7 +288,7 @@ def _ek60(path: str) -> Iterator[Record]:
                 waiting.clear()
     yield from map(ship.placed, waiting)
     if read < os.path.getsize(path):
-        raise ValueError('a datagram is cut off')
+        raise ValueError(CUT)
 
 
 def _electrical(angle: Any) -> np.ndarray:
@@ -313,8 +322,9 @@ class _Ship:
                 self.course = float(sentence.true_track)
             elif sentence.sentence_type in ('GGA', 'GLL', 'RMC') and sentence.lat:
                 place = stamp_ns, float(sentence.longitude), float(sentence.latitude)
-                self.last, self.next = self.next, place
-                return True
+                if any(place[1:]):  # 0, 0 is what a receiver without a fix writes
+                    self.last, self.next = self.next, place
+                    return True
         return False
 
     def placed(self, ping: Record) -> Record:
@@ -354,6 +364,11 @@ def _all(path: str) -> Iterator[Record]:
         depths = 0.01 * cast.get_depth_resolution() * cast.get_depths_and_sound_speeds()[:, 0]
         yield _profile(depths, cast.get_sound_speeds_in_meters_per_second())
     yield from _kongsberg(handler)
+    # As in `_simrad`. Each datagram ends with 3 and a sum of two bytes.
+    with open(path, 'rb') as file:
+        file.seek(-3, os.SEEK_END)
+        if file.read(1) != b'\3':
+            raise ValueError(CUT)
 
 
 def _profile(depths: Any, speeds: Any) -> Record:

@@ -25,6 +25,19 @@ from .csv_table import BadRow, Row, Table
 from .sources import BagError
 
 
+def check_place(latitude: float, longitude: float) -> None:
+    """Raise `BadRow` for degrees that are no position on Earth."""
+    if latitude == longitude == 0.0:
+        raise BadRow(
+            'latitude 0, longitude 0 is what receivers without a fix write', 'no position'
+        )
+    if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+        swapped = '; are the two swapped?' if abs(longitude) <= 90.0 else ''
+        raise BadRow(
+            f'latitude {latitude:g}, longitude {longitude:g} is not a position on Earth{swapped}'
+        )
+
+
 class LocalFrame:
     """The local frame of the positions of a table.
 
@@ -65,12 +78,7 @@ class LocalFrame:
 
     def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
         latitude, longitude = row.number('latitude'), row.number('longitude')
-        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-            swapped = '; are the two swapped?' if abs(longitude) <= 90.0 else ''
-            raise BadRow(
-                f'latitude {latitude:g}, longitude {longitude:g} is not a position on Earth'
-                f'{swapped}'
-            )
+        check_place(latitude, longitude)
         height = row.optional('height') if row.table.has('height') else row.height()
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 import json
 import math
 from pathlib import Path
@@ -35,20 +36,27 @@ TIMES = ('coordTimes', 'times', 'coordinateProperties.times')
 
 
 class TrackFile(Table):
-    """Rows that were read from a file of another kind than CSV: cells by name of column."""
+    """Rows that were read from a file of another kind than CSV: cells by name of column, and words
+    for what is wrong with the file."""
 
     def __init__(
         self,
         path: str | Path,
         options: CsvOptions | None,
-        records: Iterable[Mapping[str, str]],
+        records: Iterable[Mapping[str, str] | str],
         what: str,
     ):
-        self._records = list(records)
+        self._records, problems = [], []
+        for record in records:
+            if isinstance(record, str):
+                problems.append(f'{Path(path).name} {record}; what came before it is kept')
+            else:
+                self._records.append(record)
         names = dict.fromkeys(name for record in self._records for name in record)
         if not names:
-            raise BagError(f'{path} is {what} without a position')
+            raise BagError(' '.join([f'{path} is {what} without a position', *problems]))
         super().__init__(path, options, list(names))
+        self.problems = problems
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         for number, record in enumerate(self._records, start=1):
@@ -83,9 +91,11 @@ def kind_of_text(path: Path) -> str:
     return ''
 
 
-def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
-    """Positions of a GPX or KML file; what has no time has an empty one."""
+def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
+    """Positions of a GPX or KML file; what has no time has an empty one. A file that
+    is damaged ends with a word about it."""
     names: list[str] = []
+    marks: list[ElementTree.Element] = []
     with path.open('rb') as file:
         if b'<!' in file.read(START).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
             raise BagError(
@@ -96,6 +106,7 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
             tag = element.tag.rpartition('}')[2]
             if event == 'start':
                 names += [''] if tag in ('trk', 'rte', 'Placemark') else []
+                marks += [element] if tag == 'Placemark' else []
                 continue
             if tag == 'name' and names:
                 names[-1] = names[-1] or (element.text or '').strip()
@@ -103,13 +114,15 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str]]:
                 yield _gpx_point(element, names[-1] if names else '')
                 element.clear()
             elif tag == 'Placemark':
-                yield from _placemark(element, names.pop())
+                yield from _placemark(marks.pop(), names.pop())
                 element.clear()
             elif tag in ('trk', 'rte'):
                 names.pop()
                 element.clear()
     except (ElementTree.ParseError, UnicodeError) as error:
-        raise BagError(f'{path} is damaged {kind.upper()}: {error}') from None
+        for mark, name in zip(marks, names):
+            yield from _placemark(mark, name, cut=True)
+        yield f'is damaged {kind.upper()}: {error}'
 
 
 def _text(element: ElementTree.Element, tag: str) -> str:
@@ -123,8 +136,11 @@ def _gpx_point(point: ElementTree.Element, name: str) -> dict[str, str]:
     return dict(zip(PLACE, (_text(point, 'time'), *place, own)))
 
 
-def _placemark(placemark: ElementTree.Element, name: str) -> Iterator[dict[str, str]]:
-    """The points of a Placemark: one with a time, or the track of Google's extension."""
+def _placemark(
+    placemark: ElementTree.Element, name: str, cut: bool = False
+) -> Iterator[dict[str, str]]:
+    """The points of a Placemark: one with a time, or the track of Google's extension, which may
+    be cut off."""
     times, places = [], []
     for part in placemark.iter():
         tag, text = part.tag.rpartition('}')[2], (part.text or '').strip()
@@ -134,20 +150,26 @@ def _placemark(placemark: ElementTree.Element, name: str) -> Iterator[dict[str, 
             places.append(text.split())
         elif tag == 'coordinates':
             places += [place.split(',') for place in text.split()]
-    if len(times) != len(places):
+    if len(times) != len(places) and not (cut and len(times) > 1):
         times = times * len(places) if len(times) == 1 else [''] * len(places)
-    for time, (longitude, latitude, *height) in zip(times, places):
+    for time, place in zip(times, places):
+        if len(place) < 2:
+            continue
+        longitude, latitude, *height = place
         yield dict(zip(PLACE, (time, latitude, longitude, height[0] if height else '', name)))
 
 
-def _read_geojson(path: Path) -> Iterator[dict[str, str]]:
+def _read_geojson(path: Path) -> Iterator[dict[str, str] | str]:
     """The points of all features, with their properties; those of lines with their times."""
     if path.stat().st_size > LARGEST_JSON:
         raise BagError(f'{path} has more than {LARGEST_JSON // 10**6} MB')
+    text = path.read_text(encoding='utf-8-sig', errors='replace')
+    damage = ''
     try:
-        whole = json.loads(path.read_bytes())
+        whole = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise BagError(f'{path} is damaged JSON: {error}') from None
+        begin = text.find('[', text.find('"features"')) + 1
+        whole, damage = {'features': whole_items(text, begin)}, f'is damaged JSON: {error}'
     features = whole.get('features') if isinstance(whole, dict) else None
     for feature in features if isinstance(features, list) else [whole]:
         if not isinstance(feature, dict):
@@ -162,6 +184,20 @@ def _read_geojson(path: Path) -> Iterator[dict[str, str]]:
             if len(times) == len(places):
                 row['stamp'] = _cell(times[number])
             yield cells | row
+    if damage:
+        yield damage
+
+
+def whole_items(text: str, at: int) -> list[Any]:
+    """What is whole of a JSON list that is cut off, from the character `at` behind its bracket."""
+    items, decoder = [], json.JSONDecoder()
+    with suppress(ValueError, RecursionError):
+        while True:
+            while text[at : at + 1] in (' ', '\t', '\r', '\n', ','):
+                at += 1
+            item, at = decoder.raw_decode(text, at)
+            items.append(item)
+    return items
 
 
 def _places_of(geometry: Mapping[str, Any]) -> list[Any]:

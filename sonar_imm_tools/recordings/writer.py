@@ -102,7 +102,7 @@ class BagWriter:
         self.count = 0
         self._links: dict[tuple[str, str], Connection] = {}
         self._chunk: tuple[int, int] | None = None
-        self._parameters = parameters or {}
+        self._parameters = {} if parameters is None else parameters
         self._place = contextlib.ExitStack()
         if self.path.exists():
             raise BagError(f'{path} exists already; remove it or choose another name')

@@ -15,14 +15,13 @@
 """The road of a stranger's file: convert, info, track, export, with nothing but its name."""
 
 import base64
-import csv
 import gzip
-import itertools
 from pathlib import Path
 import re
 
 from helpers.dive_scenes import legs
-from helpers.sonar_files import ek80, kmall, side_scan
+from helpers.field_files import FORMATS, line, shipped_sound
+from helpers.sonar_files import kmall
 import numpy as np
 import pytest
 
@@ -54,68 +53,12 @@ def dive(count=80, seed=1):
     return BEGIN + times, legs(times * 1.0)[:, :2] + noise
 
 
-def usbl_csv(path):
-    times, place = dive()
-    rows = [f'{t},{x:.3f},{y:.3f},1.2' for t, (x, y) in zip(times, place)]
-    path.write_text('Time (s);East;North;Std\n'.replace(';', ',') + '\n'.join(rows) + '\n')
-
-
-def gpx(path):
-    times, place = dive()
-    points = [
-        f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}"><time>{np.datetime64(int(t), "s")}Z</time>'
-        '</trkpt>'
-        for t, lat, lon in zip(times, *degrees_of(place))
-    ]
-    path.write_text(
-        '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><name>1</name><trkseg>'
-        f'{"".join(points)}</trkseg></trk></gpx>'
-    )
-
-
-def ais_log(path):
-    times, place = dive()
-    lines = []
-    for t, lat, lon in zip(times, *degrees_of(5.0 * place)):
-        content = {'type': 1, 'mmsi': 211_000_001, 'lat': lat, 'lon': lon, 'second': int(t) % 60}
-        sentence = pyais.encode_dict(
-            content | {'accuracy': 1}, talker_id='AI', sentence_type='VDM'
-        )[0]
-        lines.append(f'{t} {sentence}')
-    path.write_text('\r\n'.join(lines))
-
-
-ROADS = {'usbl.csv': usbl_csv, 'dive.gpx': gpx, 'harbour.nmea': ais_log}
-
-
-@pytest.mark.parametrize('name', ROADS)
-def test_from_a_file_to_a_file_in_three_commands(tmp_path, name, capsys):
-    ROADS[name](tmp_path / name)
-    bag, run, out = tmp_path / 'dive.bag', tmp_path / 'run', tmp_path / 'tracks.csv'
-    assert main(['convert', str(tmp_path / name), str(bag)]) == 0
-    assert 'is taken for' in capsys.readouterr().err
-    assert main(['info', str(bag)]) == 0
-    suggested = capsys.readouterr().out.split('to track it: sonar-imm ')[1].splitlines()[0]
-    words = suggested.replace('OUT_DIR', str(run)).split()
-    assert main(words) == 0  # what is suggested works
-    assert 'diver <- /fix' in capsys.readouterr().out
-    assert main(['export', str(run), str(out)]) == 0
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) > 60 and {row['track_id'] for row in rows} == {rows[0]['track_id']}
-    assert np.isfinite([float(row['std_major']) for row in rows]).all()
-
-
-def shipped_sound():
-    """Blocks of what the 16 hydrophones of a shipped recording heard."""
-    with BagReader(BAGS / 'fathometer_pressure') as bag:
-        first = itertools.islice(measurements_of(bag, 'fathometer'), 12)
-        return [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+MADE = {each.name: each for each in FORMATS}
 
 
 def test_from_sound_to_reflectors(tmp_path, capsys):
     """The sound of a shipped array comes back from a WAV sample by sample, and is tracked."""
-    blocks = shipped_sound()
+    blocks = shipped_sound(12)
     pressure = np.concatenate([block.pressure for block in blocks])
     rate, scale = blocks[0].sample_rate, blocks[0].scale
     steps = np.round(pressure / scale).astype(np.int16)
@@ -133,76 +76,35 @@ def test_from_sound_to_reflectors(tmp_path, capsys):
     assert 'fathometer <- /pressure as pressure' in capsys.readouterr().out
 
 
-def pictures(folder):
-    """An echo on the bow that comes nearer as the vehicle goes east."""
-    image = pytest.importorskip('PIL.Image')
-    rng, rows = np.random.default_rng(2), ['file,time_utc,x,y,heading,depth']
-    folder.mkdir()
-    for k in range(30):
-        pixels = np.round(3.0 * np.sqrt(rng.exponential(size=(200, 41))))
-        pixels[150 - k, 20] = 200.0
-        image.fromarray(pixels.astype('u1')).save(folder / f'{k:02d}.png')
-        rows.append(f'{k:02d}.png,{BEGIN + 0.2 * k:.1f},{0.2 * k:.1f},0,90,3')
-    (folder / 'stamps.csv').write_text('\n'.join(rows))
+def drawn(report):
+    """What the plots of a report are made of."""
+    packed = re.findall('H4sI[A-Za-z0-9+/=]+', report.read_text())
+    return ''.join(gzip.decompress(base64.b64decode(each)).decode() for each in packed)
 
 
-def xtf(path):
-    pytest.importorskip('pyxtf')
-    side_scan(path)
-
-
-def split_beam(path):
-    """Two halves that hear a level floor."""
-    pytest.importorskip('themachinethatgoesping')
-    rng = np.random.default_rng(4)
-    shape = (4, 400, 4)
-    noise = 0.05 * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
-    echo = rng.normal(size=shape[:2]) + 1j * rng.normal(size=shape[:2])
-    angle = np.arccos(np.clip(4.0 / np.maximum(np.arange(400) * 0.0298, 4.0), 0.0, 1.0))
-    turn = np.exp(0.5j * np.pi * np.sin(angle))[None, :, None] ** np.array([1.0, -1.0, -1.0, 1.0])
-    ek80(path, (noise + echo[..., None] * turn).astype(np.complex64))
-
-
-SONARS = {
-    'line.xtf': (xtf, [], 'obstacle'),
-    'frames': (pictures, ['--far-range', '40', '--fov', '60'], 'obstacle'),
-    'd.raw': (split_beam, [], 'bathymetry'),
-}
-
-
-@pytest.mark.parametrize('name', SONARS)
-def test_from_a_file_of_a_sonar_to_a_report(tmp_path, name, capsys):
-    make, options, system = SONARS[name]
-    make(tmp_path / name)
+@pytest.mark.parametrize('name', ['line.xtf', 'frames'])
+def test_obstacles_of_a_file_with_positions_lie_on_earth_in_the_report(tmp_path, name):
+    """The origin that the conversion found goes beside the bag, and from there into the run."""
+    each = MADE[name]
+    each.make(tmp_path / name, line(60, each.step))
     bag, run, report = tmp_path / 'bag', tmp_path / 'run', tmp_path / 'report.html'
-    assert main(['convert', str(tmp_path / name), str(bag), *options]) == 0
-    capsys.readouterr()
-    assert main(['info', str(bag)]) == 0
-    suggested = capsys.readouterr().out.split('to track it: sonar-imm ')[1].splitlines()[0]
-    assert suggested.startswith('track') and f'--system {system}' in suggested
-    assert main(suggested.replace('OUT_DIR', str(run)).split()) == 0
-    output = capsys.readouterr().out
-    assert f'{system} <- ' in output and 'no track' not in output
+    assert main(['convert', str(tmp_path / name), str(bag), *each.options]) == 0
+    assert main(['track', str(bag), str(run)]) == 0
     assert main(['evaluate', str(run), '--report', str(report)]) == 0
-    assert '<html' in report.read_text().lower()
-
-
-def sound(path):
-    blocks = shipped_sound()
-    steps = np.round(np.concatenate([block.pressure / block.scale for block in blocks]))
-    soundfile.write(path, steps.astype(np.int16), int(blocks[0].sample_rate), subtype='PCM_16')
+    plots = drawn(report)
+    assert '"text":"latitude"' in plots and '"name":"vehicle"' in plots
 
 
 @pytest.mark.parametrize(
-    'name', ['usbl.csv', 'harbour.nmea', 'line.xtf', 'd.raw', 'array_20240531_100000.wav']
+    'name', ['usbl.csv', 'harbour.nmea', 'line.xtf', 'wbt.raw', 'array_20240531_100000.wav']
 )
 def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr('webbrowser.open', opened.append)
     monkeypatch.setenv('TMPDIR', str(tmp_path))
     monkeypatch.setattr('tempfile.tempdir', None)
-    make = ROADS.get(name) or (SONARS[name][0] if name in SONARS else sound)
-    make(tmp_path / name)
+    each = MADE[name]
+    each.make(tmp_path / name, line(12 if each.system == 'bathymetry' else 60, each.step))
     bag = tmp_path / 'line.bag'
     assert main(['convert', str(tmp_path / name), str(bag)]) == 0
     assert main(['view', str(bag), '--browser']) == 0
@@ -228,7 +130,7 @@ def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alon
 
 
 def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):
-    usbl_csv(tmp_path / 'usbl.csv')
+    MADE['usbl.csv'].make(tmp_path / 'usbl.csv', line())
     monkeypatch.chdir(tmp_path)
     assert main(['convert', 'usbl.csv']) == 0
     assert (tmp_path / 'usbl.bag').is_dir()
@@ -246,7 +148,7 @@ def test_what_cannot_be_converted_is_one_sentence(
     tmp_path, capsys, monkeypatch, arguments, wanted
 ):
     monkeypatch.chdir(tmp_path)
-    usbl_csv(tmp_path / 'usbl.csv')
+    MADE['usbl.csv'].make(tmp_path / 'usbl.csv', line())
     assert main(['convert', 'usbl.csv', 'dive.bag']) == 0
     capsys.readouterr()
     assert main(['convert', *arguments]) != 0
@@ -271,8 +173,7 @@ def test_the_map_of_fixes_on_earth_is_in_degrees(tmp_path):
     assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
     report = tmp_path / 'report.html'
     assert main(['evaluate', str(tmp_path / 'run'), '--report', str(report)]) == 0
-    packed = re.findall('H4sI[A-Za-z0-9+/=]+', report.read_text())
-    plots = ''.join(gzip.decompress(base64.b64decode(each)).decode() for each in packed)
+    plots = drawn(report)
     assert '"text":"latitude"' in plots and '"text":"longitude"' in plots
     assert '"text":"x [m]"' not in plots
 

@@ -33,6 +33,7 @@ from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sent
 from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
+from sonar_imm_tools.evaluation.plotting import in_degrees, scale_length
 from sonar_imm_tools.evaluation.report import (
     front_html,
     page_names,
@@ -197,7 +198,7 @@ def test_a_run_with_an_origin_is_drawn_in_degrees():
     series, truth = series_of(estimates), Truth.from_series(series_of(true_rows))
     origin = Origin(60.0, 10.0)
     metres = figures.map_figure(series, truth, None)
-    degrees = figures.in_degrees(figures.map_figure(series, truth, None), origin)
+    degrees = in_degrees(figures.map_figure(series, truth, None), origin)
     for plain, drawn in zip(metres.data, degrees.data):
         back = [
             origin.local(latitude, longitude)[:2]
@@ -212,7 +213,7 @@ def test_a_run_with_an_origin_is_drawn_in_degrees():
     for place, axis in ((bar.x, degrees.layout.xaxis), (bar.y, degrees.layout.yaxis)):
         low, high = axis.range
         assert 0.01 < (place[0] - low) / (high - low) < 0.1  # in the lower left corner
-    assert [figures.scale_length(x) for x in (0.7, 1.0, 4.9, 72.0)] == [0.5, 1.0, 2.0, 50.0]
+    assert [scale_length(x) for x in (0.7, 1.0, 4.9, 72.0)] == [0.5, 1.0, 2.0, 50.0]
 
 
 def test_a_run_without_tracks_still_makes_a_page():

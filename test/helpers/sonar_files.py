@@ -89,20 +89,25 @@ def xtf_soundings(seconds, beams, place=PLACE):
     return bytes(ping) + content
 
 
-def side_scan(path, pings=60, bins=500, target=(3.0, 30.0), seed=1):
+def line_east(pings, step=0.4):
+    """(seconds, (latitude, longitude)) of 5 pings per second, `step` metres apart."""
+    return [(0.2 * k, place_of(step * k, 0.0)) for k in range(pings)]
+
+
+def side_scan(path, pings=60, bins=500, target=(3.0, 30.0), seed=1, spots=None):
     """A line east at half a metre per second, 5 pings per second, with one target to starboard;
-    target: metres east along the line and away from it."""
+    target: metres east along the line and away from it; spots: other times and places, as in
+    `line_east`."""
     rng = np.random.default_rng(seed)
     channels = [('port', 'port', 'uint16'), ('stbd', 'starboard', 'uint16')]
     parts = [xtf_head(channels).to_bytes()]
-    for k in range(pings):
-        seconds = 0.2 * k
-        x = 0.5 * seconds
+    for k, (seconds, place) in enumerate(line_east(pings, 0.1) if spots is None else spots):
+        x = 0.1 * k
         port, starboard = (np.round(200.0 * np.sqrt(rng.exponential(size=bins))) for _ in range(2))
         if abs(x - target[0]) < 0.5:
             starboard[round(target[1] / 50.0 * bins)] = 20_000.0
         samples = [port[::-1].astype('u2'), starboard.astype('u2')]
-        parts.append(xtf_ping(seconds, samples, place_of(x, 0.0)))
+        parts.append(xtf_ping(seconds, samples, place))
     path.write_bytes(b''.join(parts))
     return path
 
@@ -145,7 +150,7 @@ def sentences(seconds, place=PLACE):
     return parts
 
 
-def ek60(path, power, angles):
+def ek60(path, power, angles, spots=None):
     """A raw file of an EK60 with one channel, a ping and a position each 0.2 s, 0.4 m to the east;
     power (pings, bins), whole numbers of 3.0103/256 dB; angles (pings, bins, 2) as in `ek80`, or
     None. The datagrams with samples and the configuration are written by the library."""
@@ -174,8 +179,8 @@ def ek60(path, power, angles):
     }
     built = {**zeros, 'type': 'CON0', 'configuration': {channel['channel_id']: channel}}
     parts = [ek80_datagram('CON0', 0.0, SimradConfigParser().to_string(built)[16:-4])]
-    for k, row in enumerate(power):
-        seconds = 0.2 * k
+    where = line_east(len(power)) if spots is None else spots
+    for k, (row, (seconds, place)) in enumerate(zip(power, where)):
         data = {
             **zeros,
             'type': 'RAW0',
@@ -189,14 +194,22 @@ def ek60(path, power, angles):
             'power': row.astype(np.int16),
             'angle': None if angles is None else angles[k].astype(np.int8),
         }
-        parts += sentences(seconds, place_of(0.4 * k, 0.0))
+        parts += sentences(seconds, place)
         content = SimradRawParser().to_string(data)[16:-4]
         parts.append(ek80_datagram('RAW0', seconds + 0.1, content))
     path.write_bytes(b''.join(parts))
     return path
 
 
-def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 1-15 ES70'):
+def ek80(
+    path,
+    samples,
+    chirp=False,
+    filters=FILTERS,
+    angles=None,
+    channel='WBT 1-15 ES70',
+    spots=None,
+):
     """A raw file with one channel, 5 pings per second; samples: (pings, bins, sectors), complex,
     or where there are angles, (pings, bins, 2) of -128 to 127, athwartships and alongships, whole
     numbers of power, 3.0103/256 dB each. The datagrams with samples and filters are written by the
@@ -244,9 +257,9 @@ def ek80(path, samples, chirp=False, filters=FILTERS, angles=None, channel='WBT 
         content.set_no_of_coefficients(len(coefficients))
         content.set_coefficients(coefficients.astype(np.complex64))
         parts.append(ek80_datagram('FIL1', 0.0, content.to_binary()[16:-4]))
-    for k, rows in enumerate(samples):
-        seconds = 0.2 * k
-        parts += sentences(seconds)
+    where = [(0.2 * k, PLACE) for k in range(len(samples))] if spots is None else spots
+    for k, (rows, (seconds, place)) in enumerate(zip(samples, where)):
+        parts += sentences(seconds, place)
         parts.append(
             xml(
                 seconds,
@@ -297,7 +310,7 @@ INSTALLATION = (
 )
 
 
-def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
+def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0, spots=None):
     """A KMALL file, written by the library: an EM 2042 that goes east, 5 pings per second; across,
     down: m from the reference point, of the soundings."""
     from themachinethatgoesping.echosounders.kmall import datagrams as made
@@ -316,14 +329,15 @@ def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
     installation.set_install_txt(INSTALLATION)
     runtime.set_runtime_txt('Sector coverage\nMax angle Port:      60.0\n')
     parts = [packed(installation, 0.0), packed(runtime, 0.0)]
-    for k in range(pings):
+    for k, (seconds, (latitude, longitude)) in enumerate(
+        line_east(pings) if spots is None else spots
+    ):
         place = made.SPosition()
-        latitude, longitude = place_of(0.4 * k, 0.0)
         place.set_corrected_lat_deg(latitude)
         place.set_corrected_lon_deg(longitude)
         place.set_course_over_ground_deg(90.0)
         place.set_pos_data_from_sensor('$GPGGA')
-        parts.append(packed(place, 0.2 * k))
+        parts.append(packed(place, seconds))
         soundings = []
         for number, y in enumerate(across):
             where = {'x_re_ref_point_m': 0.5, 'y_re_ref_point_m': y, 'z_re_ref_point_m': down}
@@ -342,7 +356,7 @@ def kmall(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
             number_of_soundings_valid_main=len(across),
             number_of_bytes_per_sounding=120,
         )
-        parts.append(packed(ping, 0.2 * k))
+        parts.append(packed(ping, seconds))
     path.write_bytes(b''.join(parts))
     return path
 
@@ -356,7 +370,7 @@ INSTALLATION_ALL = (
 )
 
 
-def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
+def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0, spots=None):
     """The same line as `kmall` in an .all file of an EM 2040, with a compass and a profile."""
     from themachinethatgoesping.echosounders.kongsbergall import datagrams as made
 
@@ -384,8 +398,9 @@ def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
     cast.set_depths_and_sound_speeds(np.array([[0, 14800], [30, 14900]], np.uint32))
     written = [packed(installation, 0.0), packed(zero(made.RuntimeParameters()), 0.0)]
     written.append(packed(cast, 0.0))
-    for k in range(pings):
-        latitude, longitude = place_of(0.4 * k, 0.0)
+    for k, (seconds, (latitude, longitude)) in enumerate(
+        line_east(pings) if spots is None else spots
+    ):
         place = zero(
             made.PositionDatagram(),
             latitude=round(2e7 * latitude),
@@ -421,6 +436,6 @@ def kongsberg_all(path, pings=5, across=(-10.0, 0.0, 10.0), down=20.0):
             ]
         )
         ping.beams = beams
-        written += [packed(part, 0.2 * k) for part in (place, attitude, ping)]
+        written += [packed(part, seconds) for part in (place, attitude, ping)]
     path.write_bytes(b''.join(written))
     return path

@@ -27,6 +27,7 @@ import functools
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
@@ -71,9 +72,11 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
 
     def sections() -> Iterable[Section]:
         # plotly, which only a report needs, takes a second to load.
-        from .figures import sections
+        from .figures import map_section, sections
 
-        return sections(metrics, series, truth, found, deferred, received, options.gap)
+        origin = Origin(**run['origin']) if run.get('origin') else None
+        yield from map_section(series, received, origin)
+        yield from sections(metrics, series, truth, found, deferred, received, options.gap)
 
     return Judgement(
         run=run,

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.measurements import Detections
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
 from ..plotting import (
@@ -32,6 +33,7 @@ from ..plotting import (
     AMBER,
     COLOURS,
     GREY,
+    in_degrees,
     INK,
     MOST_POINTS,
     nis_figure,
@@ -39,6 +41,7 @@ from ..plotting import (
     styled,
     thin,
     TRUTH,
+    view_of,
 )
 from ..report import Section
 from .deferred import DeferredEstimates
@@ -129,6 +132,31 @@ def sections(
             'too.',
             nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, np.full(len(hits), 2.0)),
         )
+
+
+def map_section(
+    series: Series, received: Sequence[Any], origin: Origin | None
+) -> Iterator[Section]:
+    """Where the vehicle went and the obstacles are; nothing without navigation. origin: of its
+    frame on Earth, None when nobody said."""
+    way = np.array([item.position[:2] for item in received if isinstance(item, Navigation)])
+    if not (len(way) and len(series)):
+        return
+    figure = go.Figure()
+    x, y = way[thin(len(way), MOST_POINTS)].T
+    add_line(figure, x, y, 'vehicle', INK, 2)
+    for name, colour, track in _by_track(series):
+        x, y = track.place[thin(len(track), MOST_POINTS)].T
+        add_points(figure, x, y, name, colour)
+        figure.data[-1].hovertemplate = f'{name}: x %{{x:.1f}}, y %{{y:.1f}}'
+    x_range, y_range = view_of(np.concatenate([way, series.place]))
+    along = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
+    styled(figure, 480, {'title': 'x [m]', 'range': x_range}, along)
+    yield Section(
+        'Map',
+        'Seen from above: the way of the vehicle, and where each track has its obstacle.',
+        figure if origin is None else in_degrees(figure, origin),
+    )
 
 
 def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:

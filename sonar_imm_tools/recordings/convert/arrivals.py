@@ -126,6 +126,7 @@ def write_pings(
     if not passive:
         sender_numbers = numbers if senders is places else number_names(list(senders))
     records: list[Record] = []
+    streams: dict[str, list[int]] = {}
     for label, ping in pings.items():
         try:
             measurement = _of_ping(
@@ -134,6 +135,7 @@ def write_pings(
             records.append(
                 (measurement.stamp_ns, '/arrivals', write_arrivals(measurement, ros_message))
             )
+            streams.setdefault(label[1], []).append(measurement.stamp_ns)
         except Rejection as error:
             report.bad_row(table.path, f'ping {label[0]}', error)
     if how.truth is not None and records:
@@ -149,6 +151,7 @@ def write_pings(
         source=table.path.name,
         storage=how.storage,
         parameters={'diver': origin_parameters(origin)},
+        streams=streams,
     )
 
 

@@ -41,6 +41,7 @@ from ..convert_options import AutoferryOptions
 from ..csv_table import BadRow
 from ..messages import ros_message
 from ..sources import BagError
+from ..track_files import whole_items
 from ..truth import records_of
 from .truth import difference_velocity
 
@@ -70,7 +71,7 @@ def convert_autoferry(path: str | Path, out: str | Path, **values: Any) -> Conve
     )
     covariance = None if how.std is None else np.eye(2) * how.std**2
     records: list[Record] = []
-    for index, record in enumerate(_json_list(path)):
+    for index, record in enumerate(_json_list(path, report)):
         report.rows += 1
         try:
             if record['sensorID'] not in numbers:
@@ -109,7 +110,7 @@ def _east_north(record: Any) -> NDArray[np.float64]:
 def _truth_records(path: str | Path, report: ConversionReport, frame_id: str) -> list[Record]:
     """Read the ground truth: lists of targets, each with its own and often repeated time."""
     tracks: dict[int, dict[int, tuple[float, float, float]]] = {}
-    for index, group in enumerate(_json_list(path)):
+    for index, group in enumerate(_json_list(path, report)):
         try:
             for target in group:
                 north, east, down = map(float, target['position'])
@@ -127,15 +128,22 @@ def _truth_records(path: str | Path, report: ConversionReport, frame_id: str) ->
     return records
 
 
-def _json_list(path: str | Path) -> list[Any]:
-    """Load a JSON file that holds a list."""
+def _json_list(path: str | Path, report: ConversionReport) -> list[Any]:
+    """Load a JSON file that holds a list; of one that is cut off, what is whole."""
     try:
-        content = json.loads(Path(path).read_text(encoding='utf-8-sig'))
+        text = Path(path).read_text(encoding='utf-8-sig')
+        content = json.loads(text)
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
     except (ValueError, RecursionError) as error:
         where = f' from line {error.lineno} on' if isinstance(error, json.JSONDecodeError) else ''
-        raise BagError(f'{path} is not a JSON file{where}') from None
+        content = (
+            [] if isinstance(error, UnicodeDecodeError) else whole_items(text, text.find('[') + 1)
+        )
+        if not content:
+            raise BagError(f'{path} is not a JSON file{where}') from None
+        name = Path(path).name
+        report.problems.append(f'{name} is damaged{where}; what came before it is kept')
     if not isinstance(content, list):
         raise BagError(f'{path} holds no list of records; is it an Autoferry scenario?')
     return content

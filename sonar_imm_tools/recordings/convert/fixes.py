@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import math
 from pathlib import Path
 from typing import Any
@@ -148,7 +148,16 @@ def write_fixes(
         source=table.path.name,
         storage=how.storage,
         parameters={'diver': origin_parameters(origin)},
+        streams=by_name((name if named else '', stamp) for _, stamp, _, name in read),
     )
+
+
+def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
+    """The stamps of each diver, in their order."""
+    found: dict[str, list[int]] = {}
+    for name, stamp_ns in stamps:
+        found.setdefault(name, []).append(stamp_ns)
+    return found
 
 
 def _has_places(table: Table) -> bool:

@@ -69,6 +69,10 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
             f'{sound.channels} channels, {sound.samplerate} Hz, '
             f'{sound.frames / sound.samplerate:.1f} s, {sound.subtype}'
         )
+        if 'should be' in sound.extra_info:  # words of libsndfile
+            report.problems.append(
+                f'{path.name} is shorter than it says of itself; what is there is kept'
+            )
         report.notes['full scale'] = f'{how.full_scale:g} Pa'
         notes = provenance(path.name, report.notes)
         own = {'fathometer': {'phones': len(channels)}}

@@ -45,9 +45,10 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 
 from ... import SECOND
-from ..conversion import ConversionReport, Record
+from ..conversion import ConversionReport, Leaps, Record
 from ..convert_options import FixesOptions, NmeaOptions
 from ..csv_table import BadRow, iso_ns, moment_ns
+from ..local_frame import check_place
 from ..messages import ros_message
 from ..sources import BagError
 from ..track_files import TrackFile
@@ -107,6 +108,9 @@ def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> Conversion
             (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
             for heading in log.headings
         ]
+    leaps = Leaps()
+    leaps.saw_all(log.own)
+    leaps.tell(Path(path), report)
     if log.unread:
         counts = log.unread.most_common(12)
         report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts)
@@ -251,6 +255,7 @@ def _take_own(log: _Log, sentence: Any) -> None:
     good = {'GGA': 'gps_qual', 'RMC': 'status', 'GLL': 'status', 'GNS': 'mode_indicator'}[kind]
     if not sentence.lat or str(getattr(sentence, good, '')) in ('0', 'V', 'N', 'NN'):
         raise BadRow('has no valid position', 'no position')
+    check_place(float(sentence.latitude), float(sentence.longitude))
     stamp_ns = _now(log)
     height = 0.0
     if kind == 'GGA':

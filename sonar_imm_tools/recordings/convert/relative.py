@@ -33,12 +33,13 @@ from msg_adapters.scans import write_scan
 from msg_adapters.vessel import write_heading
 from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading, VesselPose
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import BadRow, CsvTable, Row
-from ..local_frame import checked_origin, origin_parameters
+from ..local_frame import check_place, checked_origin, origin_parameters
 from ..messages import ros_message
 from ..polar_rows import PolarRows
+from .fixes import by_name
 from .truth import truth_records
 
 TRANSCEIVER = 'transceiver'
@@ -100,6 +101,13 @@ def convert_relative(path: str | Path, out: str | Path, **values: Any) -> Conver
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     if polar:
         polar.check_unit()
+    leaps = Leaps()
+    if geodetic:
+        leaps.saw_all(row.pose[0][2] for row in rows)
+    else:
+        for row in rows:
+            leaps.saw(row.stamp_ns, *row.pose[0][2].position[:2].tolist())
+    leaps.tell(table.path, report)
     tags = {row.name: re.sub(r'[^A-Za-z0-9_]+', '_', row.name) for row in rows if row.name}
     origin = checked_origin(how.origin)
     if geodetic and rows and origin is None:
@@ -127,6 +135,7 @@ def convert_relative(path: str | Path, out: str | Path, **values: Any) -> Conver
         source=Path(path).name,
         storage=how.storage,
         parameters={'diver': known},
+        streams=by_name((row.name, row.stamp_ns) for row in rows),
     )
 
 
@@ -147,12 +156,9 @@ def _pose(
             stamp_ns=stamp_ns, position=position, orientation=orientation, frame_id=frame_id
         )
         return [('/nav', write_navigation, pose)]
-    where = VesselFix(
-        stamp_ns=stamp_ns,
-        latitude=row.number('vessel_latitude'),
-        longitude=row.number('vessel_longitude'),
-        frame_id='gps',
-    )
+    latitude, longitude = row.number('vessel_latitude'), row.number('vessel_longitude')
+    check_place(latitude, longitude)
+    where = VesselFix(stamp_ns=stamp_ns, latitude=latitude, longitude=longitude, frame_id='gps')
     lies = VesselHeading(stamp_ns=stamp_ns, orientation=orientation, frame_id='vessel')
     return [('/nav_fix', write_geodetic, where), ('/heading', write_heading, lies)]
 

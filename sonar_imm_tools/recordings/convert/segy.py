@@ -32,9 +32,12 @@ states it by depth (`noise_by_depth`). Places in seconds of arc or degrees becom
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime, timedelta, timezone
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
 from attrs import frozen
@@ -56,6 +59,9 @@ if TYPE_CHECKING:
     import segyio
 
 SECOND = 10**9
+HEADERS, TRACE_HEADER = 3600, 240
+SAMPLE_BYTES = {3: 2, 8: 1, 6: 8, 7: 3, 9: 8, 11: 2, 12: 8, 15: 3, 16: 1}
+"""Of each sample by the code of its format, where they are not 4."""
 _RUN, _REACH, _LOUD = 3, 4, 8.0
 _LEAST_ARRIVALS, _LEAST_QUIET, _AROUND = 10, 20, 3
 _NARROW = 0.1
@@ -72,7 +78,7 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
     """
     how = SegyOptions(**values)
     report = ConversionReport(Path(out))
-    line = read_segy(path)
+    line = read_segy(path, report.problems)
     spacing = how.sample_spacing or 0.5 * how.sound_speed * line.interval
     if not spacing > 0.0:
         raise BagError(f'{path} states no sample interval; give the sample spacing')
@@ -118,13 +124,39 @@ class SegyLine:
     water_depth: NDArray
 
 
-def read_segy(path: str | Path) -> SegyLine:
-    """Raises `BagError`, and ModuleNotFoundError without segyio."""
+@contextmanager
+def _opened(path: Path, problems: list[str]) -> Iterator[segyio.SegyFile]:
+    """The file, or a copy of the whole traces of one that is cut off, which segyio refuses."""
+    import segyio
+
+    with path.open('rb') as source, TemporaryDirectory() as folder:
+        start = source.read(HEADERS)
+        samples, code = (int.from_bytes(start[k : k + 2], 'big') for k in (3220, 3224))
+        begin = HEADERS + 3200 * max(int.from_bytes(start[3504:3506], 'big', signed=True), 0)
+        each = TRACE_HEADER + samples * SAMPLE_BYTES.get(code, 4)
+        traces, rest = divmod(path.stat().st_size - begin, each)
+        if rest and traces > 0:
+            problems.append(
+                f'{path.name} is cut off in trace {traces + 1}; what came before it is kept'
+            )
+            path = Path(folder) / 'whole'
+            with path.open('wb') as copy:
+                source.seek(0)
+                left = begin + traces * each
+                while left and (part := source.read(min(left, 1 << 20))):
+                    left -= copy.write(part)
+        with segyio.open(str(path), 'r', ignore_geometry=True) as file:
+            yield file
+
+
+def read_segy(path: str | Path, problems: list[str] | None = None) -> SegyLine:
+    """problems: gets a sentence where the file is cut off. Raises `BagError`, and
+    ModuleNotFoundError without segyio."""
     import segyio
 
     fields = segyio.TraceField
     try:
-        with segyio.open(str(path), 'r', ignore_geometry=True) as file:
+        with _opened(Path(path), [] if problems is None else problems) as file:
             header = file.header[0]
             depth = file.attributes(fields.SourceWaterDepth)[:]
             return SegyLine(

@@ -27,7 +27,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from attrs import define
+from attrs import define, Factory
 import numpy as np
 
 from msg_adapters.detections import SOUND_SPEEDS
@@ -39,16 +39,16 @@ from sonar_imm.acoustics.rays import profile_problem
 from sonar_imm.measurements import Altitude, Ground, Navigation, Rejection
 
 from ... import SECOND
-from ..conversion import ConversionReport, provenance
+from ..conversion import ConversionReport, JUMP, Leaps, provenance
 from ..csv_table import BadRow
 from ..foreign import LIBRARIES, read_apart, Record
+from ..local_frame import origin_parameters
 from ..messages import ros_message
 from ..sources import BagError
 from ..writer import BagWriter
 
-JUMP = 3600 * SECOND
-"""A clock that goes further than this from one ping to the next is off, or was set."""
 LATEST = 2**31 * SECOND
+OBSTACLE = 'obstacle'
 EXTRAS = {'pyxtf': 'xtf', 'themachinethatgoesping': 'echosounders', 'ektools': 'echosounders'}
 """The extra of the package that installs a library."""
 
@@ -68,6 +68,7 @@ class _Frame:
     origin: Origin | None = None
     missing: int = 0
     last_ns: int = -1
+    leaps: Leaps = Factory(Leaps)
 
     def navigation(self, record: Record) -> Navigation | None:
         """Where the ship was at a ping; None where the file does not say."""
@@ -81,6 +82,7 @@ class _Frame:
         if geodetic:
             self.origin = self.origin or Origin(north, east)
             east, north = self.origin.local(north, east)[:2].tolist()
+        self.leaps.saw(record['stamp_ns'], east, north)
         depth, pitch, roll = (
             value if math.isfinite(value) else 0.0
             for value in (record['depth'], record['pitch'], record['roll'])
@@ -174,9 +176,8 @@ def write_records(
     none."""
     frame = _Frame()
     notes = provenance(path.name, report.notes)
-    with BagWriter(
-        report.path, storage=how.storage, custom_data=notes, parameters=parameters
-    ) as bag:
+    own = {} if parameters is None else parameters
+    with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
 
         def write(topic: str, content: Any, stamp_ns: int) -> None:
             bag.write(topic, content, stamp_ns)
@@ -196,6 +197,9 @@ def write_records(
                 _write_altitude(record, write)
             for message in made:
                 write(message.topic, message.content, stamp_ns)
+        if '/detections' in report.messages and frame.origin is not None:
+            place = frame.origin.latitude, frame.origin.longitude
+            own[OBSTACLE] = {**own.get(OBSTACLE, {}), **origin_parameters(place)}
         if not set(report.messages) - {'/nav', '/altitude'}:
             first = f' (the first problem: {report.problems[0]})' if report.problems else ''
             raise BagError(f'{path} holds no ping that could be converted{first}')
@@ -204,6 +208,7 @@ def write_records(
             f'{path.name}: {frame.missing} pings have no position (0, 0 is none); they have no '
             'navigation'
         )
+    frame.leaps.tell(path, report)
     report.notes |= frame.notes()
 
 

@@ -24,6 +24,7 @@ from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import fix_series
 from sonar_imm_tools.evaluation.diver.series import series_of
 from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.plotting import view_of
 
 
 def test_ellipses_hold_the_probability_they_claim():
@@ -68,7 +69,7 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
 
 
 def test_no_points_leave_the_view_open():
-    assert figures.view_of(np.empty((0, 2))) == (None, None)
+    assert view_of(np.empty((0, 2))) == (None, None)
 
 
 def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band():

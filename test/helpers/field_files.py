@@ -1,0 +1,547 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A file of each format that goes in, made from one line: who was where and when."""
+
+from collections.abc import Callable
+from datetime import timedelta
+import itertools
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg
+
+from helpers import marine
+from helpers.dive_scenes import legs
+from helpers.sonar_files import (
+    BEGIN,
+    ek60,
+    ek80,
+    kmall,
+    kongsberg_all,
+    place_of,
+    side_scan,
+    xtf_head,
+    xtf_soundings,
+)
+from msg_adapters.navigation import write_navigation
+from sonar_imm.measurements import Navigation
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+FIRST = int(BEGIN.timestamp())
+STATIONS = np.array([[0.0, 0.0], [900.0, 60.0], [930.0, 840.0], [-30.0, 900.0]])
+
+
+class Spot(NamedTuple):
+    """Whose position it is, seconds from the begin, metres east and north of `PLACE`; None for a
+    receiver that had no fix, and says 0, 0."""
+
+    seconds: float
+    place: tuple[float, float] | None
+    name: str = '1'
+
+    @property
+    def degrees(self):
+        return (0.0, 0.0) if self.place is None else place_of(*self.place)
+
+    @property
+    def time(self):
+        moment = np.datetime64(FIRST, 's') + np.timedelta64(round(1e3 * self.seconds), 'ms')
+        return f'{moment}Z'
+
+
+def line(count=80, step=1.0):
+    """A dive of ever new legs, with the noise of a USBL."""
+    seconds = step * np.arange(count)
+    noise = np.random.default_rng(1).normal(0.0, 1.2, (count, 2))
+    places = legs(seconds)[:, :2] + noise
+    return [Spot(float(t), (float(x), float(y))) for t, (x, y) in zip(seconds, places)]
+
+
+def usbl_csv(path, spots):
+    rows = [
+        f'{each.time},{each.degrees[0]:.8f},{each.degrees[1]:.8f},1.2,{each.name}'
+        for each in spots
+    ]
+    path.write_text('\n'.join(['time,lat,lon,std,id', *rows]) + '\n')
+
+
+def vessel_csv(path, spots):
+    rows = [
+        f'{each.time},{each.degrees[0]:.8f},{each.degrees[1]:.8f},90,{30 + 0.2 * k:.2f},45,'
+        f'{each.name}'
+        for k, each in enumerate(spots)
+    ]
+    head = 'time,vessel_latitude,vessel_longitude,heading,range,bearing_deg,id'
+    path.write_text('\n'.join([head, *rows]) + '\n')
+
+
+def of_each(spots):
+    names = dict.fromkeys(each.name for each in spots)
+    return [(name, [each for each in spots if each.name == name]) for name in names]
+
+
+def gpx(path, spots):
+    tracks = ''
+    for name, own in of_each(spots):
+        points = ''.join(
+            '<trkpt lat="{:.8f}" lon="{:.8f}">'.format(*each.degrees)
+            + f'<time>{each.time}</time></trkpt>\n'
+            for each in own
+        )
+        tracks += f'<trk><name>{name}</name><trkseg>{points}</trkseg></trk>'
+    path.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1">{tracks}</gpx>')
+
+
+def kml(path, spots):
+    marks = ''
+    for name, own in of_each(spots):
+        whens = ''.join(f'<when>{each.time}</when>\n' for each in own)
+        coords = ''.join(
+            '<gx:coord>{1:.8f} {0:.8f} 0</gx:coord>\n'.format(*e.degrees) for e in own
+        )
+        marks += f'<Placemark><name>{name}</name><gx:Track>{whens}{coords}</gx:Track></Placemark>'
+    path.write_text(
+        '<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">'
+        f'<Document>{marks}</Document></kml>'
+    )
+
+
+def geojson(path, spots):
+    features = [
+        {
+            'type': 'Feature',
+            'geometry': {'type': 'Point', 'coordinates': list(each.degrees[::-1])},
+            'properties': {'time': each.time, 'id': each.name},
+        }
+        for each in spots
+    ]
+    path.write_text(json.dumps({'type': 'FeatureCollection', 'features': features}, indent=1))
+
+
+def checked(text):
+    total = 0
+    for letter in text:
+        total ^= ord(letter)
+    return f'${text}*{total:02X}'
+
+
+def minutes(value, width):
+    return f'{int(value):0{width}d}{value % 1 * 60:08.5f}'
+
+
+def nmea(path, spots):
+    pytest.importorskip('pynmea2')
+    pytest.importorskip('pyais')
+    lines = []
+    for each in spots:
+        moment = BEGIN + timedelta(seconds=each.seconds)
+        where = f'{minutes(each.degrees[0], 2)},N,{minutes(each.degrees[1], 3)},E'
+        lines.append(checked(f'GPRMC,{moment:%H%M%S}.00,A,{where},1.0,90.0,{moment:%d%m%y},,'))
+        lines.append(checked(f'GPGGA,{moment:%H%M%S}.00,{where},4,08,0.9,2.0,M,40.0,M,,'))
+    path.write_text('\r\n'.join(lines) + '\r\n')
+
+
+def ais(path, spots):
+    pyais = pytest.importorskip('pyais')
+    lines = []
+    for each in spots:
+        lat, lon = each.degrees if each.place is None else place_of(*(5.0 * v for v in each.place))
+        content = {'type': 1, 'mmsi': 211_000_000 + int(each.name), 'lat': lat, 'lon': lon}
+        content |= {'second': int(FIRST + each.seconds) % 60, 'accuracy': 1}
+        sentence = pyais.encode_dict(content, talker_id='AI', sentence_type='VDM')[0]
+        lines.append(f'{FIRST + each.seconds:.0f} {sentence}')
+    path.write_text('\r\n'.join(lines) + '\r\n')
+
+
+def receptions(spots):
+    """Seconds at which each station hears each ping."""
+    for k, each in enumerate(spots):
+        place = np.array(each.place or (0.0, 0.0))
+        for number, station in enumerate(STATIONS):
+            yield k, each, number, each.seconds + np.linalg.norm(station - place) / 1500.0
+
+
+def stations(folder):
+    rows = ['{},{:.9f},{:.9f}'.format(k, *place_of(*place)) for k, place in enumerate(STATIONS)]
+    (folder / 'stations.csv').write_text('\n'.join(['receiver,latitude,longitude', *rows]) + '\n')
+
+
+def telemetry(path, spots):
+    stations(path.parent)
+    rows = [f'{FIRST + t:.6f},{number},{each.name}' for _, each, number, t in receptions(spots)]
+    path.write_text('\n'.join(['time_utc,receiver,tag', *rows]) + '\n')
+
+
+def arrivals(path, spots):
+    stations(path.parent)
+    rows = [
+        f'{k},{number},{FIRST + t:.6f},{each.name}' for k, each, number, t in receptions(spots)
+    ]
+    path.write_text('\n'.join(['ping,receiver,arrival_s,tag', *rows]) + '\n')
+
+
+def shipped_sound(most=None):
+    """Blocks of what the 16 hydrophones of a shipped recording heard."""
+    with BagReader(BAGS / 'fathometer_pressure') as bag:
+        first = itertools.islice(measurements_of(bag, 'fathometer'), most)
+        return [item.measurement for item in first if hasattr(item.measurement, 'pressure')]
+
+
+def sound(path, spots):
+    soundfile = pytest.importorskip('soundfile')
+    blocks = shipped_sound() if spots else []
+    steps = np.concatenate([np.zeros((0, 16)), *[each.pressure / each.scale for each in blocks]])
+    soundfile.write(path, np.round(steps).astype(np.int16), 6000, subtype='PCM_16')
+
+
+def echoes(count, bins=120):
+    """Envelopes (count, bins) of a floor and a layer below it."""
+    at = np.arange(bins)
+    row = 1000.0 * np.exp(-0.5 * ((at - 30) / 1.5) ** 2)
+    row = row + 300.0 * np.exp(-0.5 * ((at - 70) / 1.5) ** 2)
+    noise = np.random.default_rng(6).rayleigh(5.0, (count, bins))
+    return row + noise
+
+
+def segy(path, spots):
+    segyio = pytest.importorskip('segyio')
+    field, rows = segyio.TraceField, echoes(max(len(spots), 1))
+    spec = segyio.spec()
+    spec.format, spec.tracecount = 1, len(spots)
+    spec.samples = np.arange(rows.shape[1], dtype=float)
+    with segyio.create(str(path), spec) as file:
+        for k, each in enumerate(spots):
+            moment = np.datetime64(each.time[:-1]).astype('datetime64[s]').astype(object)
+            latitude, longitude = each.degrees
+            file.trace[k] = rows[k].astype(np.float32)
+            file.header[k] = {
+                field.TRACE_SAMPLE_INTERVAL: 266,
+                field.TRACE_SAMPLE_COUNT: rows.shape[1],
+                field.YearDataRecorded: moment.year,
+                field.DayOfYear: moment.timetuple().tm_yday,
+                field.HourOfDay: moment.hour,
+                field.MinuteOfHour: moment.minute,
+                field.SecondOfMinute: moment.second,
+                field.SourceGroupScalar: -1000,
+                field.CoordinateUnits: 2,
+                field.SourceX: round(3.6e6 * longitude),
+                field.SourceY: round(3.6e6 * latitude),
+            }
+
+
+def traces_csv(path, spots):
+    rows = [
+        f'{FIRST + each.seconds:.3f},{20 + 0.2 * n:.1f},{value:.3f}'
+        for each, row in zip(spots, echoes(len(spots)))
+        for n, value in enumerate(row)
+    ]
+    path.write_text('\n'.join(['time_utc,depth,amplitude', *rows]) + '\n')
+
+
+def traces_npz(path, spots):
+    stamp = np.array([FIRST + each.seconds for each in spots])
+    depth = 20.0 + 0.2 * np.arange(120)
+    np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamp)
+
+
+def floor(count, staves, wavelengths=0.5, spacing=0.06):
+    """Samples (count, bins, staves) of an array 15 m above a level floor, and their ranges;
+    wavelengths: from stave to stave."""
+    rng = np.random.default_rng(4)
+    distance = spacing * np.arange(round(50.0 / spacing))
+    shape = (count, len(distance))
+    noise = 0.05 * (rng.normal(size=(*shape, staves)) + 1j * rng.normal(size=(*shape, staves)))
+    echo = (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * (distance > 15.0)
+    angle = np.arccos(np.clip(15.0 / np.maximum(distance, 15.0), 0.0, 1.0))
+    place = wavelengths * (np.arange(staves) - 0.5 * (staves - 1))
+    turn = np.exp(2j * np.pi * np.outer(np.sin(angle), place))
+    return (noise + echo[..., None] * turn).astype(np.complex64), distance
+
+
+def snapshots_npz(path, spots):
+    iq, distance = floor(len(spots), 4)
+    stamp = np.array([FIRST + each.seconds for each in spots])
+    facts = {'sound_speed': 1500.0, 'frequency': 300e3, 'spacing_wavelengths': 0.5}
+    np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamp, **facts)
+
+
+def boats_json(path, spots):
+    records = [
+        {
+            'sensorID': 2,
+            'time': FIRST + each.seconds,
+            'measurement': [[(each.place or (0.0, 0.0))[1]], [(each.place or (0.0, 0.0))[0]]],
+            'ownshipPosition': [0.0, 0.0],
+        }
+        for each in spots
+    ]
+    path.write_text(json.dumps(records, indent=1))
+
+
+def bag_of(path, spots, messages, types):
+    """A recording; messages: of a spot, (topic, message) each."""
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {}
+        for each in spots:
+            stamp = round((FIRST + each.seconds) * 1e9)
+            for topic, message in messages(each, stamp):
+                kind = message.__msgtype__
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=types)
+                writer.write(topics[topic], stamp, types.serialize_cdr(message, kind))
+
+
+def pose_at(stamp, x):
+    pose = Navigation(
+        stamp_ns=stamp, position=[x, 0.0, -20.0], orientation=[0, 0, 0, 1.0], frame_id='odom'
+    )
+    return write_navigation(pose, ros_message)
+
+
+def images_bag(path, spots):
+    bearings = np.radians(np.linspace(20.0, -20.0, 41))
+    rng = np.random.default_rng(7)
+
+    def messages(each, stamp):
+        samples = np.round(3.0 * np.sqrt(rng.exponential(size=(100, 41))))
+        samples[max(round(70 - each.seconds), 1), 20] = 200.0
+        data = np.frombuffer(samples.astype('u1').tobytes(), np.uint8)
+        yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
+        yield (
+            '/fls/image',
+            marine.make(
+                'ProjectedSonarImage',
+                header=marine.header(sec=stamp // 10**9),
+                ping_info=marine.ping_info(),
+                beam_directions=marine.vectors(
+                    np.column_stack([np.zeros(41), -np.sin(bearings), np.cos(bearings)])
+                ),
+                ranges=marine.floats(2.0 + 0.5 * np.arange(100)),
+                image=marine.make(
+                    'SonarImageData', is_bigendian=False, dtype=0, beam_count=41, data=data
+                ),
+            ),
+        )
+
+    bag_of(path, spots, messages, marine.typestore())
+
+
+def phases_bag(path, spots):
+    iq, _ = floor(max(len(spots), 1), 2)
+    count = iter(range(len(spots)))
+
+    def image(stamp, row, dtype):
+        row = np.asarray(row, np.float32)
+        return marine.make(
+            'RawSonarImage',
+            header=marine.header(sec=stamp // 10**9),
+            ping_info=marine.ping_info(),
+            sample_rate=0.5 * 1500.0 / 0.06,
+            samples_per_beam=len(row),
+            sample0=140,
+            tx_delays=marine.floats([]),
+            tx_angles=marine.floats([]),
+            rx_angles=marine.floats([]),
+            image=marine.make(
+                'SonarImageData',
+                is_bigendian=False,
+                dtype=8,
+                beam_count=1,
+                data=np.frombuffer(row.tobytes(), np.uint8),
+            ),
+        )
+
+    def messages(each, stamp):
+        ping = iq[next(count), 140:]
+        yield '/sss/amplitude', image(stamp, np.abs(ping).mean(axis=1), 8)
+        yield '/sss/phase', image(stamp, np.angle(ping[:, 1] * ping[:, 0].conj()), 8)
+
+    bag_of(path, spots, messages, marine.typestore())
+
+
+def cloud_bag(path, spots):
+    types = marine.typestore()
+    text = 'std_msgs/Header header\ngeometry_msgs/Point32[] points\n'
+    text += 'sensor_msgs/ChannelFloat32[] channels'
+    for name, each in (
+        ('sensor_msgs/msg/ChannelFloat32', 'string name\nfloat32[] values'),
+        ('sensor_msgs/msg/PointCloud', text),
+    ):
+        if name not in types.types:
+            types.register(get_types_from_msg(each, name))
+    point, cloud = (
+        types.types['geometry_msgs/msg/Point32'],
+        types.types['sensor_msgs/msg/PointCloud'],
+    )
+
+    def messages(each, stamp):
+        yield '/auv/odometry', pose_at(stamp, 0.5 * each.seconds)
+        header = marine.header(sec=stamp // 10**9)
+        yield (
+            '/micron/points',
+            cloud(
+                header=header,
+                points=[point(x=60.0 - 0.5 * each.seconds, y=0.0, z=0.0)],
+                channels=[],
+            ),
+        )
+
+    bag_of(path, spots, messages, types)
+
+
+def side_scan_xtf(path, spots):
+    pytest.importorskip('pyxtf')
+    side_scan(path, spots=[(each.seconds, each.degrees) for each in spots])
+
+
+def soundings_xtf(path, spots):
+    pytest.importorskip('pyxtf')
+    beams = [(0.0, y, 20.0) for y in (-10.0, 0.0, 10.0)]
+    parts = [xtf_head([('port', 'port', 'uint16')]).to_bytes()]
+    parts += [xtf_soundings(each.seconds, beams, each.degrees) for each in spots]
+    path.write_bytes(b''.join(parts))
+
+
+def split_beam(path, spots):
+    pytest.importorskip('themachinethatgoesping')
+    iq, _ = floor(len(spots), 2, 23 / (2 * np.pi), 0.0298)
+    ek80(path, iq[..., [1, 0, 0, 1]], spots=[(each.seconds, each.degrees) for each in spots])
+
+
+def old_split_beam(path, spots):
+    pytest.importorskip('ektools')
+    iq, _ = floor(len(spots), 2, 21.9 / (2 * np.pi), 0.5 * 1490.0 * 2.56e-4)
+    power = np.round(20.0 * np.log10(np.abs(iq[..., 0]) + 1e-3) * 256 / 3.0103).astype(int)
+    turn = np.angle(iq[..., 1] * iq[..., 0].conj()) * 128 / np.pi
+    angles = np.stack([turn, 0.0 * turn], axis=-1).clip(-128, 127).astype(int)
+    ek60(path, power, angles, spots=[(each.seconds, each.degrees) for each in spots])
+
+
+def kmall_line(path, spots):
+    pytest.importorskip('themachinethatgoesping')
+    kmall(path, spots=[(each.seconds, each.degrees) for each in spots])
+
+
+def all_line(path, spots):
+    pytest.importorskip('themachinethatgoesping')
+    kongsberg_all(path, spots=[(each.seconds, each.degrees) for each in spots])
+
+
+def pictures(path, spots):
+    """An echo on the bow that comes nearer as the vehicle goes east."""
+    image = pytest.importorskip('PIL.Image')
+    rng, rows = np.random.default_rng(2), ['file,time_utc,latitude,longitude,heading,depth']
+    path.mkdir(exist_ok=True)
+    for k, each in enumerate(spots):
+        pixels = np.round(3.0 * np.sqrt(rng.exponential(size=(200, 41))))
+        pixels[150 - k, 20] = 200.0
+        image.fromarray(pixels.astype('u1')).save(path / f'{k:02d}.png')
+        latitude, longitude = each.degrees if each.place is None else place_of(0.2 * k, 0.0)
+        rows.append(f'{k:02d}.png,{each.time},{latitude:.9f},{longitude:.9f},90,3')
+    (path / 'stamps.csv').write_text('\n'.join(rows))
+
+
+class Format(NamedTuple):
+    """row: first column of the table in docs/reference/formats.md; make: (path, spots); options:
+    words of ``convert``, {} is the folder of the file; system: whose input it becomes; kind: where
+    its content does not say it; step: seconds from ping to ping."""
+
+    row: str
+    name: str
+    make: Callable
+    system: str
+    options: tuple[str, ...] = ()
+    kind: str = ''
+    step: float = 1.0
+
+
+FORMATS = [
+    Format('CSV of positions, also range and bearing', 'usbl.csv', usbl_csv, 'diver'),
+    Format('CSV of positions from a vessel', 'vessel.csv', vessel_csv, 'diver'),
+    Format('GPX 1.0, 1.1: tracks, routes, waypoints', 'dive.gpx', gpx, 'diver'),
+    Format('KML: `gx:Track`, points with a time', 'dive.kml', kml, 'diver'),
+    Format(
+        'GeoJSON: points, lines with `coordTimes` or `times`', 'dive.geojson', geojson, 'diver'
+    ),
+    Format(
+        'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM', 'gps.log', nmea, 'diver'
+    ),
+    Format('AIS: messages 1, 2, 3, 18, 19, 27', 'harbour.nmea', ais, 'diver'),
+    Format(
+        'receivers of telemetry: rows of receiver, tag, time',
+        'vue.csv',
+        telemetry,
+        'diver',
+        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'),
+        step=5.0,
+    ),
+    Format(
+        'CSV of arrival times',
+        'arrivals.csv',
+        arrivals,
+        'diver',
+        ('--receivers', '{}/stations.csv', '--toa-std', '0.001'),
+        step=5.0,
+    ),
+    Format('WAV, FLAC of an array', 'array_20240531_100000.wav', sound, 'fathometer'),
+    Format('SEG-Y', 'line.seg', segy, 'fathometer'),
+    Format('numpy archive', 'pings.npz', snapshots_npz, 'bathymetry'),
+    Format('numpy archive', 'traces.npz', traces_npz, 'fathometer'),
+    Format('CSV of traces', 'traces.csv', traces_csv, 'fathometer'),
+    Format('JSON of the Autoferry data set', 'boats.json', boats_json, 'diver', ('--std', '2')),
+    Format('bag with sonar images, or amplitude and phase', 'survey.bag', images_bag, 'obstacle'),
+    Format(
+        'bag with sonar images, or amplitude and phase',
+        'swath.bag',
+        phases_bag,
+        'bathymetry',
+        ('--amplitude', '/sss/amplitude', '--phase', '/sss/phase', '--element-spacing', '0.0025'),
+        'interferometer',
+    ),
+    Format('bag with `sensor_msgs/PointCloud`', 'micron.bag', cloud_bag, 'obstacle', kind='none'),
+    Format('XTF: side scan, processed soundings', 'line.xtf', side_scan_xtf, 'obstacle', step=0.2),
+    Format('XTF: side scan, processed soundings', 'swath.xtf', soundings_xtf, '', step=0.2),
+    Format(
+        'Simrad EK80 raw: complex samples, chirps (compressed), power with angles',
+        'wbt.raw',
+        split_beam,
+        'bathymetry',
+        step=0.2,
+    ),
+    Format(
+        'Simrad EK60, ES60 raw: power with angles',
+        'gpt.raw',
+        old_split_beam,
+        'bathymetry',
+        step=0.2,
+    ),
+    Format('Kongsberg KMALL, .all', 'line.kmall', kmall_line, '', step=0.2),
+    Format('Kongsberg KMALL, .all', 'line.all', all_line, '', step=0.2),
+    Format(
+        'folder of PNG, JPEG with a CSV of stamps',
+        'frames',
+        pictures,
+        'obstacle',
+        ('--far-range', '40', '--fov', '60'),
+        step=0.2,
+    ),
+]
