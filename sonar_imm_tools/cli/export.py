@@ -191,7 +191,7 @@ def _export_tracks(
     degrees = None if epsg is None else _to_degrees(epsg, origin)
     folder = RunFolder(run)
     record = folder.read_run()
-    if degrees is None and record['system'] == 'obstacle' and (stated := record.get('origin')):
+    if degrees is None and (stated := record.get('origin')):
         degrees = Origin(**stated).degrees
     tracks = tracks_of(folder.read_estimates(), degrees)
     with whole(out) as unfinished:

@@ -93,6 +93,11 @@ def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, float]:
     return {} if origin is None else dict(zip(names, origin))
 
 
+def origin_of_detections(origin: tuple[float, ...]) -> dict[str, dict[str, float]]:
+    """`origin_parameters` of the tracker that takes detections, by its name."""
+    return {'obstacle': origin_parameters(origin)}
+
+
 def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, float] | None:
     """Complete an origin with height 0. Raises `BagError`."""
     if origin is None:

@@ -141,7 +141,9 @@ def test_the_other_files_say_what_they_should(lines, made):
     assert adjustment['crossings']['rms_after'] < 0.3 * adjustment['crossings']['rms_before']
     assert adjustment['not_told'][0]['share'] > 0.99
     offsets = [entry['combination'].count('offset_m') for entry in adjustment['not_told']]
-    assert offsets.count(4) == 1, adjustment['not_told']  # the level, and no tide of one line alone
+    assert offsets.count(4) == 1, adjustment[
+        'not_told'
+    ]  # the level, and no tide of one line alone
     with (made / 'crossings.csv').open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6 and all(int(row['cells']) > 20 for row in rows)

@@ -34,6 +34,7 @@ from helpers.sonar_files import (
     ek80,
     kmall,
     kongsberg_all,
+    line_east,
     place_of,
     side_scan,
     xtf_head,
@@ -409,8 +410,13 @@ def cloud_bag(path, spots):
 
 
 def side_scan_xtf(path, spots):
+    """Towed straight, but for spots that are nowhere near: a jump from ping to ping is no tow."""
     pytest.importorskip('pyxtf')
-    side_scan(path, spots=[(each.seconds, each.degrees) for each in spots])
+    towed = [
+        (each.seconds, place if np.allclose(each.degrees, place, atol=0.01) else each.degrees)
+        for each, (_, place) in zip(spots, line_east(len(spots), 0.1))
+    ]
+    side_scan(path, spots=towed)
 
 
 def soundings_xtf(path, spots):

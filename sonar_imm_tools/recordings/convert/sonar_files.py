@@ -42,13 +42,12 @@ from ... import SECOND
 from ..conversion import ConversionReport, JUMP, Leaps, provenance
 from ..csv_table import BadRow
 from ..foreign import LIBRARIES, read_apart, Record
-from ..local_frame import origin_parameters
+from ..local_frame import origin_of_detections
 from ..messages import ros_message
 from ..sources import BagError
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
-OBSTACLE = 'obstacle'
 EXTRAS = {'pyxtf': 'xtf', 'themachinethatgoesping': 'echosounders', 'ektools': 'echosounders'}
 """The extra of the package that installs a library."""
 
@@ -199,7 +198,8 @@ def write_records(
                 write(message.topic, message.content, stamp_ns)
         if '/detections' in report.messages and frame.origin is not None:
             place = frame.origin.latitude, frame.origin.longitude
-            own[OBSTACLE] = {**own.get(OBSTACLE, {}), **origin_parameters(place)}
+            for system, values in origin_of_detections(place).items():
+                own[system] = {**own.get(system, {}), **values}
         if not set(report.messages) - {'/nav', '/altitude'}:
             first = f' (the first problem: {report.problems[0]})' if report.problems else ''
             raise BagError(f'{path} holds no ping that could be converted{first}')
