@@ -254,10 +254,15 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         "standard deviation of the error of a receiver's clock", range=(0.0, 1.0))
     sound_speed_std: float = parameter(0.0, 'm/s',
         'standard deviation of sound_speed', range=(0.0, 100.0))
+    bearing_bias_std_deg: float = parameter(0.0, 'deg',
+        'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
+        'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
+        'place coverage_sector states', range=(0.0, 45.0))
     systematic_errors: str = parameter('mixed', '',
-        'treatment of the errors of receiver_position_std, receiver_clock_std and '
-        'sound_speed_std: consider (in the covariance, never estimated), estimate, or mixed '
-        '(receiver positions considered, clocks and sound speed estimated)', choices=SYSTEMATIC)
+        'treatment of the errors of receiver_position_std, receiver_clock_std, sound_speed_std '
+        'and bearing_bias_std_deg: consider (in the covariance, never estimated), estimate, or '
+        'mixed (receiver positions and bearings considered, clocks and sound speed estimated)',
+        choices=SYSTEMATIC)
 
     # -- errors of fixes that last ---------------------------------------------------------------
     fix_bias_std: float = parameter(0.0, 'm',

@@ -237,6 +237,7 @@ class DiverTracker:
             if self._keeps_hypotheses:
                 now = self._branch(now, fixes)
                 continue
+            now = now.as_seen(fixes.turned_by, self._layout)
             association = self._associate(now, fixes)
             now, again = self._reacquire(now, fixes, association)
             if again:
@@ -246,8 +247,8 @@ class DiverTracker:
             now = jipda.counted(now, fixes, association.claimed)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
-            if association.free.any():
-                found += births.births_from_fixes(fixes, association.free, association.existence)
+            now = now.as_seen(fixes.turned_by, self._layout, back=True)
+            found += births.births_from_fixes(fixes, association.free, association.existence)
         if scan.pings and self._keeps_hypotheses:
             now = kbest.decided(now)
         for ping in scan.pings:
@@ -343,10 +344,12 @@ class DiverTracker:
 
     def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
         """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
+        now = now.as_seen(fixes.turned_by, self._layout)
         layout = self._layout(now.instruments)
         found = kbest.branched(now, fixes, self.models, self._chain, layout, self._covered)
         now = self._update(found.state, fixes, found.association)
         now = self._update_heights(now, fixes, found.association)
+        now = now.as_seen(fixes.turned_by, self._layout, back=True)
         new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
         now = self._with_tracks(now, new)
         return kbest.begun(now, found)
