@@ -211,6 +211,26 @@ def systematic_cells() -> Cells:
     return cells
 
 
+def bearing_cells() -> Cells:
+    everywhere = {'coverage_sector': (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)}
+    cells: Cells = []
+    for name, what, known in (
+        ('usbl', 'from a vessel that circles', scenario('usbl', {'divers': 1}).instruments()),
+        ('random_heading', 'from a sonar that stands', everywhere),
+    ):
+        for bias in (0.0, 1.0, 2.0, 4.0):
+            stated = {'bearing_bias_std_deg': bias or 2.0}
+            for column, config in {
+                'ignore': {},
+                'consider': stated,
+                'estimate': {**stated, 'systematic_errors': 'estimate'},
+            }.items():
+                scene = {'divers': 1, 'bearing_bias_std_deg': bias}
+                config = {'model_set': 'families', **known, **config}
+                cells.append((f'{what}, off by {bias:g} degrees', column, name, scene, config))
+    return cells
+
+
 def lasting_cells() -> Cells:
     cells: Cells = []
     for std, tau, white in ((1.0, 60.0, 0.5), (2.0, 60.0, 0.05), (2.0, 600.0, 0.05),
@@ -279,6 +299,7 @@ TABLES = {
     'depth': depth_cells,
     'fixes': fix_cells,
     'systematic': systematic_cells,
+    'bearings': bearing_cells,
     'lasting': lasting_cells,
 }
 

@@ -56,6 +56,7 @@ from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .jipda import Association
 from .models import build_models
+from .offsets import Heard
 from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments
@@ -138,7 +139,8 @@ class DiverTracker:
         if inputs is None or not {Arrivals, Start}.issuperset(inputs):
             steps.append(('fixes', self._warm_fixes))
         if inputs is None or Arrivals in inputs:
-            steps += [('echoes', self._warm_echoes), ('tags', self._warm_tags)]
+            steps.append(('echoes', partial(self._warm_pings, np.zeros(3))))
+            steps.append(('tags', partial(self._warm_pings, np.full(3, np.nan))))
         return steps
 
     def _warm_fixes(self) -> None:
@@ -147,12 +149,6 @@ class DiverTracker:
             for x in (0.0, 0.1):
                 stamp_ns, at, P = second * 10**9, (x, 0.0, 0.0), np.eye(self.config.dimensions)
                 tracker.process(Fix(stamp_ns=stamp_ns, position=at, covariance=P))
-
-    def _warm_echoes(self) -> None:
-        self._warm_pings(np.zeros(3))
-
-    def _warm_tags(self) -> None:
-        self._warm_pings(np.full(3, np.nan))
 
     def _warm_pings(self, tx: FloatArray) -> None:
         tracker = self._for_warming()
@@ -392,6 +388,7 @@ class DiverTracker:
             innovations = mean, covariance, z, R, tracks, row
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = now.fixes.after(sums, scale, tentative[tracks])
+            now = now._replace(offsets=now.offsets._replace(heard=Heard()))
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask
@@ -569,6 +566,7 @@ class DiverTracker:
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = state.positions(self.models.E)
+        covariance = state.offsets.widened(mean, covariance, self.config)
         depth = np.full(len(mean), self.config.target_z)
         if self.models.height >= 0:
             depth = mean[:, 2]
