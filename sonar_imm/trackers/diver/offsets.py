@@ -202,7 +202,8 @@ class Offsets(NamedTuple):
     def widened(self, mean: FloatArray, covariance: FloatArray, config: DiverConfig) -> FloatArray:
         """The covariances (T, q, q) of outputs mean (T, q), position first, with what is assumed
         of the instruments: nothing where something is stated, or fixes say where divers are."""
-        if not self.heard.pairs or any(getattr(config, name) for name in STDS):
+        exact = config.systematic_errors == 'exact'
+        if not self.heard.pairs or exact or any(getattr(config, name) for name in STDS):
             return covariance
         covariance, known = covariance.copy(), config.dimensions
         for t, row in enumerate(mean):

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Arrivals
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import offsets
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.models import build_models
@@ -203,6 +204,10 @@ def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
     config = DiverConfig()
     found = heard_by(config, mean[0, :2])
     assert Offsets().widened(mean, nothing, config) is nothing
+    exact = DiverConfig(systematic_errors='exact')
+    assert found.widened(mean, nothing, exact) is nothing
+    with pytest.raises(ConfigError, match='receiver_clock_std'):
+        DiverConfig.from_mapping({'systematic_errors': 'exact', 'receiver_clock_std': 1e-4})
     for name in offsets.STDS:
         assert found.widened(mean, nothing, DiverConfig(**{name: 1e-6})) is nothing
 
