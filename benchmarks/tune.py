@@ -95,8 +95,9 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
 }
 """System, scene, its settings, parameters to begin with, what is fitted, and what is true:
 None where the scene has no such number; scenes of `MADE` are no scenarios. Reflectors of the drift
-move by .01 m from record to record, by the tilt of the array and by .03 m of its depth; the heights
-of the rough patch are white, with a standard deviation of .5 m, and the floor beside it is flat."""
+move by .01 m from record to record, by the tilt of the array and by .03 m of its depth; the
+heights of the rough patch are white, with a standard deviation of .5 m, and the floor beside it is
+flat."""
 
 
 def wandering(out: Path, seed: int, fixes: str, noise: str) -> None:
