@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
 from benchmarks.study import final_estimates, Parts, study, truths
@@ -83,7 +84,10 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
     for seed in range(1000, 1000 + runs):
         made = simulate(scenario(name, scene), seed)
         values = {key: v(made) if callable(v) else v for key, v in config.items()}
+        # What is assumed of instruments is judged in the table of what is not stated.
+        exact = not any(values.get(name) for name in (*OFF, 'bearing_bias_std_deg'))
         values = {'model_set': 'heading_speed', **values}
+        values |= {'systematic_errors': 'exact'} if exact else {}
         rows.append(score(made, DiverConfig(max_tracks=1, **values)))
     every = np.concatenate(rows)
     seen = np.isfinite(every[:, 0])
@@ -211,6 +215,26 @@ def systematic_cells() -> Cells:
     return cells
 
 
+def bearing_cells() -> Cells:
+    everywhere = {'coverage_sector': (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)}
+    cells: Cells = []
+    for name, what, known in (
+        ('usbl', 'from a vessel that circles', scenario('usbl', {'divers': 1}).instruments()),
+        ('random_heading', 'from a sonar that stands', everywhere),
+    ):
+        for bias in (0.0, 1.0, 2.0, 4.0):
+            stated = {'bearing_bias_std_deg': bias or 2.0}
+            for column, config in {
+                'ignore': {},
+                'consider': stated,
+                'estimate': {**stated, 'systematic_errors': 'estimate'},
+            }.items():
+                scene = {'divers': 1, 'bearing_bias_std_deg': bias}
+                config = {'model_set': 'families', **known, **config}
+                cells.append((f'{what}, off by {bias:g} degrees', column, name, scene, config))
+    return cells
+
+
 def lasting_cells() -> Cells:
     cells: Cells = []
     for std, tau, white in ((1.0, 60.0, 0.5), (2.0, 60.0, 0.05), (2.0, 600.0, 0.05),
@@ -275,17 +299,62 @@ def warned(name: str, config: Values, runs: int) -> dict[str, Any]:
     }
 
 
+ASSUMED = 'assumed'
+SHARES = (0.0, 0.5, 1.0, 2.0, 2.5, 3.0)
+
+
+def assumed(scene: Values, runs: int) -> dict[str, dict[str, float]]:
+    """What it would do to the first minute of `runs` scenes of fixes, by default, to take errors
+    that last for so many of the stated standard deviations: the covariance of every estimate with
+    that added, as for arrivals (`trackers.diver.offsets`). Mean NEES, runs with `GOOD_NEES` at
+    most, and how many times as long the axes of an ellipse are."""
+    found: dict[float, list[list[float]]] = {share: [] for share in SHARES}
+    for seed in range(runs):
+        made = simulate(scenario('lasting_errors', {'duration': FIRST, **scene}), seed)
+        std = float(np.sqrt(made.measurements[0].measurement.covariance[0, 0]))
+        final = final_estimates(
+            DiverTracker(DiverConfig()), (i.measurement for i in made.measurements)
+        )
+        for share in SHARES:
+            more = (share * std) ** 2
+            wide = {
+                stamp: evolve(each, covariance=each.covariance + more * np.diag([1.0, 1.0, 0, 0]))
+                for stamp, each in final.items()
+            }
+            longer = [
+                np.linalg.det(wide[s].covariance[0, :2, :2])
+                / np.linalg.det(each.covariance[0, :2, :2])
+                for s, each in final.items()
+                if len(each)
+            ]
+            nees = float(np.nanmean(score_of(wide, made)[:, 1]))
+            found[share].append([nees, float(np.mean(np.power(longer, 0.25)))])
+    return {
+        f'{share:g} of the stated': {
+            'NEES': float(np.mean([nees for nees, _ in each])),
+            'NEES good': sum(nees <= GOOD_NEES for nees, _ in each),
+            'axes': float(np.mean([axes for _, axes in each])),
+        }
+        for share, each in found.items()
+    }
+
+
 TABLES = {
     'depth': depth_cells,
     'fixes': fix_cells,
     'systematic': systematic_cells,
+    'bearings': bearing_cells,
     'lasting': lasting_cells,
 }
 
 
 def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:
     yield {'runs': runs}
-    for name in table or [*TABLES, UNTOLD]:
+    for name in table or TABLES:
+        if name == ASSUMED:
+            yield {name: {'errors that last': assumed({}, runs)}}
+            yield {name: {'nothing lasts': assumed({'fix_bias_std': 0.0}, runs)}}
+            continue
         if name == UNTOLD:
             for scene_name, config in STATED.items():
                 for column, given in {'nothing stated': {}, 'stated': config}.items():
@@ -304,8 +373,12 @@ if __name__ == '__main__':
         shown=lambda row: (
             {key: value for key, value in row.items() if key != 'NEES'}
             if 'warn' in row
+            else {
+                c: f'{v["NEES"]:.2f} ({v["NEES good"]}, x {v["axes"]:.1f})' for c, v in row.items()
+            }
+            if 'axes' in next(iter(row.values()))
             else {column: text_of(found) for column, found in row.items()}
         ),
-        table={'action': 'append', 'choices': [*TABLES, UNTOLD]},
+        table={'action': 'append', 'choices': [*TABLES, UNTOLD, ASSUMED]},
         only={'help': 'columns or rows whose name holds this'},
     )

@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 import tempfile
 import time
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.evaluation.tuning import prepared, tune
 from sonar_imm_tools.recordings.convert import convert_fixes
 
-ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | None]] = {
+ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
     'diver, covariances 4 times too small': (
         'diver',
         'random_heading',
@@ -57,7 +58,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | Non
         {'fixes': '400', 'noise': '0.1'},
         {'covariance_scale': '0.1666667', 'model_set': 'cv', 'acceleration_noise': '0.3'},
         'covariance_scale,acceleration_noise',
-        None,
+        (1.0, 0.1),
     ),
     'tow tag, a fix in 29 s': (
         'diver',
@@ -93,10 +94,10 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, float | Non
     ),
 }
 """System, scene, its settings, parameters to begin with, what is fitted, and what is true:
-None where the scene has no such number; scenes of `MADE` are no scenarios. The wandering target
-has a scale of 1 and a noise of .1. Reflectors of the drift move by .01 m from record to record, by
-the tilt of the array and by .03 m of its depth; the heights of the rough patch are white, with a
-standard deviation of .5 m, and the floor beside it is flat."""
+None where the scene has no such number; scenes of `MADE` are no scenarios. Reflectors of the drift
+move by .01 m from record to record, by the tilt of the array and by .03 m of its depth; the
+heights of the rough patch are white, with a standard deviation of .5 m, and the floor beside it is
+flat."""
 
 
 def wandering(out: Path, seed: int, fixes: str, noise: str) -> None:
@@ -141,12 +142,13 @@ def main(seed: int = 1, rows: Sequence[str] = tuple(ROWS)) -> Parts:
             fitting, measurements = prepared(jobs, parameter.split(','))
             start = time.process_time()
             found = tune(fitting, measurements)
-        for row in found.parameters:
+        true = truth if isinstance(truth, tuple) else [truth] * len(found.parameters)
+        for row, value in zip(found.parameters, true):
             yield {
                 'rows': {
                     f'{name}: {row.name}': {
                         'before': row.before,
-                        'true': truth,
+                        'true': value,
                         'after': row.after,
                         'low': row.low,
                         'high': row.high,

@@ -42,7 +42,8 @@ PATH, ONE_WAY, BEARING, ELEVATION, HEIGHT = range(5)
 """Kinds of number that `observe` predicts: metres, metres, rad, rad, metres."""
 
 X, Y, Z, OFFSET, CLOCK, SOUND_SPEED_ERROR, EMISSION = range(7)
-"""Places in the `columns` of `observe`; OFFSET is the x of two neighbours."""
+"""Places in the `columns` of `observe`; OFFSET is the x of two neighbours, CLOCK what is added:
+the error of the clock to a path, that of all bearings of a receiver to a bearing."""
 
 NEAREST = 1e-6
 """Distance in metres below which a direction is undefined and its gradient is zero."""
@@ -141,10 +142,13 @@ def observe(
     oy = x[io + 1] if io >= 0 and kind <= ONE_WAY else 0.0
     dx, dy, dz = x[ix] - rx[0] - ox, x[iy] - rx[1] - oy, z - rx[2]
     rho2 = dx * dx + dy * dy
+    ic = columns[CLOCK]
     if kind == BEARING:
         if rho2 > NEAREST**2:
             gradient[ix], gradient[iy] = -dy / rho2, dx / rho2
-        return math.atan2(dy, dx)
+        if ic >= 0:
+            gradient[ic] = 1.0
+        return math.atan2(dy, dx) + (x[ic] if ic >= 0 else 0.0)
     r = math.sqrt(rho2 + dz * dz)
     if kind == ELEVATION:
         rho = math.sqrt(rho2)
@@ -174,9 +178,9 @@ def observe(
     if iv >= 0:
         gradient[iv] = -total
     value = scale * total
-    if columns[CLOCK] >= 0:
-        gradient[columns[CLOCK]] = 1.0
-        value += x[columns[CLOCK]]
+    if ic >= 0:
+        gradient[ic] = 1.0
+        value += x[ic]
     if kind == ONE_WAY and columns[EMISSION] >= 0:
         gradient[columns[EMISSION]] = 1.0
         value += x[columns[EMISSION]]

@@ -95,7 +95,8 @@ class Fix:
     covariance: (3, 3) in m^2, or None when the sender does not know it; NaN in the row and column
     of z where z is not stated, NaN in the block of x and y where only z is (`in_space`). Also
     taken: (2, 2) of x and y. target_id: whose position it is, `NOBODY` when that is not known;
-    sensor: which of several sensors it is from, by a name of the parameter `sensors`.
+    sensor: which of several sensors it is from, by a name of the parameter `sensors`; seen_from:
+    (2,) x and y of the sensor, None where they do not matter or are not known.
     """
 
     stamp_ns: int
@@ -104,6 +105,7 @@ class Fix:
     target_id: int = NOBODY
     sensor: str = ''
     frame_id: str = ''
+    seen_from: FloatArray | None = None
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -120,7 +122,9 @@ class Fix:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('fix' + self.sensor, self.position, self.covariance, _target_ids(self))
+        parts = self.position, self.covariance, _target_ids(self)
+        place = () if self.seen_from is None else (self.seen_from,)
+        return content_key('fix' + self.sensor, *parts, *place)
 
 
 def _checked(covariance: Any, position: FloatArray, what: str) -> FloatArray:

@@ -69,7 +69,8 @@ MOST_FOUND = 10
 class Birth(NamedTuple):
     """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
     which it is, None for a fix; the probability that there is a diver, NaN where its hits will
-    tell; whose track it is; whether it is measured, and no start; what is stated of z there."""
+    tell; whose track it is; whether it is measured, and no start; what is stated of z there; the
+    name and the place (2,) of the sensor, None where it may not be turned."""
 
     position: FloatArray
     covariance: FloatArray
@@ -79,6 +80,7 @@ class Birth(NamedTuple):
     target_id: int = NOBODY
     measured: bool = True
     height: Height | None = None
+    seen_by: tuple[str, FloatArray] | None = None
 
 
 def births_from_fixes(
@@ -91,9 +93,8 @@ def births_from_fixes(
         known = math.nan if existence is None else float(existence[d])
         name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
         height = None if fixes.heights is None else fixes.heights.row(d)
-        births.append(
-            Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name, height=height)
-        )
+        birth = Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name, height=height)
+        births.append(birth._replace(seen_by=fixes.turned_by))
     return births
 
 
@@ -192,7 +193,8 @@ def locate(
             variance,
             tx=ping.tx[rows],
             bearing=ping.bearing[rows],
-            var_bearing=bearing_variance(ping, config)[rows],
+            var_bearing=bearing_variance(ping, config)[rows]
+            + np.radians(config.bearing_bias_std_deg) ** 2,
             target_z=height,
             sound_speed=config.sound_speed,
         )
@@ -225,10 +227,11 @@ def new_tracks(
         wide = P[at_fix]
         families.with_velocities_at_fix(wide, models, config)
         P[at_fix] = wide
-    if models.height >= 0:
-        for row, birth in enumerate(births):
-            if birth.height is not None:
-                begin(x[row], P[row], birth.height, birth.covariance, models.height, config)
+    for row, birth in enumerate(births):
+        if models.height >= 0 and birth.height is not None:
+            begin(x[row], P[row], birth.height, birth.covariance, models.height, config)
+        if birth.seen_by is not None:
+            x[row], P[row] = layout.as_seen(x[row], P[row], *birth.seen_by, back=True)
     return x, P, mu
 
 

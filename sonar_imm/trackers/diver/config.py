@@ -87,7 +87,7 @@ AFLOAT = 2.0
 of it. A boat is tracked no other way, and it costs a diver nothing."""
 
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
-SYSTEMATIC = ('mixed', 'consider', 'estimate')
+SYSTEMATIC = ('mixed', 'consider', 'estimate', 'exact')
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 NAMED_TRACKS = ('share', 'alone')
 VESSELS = ('moving', 'fixed')
@@ -259,10 +259,16 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         "standard deviation of the error of a receiver's clock", range=(0.0, 1.0))
     sound_speed_std: float = parameter(0.0, 'm/s',
         'standard deviation of sound_speed', range=(0.0, 100.0))
+    bearing_bias_std_deg: float = parameter(0.0, 'deg',
+        'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
+        'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
+        'place coverage_sector states', range=(0.0, 45.0))
     systematic_errors: str = parameter('mixed', '',
-        'treatment of the errors of receiver_position_std, receiver_clock_std and '
-        'sound_speed_std: consider (in the covariance, never estimated), estimate, or mixed '
-        '(receiver positions considered, clocks and sound speed estimated)', choices=SYSTEMATIC)
+        'treatment of the errors of receiver_position_std, receiver_clock_std, sound_speed_std '
+        'and bearing_bias_std_deg: consider (in the covariance, never estimated), estimate, or '
+        'mixed (receiver positions and bearings considered, clocks and sound speed estimated); '
+        'where none is stated, 0.3 m, 0.1 ms and 2 m/s are part of the covariance of tracks from '
+        'arrivals alone; exact: nothing is off', choices=SYSTEMATIC)
 
     # -- errors of fixes that last ---------------------------------------------------------------
     fix_bias_std: float = parameter(0.0, 'm',
@@ -402,6 +408,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         problems = super().check() + self._place_problems() + self._sensor_problems()
         if not self.covariance_scales:
             problems.append('covariance_scales needs one value at least')
+        off = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
+        stated = [name for name in (*off, 'bearing_bias_std_deg') if getattr(self, name)]
+        if self.systematic_errors == 'exact' and stated:
+            problems.append(f'systematic_errors is exact, but {stated[0]} is not 0')
         if self.depth_min > self.depth_max:
             problems.append(
                 f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'

@@ -345,6 +345,7 @@ class Georeferencer:
             target_id=fix.target_id,
             sensor=fix.sensor,
             frame_id=vessel.frame_id,
+            seen_from=(vessel.pose.position + vessel.pose.R @ mounting.lever)[:2],
         )
 
 

@@ -26,6 +26,13 @@ over pings, and forgotten, the score ``s = sum w D' N t`` has the covariance
 ``V = sum w^2 D' N N' D`` if there are none, and ``s' V^-1 s`` is a chi-square (Rao 1948, *Large
 sample tests of statistical hypotheses*): the test against any error of each pair that is constant.
 What is stated of instruments adds its own covariance to V.
+
+Errors that another place explains as well leave no residual, and no test finds them. So as long as
+nothing is stated of the instruments they are taken to be as good as those in the field usually
+are (`ASSUMED`). What such errors do to the place that the pairs heard lately give by themselves
+is part of the published covariance: with G the gain of that place, ``G D B D' G'``, B their
+variances. They are the same in every ping, so that filtering does not lessen it, and no estimate
+is moved by it.
 """
 
 from __future__ import annotations
@@ -41,6 +48,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .scan import Ping
+from .state_space import AT_TRANSMITTER
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""
@@ -74,10 +82,70 @@ EVERY, DEPTH = 'every', 'target_z (or dimensions: 3)'
 STDS = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
 
 
+ASSUMED = dict(zip(STDS, (0.3, 1e-4, 2.0)))
+"""What is assumed of the instruments where nothing is stated: receivers placed by differential
+GNSS, clocks set before the dive, a sound speed from a table of temperatures."""
+
+RECENT = 20
+"""Pings for which a pair that was heard counts."""
+
+WEAK = 0.05
+"""Directions that the pairs show this many times worse than the best one, or worse still, are left
+out: how far they are off is in the covariance of the filter."""
+
+
+class Heard(NamedTuple):
+    """The pairs (R,), as (transmitter, receiver), whose echoes tracks took lately: tx (R, 3), NaN
+    of tags, rx (R, 3), variance (R,) of the path, m^2, and age (R,) in pings."""
+
+    pairs: tuple[tuple[int, int], ...] = ()
+    tx: FloatArray = np.zeros((0, 3))
+    rx: FloatArray = np.zeros((0, 3))
+    variance: FloatArray = np.zeros(0)
+    age: FloatArray = np.zeros(0)
+
+    def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> Heard:
+        """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
+        rows = {
+            pair: (self.tx[k], self.rx[k], self.variance[k], self.age[k] + 1.0)
+            for k, pair in enumerate(self.pairs)
+            if self.age[k] + 1.0 < RECENT
+        }
+        for c in np.flatnonzero(taken & ping.echo).tolist():
+            a, b = ids[ping.row[c]].tolist()
+            if (a, b) in rows or len(rows) < MOST_PAIRS:
+                measured = ping.measured
+                rows[a, b] = measured.tx[c], measured.rx[c], measured.variance[c], 0.0
+        if not rows:
+            return Heard()
+        pairs = sorted(rows)
+        columns = (np.array(column) for column in zip(*(rows[pair] for pair in pairs)))
+        return Heard(tuple(pairs), *columns)
+
+    def spread(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
+        """What `ASSUMED` errors do to a place (3,), of whose coordinates the first `known` are
+        states: (known, known), m^2."""
+        tag = bool(np.isnan(self.tx[0, 0]))
+        paths = arrival_paths(place, None if tag else self.tx, self.rx)
+        std = np.sqrt(self.variance)
+        H = np.column_stack([paths.by_position[:, :known], np.ones((len(std), int(tag)))])
+        gain = np.linalg.pinv(H / std[:, None], rcond=WEAK)[:known] / std
+        off, late, slow = ASSUMED.values()
+        far = np.hypot(*(self.rx - self.tx)[:, :2].T)
+        receivers = np.array([pair[1] for pair in self.pairs])
+        D = [slow / sound_speed * paths.by_sound_speed]
+        for receiver in np.unique(receivers):
+            own = receivers == receiver
+            D.append(np.where(own, late * sound_speed, 0.0))
+            D += list(np.where(own & ~(far <= AT_TRANSMITTER), off * paths.by_offset.T, 0.0))
+        moved = gain @ np.stack(D, axis=1)
+        return np.asarray(moved @ moved.T)
+
+
 class Offsets(NamedTuple):
     """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
     = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
-    square and freedom: of all t, and how many there were."""
+    square and freedom: of all t, and how many there were; heard: where pings put divers."""
 
     pairs: tuple[tuple[int, int], ...] = ()
     score: FloatArray = np.zeros(CAUSES)
@@ -85,6 +153,7 @@ class Offsets(NamedTuple):
     length: FloatArray = np.zeros(0)
     square: float = 0.0
     freedom: float = 0.0
+    heard: Heard = Heard()
 
     def after(
         self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
@@ -127,7 +196,21 @@ class Offsets(NamedTuple):
             lengths,
             keep**2 * now.square + float(t @ t),
             keep**2 * now.freedom + len(t),
+            now.heard,
         )
+
+    def widened(self, mean: FloatArray, covariance: FloatArray, config: DiverConfig) -> FloatArray:
+        """The covariances (T, q, q) of outputs mean (T, q), position first, with what is assumed
+        of the instruments: nothing where something is stated, or fixes say where divers are."""
+        exact = config.systematic_errors == 'exact'
+        if not self.heard.pairs or exact or any(getattr(config, name) for name in STDS):
+            return covariance
+        covariance, known = covariance.copy(), config.dimensions
+        for t, row in enumerate(mean):
+            place = row[:3] if known == 3 else np.append(row[:2], config.target_z)
+            spread = self.heard.spread(place, known, config.sound_speed)
+            covariance[t, :known, :known] += spread
+        return covariance
 
     def _with_pairs(self, new: list[tuple[int, int]]) -> Offsets:
         if not new:
@@ -217,6 +300,7 @@ def watched(
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
+    found = found._replace(heard=found.heard.after(seen, taken, ids))
     for track, place in places.items():
         good = took[track]
         echo = np.flatnonzero(seen.echo)

@@ -107,7 +107,8 @@ class Positions:
     multiplied by to give R; target_id: (D,) whose fixes they are, None when that is not known of
     any; whole: whether they are all that there was to see, so that a diver without a fix was
     missed; heights: what they state of z, None where nothing, or depth is no state; sensor: its
-    name; learnt: the density of false fixes where `clutter_density` is not stated.
+    name, and seen_from (2,) where it stands, None where that is not known; learnt: the density of
+    false fixes where `clutter_density` is not stated.
     """
 
     z: FloatArray
@@ -118,7 +119,16 @@ class Positions:
     whole: bool
     heights: Heights | None = None
     sensor: str = ''
+    seen_from: FloatArray | None = None
     learnt: float = CLUTTER
+
+    @property
+    def turned_by(self) -> tuple[str, FloatArray] | None:
+        """The name and the place (2,) of a sensor whose bearings may be off, None where they are
+        not, or nobody knows where it stands."""
+        if not self.config.bearing_bias_std_deg or self.seen_from is None:
+            return None
+        return self.sensor, self.seen_from
 
     @property
     def clutter(self) -> float:
@@ -216,8 +226,8 @@ def position_groups(
             if fix.target_id == NOBODY:
                 nameless.append(fix)
             else:
-                scan = scan_of(fix)
-                groups.append(_group(scan, np.arange(1), own, factor, named=True))
+                group = _group(scan_of(fix), np.arange(1), own, factor, named=True)
+                groups.append(_seen_from(fix, group))
         if nameless:
             groups.append(_together(nameless, own, factor))
     for item in items:
@@ -252,7 +262,7 @@ def _group(
             heights = Heights.of(scan.position[rows], scan.covariance[rows], factor)
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(scan.position[rows, :2])
-    named_rows = target_id, not named, heights, scan.sensor
+    named_rows = target_id, not named, heights, scan.sensor, _place(config)
     return Positions(z, R[rows] * factor, config, factor, *named_rows)
 
 
@@ -271,7 +281,17 @@ def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Posit
         whole = [nothing if fix.covariance is None else fix.covariance for fix in fixes]
         heights = Heights.of(np.array([fix.position for fix in fixes]), np.array(whole), factor)
     more = None, config.fixes_are_scans, heights, fixes[0].sensor
-    return Positions(z, R * factor, config, factor, *more)
+    return _seen_from(fixes[0], Positions(z, R * factor, config, factor, *more, _place(config)))
+
+
+def _seen_from(fix: Fix, group: Positions) -> Positions:
+    """A group of fixes with the place of the sensor that `fix` states."""
+    return group if fix.seen_from is None else evolve(group, seen_from=fix.seen_from)
+
+
+def _place(config: DiverConfig) -> FloatArray | None:
+    """Where a sensor with these parameters stands."""
+    return np.array(config.coverage_sector[:2]) if config.coverage_sector else None
 
 
 # -- pings ---------------------------------------------------------------------------------------
@@ -376,7 +396,7 @@ def ping_measurements(
         density=columns[5].astype(np.float64),
         tx=np.ascontiguousarray(ping.tx[row_of]),
         rx=np.ascontiguousarray(ping.rx[row_of]),
-        columns=layout.columns(models, ping.rx_id[row_of], ping.passive),
+        columns=layout.columns(models, ping.rx_id[row_of], ping.passive, columns[2] == BEARING),
     )
     return Ping(measured, row_of, ping.passive, int(new.sum()))
 

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 import math
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ from .clutter import Clutters
 from .config import DiverConfig
 from .family_kernels import Mixing
 from .offsets import Offsets
-from .state_space import Instruments, ModelSet
+from .state_space import Instruments, Layout, ModelSet
 
 FIXES, ARRIVALS = 0, 1
 """Rows of the learnt scale."""
@@ -320,6 +320,22 @@ class DiverState(NamedTuple):
             name: np.concatenate([getattr(self, name), new[name]]) for name in ROWS
         }
         return self._replace(life=life, **parts)
+
+    def as_seen(
+        self,
+        sensor: tuple[str, FloatArray] | None,
+        layouts: Callable[[Instruments], Layout],
+        *,
+        back: bool = False,
+    ) -> DiverState:
+        """The tracks where a `sensor` shows them whose bearings may all be off, by its name and
+        place (2,), or back; None: a sensor without such an error."""
+        if sensor is None:
+            return self
+        instruments = self.instruments.with_sensor(sensor[0])
+        layout = layouts(instruments)
+        x, P = layout.as_seen(*layout.widened(self.x, self.P), *sensor, back=back)
+        return self._replace(x=x, P=P, instruments=instruments)
 
     def positions(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (T, q) and covariance (T, q, q) of the outputs E (M, q, n) of the motion."""

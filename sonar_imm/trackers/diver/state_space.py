@@ -25,7 +25,8 @@ weighs them. Where the arrivals say nothing about z the copies stay as likely as
 their spread is in the published covariance.
 
 *Constants* (`Instruments`, `Layout`): each receiver may lie off its stated place and have a late
-clock; the sound speed may be wrong for all. These constants stand behind the states of motion of
+clock; the sound speed may be wrong for all; a sensor of bearings may be turned by some degrees,
+because its mount or its heading is off. These constants stand behind the states of motion of
 every model and track, and the receivers that have been heard so far decide how many there are. New
 ones come in with their prior, uncorrelated with all that is known.
 
@@ -275,27 +276,41 @@ def _joined(base: Motion, F: FloatArray, Q: FloatArray) -> Motion:
     return both
 
 
+TIMES, PLACE, BEARINGS = 'times', 'place', 'bearings'
+"""What may be off for good."""
+
+
 @frozen
 class Instruments:
     """Receivers heard so far, in the order in which their errors stand in the state.
 
-    known: (receiver id, has an offset) each.
+    known: each a receiver id or the name of a sensor, and what of it may be off: `TIMES` of
+    arrival, `PLACE` as well, or `BEARINGS`.
     """
 
-    known: tuple[tuple[int, bool], ...] = ()
+    known: tuple[tuple[int | str, str], ...] = ()
 
     def with_receivers(self, ping: Arrivals, config: DiverConfig) -> Instruments:
         """With the receivers of a ping, `MOST_RECEIVERS` in all; the same where nothing is to be
         known of them."""
-        if not (config.receiver_position_std or config.receiver_clock_std):
-            return self
-        ids = {receiver for receiver, _ in self.known}
-        new = []
-        for receiver in np.unique(ping.rx_id).tolist():
-            if receiver not in ids:
-                row = int(np.flatnonzero(ping.rx_id == receiver)[0])
-                apart = np.hypot(*(ping.rx[row] - ping.tx[row])[:2])
-                new.append((receiver, not apart <= AT_TRANSMITTER))
+        new: list[tuple[int | str, str]] = []
+        if config.receiver_position_std or config.receiver_clock_std:
+            ids = {each for each, what in self.known if what != BEARINGS}
+            for receiver in np.unique(ping.rx_id).tolist():
+                if receiver not in ids:
+                    row = int(np.flatnonzero(ping.rx_id == receiver)[0])
+                    apart = np.hypot(*(ping.rx[row] - ping.tx[row])[:2])
+                    new.append((receiver, TIMES if apart <= AT_TRANSMITTER else PLACE))
+        if config.bearing_bias_std_deg:
+            bearing = np.unique(ping.rx_id[np.isfinite(ping.bearing)]).tolist()
+            new += [(each, BEARINGS) for each in bearing if (each, BEARINGS) not in self.known]
+        return self._with(new)
+
+    def with_sensor(self, name: str) -> Instruments:
+        """With a sensor whose fixes may all be turned about it; the same where it is known."""
+        return self if (name, BEARINGS) in self.known else self._with([(name, BEARINGS)])
+
+    def _with(self, new: list[tuple[int | str, str]]) -> Instruments:
         new = new[: max(0, MOST_RECEIVERS - len(self.known))]
         return Instruments((*self.known, *new)) if new else self
 
@@ -310,9 +325,14 @@ class Instruments:
             sound = n
             variances.append((config.sound_speed_std / config.sound_speed) ** 2)
             estimated.append(errors != 'consider')
-        offsets, clocks = {}, {}
-        for receiver, apart in self.known:
-            if config.receiver_position_std and apart:
+        offsets, clocks, bearings = {}, {}, {}
+        for receiver, what in self.known:
+            if what == BEARINGS:
+                bearings[receiver] = n + len(variances)
+                variances.append(np.radians(config.bearing_bias_std_deg) ** 2)
+                estimated.append(errors == 'estimate')
+                continue
+            if config.receiver_position_std and what == PLACE:
                 offsets[receiver] = n + len(variances)
                 variances += [config.receiver_position_std**2] * 2
                 estimated += [errors == 'estimate'] * 2
@@ -324,7 +344,8 @@ class Instruments:
         H[0, :, :, :n] = models.fix
         mask = np.array([True] * n + estimated)
         scales = np.array(models.scales)
-        return Layout(n, np.array(variances), mask, H, scales, sound, offsets, clocks)
+        places = sound, offsets, clocks, bearings
+        return Layout(n, np.array(variances), mask, H, scales, *places)
 
 
 @frozen(eq=False)
@@ -333,7 +354,7 @@ class Layout:
 
     mask (n + q,): True for what an update may move, False for what is only considered; H
     (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`; sound,
-    offsets, clocks: places in the whole state, -1 or absent for none.
+    offsets, clocks, bearings: places in the whole state, -1 or absent for none.
     """
 
     n: int
@@ -342,23 +363,55 @@ class Layout:
     H: FloatArray
     scales: FloatArray
     sound: int
-    offsets: dict[int, int]
-    clocks: dict[int, int]
+    offsets: dict[int | str, int]
+    clocks: dict[int | str, int]
+    bearings: dict[int | str, int]
 
     @property
     def size(self) -> int:
         return self.n + len(self.variances)
 
-    def columns(self, models: ModelSet, receivers: np.ndarray, passive: bool) -> IntArray:
-        """(C, 7) for `acoustics.arrivals_3d.observe`; of a tag the emission stands last."""
+    def columns(
+        self, models: ModelSet, receivers: np.ndarray, passive: bool, bearing: BoolArray
+    ) -> IntArray:
+        """(C, 7) for `acoustics.arrivals_3d.observe`, of which some are a `bearing` (C,); of a tag
+        the emission stands last."""
         out = np.full((len(receivers), 7), -1)
         out[:, X], out[:, Y], out[:, Z] = 0, 1, models.height
         out[:, SOUND_SPEED_ERROR] = self.sound
         out[:, OFFSET] = [self.offsets.get(receiver, -1) for receiver in receivers.tolist()]
-        out[:, CLOCK] = [self.clocks.get(receiver, -1) for receiver in receivers.tolist()]
+        out[:, CLOCK] = [
+            (self.bearings if angle else self.clocks).get(receiver, -1)
+            for receiver, angle in zip(receivers.tolist(), bearing)
+        ]
         if passive:
             out[:, EMISSION] = self.size
         return out
+
+    def as_seen(
+        self, x: FloatArray, P: FloatArray, sensor: str, place: FloatArray, *, back: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """States (..., n + q) and covariances whose positions are those that a `sensor` at `place`
+        (2,) shows: turned about it by the error of its bearings, or `back`.
+
+        So a fix measures the position itself, whoever it is of and wherever he is: what the error
+        does to it stands in the covariance of the state, wherever the state goes from there.
+        """
+        if sensor not in self.bearings:  # there were too many before it
+            return x, P
+        at, sign = self.bearings[sensor], -1.0 if back else 1.0
+        angle, arm = sign * x[..., at], x[..., :2] - place
+        cos, sin = np.cos(angle), np.sin(angle)
+        turned = np.stack([cos * arm[..., 0] - sin * arm[..., 1],
+                           sin * arm[..., 0] + cos * arm[..., 1]], axis=-1)  # fmt: skip
+        T = np.zeros_like(P)
+        T[..., range(self.size), range(self.size)] = 1.0
+        T[..., 0, 0] = T[..., 1, 1] = cos
+        T[..., 1, 0], T[..., 0, 1] = sin, -sin
+        T[..., 0, at], T[..., 1, at] = -sign * turned[..., 1], sign * turned[..., 0]
+        x, P = x.copy(), T @ P @ np.swapaxes(T, -1, -2)
+        x[..., :2] = place + turned
+        return x, 0.5 * (P + np.swapaxes(P, -1, -2))
 
     def widened(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (..., m) and covariances (..., m, m), m <= n + q, with the constants that are new

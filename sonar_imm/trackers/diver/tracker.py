@@ -56,6 +56,7 @@ from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .jipda import Association
 from .models import build_models
+from .offsets import Heard
 from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments
@@ -138,7 +139,8 @@ class DiverTracker:
         if inputs is None or not {Arrivals, Start}.issuperset(inputs):
             steps.append(('fixes', self._warm_fixes))
         if inputs is None or Arrivals in inputs:
-            steps += [('echoes', self._warm_echoes), ('tags', self._warm_tags)]
+            steps.append(('echoes', partial(self._warm_pings, np.zeros(3))))
+            steps.append(('tags', partial(self._warm_pings, np.full(3, np.nan))))
         return steps
 
     def _warm_fixes(self) -> None:
@@ -147,12 +149,6 @@ class DiverTracker:
             for x in (0.0, 0.1):
                 stamp_ns, at, P = second * 10**9, (x, 0.0, 0.0), np.eye(self.config.dimensions)
                 tracker.process(Fix(stamp_ns=stamp_ns, position=at, covariance=P))
-
-    def _warm_echoes(self) -> None:
-        self._warm_pings(np.zeros(3))
-
-    def _warm_tags(self) -> None:
-        self._warm_pings(np.full(3, np.nan))
 
     def _warm_pings(self, tx: FloatArray) -> None:
         tracker = self._for_warming()
@@ -237,6 +233,7 @@ class DiverTracker:
             if self._keeps_hypotheses:
                 now = self._branch(now, fixes)
                 continue
+            now = now.as_seen(fixes.turned_by, self._layout)
             association = self._associate(now, fixes)
             now, again = self._reacquire(now, fixes, association)
             if again:
@@ -246,8 +243,8 @@ class DiverTracker:
             now = jipda.counted(now, fixes, association.claimed)
             if self._covered and fixes.whole and fixes.target_id is None:
                 now = self._missed(now, fixes, association)
-            if association.free.any():
-                found += births.births_from_fixes(fixes, association.free, association.existence)
+            now = now.as_seen(fixes.turned_by, self._layout, back=True)
+            found += births.births_from_fixes(fixes, association.free, association.existence)
         if scan.pings and self._keeps_hypotheses:
             now = kbest.decided(now)
         for ping in scan.pings:
@@ -343,10 +340,12 @@ class DiverTracker:
 
     def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
         """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
+        now = now.as_seen(fixes.turned_by, self._layout)
         layout = self._layout(now.instruments)
         found = kbest.branched(now, fixes, self.models, self._chain, layout, self._covered)
         now = self._update(found.state, fixes, found.association)
         now = self._update_heights(now, fixes, found.association)
+        now = now.as_seen(fixes.turned_by, self._layout, back=True)
         new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
         now = self._with_tracks(now, new)
         return kbest.begun(now, found)
@@ -389,6 +388,7 @@ class DiverTracker:
             innovations = mean, covariance, z, R, tracks, row
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = now.fixes.after(sums, scale, tentative[tracks])
+            now = now._replace(offsets=now.offsets._replace(heard=Heard()))
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask
@@ -566,6 +566,7 @@ class DiverTracker:
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = state.positions(self.models.E)
+        covariance = state.offsets.widened(mean, covariance, self.config)
         depth = np.full(len(mean), self.config.target_z)
         if self.models.height >= 0:
             depth = mean[:, 2]

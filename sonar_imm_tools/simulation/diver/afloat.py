@@ -102,7 +102,7 @@ def sense_from_vessel(
     for number, diver in enumerate(present, start=1):
         if rng.uniform() >= config.detection_probability:
             continue
-        seen = R.T @ (diver - place) - LEVER
+        seen = geometry.rotation(0.0, 0.0, errors.bearing) @ (R.T @ (diver - place) - LEVER)
         bent = np.radians(config.bearing_std_deg) * rng.normal(size=3)
         distance = float(np.linalg.norm(seen))
         turned = seen + np.cross(bent, seen)

@@ -98,6 +98,9 @@ class DiverScenario(Scenario):
         'standard deviation of the errors of the clocks of the receivers', range=(0.0, None))
     sound_speed_std: float = parameter(0.0, 'm/s',
         'standard deviation of the error of the stated sound speed', range=(0.0, None))
+    bearing_bias_std_deg: float = parameter(0.0, 'deg',
+        'standard deviation of the error of all bearings of the sensors polar and usbl, drawn '
+        'once', range=(0.0, 45.0))
     fix_std: float = parameter(1.0, 'm',
         'standard deviation on each axis of the white error of the sensors positions, scans and '
         'geodetic', range=(1e-6, None))

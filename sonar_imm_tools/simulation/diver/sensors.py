@@ -36,12 +36,13 @@ from .scenarios import DiverScenario, RECEIVERS, TRANSMITTER
 @frozen(eq=False)
 class Errors:
     """height (n, divers) z of the divers at n times; misplaced (receivers, 2) m, clock
-    (receivers,) s and sound_speed m/s of the whole scene; fix_bias (n, 2) m."""
+    (receivers,) s, sound_speed m/s and bearing rad of the whole scene; fix_bias (n, 2) m."""
 
     height: FloatArray
     misplaced: FloatArray
     clock: FloatArray
     sound_speed: float
+    bearing: float
     fix_bias: FloatArray
 
     def at(self, k: int) -> Errors:
@@ -65,7 +66,8 @@ def draw_errors(config: DiverScenario, times: FloatArray, rng: np.random.Generat
         fade, _ = gauss_markov(config.fix_bias_std, config.fix_bias_time, dt)
         bias[k] = fade * bias[k - 1] + np.sqrt(1.0 - fade**2) * bias[k]
     height = -depth - config.swell_height * swell
-    return Errors(height, misplaced, clock, float(sound_speed), bias)
+    bearing = np.radians(config.bearing_bias_std_deg) * rng.normal()
+    return Errors(height, misplaced, clock, float(sound_speed), float(bearing), bias)
 
 
 def _sense_polar(
@@ -89,6 +91,7 @@ def _sense_polar(
     bearing_std = np.deg2rad(config.bearing_std_deg)
     ranges = np.hypot(*points.T) + config.range_std * rng.normal(size=len(points))
     bearings = np.arctan2(points[:, 1], points[:, 0]) + bearing_std * rng.normal(size=len(points))
+    bearings += errors.bearing
     z, R = unbiased_polar_to_cartesian(ranges, bearings, config.range_std**2, bearing_std**2)
     return [
         Fix(

@@ -15,16 +15,20 @@
 """Errors of arrivals that last: the evidence is what least squares over all pings says, whatever
 the motion, and what is stated of instruments is taken from it."""
 
+from helpers.diver_runs import fix, run
 import numpy as np
 import pytest
 
 from sonar_imm.measurements import Arrivals
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import offsets
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.offsets import most, Offsets
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.state_space import Instruments
+from sonar_imm.trackers.diver.tracker import DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
 STD, SPEED = 2e-4, 1500.0
@@ -137,3 +141,110 @@ def test_pings_that_any_place_explains_say_nothing():
     received[:, 2:] = False
     found, config = evidence(places, received, noise + 1.0)
     assert found.freedom == 0.0 and found.warnings(config) == []
+
+
+# -- what is assumed where nothing is stated -----------------------------------------------------
+
+
+def heard_by(config, place, tag=False):
+    """The evidence after one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
+    models, everyone = build_models(config), np.ones(4, bool)
+    ping = Arrivals(
+        stamp_ns=1,
+        tx_id=np.ones(4),
+        rx_id=np.arange(4),
+        tx=np.tile([np.nan if tag else 0.0] * 3, (4, 1)),
+        rx=RECEIVERS,
+        toa=legs(place, tag) / SPEED,
+        var_toa=np.full(4, STD**2),
+        bearing=np.full(4, np.nan),
+        var_bearing=np.full(4, np.nan),
+    )
+    layout = Instruments().layout(config, models)
+    seen = ping_measurements(ping, np.arange(4), config, 1.0, models, layout)
+    at = np.asarray(place, float)
+    return offsets.watched(Offsets(), {0: at}, {0: everyone}, ping, seen, config)
+
+
+def placed(path, guess, receivers, tag):
+    """Where path lengths (4,) put a diver, by least squares with these receivers (4, 3)."""
+    x = np.array([*guess, 0.0] if tag else guess, float)
+
+    def expected(at):
+        reach = np.linalg.norm(receivers - [*at[:2], 0.0], axis=1)
+        return reach + (at[2] if tag else np.hypot(*at[:2]))
+
+    for _ in range(6):
+        H = np.stack([(expected(x + d) - expected(x - d)) / 2e-4 for d in 1e-4 * np.eye(len(x))])
+        x = x + np.linalg.lstsq(H.T, path - expected(x), rcond=None)[0]
+    return x[:2]
+
+
+@pytest.mark.parametrize('tag', [False, True])
+def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag):
+    """Against draws of receivers, clocks and sound speeds, and least squares of each."""
+    config, place = DiverConfig(), np.array([20.0, 30.0])
+    wide = heard_by(config, place, tag).widened(
+        np.array([[*place, 0.0, 0.0]]), np.zeros((1, 4, 4)), config
+    )
+    rng, found = np.random.default_rng(2), []
+    off, late, slow = offsets.ASSUMED.values()
+    for _ in range(1500):
+        moved = RECEIVERS.copy()
+        moved[0 if tag else 1 :, :2] += off * rng.normal(size=(4 if tag else 3, 2))
+        reach = np.linalg.norm(moved - [*place, 0.0], axis=1)
+        path = (reach + (0.0 if tag else np.hypot(*place))) * (1.0 - slow / SPEED * rng.normal())
+        found.append(placed(path + late * SPEED * rng.normal(size=4), place, RECEIVERS, tag))
+    np.testing.assert_allclose(wide[0, :2, :2], np.cov(np.array(found).T), rtol=0.15, atol=0.01)
+    assert (wide[0, 2:] == 0.0).all()
+
+
+def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
+    mean, nothing = np.array([[20.0, 30.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
+    config = DiverConfig()
+    found = heard_by(config, mean[0, :2])
+    assert Offsets().widened(mean, nothing, config) is nothing
+    exact = DiverConfig(systematic_errors='exact')
+    assert found.widened(mean, nothing, exact) is nothing
+    with pytest.raises(ConfigError, match='receiver_clock_std'):
+        DiverConfig.from_mapping({'systematic_errors': 'exact', 'receiver_clock_std': 1e-4})
+    for name in offsets.STDS:
+        assert found.widened(mean, nothing, DiverConfig(**{name: 1e-6})) is nothing
+
+
+def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
+    made = simulate(scenario('multistatic', {'duration': 20.0}), 1)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    assumed = run(tracker, (item.measurement for item in made.measurements))[-1]
+    mean, inside = tracker._stream.state.positions(tracker.models.E)
+    np.testing.assert_array_equal(assumed.state, mean)
+    ratio = np.diag(assumed.covariance[0])[:2] / np.diag(inside[0])[:2]
+    assert (ratio > 1.5).all() and (ratio < 30.0).all()
+    last = made.measurements[-1].measurement.stamp_ns * 1e-9
+    after = tracker.process(fix(last + 1.0, *mean[0, :2]))[-1]
+    inside = tracker._stream.state.positions(tracker.models.E)[1]
+    np.testing.assert_array_equal(after.covariance, inside)
+
+
+def test_pairs_that_fell_silent_are_forgotten():
+    config = DiverConfig()
+    found = heard_by(config, np.array([20.0, 30.0])).heard
+    nobody = found
+    for _ in range(offsets.RECENT):
+        nobody = nobody._replace(age=nobody.age + 1.0)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    ping = Arrivals(
+        stamp_ns=2,
+        tx_id=[1],
+        rx_id=[2],
+        tx=np.zeros((1, 3)),
+        rx=RECEIVERS[2:3],
+        toa=[0.1],
+        var_toa=[STD**2],
+        bearing=[np.nan],
+        var_bearing=[np.nan],
+    )
+    seen = ping_measurements(ping, np.arange(1), config, 1.0, models, layout)
+    left = nobody.after(seen, np.ones(1, bool), np.array([[1, 2]]))
+    assert left.pairs == ((1, 2),) and len(found.pairs) == 4

@@ -21,7 +21,7 @@ from oracles.student_t import student_t_maximum
 from oracles.subset_update import subset_update
 import pytest
 
-from sonar_imm.acoustics.arrivals_3d import observe
+from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
@@ -44,6 +44,7 @@ def case(seed=0):
     rx = np.vstack([RECEIVERS, RECEIVERS[:2] + 3.0])
     tx = np.zeros((6, 3))
     columns = np.array([[0, 1, 3, 5 + 2 * (r % 3), 11, 12, 13] for r in range(6)])
+    columns[kind == BEARING, CLOCK] = -1  # no error that all bearings have
     value = [observe(k, x, c, 0.0, t, r, np.empty(N)) for k, c, t, r in zip(kind, columns, tx, rx)]
     value = np.array(value) + rng.normal(size=6) * np.where(kind < 2, 0.3, 0.01)
     value[2] += 9.0
