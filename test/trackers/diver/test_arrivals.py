@@ -237,13 +237,14 @@ def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
 @pytest.mark.statistics
 def test_elevations_show_the_depth():
     """Two hundredths of a radian at 70 m are 1.4 m a receiver, and eight of them hear it."""
-    seen, divers, _ = many_receivers(0.0, elevation=True, dimensions=3)
+    exact = {'dimensions': 3, 'systematic_errors': 'exact'}
+    seen, divers, _ = many_receivers(0.0, elevation=True, **exact)
     error = np.array([item.state[0, :3] - diver for item, diver in zip(seen, divers)])[5:]
     P = np.array([item.covariance[0, :3, :3] for item in seen])[5:]
     nees = np.einsum('ka,ka->k', error, np.linalg.solve(P, error[..., None])[..., 0])
     assert np.sqrt(np.mean(error[:, 2] ** 2)) < 0.5
     assert np.sqrt(P[-1, 2, 2]) < 0.6 and 1.0 < nees.mean() < 6.0
-    unheard, _, _ = many_receivers(0.0, elevation=False, scale=1.01, dimensions=3)
+    unheard, _, _ = many_receivers(0.0, elevation=False, scale=1.01, **exact)
     assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(P[-1, 2, 2])
 
 

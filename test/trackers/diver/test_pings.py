@@ -308,5 +308,5 @@ def test_the_state_does_not_grow_with_numbers_that_wander():
     layout = known.layout(config, models)
     assert len(known.known) == MOST_RECEIVERS
     assert len(layout.mask) <= models.n + 1 + 3 * MOST_RECEIVERS
-    first, last = layout.columns(models, np.array([101, 299]), False)
+    first, last = layout.columns(models, np.array([101, 299]), False, np.zeros(2, bool))
     assert (first != last).sum() == 2  # the errors of the last one have no place
