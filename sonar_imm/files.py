@@ -100,7 +100,7 @@ def _where_it_can() -> contextlib.AbstractContextManager[None]:
     return contextlib.nullcontext() if fcntl is not None else contextlib.suppress(OSError)
 
 
-def _lock(handle: int) -> None:
+def lock(handle: int) -> None:
     """Lock an open file or folder for this process. Raises BlockingIOError where another one has
     it, and another OSError where there are no locks."""
     if fcntl is None:
@@ -113,7 +113,7 @@ def remove_leftovers(path: Path) -> None:
     for place in path.parent.glob(f'{glob.escape(path.name)}{UNFINISHED}*'):
         with contextlib.suppress(OSError), _folder(place) as handle:
             # Nobody holds it: the process that made it is gone.
-            _lock(handle)
+            lock(handle)
             shutil.rmtree(place, ignore_errors=True)
 
 
@@ -130,7 +130,7 @@ def beside(target: Path) -> Iterator[Path]:
             except FileNotFoundError:
                 continue  # taken for a leftover by another process, before the lock
             with contextlib.suppress(OSError):  # without locks: leftovers stay there
-                _lock(handle)
+                lock(handle)
             if place.exists():
                 break
             stack.close()
@@ -148,7 +148,7 @@ def hold(path: Path) -> Callable[[], None] | None:
     while True:
         handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            _lock(handle)
+            lock(handle)
         except BlockingIOError:
             os.close(handle)
             return None

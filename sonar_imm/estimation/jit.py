@@ -27,7 +27,7 @@ same contents. Their dates do not matter, so a copy, a checkout or a wheel keeps
 numba keeps an index file beside files of code with running numbers. Processes that compile at the
 same time take the same number for different code, and one then runs the other's. Here each file
 has the name of what it holds, and says it inside. It begins with a checksum of the rest, so that
-LLVM never sees a damaged one.
+LLVM never sees a damaged one. A process that needs what another one compiles waits, and loads it.
 
 No cache is a condition. What cannot be loaded is compiled, and what cannot be kept (a full disk, a
 folder of another user) is compiled anew by each process; a warning says so once.
@@ -92,6 +92,10 @@ present: dict[str, int] = {}
 """The kernels that this process can run, by name, each with its lines of source: what was compiled
 or loaded, and what it calls."""
 
+LONGEST_SECONDS = 120.0
+"""How long a process waits for a kernel that another one compiles. No kernel takes as long: the
+other was stopped, and is not waited for again."""
+
 _CHECKSUM = hashlib.sha256().digest_size
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
@@ -128,19 +132,23 @@ def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
     files: Any = type(numbas_own._cache_file)
     replaced: Any = type(compiled._cache)
     _check_verbs(files, replaced)
-    numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
-    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded', function)
-    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled', function)
+    ours = numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
+    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded', function, ours)
+    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled', function, ours)
     compiled._cache = numbas_own
 
 
 def _or_none(
-    use_cache: Callable[..., Any], counted_as: str, function: Callable[..., Any]
+    use_cache: Callable[..., Any],
+    counted_as: str,
+    function: Callable[..., Any],
+    files: _FilePerKey,
 ) -> Callable[..., Any]:
     """`use_cache`, which gives None and warns where it failed: the kernel is compiled then. Counts
     in `kernels` and `present` what was found, or is to be kept."""
 
     def guarded(*args: Any) -> Any:
+        found = None
         try:
             found = use_cache(*args)
             if found is None and getattr(_thread, 'only_kept', False):
@@ -155,6 +163,9 @@ def _or_none(
         except Exception as error:  # whatever it is, it is no reason to end a node
             _warn_of_no_cache(getattr(error, 'strerror', None) or type(error).__name__)
             return None
+        finally:
+            if counted_as == 'compiled' or found is not None:
+                files.end()
 
     return guarded
 
@@ -381,8 +392,10 @@ class _FilePerKey:
     """One file for each state of the sources and each key, which numba makes of the argument
     types, the processor and the bytecode."""
 
+    patience = LONGEST_SECONDS
+
     def __init__(self, folder: Path, function: Callable[..., Any]):
-        self.folder = folder
+        self.folder, self._locked = folder, list[tuple[Path, int]]()
         # Who installed the package may have compiled it for those who can only read it.
         beside = Path(inspect.getfile(function)).parent / '__pycache__'
         self._readable = [folder] if getattr(numba.config, 'CACHE_DIR', '') else [folder, beside]
@@ -395,6 +408,37 @@ class _FilePerKey:
         self._stem = f'{self._base}{_short_digest(self._stamp)}.'
 
     def load(self, key: Any) -> Any:
+        found = self._find(key)
+        if found is None and not getattr(_thread, 'only_kept', False):
+            self._begin(key)
+            found = self._find(key)
+        return found
+
+    def _begin(self, key: Any) -> None:
+        """Wait for another process that compiles this kernel, and have others wait for this one
+        until `end`. Callees wait for nobody who waits for them, so no two wait for each other."""
+        from ..files import lock  # here, because compiled code does not depend on that file
+
+        give_up = time.monotonic() + _FilePerKey.patience
+        path = self._path_of(key).with_suffix('.lock')
+        with contextlib.suppress(OSError):  # no folder, no locks, or a file of another user
+            handle = os.open(path, os.O_RDWR | os.O_CREAT)
+            self._locked.append((path, handle))
+            while time.monotonic() < give_up:
+                try:
+                    return lock(handle)
+                except BlockingIOError:
+                    time.sleep(0.02)
+            _FilePerKey.patience = 0.0
+
+    def end(self) -> None:
+        """Let others load what this process has compiled, or not."""
+        while self._locked:
+            path, handle = self._locked.pop()
+            path.unlink(missing_ok=True)  # who waits for it has it open, and looks again
+            os.close(handle)
+
+    def _find(self, key: Any) -> Any:
         for folder in self._readable:
             found = self._load(folder / self._path_of(key).name, key)
             if found is not None:
@@ -435,7 +479,7 @@ class _FilePerKey:
     def _files(self) -> Iterator[Path]:
         """The files of this kernel, of any state of the sources."""
         for path in self.folder.iterdir():
-            if path.name.startswith(self._base) and path.suffix == '.nbc':
+            if path.name.startswith(self._base) and path.suffix in ('.nbc', '.lock'):
                 yield path
 
     def _tidy(self) -> None:

@@ -62,7 +62,8 @@ def command(
     """
     from ..offline.jobs import processes
 
-    chosen = systems or tuple(SYSTEMS)
+    # What takes longest first, so that no process is left with it at the end.
+    chosen = sorted(systems or SYSTEMS, key=lambda name: -SYSTEMS[name].all_kernels[1])
     if (params or overrides) and len(chosen) != 1:
         raise click.UsageError('--params and --set need exactly one system')
     configs = {system: load_config(SYSTEMS[system], params, overrides)[0] for system in chosen}

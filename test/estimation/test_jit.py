@@ -30,7 +30,9 @@ import numba
 from numba.core import caching
 import pytest
 
+from sonar_imm import files
 from sonar_imm.estimation import jit
+from sonar_imm.files import lock
 
 ROOT = Path(__file__).parents[2]
 
@@ -555,6 +557,55 @@ def test_another_process_compiles_and_this_one_loads(stranger, elsewhere):
     assert jit.kept(stranger.work) and jit.kernels - before == {'compiled': 1, 'loaded': 1}
     elsewhere.compile('work')  # nothing is left
     assert jit.kernels - before == {'compiled': 1, 'loaded': 1}
+
+
+@pytest.fixture
+def at_it(stranger, tmp_path):
+    """As if another process were compiling `stranger.halved`: the file that it has locked, and
+    what it will write, with its name."""
+    code = f'import sys; sys.path.append({str(tmp_path)!r}); import stranger; stranger.work()'
+    run(code, ROOT, tmp_path / 'kernels')
+    (made,) = (tmp_path / 'kernels').rglob('*.nbc')
+    content = made.read_bytes()
+    made.unlink()
+    with made.with_suffix('.lock').open('w') as locked:
+        lock(locked.fileno())
+        yield locked, made, content
+    assert not list((tmp_path / 'kernels').rglob('*.lock'))
+
+
+def test_what_another_process_compiles_is_waited_for_and_loaded(stranger, at_it, monkeypatch):
+    """The command, a node and `warm` start side by side, and need the same kernels."""
+    locked, made, content = at_it
+    waited = []
+
+    def ends(seconds):
+        waited.append(seconds)
+        if len(waited) == 3:
+            made.write_bytes(content)
+            locked.close()
+
+    monkeypatch.setattr(jit.time, 'sleep', ends)
+    before = jit.kernels.copy()
+    stranger.work()
+    assert len(waited) == 3 and jit.kernels - before == {'loaded': 1}
+
+
+def test_nobody_waits_for_ever_nor_twice(stranger, at_it, monkeypatch):
+    """For a process that was stopped while it compiled."""
+    monkeypatch.setattr(jit._FilePerKey, 'patience', 0.1)
+    before = jit.kernels.copy()
+    stranger.work()
+    assert jit.kernels - before == {'compiled': 1} and jit._FilePerKey.patience == 0.0
+
+
+def test_without_locks_a_kernel_is_compiled_at_once(stranger, at_it, monkeypatch):
+    """As on Windows, and on file systems without them."""
+    monkeypatch.setattr(files, 'fcntl', None)
+    monkeypatch.setattr(jit.time, 'sleep', None)
+    before = jit.kernels.copy()
+    stranger.work()
+    assert jit.kernels - before == {'compiled': 1}
 
 
 def test_what_cannot_be_kept_elsewhere_is_compiled_here(stranger):
