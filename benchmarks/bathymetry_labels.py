@@ -150,8 +150,8 @@ def exact(seen: Look, std: float, kept: float) -> FloatArray:
     step[-1, :-1], step[-1, -1] = BECOMES_ROUGH * law, 1.0 - BECOMES_ROUGH
     T = len(ping.ranges)
     level, sines, work = np.zeros((T, len(places))), np.empty(len(places)), np.empty((4, 256))
-    for t in np.flatnonzero(ping.echo):
-        state_log_likelihoods(places, ping, t, sines, work, level[t])
+    for k in np.flatnonzero(ping.echo).tolist():
+        state_log_likelihoods(places, ping, k, sines, work, level[k])
     level = np.exp(level - level.max(axis=1, keepdims=True))
     share = BECOMES_ROUGH / (BECOMES_ROUGH + BECOMES_SMOOTH)
     before = np.empty_like(level)

@@ -23,6 +23,7 @@ Of bins with two heights: `rmse`, both against the nearest surface that answers,
 standard deviations, the median `sd`, and `outer`: both the lowest and the highest surface met
 within .6 m. Surfaces count at their mean height; that of a round face lies between the parts above
 and below its nearest one, where nothing is. `facets`: the same against the nearest facet.
+`ranges`: the share that is caught, of all objects, by the slant range of the bin.
 `existence`: how often there are two where the tracker says so, over all objects.
 `ship`: the same below a ship in a swell, from the soundings and the two strongest surfaces.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
@@ -37,7 +38,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bathymetry_layover import FLAT, objects, SIZES
+from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
 from benchmarks.layover_tables import circular
 from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, rms, study
@@ -75,9 +76,11 @@ class Tally:
         self.of_three: list[FloatArray] = []
         self.stated: list[FloatArray] = []
         self.true: list[BoolArray] = []
+        self.ranges: list[FloatArray] = []
+        self.pair: list[BoolArray] = []
 
-    def add(self, estimate: Estimate, facets: Facets) -> None:
-        """One ping, and the facets that it sees."""
+    def add(self, ranges: FloatArray, estimate: Estimate, facets: Facets) -> None:
+        """One ping with bins at these ranges (T,), and the facets that it sees."""
         power, height = surfaces_of(facets, len(estimate))
         number = second_of(power, height)[0]
         double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
@@ -85,6 +88,8 @@ class Tally:
         pair = surfaces == 2
         self.double, self.single = self.double + int(double.sum()), self.single + int(single.sum())
         self.caught += int((pair & double).sum())
+        self.ranges.append(ranges[double])
+        self.pair.append(pair[double])
         self.doubt += int((~valid & (surfaces == 1) & double).sum())
         self.silent += int(((surfaces == 0) & double).sum())
         self.false += int((pair & single).sum())
@@ -253,12 +258,17 @@ def main(pings: int = 40, seed: int = 4) -> Parts:
     stated: list[FloatArray] = []
     true: list[BoolArray] = []
     for name, changes in SETTINGS.items():
+        ranges: list[FloatArray] = []
+        pair: list[BoolArray] = []
         for kind in SIZES:
             tally = Tally()
             for snapshot, facets in objects(kind, pings, seed, changes):
-                tally.add(tracked(snapshot), facets)
+                tally.add(snapshot.range, tracked(snapshot), facets)
             yield {'objects': {f'{kind}, {name}': tally.row()}}
             stated, true = stated + tally.stated, true + tally.true
+            ranges, pair = ranges + tally.ranges, pair + tally.pair
+        for band, row in by_range(ranges, pair).items():
+            yield {'ranges': {f'{name}, {band}': row}}
     for name, row in calibration(np.concatenate(stated), np.concatenate(true)):
         yield {'existence': {name: row}}
     for kind in SIZES:

@@ -102,7 +102,7 @@ def test_the_table_is_normalised_so_that_its_mean_under_one_surface_is_one():
             ratio = np.exp(layover.log_ratio(L, snr, staves, float(fades)))
             # At high ratios rare bins say much, and the mean of a sample is uncertain.
             error = ratio.std() / math.sqrt(6000)
-            assert error < (0.003 if decibels < 10.0 else 0.7)
+            assert error < (0.01 if decibels < 10.0 else 0.7)
             assert ratio.mean() == pytest.approx(1.0, abs=0.01 + 4.0 * error)
 
 
