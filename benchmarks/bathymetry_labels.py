@@ -18,7 +18,9 @@
 
 `cells`: overlap of a rough patch with the bins that are more probably rough than not, for three
 sets of models: the default, `height_bank` and `scatter_bank`. The patch lies at 20 to 26, 40 to 50
-or 58 to 68 m; its heights are white, or correlated as exp(-distance / length). `floors`: the same
+or 58 to 68 m; its heights are white, or correlated as exp(-distance / length). `exact`: what can
+be had at most, by the exact smoother that is told the level of the floor and the law of the
+heights, and the share of bins of which it is not sure (.1 to .9). `floors`: the same
 on slopes and undulations, and with Gaussian correlation. `calibration`: bins of all cells in which
 roughness of the patch is detectable, by the probability of rough floor: how many, the mean
 probability and the share that is rough. `verdicts`: bins called smooth and rough, and how many of
@@ -38,6 +40,7 @@ from scipy.special import kve
 from benchmarks.study import Parts, study, truths
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.kernels import state_log_likelihoods
 from sonar_imm.trackers.bathymetry.ping import (
     CANNOT_TELL,
     estimate_of,
@@ -58,7 +61,7 @@ SETS = {
     'scatter_bank': BathymetryConfig(model_set='scatter_bank', layover='ignored'),
 }
 PATCHES = {'20-26 m': (20.0, 26.0), '40-50 m': (40.0, 50.0), '58-68 m': (58.0, 68.0)}
-STDS = (0.2, 0.3, 0.5)
+STDS = (0.1, 0.2, 0.3, 0.5)
 LENGTHS = {'white': 0.0, '.3 m': 0.3, '1 m': 1.0}
 FLOORS: dict[str, dict[str, Any]] = {
     'slope .1': {'slope': 0.1},
@@ -75,6 +78,10 @@ FLOORS: dict[str, dict[str, Any]] = {
         'undulation_length': 15.0,
     },
 }
+BECOMES_ROUGH, BECOMES_SMOOTH = 1.0 / 400.0, 1.0 / 200.0
+"""Per bin, as `exact` is told: the patches have 120 to 200 of 600 bins."""
+CELLS, REACH = 121, 5.0
+"""Of the grid of `exact`, and how many standard deviations of the roughness it reaches."""
 AROUND, WHOLE = 15.0, 1e3
 """Of a ping the bins so near to the middle of the patch are used, m: of `floors` all."""
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
@@ -126,6 +133,42 @@ class Labels:
         }
 
 
+def exact(seen: Look, std: float, kept: float) -> FloatArray:
+    """Probability (T,) of rough floor on flat floor at height 0 whose roughness is normal with a
+    standard deviation of `std` m and a correlation of `kept` from bin to bin; forward-backward
+    over smooth floor and the heights of rough floor."""
+    ping = seen.likelihood
+    heights = std * np.linspace(-REACH, REACH, CELLS)
+    places = np.append(heights, 0.0)
+    law = np.exp(-0.5 * np.square(heights / std))
+    law /= law.sum()
+    off = (heights[None, :] - kept * heights[:, None]) / (std * np.sqrt(1.0 - kept * kept))
+    walk = np.exp(-0.5 * np.square(off))
+    walk /= walk.sum(axis=1, keepdims=True)
+    step = np.zeros((CELLS + 1, CELLS + 1))
+    step[:-1, :-1], step[:-1, -1] = (1.0 - BECOMES_SMOOTH) * walk, BECOMES_SMOOTH
+    step[-1, :-1], step[-1, -1] = BECOMES_ROUGH * law, 1.0 - BECOMES_ROUGH
+    T = len(ping.ranges)
+    level, sines, work = np.zeros((T, len(places))), np.empty(len(places)), np.empty((4, 256))
+    for k in np.flatnonzero(ping.echo).tolist():
+        state_log_likelihoods(places, ping, k, sines, work, level[k])
+    level = np.exp(level - level.max(axis=1, keepdims=True))
+    share = BECOMES_ROUGH / (BECOMES_ROUGH + BECOMES_SMOOTH)
+    before = np.empty_like(level)
+    p = np.append(share * law, 1.0 - share)
+    for t in range(T):
+        before[t] = p
+        p = p * level[t]
+        p = p / p.sum() @ step
+    rough, later = np.empty(T), np.ones(len(places))
+    for t in range(T - 1, -1, -1):
+        later = later * level[t] / later.max()
+        p = before[t] * later
+        rough[t] = p[:-1].sum() / p.sum()
+        later = step @ later
+    return rough
+
+
 def pings(
     changes: Mapping[str, Any], count: int, seed: int, around: float = AROUND
 ) -> Iterator[tuple[Snapshot, Any]]:
@@ -148,6 +191,20 @@ def part_of(table: Any, bins: BoolArray) -> Any:
             if isinstance(value, np.ndarray) and len(value) == len(bins)
         },
     )
+
+
+def most(changes: Mapping[str, Any], count: int, seed: int, length: float) -> tuple[float, float]:
+    """Overlap of `exact` with the patch, and the share of bins of which it is not sure."""
+    both = either = unsure = bins = 0
+    for snapshot, truth in pings(changes, count, seed):
+        seen = look(Ping(SETS['two walks'], snapshot, None))
+        kept = float(np.exp(-np.diff(snapshot.range).mean() / length)) if length else 0.0
+        used = truth.valid & seen.likelihood.echo
+        p, patch = exact(seen, changes['patch_std'], kept)[used], truth.patch[used]
+        both += int(((p > 0.5) & patch).sum())
+        either += int(((p > 0.5) | patch).sum())
+        unsure, bins = unsure + int(((p > 0.1) & (p < 0.9)).sum()), bins + len(p)
+    return both / either, unsure / bins
 
 
 def labelled(
@@ -253,6 +310,7 @@ def main(count: int = 3, seed: int = 1, only: str = '') -> Parts:
                     for name, labels in found.items():
                         whole[name].extend(labels)
                     row = {name: labels.overlap() for name, labels in found.items()}
+                    row['exact'], row['exact_unsure'] = most(changes, count, seed, length)
                     yield {'cells': {f'{place}, {std:g} m, {kind}': row}}
         yield {'calibration': {name: calibration(labels) for name, labels in whole.items()}}
         yield {'verdicts': {name: verdicts(labels) for name, labels in whole.items()}}

@@ -21,17 +21,19 @@ of 2 to 6 m or a boulder of .6 to 2 m radius; or none. A bin has two surfaces if
 lies .5 m or more beside the strongest, at most 15 dB below it and at 0 dB or more at a stave; it
 has one if no other answers. `soundings`: share of the bins with two that become soundings, of
 these `near`: inside two standard deviations of a surface, and `rmse` to the nearest; with layover
-ignored where it says so, else gated.
+ignored where it says so, else gated. `ranges`: the share of those with two that are caught, of all
+objects, by the slant range of the bin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.study import Parts, study
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.hearing import snr
@@ -46,6 +48,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 SIZES = {'ledge': (0.8, 3.0), 'box': (1.0, 4.0), 'wall': (2.0, 6.0), 'boulder': (0.6, 2.0)}
 FAINT = {'snr_near_db': 20.0, 'snr_far_db': 0.0}
 THERMAL = {'noise_fades': False}
+BANDS = ((17.0, 30.0), (30.0, 40.0), (40.0, 50.0), (50.0, 77.0))
 SETTINGS: dict[str, dict[str, Any]] = {
     '8 staves, 30-10 dB': {},
     '8 staves, 20-0 dB': FAINT,
@@ -79,6 +82,8 @@ class Bins:
         self.double = self.caught = self.single = self.lost = self.kept = 0
         self.ignored = self.near_ignored = 0
         self.error_ignored = 0.0
+        self.ranges: list[FloatArray] = []
+        self.marked: list[BoolArray] = []
 
 
 def objects(
@@ -114,6 +119,8 @@ def count(bins: Bins, snapshot: Snapshot, facets: Facets) -> None:
     bins.double, bins.single = bins.double + int(double.sum()), bins.single + int(single.sum())
     bins.caught += int((marked & double).sum())
     bins.lost += int((marked & single).sum())
+    bins.ranges.append(snapshot.range[double])
+    bins.marked.append(marked[double])
     bins.kept += int((gated & double).sum())
     bins.ignored += int((ignored & double).sum())
     bins.near_ignored += int((nearest < 2.0 * sd)[ignored & double].sum())
@@ -133,6 +140,19 @@ def shares(bins: Bins) -> dict[str, float]:
     }
 
 
+def by_range(
+    ranges: Sequence[FloatArray], caught: Sequence[BoolArray]
+) -> dict[str, dict[str, float]]:
+    """Of bins with two surfaces, at slant ranges and caught or not, how many are, by range."""
+    at, found = np.concatenate(ranges), np.concatenate(caught)
+    table = {}
+    for low, high in BANDS:
+        here = (at >= low) & (at < high)
+        row = {'bins_two': int(here.sum()), 'caught': float(found[here].mean())}
+        table[f'{low:g} to {high:g} m'] = row
+    return table
+
+
 def lost(name: str, pings: int, seed: int) -> dict[str, float]:
     """Bins of a floor without objects that are gated, and the worst ping."""
     scene_name, changes = FLAT[name]
@@ -149,11 +169,16 @@ def lost(name: str, pings: int, seed: int) -> dict[str, float]:
 def main(pings: int = 40, seed: int = 1) -> Parts:
     yield {'pings': pings, 'seed': seed}
     for name, changes in SETTINGS.items():
+        ranges: list[FloatArray] = []
+        marked: list[BoolArray] = []
         for kind in SIZES:
             bins = Bins()
             for ping in objects(kind, pings, seed, changes):
                 count(bins, *ping)
             yield {'objects': {f'{kind}, {name}': shares(bins)}}
+            ranges, marked = ranges + bins.ranges, marked + bins.marked
+        for band, row in by_range(ranges, marked).items():
+            yield {'ranges': {f'{name}, {band}': row}}
     for name in FLAT:
         yield {'floors': {name: lost(name, pings, seed)}}
 

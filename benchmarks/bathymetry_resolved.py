@@ -23,8 +23,11 @@ Of bins with two heights: `rmse`, both against the nearest surface that answers,
 standard deviations, the median `sd`, and `outer`: both the lowest and the highest surface met
 within .6 m. Surfaces count at their mean height; that of a round face lies between the parts above
 and below its nearest one, where nothing is. `facets`: the same against the nearest facet.
+`ranges`: the share that is caught, of all objects, by the slant range of the bin.
 `existence`: how often there are two where the tracker says so, over all objects.
 `ship`: the same below a ship in a swell, from the soundings and the two strongest surfaces.
+`rays`: two level surfaces along 120 bins below a ship, as the array of `moving` and of
+`moving_profile` has their directions, under which rays bend.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
 what the tracker reaches along 60 bins. `cost`: CPU time, see `benchmarks.speed.bathymetry`.
 """
@@ -35,18 +38,20 @@ from collections.abc import Iterator
 import math
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
-from benchmarks.bathymetry_layover import FLAT, objects, SIZES
+from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
 from benchmarks.layover_tables import circular
 from benchmarks.speed.bathymetry import bench_layover
-from benchmarks.study import Parts, rms, study
+from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.acoustics import array
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm.truth import TrueProfile
+from sonar_imm_tools.simulation.bathymetry.hearing import snr
 from sonar_imm_tools.simulation.bathymetry.objects import Facets, second_of, surfaces_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
@@ -60,6 +65,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 CLASSES = (0.0, 0.01, 0.3, 0.5, 0.7, 0.95, 0.99, 1.0 + 1e-6)
 APART, RATIOS = (0.3, 0.5, 1.0, 2.0, 4.0), (10.0, 20.0, 30.0)
+STRETCH = (38.0, 44.0)
 AT, HEIGHT, TILT = 40.0, 15.0, math.radians(30.0)
 
 
@@ -75,9 +81,11 @@ class Tally:
         self.of_three: list[FloatArray] = []
         self.stated: list[FloatArray] = []
         self.true: list[BoolArray] = []
+        self.ranges: list[FloatArray] = []
+        self.pair: list[BoolArray] = []
 
-    def add(self, estimate: Estimate, facets: Facets) -> None:
-        """One ping, and the facets that it sees."""
+    def add(self, ranges: FloatArray, estimate: Estimate, facets: Facets) -> None:
+        """One ping with bins at these ranges (T,), and the facets that it sees."""
         power, height = surfaces_of(facets, len(estimate))
         number = second_of(power, height)[0]
         double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
@@ -85,6 +93,8 @@ class Tally:
         pair = surfaces == 2
         self.double, self.single = self.double + int(double.sum()), self.single + int(single.sum())
         self.caught += int((pair & double).sum())
+        self.ranges.append(ranges[double])
+        self.pair.append(pair[double])
         self.doubt += int((~valid & (surfaces == 1) & double).sum())
         self.silent += int(((surfaces == 0) & double).sum())
         self.false += int((pair & single).sum())
@@ -203,6 +213,58 @@ def below_ship(kind: str, pings: int, seed: int) -> dict[str, float]:
     }
 
 
+def two_levels(name: str, up: float, pings: int, seed: int) -> dict[str, float]:
+    """Soundings of a level floor below a ship and of another one `up` m higher, which answer
+    together in the bins of `STRETCH`, from the directions that the scene has for either."""
+    rng = np.random.default_rng((seed, round(10.0 * up)))
+    flat = {'patch_std': 0.0, 'noise_fades': False, 'pings': pings}
+    config = scenario(name, flat)
+    higher = scenario(name, {**flat, 'sonar_height': config.sonar_height - up})
+    scene = simulate(config, seed)
+    floors = truths(scene, TrueProfile), truths(simulate(higher, seed), TrueProfile)
+    values = {**config.instruments(), 'navigation': 'required', 'layover': 'resolved'}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
+    made, number = [], 0
+    for item in scene.measurements:
+        measurement = item.measurement
+        if isinstance(measurement, Snapshot):
+            ranges = measurement.range
+            y = math.sqrt(config.noise_variance) * circular(rng, len(ranges), config.staves)
+            for level, floor in enumerate((floors[0][number], floors[1][number])):
+                answers = floor.valid & ((level == 0) | in_stretch(ranges))
+                power = config.noise_variance * snr(config, ranges) * answers
+                sine = np.nan_to_num(np.sin(floor.angle))
+                echo = (
+                    circular(rng, len(ranges), 1) * rng.exponential(size=(len(ranges), 1)) ** 0.5
+                )
+                wave = array.steering(sine, config.staves, config.spacing_wavelengths)
+                y += np.sqrt(power)[:, None] * echo * wave
+            measurement, number = evolve(measurement, iq=y.astype(np.complex64)), number + 1
+        made += tracker.process(measurement)
+    off, sd, caught, false = [], [], 0, 0
+    for estimate, *levels in zip(made, *floors):
+        here = in_stretch(levels[0].range)
+        pair = estimate.extras['surfaces'] == 2
+        caught, false = caught + int((pair & here).sum()), false + int((pair & ~here).sum())
+        for end, level in zip(('', '_2'), levels):
+            off.append((estimate.extras[f'pz{end}'] - level.height)[pair & here])
+            sd.append(np.sqrt(estimate.extras[f'vertical_uncertainty{end}'][pair & here]))
+    errors, stds = np.concatenate(off), np.concatenate(sd)
+    bins = len(made) * int(in_stretch(floors[0][0].range).sum())
+    return {
+        'bins_two': bins,
+        'caught': caught / bins,
+        'false': false / sum(len(estimate) for estimate in made),
+        'rmse_m': rms(errors),
+        'inside': float((np.abs(errors) < 2.0 * stds).mean()),
+        'sd_m': float(np.median(stds)),
+    }
+
+
+def in_stretch(ranges: FloatArray) -> BoolArray:
+    return np.asarray((ranges >= STRETCH[0]) & (ranges < STRETCH[1]))
+
+
 def bound(apart: float, decibels: float, staves: int = 8) -> float:
     """Cramer-Rao bound of two heights at `AT` m, RMS of both sd in m, from one bin of normal
     echoes of known power: F_ij = tr(R^-1 R_i R^-1 R_j), R = I + v (a1 a1^H + a2 a2^H)."""
@@ -253,16 +315,25 @@ def main(pings: int = 40, seed: int = 4) -> Parts:
     stated: list[FloatArray] = []
     true: list[BoolArray] = []
     for name, changes in SETTINGS.items():
+        ranges: list[FloatArray] = []
+        pair: list[BoolArray] = []
         for kind in SIZES:
             tally = Tally()
             for snapshot, facets in objects(kind, pings, seed, changes):
-                tally.add(tracked(snapshot), facets)
+                tally.add(snapshot.range, tracked(snapshot), facets)
             yield {'objects': {f'{kind}, {name}': tally.row()}}
             stated, true = stated + tally.stated, true + tally.true
+            ranges, pair = ranges + tally.ranges, pair + tally.pair
+        for band, row in by_range(ranges, pair).items():
+            yield {'ranges': {f'{name}, {band}': row}}
     for name, row in calibration(np.concatenate(stated), np.concatenate(true)):
         yield {'existence': {name: row}}
     for kind in SIZES:
         yield {'ship': {kind: below_ship(kind, pings, seed)}}
+    for name in ('moving', 'moving_profile'):
+        for up in (1.0, 2.0, 4.0):
+            row = two_levels(name, up, max(pings // 4, 1), seed)
+            yield {'rays': {f'{name}, {up:g} m': row}}
     for decibels in RATIOS:
         for apart in APART:
             name = f'{decibels:g} dB, {apart:g} m'

@@ -25,7 +25,9 @@ say how well one and two plane waves fit, amplitudes taken out::
 L is the log ratio of the likelihoods of the law of `laplace`, whose tails are those of
 exp(-2 sqrt q). What L says at a local signal-to-noise ratio is in a table, log p(L | two) / p(L |
 one), simulated for each number of staves (``python -m benchmarks.layover_tables``) and made
-monotonic by pooling neighbours, so that its mean under one surface stays 1.
+monotonic by pooling neighbours, so that its mean under one surface stays 1. There is one table for
+noise that is the same in all bins and one for noise that fades with the echo, which makes large L
+of one surface: each ping measures between which of them it lies, see `fading`.
 
 One bin says little, runs of bins say much: `existence` is the smoothed probability of the second
 surface in a chain of two states along the ping.
@@ -65,7 +67,11 @@ EVIDENCE = -4.0, 8.0
 """Bounds of what one bin may say, as a log ratio."""
 LEFT = 0.999
 """What two waves leave of a bin is no more than noise leaves in so many bins."""
-LEAST_ERROR, ERROR_MARGIN, FEWEST_BINS = 2e-4, 3.0, 50
+LEAST_ERROR, ERROR_MARGIN, FEWEST_BINS = 2e-4, 2.0, 50
+ALL_FADES = 0.5
+"""From so much of the way to noise that fades on the table is that of such noise: it is the more
+cautious one, and part of the noise suffices for large L."""
+QUARTERS = 0.25, 0.75
 TABLES = Path(__file__).with_name('layover_tables.npz')
 _POINTS = 32
 """Fewest directions of the grid from which the search for two begins: four for each stave, and of
@@ -103,8 +109,9 @@ def layover(
     snr = signal / noise
     error = array_error(rest_1 / noise, snr, staves, usable)
     larger = 1.0 + error * snr
+    fades = fading(rest_1 / (noise * larger), staves, usable)
     level = 2.0 * (np.sqrt(rest_1) - np.sqrt(rest_2)) / np.sqrt(noise * larger)
-    evidence = np.where(usable, log_ratio(level, snr / larger, staves), 0.0)
+    evidence = np.where(usable, log_ratio(level, snr / larger, staves, fades), 0.0)
     if loud is not None and staves > 2:
         most = float(gammaincinv(staves - 2.0, LEFT))
         usable = usable | loud & (rest_2 < most * noise * larger)
@@ -141,7 +148,7 @@ def residuals(iq: ArrayLike, spacing: float) -> tuple[FloatArray, FloatArray, Fl
 def array_error(rest_1: FloatArray, snr: FloatArray, staves: int, usable: BoolArray) -> float:
     """Power that is no plane wave as a share eps of the echo: noise is (1 + eps SNR) as large.
 
-    Three times the median over bins above 20 dB of (R1 / m - 1) / SNR, m the median of R1 without
+    Twice the median over bins above 20 dB of (R1 / m - 1) / SNR, m the median of R1 without
     any error, the gamma distribution of P - 3/2 degrees; at least `LEAST_ERROR`, also where there
     are too few bins to measure it. rest_1 (n,): R1.
     """
@@ -153,9 +160,33 @@ def array_error(rest_1: FloatArray, snr: FloatArray, staves: int, usable: BoolAr
     return max(LEAST_ERROR, ERROR_MARGIN * excess)
 
 
+def fading(rest_1: FloatArray, staves: int, usable: BoolArray) -> float:
+    """How much of the noise fades with the echo, 0 to 1, by the spread of R1, rest_1 (n,), over
+    the ping: noise that fades spreads it more, whatever its power. 1 where there are too few
+    bins."""
+    if np.count_nonzero(usable) < FEWEST_BINS:
+        return 1.0
+    steady, fades = _spreads(staves)
+    rest = np.maximum(rest_1[usable], np.finfo(float).tiny)
+    low, high = np.quantile(np.log(rest), QUARTERS)
+    return float(np.clip((high - low - steady) / (fades - steady) / ALL_FADES, 0.0, 1.0))
+
+
+@lru_cache(maxsize=16)
+def _spreads(staves: int) -> tuple[float, float]:
+    """Distance between the quartiles of log R1 in noise that is steady, gamma-distributed R1, and
+    in noise that fades, a product with an exponential number."""
+    p = (np.arange(200) + 0.5) / 200
+    steady = np.log(gammaincinv(staves - 1.5, p))
+    fades = np.add.outer(steady, np.log(-np.log1p(-p)))
+    (a, b), (c, d) = np.quantile(steady, QUARTERS), np.quantile(fades, QUARTERS)
+    return float(b - a), float(d - c)
+
+
 class Table(NamedTuple):
-    """value (S, K): log ratio of two surfaces to one in the classes of L between edges (K + 1,),
-    at signal-to-noise ratios of decibels (S,), evenly spaced."""
+    """value (2, S, K): log ratio of two surfaces to one in the classes of L between edges
+    (K + 1,), at signal-to-noise ratios of decibels (S,), evenly spaced; for noise that is steady,
+    and for noise that fades with the echo."""
 
     edges: FloatArray
     decibels: FloatArray
@@ -171,9 +202,11 @@ def table_of(staves: int) -> Table:
         return Table(tables['edges'], tables['decibels'], tables[f'value_{of}'].astype(float))
 
 
-def log_ratio(level: FloatArray, snr: FloatArray, staves: int) -> FloatArray:
-    """What L (n,) says at local signal-to-noise ratios (n,): log p(L | two) / p(L | one)."""
-    edges, decibels, value = table_of(staves)
+def log_ratio(level: FloatArray, snr: FloatArray, staves: int, fades: float) -> FloatArray:
+    """What L (n,) says at local signal-to-noise ratios (n,): log p(L | two) / p(L | one), where so
+    much of the noise, 0 to 1, fades with the echo."""
+    edges, decibels, of_noise = table_of(staves)
+    value = (1.0 - fades) * of_noise[0] + fades * of_noise[1]
     with np.errstate(divide='ignore'):
         place = (10.0 * np.log10(snr) - decibels[0]) / (decibels[1] - decibels[0])
     place = np.clip(place, 0.0, len(decibels) - 1.0)
