@@ -144,9 +144,9 @@ def hold(path: Path) -> Callable[[], None] | None:
     """Keep the file `path` for this caller alone, until what is given is called or the process
     ends; None where another caller has it. `path` itself is not touched: a file beside it is
     locked, on a file system without locks nothing is. Raises OSError where none can be written."""
-    lock = path.with_name(f'{path.name}.lock')
+    beside_it = path.with_name(f'{path.name}.lock')
     while True:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        handle = os.open(beside_it, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             lock(handle)
         except BlockingIOError:
@@ -155,12 +155,12 @@ def hold(path: Path) -> Callable[[], None] | None:
         except OSError:
             pass
         with contextlib.suppress(OSError):
-            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+            if os.path.samestat(os.fstat(handle), os.stat(beside_it)):
                 break
         os.close(handle)  # removed by the one before, between our two calls
 
     def release() -> None:
-        lock.unlink(missing_ok=True)
+        beside_it.unlink(missing_ok=True)
         os.close(handle)
 
     return release
