@@ -100,10 +100,9 @@ def test_the_table_is_normalised_so_that_its_mean_under_one_surface_is_one():
             L = levels(snapshots(6000, staves, decibels, 1, rng, fades))
             snr = np.full(6000, 10.0 ** (0.1 * decibels))
             ratio = np.exp(layover.log_ratio(L, snr, staves, float(fades)))
-            # At high ratios rare bins say much, and the mean of a sample is uncertain.
-            error = ratio.std() / math.sqrt(6000)
-            assert error < (0.01 if decibels < 10.0 else 0.7)
-            assert ratio.mean() == pytest.approx(1.0, abs=0.01 + 4.0 * error)
+            # At high ratios rare bins say much: the mean of a sample is uncertain, and so is what
+            # the sample says of its error.
+            assert ratio.mean() == pytest.approx(1.0, abs=0.01 if decibels < 10.0 else 0.7)
 
 
 @pytest.mark.parametrize('staves, least', [(2, 0.7), (4, 0.9), (8, 0.9), (32, 0.9)])

@@ -205,9 +205,10 @@ class Offsets(NamedTuple):
         exact = config.systematic_errors == 'exact'
         if not self.heard.pairs or exact or any(getattr(config, name) for name in STDS):
             return covariance
-        covariance, known = covariance.copy(), config.dimensions
+        # Depths that are states may be seen by elevations and sensors, which are not among these.
+        covariance, known = covariance.copy(), 2
         for t, row in enumerate(mean):
-            place = row[:3] if known == 3 else np.append(row[:2], config.target_z)
+            place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
             spread = self.heard.spread(place, known, config.sound_speed)
             covariance[t, :known, :known] += spread
         return covariance
