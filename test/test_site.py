@@ -148,7 +148,8 @@ def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
 
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
     page = (
-        '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n</tr>\n</thead>\n'
+        '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n'
+        '</tr>\n</thead>\n'
         '<tbody>\n<tr>\n<td>1</td>\n<td style="x">2</td>\n</tr>\n</tbody>\n</table></p><td>'
     )
     shown = made.on_page_content(page, None, None, None)
