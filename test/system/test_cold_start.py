@@ -30,7 +30,7 @@ from sonar_imm_tools.replay.link import Link
 pytestmark = pytest.mark.system
 LIMIT = 240.0
 ANSWER = 2.0
-"""Seconds in which a service is answered, unless other work holds the machine for a moment."""
+"""Seconds in which a service is answered."""
 
 
 @pytest.mark.parametrize('system', ['diver', 'obstacle'])
@@ -55,17 +55,15 @@ def test_a_node_answers_and_reports_while_it_compiles(system, tmp_path, monkeypa
             return any(re.match(r'compiling \d+ of \d+ kernels, once', s) for s in sentences)
 
         wait_for(client.service_is_ready)
-        took = []
         for _ in range(3):
             begun = time.monotonic()
             request = GetParameters.Request(names=['frame_id'])
             client.call_async(request).add_done_callback(answers.append)
             wait_for(lambda: answers and answers.pop())
-            took.append(time.monotonic() - begun)
+            assert time.monotonic() - begun < ANSWER
             del reports[:]
             wait_for(compiles)
-        assert 'ready, hears' not in node.log(), 'all three came while it compiled'
-        assert min(took) < ANSWER
+        assert 'ready, hears' not in node.log()
 
 
 def test_a_node_that_had_to_compile_has_the_memory_of_one_that_had_not(tmp_path, monkeypatch):
