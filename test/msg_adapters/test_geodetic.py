@@ -18,7 +18,7 @@ from helpers.marine import driver_message
 import numpy as np
 import pytest
 
-from msg_adapters.geodetic import (
+from msg_adapters.fixes import (
     doubt_geodetic,
     read_geodetic,
     read_vessel_fix,

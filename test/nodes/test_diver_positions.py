@@ -21,9 +21,8 @@ from sensor_msgs.msg import NavSatFix, PointCloud2
 from std_srvs.srv import Trigger
 
 from msg_adapters.estimates import read_estimate
-from msg_adapters.geodetic import read_geodetic, write_geodetic
+from msg_adapters.fixes import read_geodetic, write_geodetic, write_relative
 from msg_adapters.navigation import write_navigation
-from msg_adapters.relative import write_relative
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import GeodeticFix, RelativeFix, VesselPose
 from sonar_imm.nodes.diver import DiverNode
