@@ -112,6 +112,21 @@ def test_a_false_fix_in_clutter_is_not_published():
     assert row == pytest.approx(1.2e-5 / (1.2e-5 + 4e-4))
 
 
+@pytest.mark.parametrize('most', [1, 2])
+def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
+    """The share of one track in one fix, by Bayes: of a second diver only where there may be."""
+    config = DiverConfig(max_tracks=most, clutter_density=1e-5, birth_density=1e-4)
+    tracker = DiverTracker(config)
+    run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
+    now, _ = tracker._predict(tracker._stream.state, 11 * SECOND)
+    (fixes,) = tracker._scan(now, [scan(11, (7.5, 1.9))]).fixes
+    found = tracker._associate(now, fixes)
+    p, r = config.detection_probability, now.existence[0]
+    seen = r * p * np.exp(found.densities.whole[0, 0]) / (1e-5 + (most - 1) * 1e-4)
+    assert 0.01 < found.weights.beta[0, 0] < 0.99
+    assert found.weights.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
+
+
 def test_a_diver_is_confirmed_by_existence_and_evidence():
     tracker = DiverTracker(DiverConfig(association='jipda'))
     states = []
