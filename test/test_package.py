@@ -253,6 +253,14 @@ def test_ci_files_call_what_has_to_pass() -> None:
     assert 'PYTHON=python3 .ci/run' in lab['.run']['script']
 
 
+def test_tests_that_start_processes_lie_where_make_looks_for_them() -> None:
+    """Collecting all the others takes longer than many of them."""
+    marked = [
+        path for path in (ROOT / 'test').rglob('*.py') if f'mark.{"system"}' in path.read_text()
+    ]
+    assert {path.relative_to(ROOT / 'test').parts[0] for path in marked} == {'system'}
+
+
 def test_a_release_is_told_what_only_its_owner_can_fill_in(tmp_path: Path) -> None:
     spec = importlib.util.spec_from_file_location('placeholders', ROOT / '.ci/placeholders.py')
     assert spec and spec.loader

@@ -245,6 +245,11 @@ def test_a_part_of_another_system_makes_a_page():
     assert 'Length' in front_html([part(), other], ['1.html', '2.html'])
 
 
+def test_a_topic_of_another_name_is_told_with_what_it_was_read_as():
+    run = {**RUN, 'topics': {'/boat/fix': 'fix', '/gps': 'fix'}}
+    assert Part(run=run, metrics={}, summary='').input == '/boat/fix, /gps as fix'
+
+
 SCRIPT = '<script>alert(1)</script>'
 
 
