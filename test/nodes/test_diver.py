@@ -12,9 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diver node: its displays, and positions on Earth, from a vessel and with names."""
+"""The diver node's displays: odometry of every confirmed diver, probabilities of one."""
+
+import math
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -22,14 +25,18 @@ from sensor_msgs.msg import JointState, NavSatFix, PointCloud2
 from std_srvs.srv import Trigger
 
 from msg_adapters.estimates import read_estimate
-from msg_adapters.fixes import write_fix
-from msg_adapters.geodetic import read_geodetic, write_geodetic
+from msg_adapters.fixes import (
+    read_geodetic,
+    write_fix,
+    write_geodetic,
+    write_relative,
+    write_start,
+)
 from msg_adapters.navigation import write_navigation
-from msg_adapters.relative import write_relative
 from msg_adapters.scans import write_scan
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, VesselPose
+from sonar_imm.measurements import Fix, Fixes, GeodeticFix, RelativeFix, Start, VesselPose
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import lockstep_qos
@@ -203,7 +210,7 @@ def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
     assert states[2:] == [[1]] * 4 + [[2]]
 
 
-# -- positions on Earth and from a vessel ---------------------------------------------------------
+# -- The diver node with positions as users have them: on Earth, from a vessel, with names --
 
 
 ORIGIN = Origin(59.0, 10.0)
@@ -327,3 +334,62 @@ def test_a_tag_has_a_topic_of_its_own(make_bench):
 def test_a_type_that_is_not_installed_is_one_sentence(make_bench):
     with pytest.raises(ConfigError, match='BeaconInfo is not installed here'):
         start(make_bench, 'relative_type:=stonefish_ros2/msg/BeaconInfo')
+
+
+# -- ``~/initial`` of the diver node: a track begins where somebody says that a diver is --
+
+
+POSE = PoseWithCovarianceStamped
+
+
+def told(second, x, frame_id='map'):
+    return write_start(
+        Start(
+            stamp_ns=second * SECOND,
+            position=[x, 2.0, 0.0],
+            covariance=np.eye(2),
+            frame_id=frame_id,
+        ),
+        make,
+    )
+
+
+def test_a_start_begins_a_track_and_a_useless_one_is_refused_by_name(make_bench, capfd):
+    bench = make_bench()
+    node = bench.add(DiverNode(context=bench.context))
+    estimates = bench.listen(PointCloud2, '/diver/estimate')
+    initial = bench.peer.create_publisher(POSE, '/diver/initial', 10)
+    fixes = bench.peer.create_publisher(POSE, '/fix', 10)
+    bench.spin_until(
+        lambda: (
+            initial.get_subscription_count()
+            and fixes.get_subscription_count()
+            and node.count_subscribers('/diver/estimate')
+        )
+    )
+
+    def send(publisher, message):
+        before = node._meter.received.total()
+        publisher.publish(message)
+        bench.spin_until(lambda: node._meter.received.total() > before)
+
+    send(initial, told(1, 5.0))
+    bench.spin_until(lambda: estimates)
+    first = read_estimate(estimates[0])
+    assert first.extras['track_state'].tolist() == [1] and first.xyz[0].tolist() == [5.0, 2.0, 0.0]
+    fix = Fix(stamp_ns=2 * SECOND, position=[5.5, 2.0, 0.0], frame_id='map')
+    send(fixes, write_fix(fix, make))
+    bench.spin_until(lambda: len(estimates) == 2)
+    assert read_estimate(estimates[1]).extras['track_id'].tolist() == [1]
+
+    nan, unknown = told(3, math.pi), told(3, 4.0)
+    nan.pose.pose.position.x = math.nan
+    unknown.pose.covariance = np.zeros(36)
+    for bad in (nan, unknown, told(3, 4.0, frame_id='odom')):
+        send(initial, bad)
+    assert node._meter.refused == {'nan': 1, 'no_covariance': 1, 'frame': 1}
+    assert node._meter.received == {'initial': 4, 'fix': 1} and len(estimates) == 2
+    errors = capfd.readouterr().err
+    assert "the frame 'odom' is not the frame 'map' of the tracks" in errors
+    assert 'the start has no covariance of x and y' in errors
+    assert 'the start has a position that is not finite' in errors

@@ -95,13 +95,13 @@ def test_no_scan_is_no_evidence():
 
 
 def test_existence_is_published_and_not_a_number_where_hits_are_counted():
-    soft_one, hard = (DiverTracker(DiverConfig(association=name)) for name in ('jipda', 'gnn'))
+    jipda, gnn = (DiverTracker(DiverConfig(association=name)) for name in ('jipda', 'gnn'))
     for second in range(1, 6):
-        for tracker in (soft_one, hard):
+        for tracker in (jipda, gnn):
             (estimate,) = tracker.process(scan(second, (0.0, 0.0)))
             known = estimate.extras['existence']
-            assert len(known) == 1 and (np.isfinite(known).all() == (tracker is soft_one))
-            assert tracker is hard or 0.5 < known[0] <= 1.0
+            assert len(known) == 1 and (np.isfinite(known).all() == (tracker is jipda))
+            assert tracker is gnn or 0.5 < known[0] <= 1.0
 
 
 def test_a_false_fix_in_clutter_is_not_published():
@@ -178,10 +178,10 @@ def test_late_scans_give_the_same_bits(association):
 def test_crossing_in_clutter_is_better_softly():
     from benchmarks.diver_crossing import case
 
-    hard, soft_one = (case(0.9, 10.0, name, 2) for name in ASSOCIATIONS)
-    assert soft_one['GOSPA, rms'] <= 2.7 < 3.5 < hard['GOSPA, rms']
-    assert soft_one['false tracks/h'] == 0.0 and soft_one['identities kept'] == 1.0
-    assert soft_one['NEES'] < 2.6
+    gnn, jipda = (case(0.9, 10.0, name, 2) for name in ASSOCIATIONS)
+    assert jipda['GOSPA, rms'] <= 2.7 < 3.5 < gnn['GOSPA, rms']
+    assert jipda['false tracks/h'] == 0.0 and jipda['identities kept'] == 1.0
+    assert jipda['NEES'] < 2.6
 
 
 def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
