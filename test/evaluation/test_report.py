@@ -28,9 +28,8 @@ from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.diver import figures
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sentence
-from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
 from sonar_imm_tools.evaluation.plotting import in_degrees, scale_length
