@@ -71,6 +71,8 @@ FLAT: dict[str, tuple[str, dict[str, Any]]] = {
     '0.5 % differ': ('thermal', {'decorrelation': 0.005}),
     '2 staves': ('thermal', {'staves': 2}),
     '4 staves': ('thermal', {'staves': 4}),
+    'surface echoes, not told': ('multipath', THERMAL),
+    'surface echoes at -10 dB, not told': ('multipath', {'multipath_level_db': -10.0, **THERMAL}),
 }
 
 
