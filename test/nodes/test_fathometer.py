@@ -331,23 +331,6 @@ def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     assert (offset.min(axis=1) < 0.2).all()
 
 
-def test_an_array_of_another_size_is_counted_and_a_dead_hydrophone_masked(rig):
-    scene = simulate(scenario('small', {'records': 2, 'fading': (), 'depth_companion': False}), 2)
-    first, second = (item.measurement for item in scene.measurements)
-    wrong = simulate(
-        scenario('small', {'records': 1, 'fading': (), 'phones': 6, 'depth_companion': False}), 2
-    )
-    rig.send('csdm', write_csdm(wrong.measurements[0].measurement, make))
-    assert rig.node.tracker.counts['wrong_hydrophones'] == 1 and not rig.tables
-    dead = np.array(second.csdm)
-    dead[:, 5], dead[:, :, 5] = 0.0, 0.0
-
-    rig.send('csdm', write_csdm(attrs.evolve(second, csdm=dead), make))
-    assert rig.node.tracker.counts['dead_hydrophones_masked'] == 1
-    assert len(rig.tables) == 1 and not rig.node._errors
-    assert first.hydrophones == 8
-
-
 def test_offline_says_the_same_to_the_bit(rig):
     measured, _ = traces(fading=(), layers=4)
     rig.send('trace', *[write_trace(item, make) for item in measured])
