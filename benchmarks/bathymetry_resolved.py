@@ -242,12 +242,12 @@ def two_levels(name: str, up: float, pings: int, seed: int) -> dict[str, float]:
             measurement, number = evolve(measurement, iq=y.astype(np.complex64)), number + 1
         made += tracker.process(measurement)
     off, sd, caught, false = [], [], 0, 0
-    for estimate, *levels in zip(made, *floors):
+    for estimate, levels in zip(made, zip(*floors)):
         here = in_stretch(levels[0].range)
         pair = estimate.extras['surfaces'] == 2
         caught, false = caught + int((pair & here).sum()), false + int((pair & ~here).sum())
-        for end, level in zip(('', '_2'), levels):
-            off.append((estimate.extras[f'pz{end}'] - level.height)[pair & here])
+        for end, surface in zip(('', '_2'), levels):
+            off.append((estimate.extras[f'pz{end}'] - surface.height)[pair & here])
             sd.append(np.sqrt(estimate.extras[f'vertical_uncertainty{end}'][pair & here]))
     errors, stds = np.concatenate(off), np.concatenate(sd)
     bins = len(made) * int(in_stretch(floors[0][0].range).sum())

@@ -500,7 +500,10 @@ def test_links_between_pages_lead_somewhere(page: str) -> None:
     text = (ROOT / page).read_text(encoding='utf-8')
     for target in re.findall(r'\]\(([^)#]+)(?:#[^)]*)?\)', text):
         if '://' not in target:
-            assert ((ROOT / page).parent / target).exists(), f'{page} links to {target}'
+            file = ((ROOT / page).parent / target).resolve()
+            if file.parent.name == 'examples' and file.suffix == '.md':  # a notebook as a page
+                file = ROOT / 'examples' / f'{file.stem}.ipynb'
+            assert file.exists(), f'{page} links to {target}'
 
 
 def texts(manifest: ElementTree.Element, tag: str) -> set[str]:

@@ -105,6 +105,7 @@ class System:
     def build(self, config: ObstacleConfig) -> ObstacleTracker: ...
     @overload
     def build(self, config: Config) -> Tracker: ...
+
     def build(self, config: Config) -> Tracker:
         """The tracker with these parameters."""
         return self._own(self.tracker)(config)
@@ -113,6 +114,7 @@ class System:
     def build_smoother(self, config: DiverConfig) -> SmoothingDiverTracker: ...
     @overload
     def build_smoother(self, config: Config) -> SmoothingTracker: ...
+
     def build_smoother(self, config: Config) -> SmoothingTracker:
         """The tracker that can look back at the end of a recording.
 

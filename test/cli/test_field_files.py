@@ -25,8 +25,7 @@ from helpers.sonar_files import kmall
 import numpy as np
 import pytest
 
-from msg_adapters.fixes import write_fix
-from msg_adapters.geodetic import write_geodetic
+from msg_adapters.fixes import write_fix, write_geodetic
 from sonar_imm.measurements import Fix, GeodeticFix, VesselFix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.measurements import measurements_of

@@ -23,7 +23,7 @@ from helpers.source import ROOT
 import numpy as np
 import pytest
 
-from msg_adapters.geodetic import write_geodetic
+from msg_adapters.fixes import write_geodetic
 from sonar_imm.measurements import GeodeticFix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main

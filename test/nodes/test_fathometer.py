@@ -162,7 +162,7 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     assert rig.node.tracker.counts['blocks'] == 20
 
 
-HEARD = (
+RECORD = (
     'phones:=12',
     'element_spacing:=0.36',
     'frequency_max:=2000.0',
@@ -204,7 +204,7 @@ def spectra_of(messages, stamp_ns):
 
 
 def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):
-    rig = rig_of(make_bench, *HEARD)
+    rig = rig_of(make_bench, *RECORD)
     rig.send('pressure', *received)
     assert len(rig.tables) == 1 and not rig.node._meter.refused
     live = read_estimate(rig.tables[0])
@@ -226,7 +226,7 @@ def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):
 
 
 def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, received):
-    rig = rig_of(make_bench, *HEARD)
+    rig = rig_of(make_bench, *RECORD)
     more = [write_pressure(item, make) for item in follow(received, 3)]
     blocks = [*received, *more]
     order = [0, 1, 1, 2, 4, 3, 5, *range(7, len(blocks))]

@@ -432,9 +432,13 @@ def array_coherence(
     if _sees_processor(config, heights) and below is not None and config.output != 'printed':
         far, near = (1.0 / max(float(below[k]), aperture) for k in (-1, 0))
         inverse = np.linspace(far, near, _PHASES)
-        sound = config.sound_speed, config.loading
         phase = fathometer.echo_phase(
-            csdm[there], frequency[there], heights, 1.0 / inverse, *sound
+            csdm[there],
+            frequency[there],
+            heights,
+            1.0 / inverse,
+            config.sound_speed,
+            config.loading,
         )
         turns = np.ones((_PHASES, len(gamma)), np.complex128)
         turns[:, index[use][there]] = np.exp(-1j * phase)

@@ -33,8 +33,7 @@ from typing import Any
 
 from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import bathymetry, inputs_of, InputTopic, made_inputs
-from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
-from msg_adapters.snapshots import write_snapshot
+from msg_adapters.snapshots import FIELDS, snapshot_of_phase, snapshot_of_staves, write_snapshot
 from sonar_imm.measurements import Rejection, Snapshot
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 

@@ -54,7 +54,7 @@ LEAST = 1e-6
 """Seconds; no clock is compared better."""
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """Detections: receiver (n,), an index; tag (n,), an index; stamp_ns (n,)."""
 
     receiver: IntArray
@@ -73,7 +73,7 @@ class Clocks(NamedTuple):
     std: float
     used: int
 
-    def right(self, received: Heard) -> tuple[IntArray, BoolArray]:
+    def right(self, received: Received) -> tuple[IntArray, BoolArray]:
         """Stamps (n,) by one clock, and whether (n,) they could be told."""
         seconds = (received.stamp_ns - self.begin_ns) / SECOND
         late = np.zeros(len(seconds))
@@ -110,7 +110,7 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))
     number = {tag: k for k, tag in enumerate(tags)}
-    received = Heard(
+    received = Received(
         np.array([receiver for receiver, _, _ in rows], np.int64),
         np.array([number[tag] for _, tag, _ in rows], np.int64),
         np.array([stamp for _, _, stamp in rows], np.int64),
@@ -189,7 +189,11 @@ def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArr
 
 
 def compare_clocks(
-    received: Heard, receivers: FloatArray, tags: FloatArray, sound_speed: float, interval: float
+    received: Received,
+    receivers: FloatArray,
+    tags: FloatArray,
+    sound_speed: float,
+    interval: float,
 ) -> Clocks:
     """Compare the clocks of receivers (R, 3) by tags (T, 3), NaN for those that move; m, s.
 
@@ -228,7 +232,7 @@ def compare_clocks(
 
 
 def _sync_groups(
-    received: Heard,
+    received: Received,
     seconds: FloatArray,
     receivers: FloatArray,
     tags: FloatArray,

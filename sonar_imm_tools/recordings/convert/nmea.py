@@ -39,8 +39,8 @@ from typing import Any
 from attrs import define, Factory
 import numpy as np
 
-from msg_adapters.geodetic import write_geodetic
-from msg_adapters.vessel import write_heading
+from msg_adapters.fixes import write_geodetic
+from msg_adapters.navigation import write_heading
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 

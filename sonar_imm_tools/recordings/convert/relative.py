@@ -26,11 +26,9 @@ from attrs import evolve
 import numpy as np
 
 from msg_adapters.arrivals import FARTHEST
-from msg_adapters.geodetic import write_geodetic
-from msg_adapters.navigation import write_navigation
-from msg_adapters.relative import write_relative
+from msg_adapters.fixes import write_geodetic, write_relative
+from msg_adapters.navigation import write_heading, write_navigation
 from msg_adapters.scans import write_scan
-from msg_adapters.vessel import write_heading
 from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading, VesselPose
 
 from ..conversion import ConversionReport, converter, Leaps, Record, write_bag

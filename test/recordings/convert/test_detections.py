@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.recordings.convert import convert_detections
-from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Heard
+from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -67,13 +67,13 @@ def detect(rng, tag, T, place, echoes, receivers):
     return found
 
 
-def heard_of(rows):
-    return Heard(*(np.array(column, np.int64) for column in zip(*rows)))
+def received_of(rows):
+    return Received(*(np.array(column, np.int64) for column in zip(*rows)))
 
 
 def compared(rows):
     places = np.vstack([SYNC, np.full((1, 3), np.nan)])
-    return compare_clocks(heard_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
+    return compare_clocks(received_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
 
 
 @pytest.mark.parametrize('seed', range(3))
