@@ -30,9 +30,8 @@ from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.diver import figures
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sentence
-from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
 from sonar_imm_tools.evaluation.plotting import in_degrees, nis_figure, scale_length, thin
@@ -247,6 +246,11 @@ def test_a_part_of_another_system_makes_a_page():
     assert page.headings.index('whale.bag') < page.headings.index('Whale')
     assert 'sonar_imm · whale tracker' in text and 'size.rmse_m' in text
     assert 'Length' in front_html([part(), other], ['1.html', '2.html'])
+
+
+def test_a_topic_of_another_name_is_told_with_what_it_was_read_as():
+    run = {**RUN, 'topics': {'/boat/fix': 'fix', '/gps': 'fix'}}
+    assert Part(run=run, metrics={}, summary='').input == '/boat/fix, /gps as fix'
 
 
 SCRIPT = '<script>alert(1)</script>'
