@@ -25,8 +25,8 @@ A particle filter multiplies the weights of its particles at every step, and aft
 particle has them all. `systematic` draws `count` particles so that particle n, of weight w_n, is
 drawn ``count w_n`` times *on average*, and floor(count w_n) or one more times in every case, which
 no other scheme can better. It takes one uniform draw for all `count` equal slices of the
-cumulative weights. (What one draw shares it also shifts: all slices are read a little left or right together,
-by 1 / count at the most.)
+cumulative weights. (What one draw shares it also shifts: all slices are read a little left or
+right together, by 1 / count at the most.)
 
 Reference: Douc, Cappe, Moulines, *Comparison of resampling schemes for particle filtering*, ISPA
 2005.
