@@ -32,7 +32,6 @@ LIBRARY = {
     'sonar_imm.estimation.motion.ct': 'of the ready filter',
     'sonar_imm.estimation.motion.cv': 'of the ready filter',
     'sonar_imm.estimation.motion.hover': 'of the ready filter',
-    'sonar_imm.estimation.unscented.predict': 'one unscented filter, without models',
 }
 """Public functions that this package does not call itself: what they are there for."""
 
