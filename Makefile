@@ -121,7 +121,7 @@ generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the cod
 
 docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/
 	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo 'Open site/index.html. For its search: python3 -m http.server --bind 127.0.0.1 -d site'
+	@echo 'Open site/index.html.'
 
 docs-numbers: venv ## check that the tables of docs/ still hold the numbers of docs/results/
 	$(BIN)/python docs/check_numbers.py

@@ -49,7 +49,11 @@ from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage 
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
 from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.simulator import (  # noqa: E402
+    scenario,
+    simulate,
+    TrueObstacle,
+)
 
 OUT = ROOT / 'docs' / 'images'
 CALIBRATION = ROOT / 'docs' / 'results' / 'obstacle_calibration.json'

@@ -30,19 +30,15 @@ __all__ = [
     'displays',
     'estimates',
     'fixes',
-    'geodetic',
     'headers',
     'inputs',
-    'interferometer',
     'navigation',
-    'relative',
     'scans',
     'snapshots',
     'sonar_images',
     'soundings',
     'table',
     'transforms',
-    'vessel',
 ]
 
 __owner__ = 'sonar_imm'

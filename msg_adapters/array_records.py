@@ -41,8 +41,8 @@ from numpy.typing import NDArray
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from sonar_imm.measurements.fathometer import MAX_FREQUENCIES, MAX_SAMPLES
 
-from .headers import Make, make_header, stamp_ns
-from .table import constant_column, decode_table, encode_table, require_columns, scalar_column
+from .headers import head_of, Make, make_header
+from .table import constant_column, decode_table, require_columns, scalar_column, table_of
 
 Columns = Mapping[str, NDArray]
 _DEPTHS = ('array_depth', 'element_depth')
@@ -59,8 +59,7 @@ def read_csdm(message: Any, *, world_frame: str = 'enu') -> CrossSpectra:
     require_columns(columns, ('frequency', 'csdm'), 'cross-spectra')
     csdm = _matrices(columns['csdm'])
     return CrossSpectra(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         frequency=scalar_column(columns, 'frequency'),
         csdm=csdm,
         snapshots=_snapshots(columns),
@@ -95,8 +94,7 @@ def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
         samples = samples * np.float32(scale)
     rate = constant_column(columns, 'sample_rate')
     return Pressure(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         pressure=samples,
         sample_rate=0.0 if rate is None else rate,
         reference_depth=_array_depth(columns, samples.shape[1]),
@@ -126,8 +124,7 @@ def read_trace(message: Any, *, world_frame: str = 'enu') -> Trace:
     columns = decode_table(message, names, most_rows=MAX_SAMPLES)
     require_columns(columns, ('depth', 'amplitude'), 'traces')
     return Trace(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         depth=scalar_column(columns, 'depth'),
         amplitude=scalar_column(columns, 'amplitude'),
         sigma=scalar_column(columns, 'sigma') if 'sigma' in columns else None,
@@ -147,7 +144,7 @@ def write_response(response: Any, make: Make) -> Any:
     zero = np.zeros(len(response.depth), np.float32)
     columns = {'x': zero, 'y': zero, 'z': (-response.depth).astype(np.float32)}
     columns |= _trace_columns(response.depth, response.amplitude, response.sigma)
-    return encode_table(columns, stamp_ns=response.stamp_ns, frame_id=response.frame_id, make=make)
+    return table_of(response, columns, make)
 
 
 def _trace_columns(
@@ -162,7 +159,7 @@ def _trace_columns(
 def _encode(record: Any, columns: dict[str, NDArray], rows: int, make: Make) -> Any:
     if record.reference_depth is not None:
         columns['array_depth'] = np.full(rows, record.reference_depth, np.float32)
-    return encode_table(columns, stamp_ns=record.stamp_ns, frame_id=record.frame_id, make=make)
+    return table_of(record, columns, make)
 
 
 def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
@@ -216,8 +213,7 @@ def read_array_depth(message: Any, *, world_frame: str = 'enu') -> ArrayDepth:
     down = world_frame == 'ned' or str(message.header.frame_id).endswith('_ned')
     z = float(point.z)
     return ArrayDepth(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         depth=z if down else -z,
     )
 

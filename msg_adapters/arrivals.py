@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.measurements import Arrivals, Rejection
 
-from .headers import Make, stamp_ns, swap_axes, to_enu
-from .table import decode_table, encode_table, require_columns, scalar_column
+from .headers import head_of, Make, swap_axes, to_enu
+from .table import decode_table, require_columns, scalar_column, table_of
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
 REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
@@ -86,8 +86,7 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
     if not keep.any():
         raise Rejection('nan', f'none of the {rows} arrivals has a usable time and positions')
     arrivals = Arrivals(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         tx_id=_ids(values['tx_id'][keep], 'tx_id'),
         rx_id=_ids(values['rx_id'][keep], 'rx_id'),
         tx=tx[keep],
@@ -125,7 +124,7 @@ def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
         if not np.isnan(getattr(arrivals, name)).all():
             columns[name] = getattr(arrivals, name)
             columns[f'var_{name}'] = getattr(arrivals, f'var_{name}').astype(np.float32)
-    return encode_table(columns, stamp_ns=arrivals.stamp_ns, frame_id=arrivals.frame_id, make=make)
+    return table_of(arrivals, columns, make)
 
 
 def _usable(toa: NDArray, tx: NDArray, rx: NDArray) -> NDArray[np.bool_]:

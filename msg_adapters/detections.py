@@ -43,8 +43,8 @@ from numpy.typing import ArrayLike, NDArray
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import BEAM_AXES, Detections, OPTIONAL_COLUMNS, Rejection
 
-from .headers import Make, places_of, stamp_ns
-from .table import decode_table, encode_table, require_columns, scalar_column
+from .headers import head_of, Make, places_of
+from .table import decode_table, require_columns, scalar_column, table_of
 
 MAX_DETECTIONS = 10_000
 COLUMNS = ('x', 'y', 'z', 'range', 'bearing', *OPTIONAL_COLUMNS)
@@ -214,9 +214,7 @@ def write_detections(detections: Detections, make: Make) -> Any:
         values = getattr(detections, name)
         if np.isfinite(values).any():
             columns[name] = values.astype(np.float32)
-    return encode_table(
-        columns, stamp_ns=detections.stamp_ns, frame_id=detections.frame_id, make=make
-    )
+    return table_of(detections, columns, make)
 
 
 def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
@@ -235,7 +233,7 @@ def _detections(
     distance: FloatArray,
     bearing: FloatArray,
     bearing_positive: str,
-    **optional: FloatArray,
+    **optional: Any,
 ) -> Detections:
     """Put columns (n,) together, without the rows that are no echo."""
     if bearing_positive not in BEARING_SIDES:
@@ -262,8 +260,7 @@ def _detections(
     keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
     keep &= distance <= FARTHEST
     return Detections(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         range=distance[keep],
         bearing=bearing[keep] if bearing_positive == 'port' else -bearing[keep],
         **{name: column[keep] for name, column in optional.items()},

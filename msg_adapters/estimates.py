@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
-from .headers import Make, make_header, make_pose, stamp_ns
+from .headers import head_of, Make, make_header, make_stated_pose, make_stated_twist
 from .table import decode_table, is_finite, layout_of, packed_table, require_columns
 
 NOT_ESTIMATED = 1.0
@@ -123,9 +123,7 @@ def read_estimate(message: Any) -> Estimate:
     columns = decode_table(message)
     require_columns(columns, ('x', 'y', 'z'), 'estimates')
     try:
-        return Estimate.from_columns(
-            columns, stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id)
-        )
+        return Estimate.from_columns(columns, **head_of(message))
     except (ValueError, KeyError) as error:
         raise Rejection('missing_column', f'not an estimate table: {error}') from None
 
@@ -145,26 +143,12 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
         place[2] = estimate.xyz[row, 2]
     covariance = estimate.covariance[row]
     track_id = int(estimate.extras['track_id'][row]) if 'track_id' in estimate.extras else row
-    pose = make_pose(place.tolist(), make)
-    twist = make(
-        'geometry_msgs/msg/Twist',
-        linear=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', velocity.tolist()))),
-        angular=make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0),
-    )
     return make(
         'nav_msgs/msg/Odometry',
         header=make_header(estimate.stamp_ns, estimate.frame_id, make),
         child_frame_id=f'diver_{track_id}',
-        pose=make(
-            'geometry_msgs/msg/PoseWithCovariance',
-            pose=pose,
-            covariance=_six(covariance[np.ix_(at, at)]),
-        ),
-        twist=make(
-            'geometry_msgs/msg/TwistWithCovariance',
-            twist=twist,
-            covariance=_six(covariance[np.ix_(moving, moving)]),
-        ),
+        pose=make_stated_pose(place, _six(covariance[np.ix_(at, at)]), make),
+        twist=make_stated_twist(velocity, _six(covariance[np.ix_(moving, moving)]), make),
     )
 
 
@@ -202,7 +186,7 @@ def write_model_shares(estimate: Estimate, make: Make) -> Any:
 
 
 def _six(block: np.ndarray) -> np.ndarray:
-    """Put a covariance (2, 2) of x and y, or (3, 3), into the 36 numbers of ROS."""
+    """Put a covariance (2, 2) of x and y, or (3, 3), into the (6, 6) of ROS."""
     covariance = np.diag([NOT_ESTIMATED] * 3 + [ALIGNED] * 3)
     covariance[: len(block), : len(block)] = block
-    return covariance.ravel()
+    return covariance

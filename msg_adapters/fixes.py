@@ -12,29 +12,73 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Position fixes and starts of tracks: geometry_msgs PoseWithCovarianceStamped or PointStamped.
+"""Position fixes and starts of tracks: in metres (geometry_msgs PoseWithCovarianceStamped or
+PointStamped), relative to a vessel, and in latitude and longitude.
 
 Publishers fill in covariances in different ways. Of the x-y block a negative variance means
 unknown. All zeros mean that it was not filled in: unknown too, and worth a warning (see
 `doubt_fix`). Anything else has to be finite, symmetric and positive definite, or the fix is
 refused. What is stated of z is used with it, or left out where it cannot be true
 (`measurements.in_space`).
+
+Positions that a transceiver on a vessel has measured from itself (USBL), and those of
+geographic_msgs, are read by field names, so that the packages of the drivers need not be
+installed:
+
+- geometry_msgs/PointStamped, Vector3Stamped, PoseWithCovarianceStamped: x y z, in the axes that
+  `relative_axes` names;
+- seatrac_interfaces/ModemRec: range, azimuth and elevation in the axes of the beacon, clockwise
+  and up, tenths of a metre and a degree; without those its position east and north, by the compass
+  of the beacon. ``src_id`` says whose it is;
+- acomms_msgs/UsblData (EvoLogics): east, north, up where the device knows its attitude, else x y
+  z; ``accuracy`` is taken as the standard deviation on each axis, ``remote_address`` says whose it
+  is. The stamp is that of reception: the age of the measurement by the clock of the device,
+  ``current_time - measurement_time``, is taken off;
+- stonefish_ros2/BeaconInfo: ``relative_position`` in the axes of the simulated transceiver,
+  forward, starboard, down; ``beacon_id`` says whose it is.
+
+What a driver flags as invalid is refused.
+
+A sensor_msgs/NavSatFix whose status says that there is no fix is refused (``no_fix``). The type of
+its covariance (east, north, up) decides: unknown is unknown, whatever the numbers; diagonal means
+only the diagonal.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeVar
 
 from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Fix, Rejection, RelativeFix, Start
+from sonar_imm.measurements import (
+    Fix,
+    GeodeticFix,
+    nanoseconds,
+    Rejection,
+    RelativeFix,
+    Start,
+    VesselFix,
+)
 from sonar_imm.measurements.checks import check_covariance
 from sonar_imm.measurements.diver import UNKNOWN_VARIANCE
 
-from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, swap_covariance, to_enu
+from .headers import (
+    head_of,
+    Make,
+    make_header,
+    make_stated_pose,
+    square,
+    stamp_ns,
+    swap_axes,
+    swap_covariance,
+    to_enu,
+)
 
 Place = TypeVar('Place', Fix, Start)
 
@@ -54,10 +98,9 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
         covariance[2, 2] = np.nan
         covariance = None if np.isnan(covariance).all() else covariance
     fix = Fix(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         position=(x, y, z if np.isfinite(z) else 0.0),
         covariance=covariance,
-        frame_id=str(message.header.frame_id),
     )
     check_size(fix)
     return to_enu(fix, world_frame, _turned)
@@ -74,10 +117,9 @@ def read_start(message: Any, *, world_frame: str = 'enu') -> Start:
             'the start has no covariance of x and y: state how far off it may be, in m^2',
         )
     start = Start(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         position=(float(point.x), float(point.y), float(point.z)),
         covariance=covariance,
-        frame_id=str(message.header.frame_id),
     )
     check_size(start, 'start')
     return to_enu(start, world_frame, _turned)
@@ -146,15 +188,12 @@ def make_position(
 ) -> Any:
     """Make a PoseWithCovarianceStamped with stamp and frame of `fix`, at `position` (3,) m, not
     turned, with `covariance` (6, 6)."""
-    return make(
+    header = make_header(fix.stamp_ns, fix.frame_id, make)
+    kind, pose = (
         'geometry_msgs/msg/PoseWithCovarianceStamped',
-        header=make_header(fix.stamp_ns, fix.frame_id, make),
-        pose=make(
-            'geometry_msgs/msg/PoseWithCovariance',
-            pose=make_pose(position, make),
-            covariance=covariance.ravel(),
-        ),
+        make_stated_pose(position, covariance, make),
     )
+    return make(kind, header=header, pose=pose)
 
 
 def known_covariance(message: Any) -> NDArray[np.float64] | None:
@@ -177,9 +216,274 @@ def _covariance(message: Any) -> NDArray[np.float64] | None:
     """Cut x, y and z (3, 3) out of the 6 x 6 covariance; None for a message without one."""
     if hasattr(message, 'point'):
         return None
-    covariance = np.array(message.pose.covariance, np.float64)
-    if covariance.size != 36:
+    return square(message.pose.covariance, 6)[:3, :3].copy()
+
+
+# -- relative to a vessel ----------------------------------------------------------------------
+
+
+AXES = ('flu', 'frd', 'enu', 'ned')
+_FRD = np.array([1.0, -1.0, -1.0])
+LONGEST_AGE = 60.0
+"""Seconds by which a USBL measurement may be older than its message."""
+
+
+def read_relative(message: Any, *, relative_axes: str = 'flu', **_: Any) -> RelativeFix:
+    """Read x y z from a transceiver. Raises `Rejection`."""
+    covariance = None
+    if hasattr(message, 'vector'):
+        at = message.vector
+    elif hasattr(message, 'point'):
+        at = message.point
+    else:
+        at = message.pose.pose.position
+        covariance = _stated(message.pose.covariance)
+    offset, covariance, levelled = _in_axes(
+        np.array([at.x, at.y, at.z], np.float64), covariance, relative_axes
+    )
+    return _fix(message, offset, covariance=covariance, levelled=levelled)
+
+
+def read_modem(message: Any, **_: Any) -> RelativeFix:
+    """Read a seatrac_interfaces/ModemRec. Raises `Rejection`."""
+    if message.position_flt_error:
         raise Rejection(
-            'bad_shape', f'the covariance of a pose has {covariance.size} numbers, 36 are needed'
+            'flagged_invalid', 'the position filter of the beacon has rejected the position'
         )
-    return covariance.reshape(6, 6)[:3, :3].copy()
+    own = int(message.src_id)
+    if message.includes_range and message.includes_usbl:
+        distance = 0.1 * float(message.range_dist)
+        azimuth, elevation = np.radians(
+            [0.1 * float(message.usbl_azimuth), 0.1 * float(message.usbl_elevation)]
+        )
+        level = distance * math.cos(elevation)
+        offset = np.array(
+            [
+                level * math.cos(azimuth),
+                -level * math.sin(azimuth),
+                distance * math.sin(elevation),
+            ]
+        )
+        return _fix(message, offset, target_id=own)
+    if message.includes_position and (message.position_easting or message.position_northing):
+        offset = 0.1 * np.array(
+            [
+                message.position_easting,
+                message.position_northing,
+                float(message.depth_local) - float(message.position_depth),
+            ]
+        )
+        return _fix(message, offset, target_id=own, levelled=True)
+    raise Rejection(
+        'no_position', 'the message of the modem has neither range and direction nor a position'
+    )
+
+
+def read_usbl_data(message: Any, *, relative_axes: str = 'flu', **_: Any) -> RelativeFix:
+    """Read an acomms_msgs/UsblData. Raises `Rejection`."""
+    age = float(message.current_time) - float(message.measurement_time)
+    if not 0.0 <= age <= LONGEST_AGE:
+        age = 0.0  # clocks that were set, or fields that were not filled in
+    own = int(message.remote_address)
+    accuracy = float(message.accuracy)
+    covariance = np.eye(3) * accuracy**2 if 1e-3 < accuracy < 1e4 else None
+    enu = np.array([message.enu.x, message.enu.y, message.enu.z], np.float64)
+    if enu.any() and np.isfinite(enu).all():
+        return _fix(message, enu, covariance=covariance, levelled=True, target_id=own, age=age)
+    xyz = np.array([message.xyz.x, message.xyz.y, message.xyz.z], np.float64)
+    if not xyz.any():
+        raise Rejection('no_position', 'the USBL message has no position')
+    offset, covariance, levelled = _in_axes(xyz, covariance, relative_axes)
+    return _fix(message, offset, covariance=covariance, levelled=levelled, target_id=own, age=age)
+
+
+def read_beacon(message: Any, **_: Any) -> RelativeFix:
+    """Read a stonefish_ros2/BeaconInfo. Raises `Rejection`."""
+    at = message.relative_position
+    offset = np.array([at.x, at.y, at.z], np.float64) * _FRD
+    if not offset.any():
+        raise Rejection('no_position', 'the beacon has no position')
+    return _fix(message, offset, target_id=int(message.beacon_id))
+
+
+def write_relative(fix: RelativeFix, make: Make) -> Any:
+    """Write a PoseWithCovarianceStamped in forward, port, up; its covariance starts with -1 when
+    the fix has none."""
+    covariance = np.diag(np.full(6, -1.0))
+    if fix.covariance is not None:
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = fix.covariance
+    return make_position(fix, fix.offset, covariance, make)
+
+
+def _fix(message: Any, offset: np.ndarray, *, age: float = 0.0, **known: Any) -> RelativeFix:
+    """A fix of which the message says what is `known` besides; age: seconds before its stamp."""
+    return RelativeFix(
+        stamp_ns=stamp_ns(message) - nanoseconds(age),
+        offset=offset,
+        frame_id=str(message.header.frame_id),
+        **known,
+    )
+
+
+def _in_axes(
+    offset: np.ndarray, covariance: np.ndarray | None, axes: str
+) -> tuple[np.ndarray, np.ndarray | None, bool]:
+    """Offset and covariance in forward, port, up, or in east, north, up (True)."""
+    if axes not in AXES:
+        raise ValueError(f"relative_axes must be one of {', '.join(AXES)}, got '{axes}'")
+    if axes == 'frd':
+        turned = None if covariance is None else covariance * np.outer(_FRD, _FRD)
+        return offset * _FRD, turned, False
+    if axes == 'ned':
+        turned = None if covariance is None else swap_covariance(covariance)
+        return swap_axes(offset), turned, True
+    return offset, covariance, axes == 'enu'
+
+
+def _stated(values: Any) -> np.ndarray | None:
+    """The part of x y z (3, 3); None when it is unknown: negative on the diagonal or all zero."""
+    block = square(values, 6)[:3, :3]
+    if not block.any() or (np.diag(block) < 0.0).any():
+        return None
+    return block
+
+
+# -- in latitude and longitude -----------------------------------------------------------------
+
+
+NO_FIX, FIX = -1, 0
+UNKNOWN, DIAGONAL, KNOWN = 0, 2, 3
+"""Status and covariance types of NavSatFix that matter here."""
+
+
+def read_geodetic(message: Any, **_: Any) -> GeodeticFix:
+    """Read a NavSatFix or a message of geographic_msgs. Raises `Rejection`."""
+    return _read(message, GeodeticFix)
+
+
+def read_vessel_fix(message: Any, **_: Any) -> VesselFix:
+    """The same as the position of a vessel. Raises `Rejection`."""
+    fix: VesselFix = _read(message, VesselFix)
+    return fix
+
+
+def write_geodetic(fix: GeodeticFix, make: Make) -> Any:
+    """Write a NavSatFix."""
+    known = fix.covariance is not None
+    covariance = np.zeros((3, 3)) if fix.covariance is None else fix.covariance
+    return _navsat(
+        fix.stamp_ns,
+        fix.frame_id,
+        np.array([fix.latitude, fix.longitude, fix.height]),
+        covariance,
+        KNOWN if known else UNKNOWN,
+        make,
+    )
+
+
+def write_geo(estimate: Estimate, row: int, origin: Origin, make: Make) -> Any:
+    """Write where one diver is as a NavSatFix, frame ``diver_<track_id>``.
+
+    The covariance is east, north, up at the diver. Where depth is not estimated the altitude is
+    NaN and its variance large.
+    """
+    names = [name for name in ('px', 'py', 'pz') if name in estimate.state_names]
+    index = [estimate.state_names.index(name) for name in names]
+    enu = np.zeros(3)
+    enu[2] = estimate.xyz[row, 2]
+    enu[: len(index)] = estimate.state[row, index]
+    covariance = np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
+    covariance[: len(index), : len(index)] = estimate.covariance[row][np.ix_(index, index)]
+    place = origin.geodetic(enu)
+    turn = origin.turn(place[0], place[1]).T
+    if len(index) < 3:
+        place[2] = np.nan
+    return _navsat(
+        estimate.stamp_ns,
+        f'diver_{int(estimate.extras["track_id"][row])}',
+        place,
+        turn @ covariance @ turn.T,
+        KNOWN,
+        make,
+    )
+
+
+def doubt_geodetic(message: Any) -> str | None:
+    """Give ``'zero_covariance'`` for a NavSatFix that claims a covariance of zeros."""
+    if not hasattr(message, 'position_covariance_type') or not message.position_covariance_type:
+        return None
+    return None if np.any(message.position_covariance) else 'zero_covariance'
+
+
+def is_geodetic(message: Any) -> bool:
+    """Whether a message says latitude and longitude."""
+    return hasattr(_point(message), 'latitude')
+
+
+def _point(message: Any) -> Any:
+    """Where latitude, longitude and altitude stand."""
+    for name in ('position', 'pose'):
+        message = getattr(message, name, message)
+    for name in ('pose', 'position'):
+        message = getattr(message, name, message)
+    return message
+
+
+def _read(message: Any, kind: type[GeodeticFix]) -> Any:
+    status = getattr(message, 'status', None)
+    if status is not None and int(status.status) < FIX:
+        raise Rejection('no_fix', 'the receiver says that it has no fix')
+    point = _point(message)
+    return kind(
+        **head_of(message),
+        latitude=float(point.latitude),
+        longitude=float(point.longitude),
+        height=float(point.altitude) if np.isfinite(point.altitude) else float('nan'),
+        covariance=_on_earth(message),
+    )
+
+
+def _on_earth(message: Any) -> np.ndarray | None:
+    """(3, 3) east, north, up; None where it is unknown or was not filled in."""
+    if hasattr(message, 'position_covariance'):
+        values, n, kind = message.position_covariance, 3, int(message.position_covariance_type)
+    elif hasattr(getattr(message, 'pose', None), 'covariance'):
+        values, n, kind = message.pose.covariance, 6, KNOWN
+    else:
+        return None
+    if kind == UNKNOWN:
+        return None
+    covariance = square(values, n, 'covariance')[:3, :3]
+    if kind == DIAGONAL:
+        covariance = np.diag(np.diag(covariance))
+    if not covariance.any() or (np.diag(covariance) < 0.0).any():
+        return None
+    if not covariance[2].any():  # no height: say so, rather than that it is certain
+        covariance = covariance + np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
+    if (np.abs(covariance) <= MOST_VARIANCE).all():
+        least = float(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0])
+        if least < LEAST_VARIANCE:
+            raise Rejection('out_of_range', f'the position states a variance of {least:g} m^2')
+    return covariance
+
+
+def _navsat(
+    stamp: int,
+    frame_id: str,
+    place: np.ndarray,
+    covariance: np.ndarray,
+    kind: int,
+    make: Make,
+) -> Any:
+    latitude, longitude, height = (float(value) for value in place)
+    return make(
+        'sensor_msgs/msg/NavSatFix',
+        header=make_header(stamp, frame_id, make),
+        status=make('sensor_msgs/msg/NavSatStatus', status=FIX, service=1),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=height,
+        position_covariance=np.ravel(covariance),
+        position_covariance_type=kind,
+    )

@@ -62,6 +62,19 @@ def stamp_ns(message: Any) -> int:
     return seconds * _NANO + nanoseconds
 
 
+def head_of(message: Any) -> dict[str, Any]:
+    """`stamp_ns` and `frame_id` of a measurement, as the header of `message` says."""
+    return {'stamp_ns': stamp_ns(message), 'frame_id': str(message.header.frame_id)}
+
+
+def square(values: Any, n: int, what: str = 'covariance of a pose') -> FloatArray:
+    """A copy of the numbers of a matrix (n, n). Raises `Rejection` where there are not as many."""
+    matrix = np.array(values, np.float64)
+    if matrix.size != n * n:
+        raise Rejection('bad_shape', f'the {what} has {matrix.size} numbers, {n * n} are needed')
+    return matrix.reshape(n, n)
+
+
 def make_header(stamp: int, frame_id: str, make: Make) -> Any:
     """Build a std_msgs/Header from a stamp in integer nanoseconds.
 
@@ -74,17 +87,45 @@ def make_header(stamp: int, frame_id: str, make: Make) -> Any:
     return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
 
 
+def make_vector(values: Iterable[float], make: Make, kind: str = 'Vector3') -> Any:
+    """Make a Vector3 of geometry_msgs, or another `kind` with x, y, z and maybe w."""
+    return make(f'geometry_msgs/msg/{kind}', **dict(zip('xyzw', map(float, values))))
+
+
 def make_pose(
     position: Iterable[float], make: Make, orientation: Iterable[float] = (0.0, 0.0, 0.0, 1.0)
 ) -> Any:
     """Make a Pose. position: x, y, z, m; orientation: x, y, z, w, by default not turned."""
-    place = (float(value) for value in position)
-    turn = (float(value) for value in orientation)
     return make(
         'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', place))),
-        orientation=make('geometry_msgs/msg/Quaternion', **dict(zip('xyzw', turn))),
+        position=make_vector(position, make, 'Point'),
+        orientation=make_vector(orientation, make, 'Quaternion'),
     )
+
+
+def make_stated_pose(
+    position: Iterable[float],
+    covariance: FloatArray,
+    make: Make,
+    orientation: Iterable[float] = (0.0, 0.0, 0.0, 1.0),
+) -> Any:
+    """Make a PoseWithCovariance; covariance: of 36 numbers."""
+    pose = make_pose(position, make, orientation)
+    kind = 'geometry_msgs/msg/PoseWithCovariance'
+    return make(kind, pose=pose, covariance=np.ravel(covariance))
+
+
+def make_stated_twist(
+    velocity: Iterable[float],
+    covariance: FloatArray,
+    make: Make,
+    turn_rate: Iterable[float] = (0.0, 0.0, 0.0),
+) -> Any:
+    """Make a TwistWithCovariance; covariance: of 36 numbers."""
+    linear, angular = make_vector(velocity, make), make_vector(turn_rate, make)
+    twist = make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
+    kind = 'geometry_msgs/msg/TwistWithCovariance'
+    return make(kind, twist=twist, covariance=np.ravel(covariance))
 
 
 def places_of(points: Iterable[Any]) -> FloatArray:

@@ -18,20 +18,32 @@ log, whose velocity is not read: the pose of the navigation has it already.
 The twist of an Odometry is defined in the child frame, the vehicle's own; many drivers state it in
 the axes of the world instead, which `nav_twist_frame` undoes. With `world_frame` ``'ned'`` the
 pose is that of an FRD body in a NED world; it is turned into that of an FLU body in an ENU world.
+
+Of a vessel that carries a transceiver the pose is read whole, or its heading alone.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from attrs import evolve
+from attrs import evolve, fields
 import numpy as np
 
 from sonar_imm.acoustics.geometry import flip_quaternion
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Altitude, Navigation, Rejection
+from sonar_imm.measurements import Altitude, Navigation, Rejection, VesselHeading, VesselPose
 
-from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
+from .headers import (
+    head_of,
+    Make,
+    make_header,
+    make_stated_pose,
+    make_stated_twist,
+    make_vector,
+    square,
+    swap_axes,
+    to_enu,
+)
 
 TWIST_FRAMES = ('child', 'world')
 _FRD = np.array([1.0, -1.0, -1.0])
@@ -51,8 +63,7 @@ def read_navigation(
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
     navigation = Navigation(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         child_frame_id=str(message.child_frame_id),
         position=_vector(pose.position),
         orientation=(float(q.x), float(q.y), float(q.z), float(q.w)),
@@ -100,26 +111,14 @@ def read_dave_dvl(message: Any, **_: Any) -> Altitude:
 
 def write_navigation(navigation: Navigation, make: Make) -> Any:
     """Write an Odometry; unknown covariances start with -1, unknown velocities are NaN."""
-    pose = make_pose(navigation.position, make, navigation.orientation)
-    twist = make(
-        'geometry_msgs/msg/Twist',
-        linear=_named(navigation.velocity, 'Vector3', make),
-        angular=_named(navigation.turn_rate, 'Vector3', make),
-    )
+    pose_covariance = _written(navigation.pose_covariance)
+    twist_covariance = _written(navigation.twist_covariance)
     return make(
         'nav_msgs/msg/Odometry',
         header=make_header(navigation.stamp_ns, navigation.frame_id, make),
         child_frame_id=navigation.child_frame_id,
-        pose=make(
-            'geometry_msgs/msg/PoseWithCovariance',
-            pose=pose,
-            covariance=_written(navigation.pose_covariance),
-        ),
-        twist=make(
-            'geometry_msgs/msg/TwistWithCovariance',
-            twist=twist,
-            covariance=_written(navigation.twist_covariance),
-        ),
+        pose=make_stated_pose(navigation.position, pose_covariance, make, navigation.orientation),
+        twist=make_stated_twist(navigation.velocity, twist_covariance, make, navigation.turn_rate),
     )
 
 
@@ -151,10 +150,9 @@ def _altitude(message: Any, height: float, variance: float) -> Altitude:
     if not (np.isfinite(variance) and variance > 1e-12):
         variance = np.nan
     return Altitude(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         altitude=height,
         variance=variance,
-        frame_id=str(message.header.frame_id),
     )
 
 
@@ -204,24 +202,64 @@ def _vector(value: Any) -> tuple[float, float, float]:
     return float(value.x), float(value.y), float(value.z)
 
 
-def _named(vector: FloatArray, name: str, make: Make) -> Any:
-    x, y, z = (float(value) for value in vector)
-    return make(f'geometry_msgs/msg/{name}', x=x, y=y, z=z)
-
-
 def _covariance(values: Any) -> FloatArray | None:
     """(6, 6), or None when it is all zero, negative on the diagonal, or not numbers: unknown."""
-    covariance = np.array(values, np.float64).ravel()
-    if covariance.size != 36:
-        raise Rejection(
-            'bad_shape',
-            f'a covariance of the navigation has {covariance.size} numbers, 36 are needed',
-        )
-    matrix = covariance.reshape(6, 6)
+    matrix = square(values, 6, 'covariance of the navigation')
     diagonal = np.diag(matrix)
     usable = np.isfinite(matrix).all() and matrix.any() and (diagonal >= 0.0).all()
     return matrix if usable else None
 
 
 def _written(covariance: FloatArray | None) -> FloatArray:
-    return np.diag(np.full(6, -1.0)).ravel() if covariance is None else np.ravel(covariance)
+    return np.diag(np.full(6, -1.0)) if covariance is None else covariance
+
+
+# -- the pose of a vessel that carries a transceiver -------------------------------------------
+
+
+def read_vessel_pose(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselPose:
+    """Read an Odometry. Raises `Rejection`."""
+    pose = read_navigation(message, world_frame=world_frame)
+    return VesselPose(**{field.name: getattr(pose, field.name) for field in fields(type(pose))})
+
+
+def read_heading(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselHeading:
+    """Read the orientation of a sensor_msgs/Imu or a geometry_msgs/QuaternionStamped.
+
+    Raises `Rejection`, also for an Imu that says it has no orientation.
+    """
+    covariance = None
+    if hasattr(message, 'orientation_covariance'):
+        given = square(message.orientation_covariance, 3, 'covariance of an orientation')
+        if given[0, 0] == -1.0:
+            raise Rejection('no_orientation', 'the IMU says that it has no orientation')
+        usable = np.isfinite(given).all() and (np.diag(given) > 0.0).all()
+        covariance = given if usable else None
+    q = message.orientation if hasattr(message, 'orientation') else message.quaternion
+    heading = VesselHeading(
+        **head_of(message),
+        orientation=(float(q.x), float(q.y), float(q.z), float(q.w)),
+        covariance=covariance,
+    )
+    return to_enu(heading, world_frame, _turned_heading)
+
+
+def write_heading(heading: VesselHeading, make: Make) -> Any:
+    """Write a sensor_msgs/Imu with an orientation and nothing else."""
+    covariance = np.zeros(9) if heading.covariance is None else np.ravel(heading.covariance)
+    return make(
+        'sensor_msgs/msg/Imu',
+        header=make_header(heading.stamp_ns, heading.frame_id, make),
+        orientation=make_vector(heading.orientation, make, 'Quaternion'),
+        orientation_covariance=covariance,
+        angular_velocity_covariance=np.array([-1.0] + [0.0] * 8),
+        linear_acceleration_covariance=np.array([-1.0] + [0.0] * 8),
+    )
+
+
+def _turned_heading(heading: VesselHeading) -> VesselHeading:
+    """An FLU body in ENU, of an FRD body in NED."""
+    covariance = heading.covariance
+    if covariance is not None:
+        covariance = swap_axes(swap_axes(covariance).T)
+    return evolve(heading, orientation=flip_quaternion(heading.orientation), covariance=covariance)

@@ -39,7 +39,7 @@ from sonar_imm.estimates import Estimate, PLACES
 
 from .displays.tracks import confirmed_rows, Drawn
 from .fixes import UNKNOWN_VARIANCE
-from .headers import Make, make_header, make_pose
+from .headers import Make, make_header, make_pose, make_stated_pose, make_stated_twist, make_vector
 
 CONTACT = 'marine_interfaces/msg/Contact'
 CONTACTS = 'marine_interfaces/msg/ContactArray'
@@ -155,7 +155,7 @@ class Neighbours:
                 'marine_interfaces/msg/Shape',
                 type=0,
                 footprint=make('geometry_msgs/msg/Polygon', points=[]),
-                dimensions=_vector((0.0, 0.0, 0.0), make),
+                dimensions=make_vector((0.0, 0.0, 0.0), make),
             ),
             geo_pose=_geo_pose(self._origin(), motion, make),
             source=f'sonar_imm.{self._system}',
@@ -185,7 +185,7 @@ class Neighbours:
             bbox=make(
                 'vision_msgs/msg/BoundingBox3D',
                 center=make_pose(motion.place, make),
-                size=_vector((0.0, 0.0, 0.0), make),
+                size=make_vector((0.0, 0.0, 0.0), make),
             ),
             id=self._id(estimate, row),
         )
@@ -216,24 +216,16 @@ def _above(estimate: Estimate) -> dict[str, np.ndarray]:
 
 
 def _pose(motion: Motion, make: Make) -> Any:
-    return make(
-        'geometry_msgs/msg/PoseWithCovariance',
-        pose=make_pose(motion.place, make),
-        covariance=_six(motion.covariance),
-    )
+    return make_stated_pose(motion.place, _six(motion.covariance), make)
 
 
 def _twist(motion: Motion, make: Make) -> Any:
-    unknown = motion.velocity is None
     covariance = _six(motion.velocity_covariance)
-    if unknown:
-        covariance[0] = -1.0
-    twist = make(
-        'geometry_msgs/msg/Twist',
-        linear=_vector(np.zeros(3) if motion.velocity is None else motion.velocity, make),
-        angular=_vector((0.0, 0.0, 0.0), make),
+    if motion.velocity is None:
+        covariance[0, 0] = -1.0
+    return make_stated_twist(
+        (0.0,) * 3 if motion.velocity is None else motion.velocity, covariance, make
     )
-    return make('geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=covariance)
 
 
 def _geo_pose(origin: Origin | None, motion: Motion, make: Make) -> Any:
@@ -248,16 +240,12 @@ def _geo_pose(origin: Origin | None, motion: Motion, make: Make) -> Any:
             longitude=longitude,
             altitude=altitude if motion.has_height else np.nan,
         ),
-        orientation=make('geometry_msgs/msg/Quaternion', **dict(zip('xyzw', _NO_TURN))),
+        orientation=make_vector(_NO_TURN, make, 'Quaternion'),
     )
 
 
-def _vector(values: Any, make: Make) -> Any:
-    return make('geometry_msgs/msg/Vector3', **dict(zip('xyz', map(float, values))))
-
-
 def _six(block: np.ndarray) -> np.ndarray:
-    """A covariance (3, 3) in the 36 numbers of ROS; the rest is not estimated."""
+    """A covariance (3, 3) in the (6, 6) of ROS; the rest is not estimated."""
     covariance = np.eye(6) * UNKNOWN_VARIANCE
     covariance[:3, :3] = block
-    return covariance.ravel()
+    return covariance

@@ -39,16 +39,16 @@ from sonar_imm.measurements import Fixes, in_space, NOBODY, Rejection, usable_fi
 
 from .fixes import LEAST_VARIANCE, MOST_VARIANCE
 from .headers import (
+    head_of,
     Make,
     make_header,
     make_pose,
     places_of,
-    stamp_ns,
     swap_axes,
     swap_covariance,
     to_enu,
 )
-from .table import decode_table, encode_table, require_columns, scalar_column
+from .table import decode_table, require_columns, scalar_column, table_of
 
 REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
 OF_Z = {'cov_x_z': (0, 2), 'cov_y_z': (1, 2), 'cov_z_z': (2, 2)}
@@ -117,7 +117,7 @@ def write_scan(scan: Fixes, make: Make) -> Any:
         columns[name] = covariance[:, i, j].astype(np.float32)
     if scan.target_id is not None:
         columns['id'] = scan.target_id
-    return encode_table(columns, stamp_ns=scan.stamp_ns, frame_id=scan.frame_id, make=make)
+    return table_of(scan, columns, make)
 
 
 def write_poses(scan: Fixes, make: Make) -> Any:
@@ -159,8 +159,7 @@ def _of_rows(
     if covariance is not None and np.isnan(covariance).all():
         covariance = None
     return Fixes(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         position=position,
         covariance=covariance,
         target_id=target_id,

@@ -44,7 +44,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, SonarImage, SonarInfo
 
 from .detections import beam_bearings, FARTHEST, SOUND_SPEEDS
-from .headers import Make, make_header, places_of, stamp_ns
+from .headers import head_of, Make, make_header, places_of
 
 DTYPES = ('u1', 'i1', 'u2', 'i2', 'u4', 'i4', 'u8', 'i8', 'f4', 'f8')
 ENCODINGS = {
@@ -94,11 +94,10 @@ def _image(
 ) -> SonarImage:
     """The SonarImageData of a message, with its axes."""
     return SonarImage(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         range=distance,
         bearing=bearing,
         amplitude=image_samples(message.image, len(distance), len(bearing), image_order),
-        frame_id=str(message.header.frame_id),
     )
 
 
@@ -158,11 +157,10 @@ def on_a_grid(
     rows, beams = pixels.shape
     depth, sector = image_far_range - image_near_range, np.radians(image_fov_deg)
     return SonarImage(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         range=image_near_range + depth * (np.arange(rows) + 0.5) / max(rows, 1),
         bearing=sector * (0.5 - (np.arange(beams) + 0.5) / max(beams, 1)),
         amplitude=pixels.astype(np.float64),
-        frame_id=str(message.header.frame_id),
     )
 
 
@@ -266,11 +264,10 @@ def read_oculus_ping(message: Any, **_: Any) -> SonarImage:
         gain = np.ascontiguousarray(table[:, :_GAIN_BYTES]).view('<u4').astype(np.float64)
         amplitude = amplitude / np.sqrt(np.maximum(gain, 1.0))  # a gain of zero was not filled in
     return SonarImage(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         range=resolution * (np.arange(rows) + 0.5),
         bearing=-np.radians(0.01 * bearings),
         amplitude=amplitude,
-        frame_id=str(message.header.frame_id),
     )
 
 
@@ -287,11 +284,10 @@ def read_ping360_echo(message: Any, **_: Any) -> SonarImage:
     if not (np.isfinite(angle) and abs(angle) <= 4.0 * np.pi):
         raise Rejection('out_of_range', f'the echo has an angle of {angle:g} rad')
     return SonarImage(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         range=far * (np.arange(len(samples)) + 1.0) / len(samples),
         bearing=np.array([np.arctan2(np.sin(angle), np.cos(angle))]),
         amplitude=samples.astype(np.float64)[:, None],
-        frame_id=str(message.header.frame_id),
         scanning=True,
     )
 
@@ -330,12 +326,11 @@ def read_sonar_info(message: Any, **_: Any) -> SonarInfo:
     if not (np.isfinite([gain, offset]).all() and gain >= 0.0):
         raise Rejection('out_of_range', f'samples times {gain:g} plus {offset:g} are no levels')
     return SonarInfo(
-        stamp_ns=stamp_ns(message),
+        **head_of(message),
         scale=scale,
         gain=gain,
         offset=offset,
         echo_duration=_echo_duration(message),
-        frame_id=str(message.header.frame_id),
     )
 
 

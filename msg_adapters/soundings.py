@@ -25,17 +25,15 @@ from sonar_imm.estimates import PLACES, places
 from sonar_imm.measurements import Ground, Rejection
 from sonar_imm.soundings import COLUMNS, LATER, Soundings
 
-from .headers import Make, stamp_ns, swap_axes, to_enu
-from .table import decode_table, encode_table, require_columns, scalar_column
+from .headers import head_of, Make, swap_axes, to_enu
+from .table import decode_table, require_columns, scalar_column, table_of
 
 MOST_SOUNDINGS = 1_000_000
 
 
 def write_soundings(soundings: Soundings, make: Make) -> Any:
     """Write the table of ``~/soundings``, one row per bin with an echo, nothing NaN."""
-    return encode_table(
-        soundings.columns, stamp_ns=soundings.stamp_ns, frame_id=soundings.frame_id, make=make
-    )
+    return table_of(soundings, soundings.columns, make)
 
 
 def read_soundings(message: Any) -> Soundings:
@@ -52,9 +50,7 @@ def read_soundings(message: Any) -> Soundings:
             raise Rejection(
                 'bad_field', f'column {name} of a table of soundings is not {np.dtype(kind).name}'
             )
-    return Soundings(
-        stamp_ns(message), str(message.header.frame_id), {name: columns[name] for name in COLUMNS}
-    )
+    return Soundings(**head_of(message), columns={name: columns[name] for name in COLUMNS})
 
 
 def read_ground(message: Any, *, world_frame: str = 'enu', **_: Any) -> Ground:
@@ -74,8 +70,7 @@ def read_ground(message: Any, *, world_frame: str = 'enu', **_: Any) -> Ground:
         variance = np.where(np.isfinite(variance) & (variance > 0.0), variance, 0.0)
     kept = np.isfinite(position).all(axis=1)
     ground = Ground(
-        stamp_ns=stamp_ns(message),
-        frame_id=str(message.header.frame_id),
+        **head_of(message),
         position=position[kept],
         variance=variance[kept],
     )
@@ -89,7 +84,7 @@ def write_ground(ground: Ground, make: Make) -> Any:
         'vertical_uncertainty': ground.variance.astype(np.float32),
         **places(ground.position),
     }
-    return encode_table(columns, stamp_ns=ground.stamp_ns, frame_id=ground.frame_id, make=make)
+    return table_of(ground, columns, make)
 
 
 def _turned(ground: Ground) -> Ground:

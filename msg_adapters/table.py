@@ -39,6 +39,8 @@ from .headers import Make, make_header
 DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _CODES = {name: code for code, name in DATATYPES.items()}
 
+Field = tuple[str, int, np.dtype, int]
+
 MAX_FIELDS = 1024
 MAX_ROWS = 1 << 24
 MAX_BYTES = 1 << 28
@@ -64,7 +66,7 @@ def decode_table(
     data = _bytes_of(message.data)
     fields = _checked_fields(message.fields, point_step)
     if names is not None:
-        fields = [field for field in fields if field[0] in names]
+        fields = tuple(field for field in fields if field[0] in names)
     if row_step < width * point_step:
         raise Rejection(
             'bad_layout',
@@ -120,6 +122,12 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
     header = make_header(stamp_ns, frame_id, make)
     flat = all(array.ndim == 1 for array in arrays)
     return packed_table(packed, fields, is_finite(packed, arrays, flat), header, make)
+
+
+def table_of(measurement: Any, columns: Mapping[str, Any], make: Make) -> Any:
+    """`encode_table` with stamp and frame of `measurement`."""
+    stamp, frame_id = measurement.stamp_ns, measurement.frame_id
+    return encode_table(columns, stamp_ns=stamp, frame_id=frame_id, make=make)
 
 
 def packed_table(
@@ -239,32 +247,37 @@ def _bytes_of(data: Any) -> memoryview:
         ) from None
 
 
-def _checked_fields(fields: Any, point_step: int) -> list[tuple[str, int, np.dtype, int]]:
+def _checked_fields(fields: Any, point_step: int) -> tuple[Field, ...]:
     """Check every PointField: (name, offset, native dtype, count). Overlapping fields are fine."""
     if len(fields) > MAX_FIELDS:
         raise Rejection(
             'too_large', f'the table has {len(fields)} fields, at most {MAX_FIELDS} are read'
         )
-    checked: dict[str, tuple[str, int, np.dtype, int]] = {}
-    for field in fields:
-        name, offset, count = str(field.name), int(field.offset), int(field.count)
+    layout = tuple((str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in fields)
+    return _layout_read(layout, point_step)
+
+
+@lru_cache(maxsize=64)
+def _layout_read(
+    layout: tuple[tuple[str, int, int, int], ...], point_step: int
+) -> tuple[Field, ...]:
+    """As `_checked_fields`, which is the same for message after message."""
+    checked: dict[str, Field] = {}
+    for name, offset, datatype, count in layout:
         if not name:
             raise Rejection('bad_field', 'the table has a field without a name')
         if name in checked:
             raise Rejection('bad_field', f"the table has two fields named '{name}'")
-        if int(field.datatype) not in DATATYPES:
-            raise Rejection(
-                'bad_field', f"field '{name}' has the unknown datatype {int(field.datatype)}"
-            )
+        if datatype not in DATATYPES:
+            raise Rejection('bad_field', f"field '{name}' has the unknown datatype {datatype}")
         if count < 1:
             raise Rejection('bad_field', f"field '{name}' has a count of {count}")
-        dtype = np.dtype(DATATYPES[int(field.datatype)])
-        if offset < 0 or offset + dtype.itemsize * count > point_step:
+        dtype = np.dtype(DATATYPES[datatype])
+        end = offset + dtype.itemsize * count
+        if offset < 0 or end > point_step:
             raise Rejection(
                 'bad_field',
-                f"field '{name}' ends at byte "
-                f'{offset + dtype.itemsize * count}, beyond the '
-                f'point_step of {point_step}',
+                f"field '{name}' ends at byte {end}, beyond the point_step of {point_step}",
             )
         checked[name] = (name, offset, dtype, count)
-    return list(checked.values())
+    return tuple(checked.values())

@@ -25,7 +25,7 @@ import numpy as np
 from sonar_imm.acoustics.geometry import Pose, rotation_of_quaternion
 from sonar_imm.measurements import Rejection, StaticTransforms
 
-from .headers import Make, make_header, stamp_ns
+from .headers import Make, make_header, make_vector, stamp_ns
 from .inputs.topic import InputTopic
 
 MOST_TRANSFORMS = 10_000
@@ -56,12 +56,8 @@ def write_transforms(transforms: StaticTransforms, make: Make) -> Any:
                 child_frame_id=child,
                 transform=make(
                     'geometry_msgs/msg/Transform',
-                    translation=make(
-                        'geometry_msgs/msg/Vector3', **dict(zip('xyz', pose.position.tolist()))
-                    ),
-                    rotation=make(
-                        'geometry_msgs/msg/Quaternion', **dict(zip('xyzw', _quaternion(pose.R)))
-                    ),
+                    translation=make_vector(pose.position, make),
+                    rotation=make_vector(_quaternion(pose.R), make, 'Quaternion'),
                 ),
             )
             for child, (parent, pose) in transforms.poses.items()

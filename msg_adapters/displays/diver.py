@@ -30,7 +30,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from ..estimates import write_odometry
-from ..headers import Make, make_header, make_pose
+from ..headers import Make, make_header, make_pose, make_vector
 from .tracks import (
     confirmed_rows,
     Drawn,
@@ -117,7 +117,7 @@ def _diver(estimate: Estimate, row: int, make: Make) -> list[Any]:
         return make_marker(estimate, row, make, name, kind, size, colour, **more)
 
     ends = [(x, y, z), (x + AHEAD * vx, y + AHEAD * vy, z)]
-    points = [make('geometry_msgs/msg/Point', **dict(zip('xyz', end))) for end in ends]
+    points = [make_vector(end, make, 'Point') for end in ends]
     turn = (0.0, 0.0, math.sin(half), math.cos(half))
     words = f'{track_id}: {speed:.1f} m/s' + (', not seen' if coasts else '')
     return [

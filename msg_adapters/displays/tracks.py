@@ -30,7 +30,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from ..estimates import write_model_probabilities
-from ..headers import Make, make_header
+from ..headers import Make, make_header, make_vector
 
 CONFIRMED = 1
 """Least `track_state` of a confirmed track: 0 tentative, 1 confirmed, 2 coasting."""
@@ -110,7 +110,7 @@ def make_marker(
         id=_number(int(estimate.extras['track_id'][row])),
         type=kind,
         action=_ADD,
-        scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', size))),
+        scale=make_vector(size, make),
         color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour_rgba))),
         lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
         **more,

@@ -31,14 +31,28 @@ from sonar_imm.measurements import (
 )
 
 from ..arrivals import read_arrivals, write_arrivals
-from ..fixes import doubt_fix, doubt_height, read_fix, read_start, write_fix, write_start
-from ..geodetic import doubt_geodetic, is_geodetic, read_geodetic, read_vessel_fix, write_geodetic
+from ..fixes import (
+    doubt_fix,
+    doubt_geodetic,
+    doubt_height,
+    is_geodetic,
+    read_beacon,
+    read_fix,
+    read_geodetic,
+    read_modem,
+    read_relative,
+    read_start,
+    read_usbl_data,
+    read_vessel_fix,
+    write_fix,
+    write_geodetic,
+    write_relative,
+    write_start,
+)
 from ..headers import Make
-from ..navigation import write_navigation
-from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative
+from ..navigation import read_heading, read_vessel_pose, write_heading, write_navigation
 from ..scans import doubt_scan, read_poses, read_scan, write_scan
 from ..transforms import TF_STATIC
-from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'

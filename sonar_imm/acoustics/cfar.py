@@ -208,14 +208,14 @@ def _tails(false_alarm: float) -> tuple[FloatArray, FloatArray]:
         return np.asarray(power - gammaln(shape))
 
     grid = np.linspace(np.log(_SILENT), np.log(1e4), 4000)
-    variances, factors = [], []
+    variances, factors, wanted = [], [], np.log(false_alarm)
     for shape in _SHAPES:
         # Moments of a value that is never below the first of the grid, from its tail alone.
         above = np.exp(tail(grid, shape))
         first = _area(above, grid)
         second = 2.0 * _area((grid - grid[0]) * above, grid)
         variances.append(second - first**2)
-        factor = brentq(lambda x: float(tail(x, shape)) - np.log(false_alarm), -5.0, 15.0)  # noqa: B023
+        factor = brentq(lambda x, k=shape: float(tail(x, k)) - wanted, -5.0, 15.0)
         factors.append(np.exp(factor) / -np.log(false_alarm))
     return np.array(variances)[::-1], np.maximum(np.array(factors)[::-1], 1.0)
 

@@ -71,6 +71,9 @@ def in_space(covariance: Any, position: FloatArray) -> FloatArray:
         whole[:, :2, :2] = given
         return whole
     whole[:] = floats(given, n, 3, 3)
+    if np.isnan(whole[:, 2, 2]).all():  # z is not stated, which is so scan after scan
+        whole[:, 2, :] = whole[:, :, 2] = np.nan
+        return whole
     with np.errstate(all='ignore'):
         variance, across = whole[:, 2, 2], 0.5 * (whole[:, 2, :2] + whole[:, :2, 2])
         a, b, d = whole[:, 0, 0], 0.5 * (whole[:, 0, 1] + whole[:, 1, 0]), whole[:, 1, 1]

@@ -36,7 +36,7 @@ import sys
 from typing import Any
 
 from msg_adapters.displays.tracks import confirmed_rows
-from msg_adapters.geodetic import write_geo
+from msg_adapters.fixes import write_geo
 
 from ..acoustics.geodesy import Origin
 from ..estimates import Estimate

@@ -105,6 +105,7 @@ class System:
     def build(self, config: ObstacleConfig) -> ObstacleTracker: ...
     @overload
     def build(self, config: Config) -> Tracker: ...
+
     def build(self, config: Config) -> Tracker:
         """The tracker with these parameters."""
         return self._own(self.tracker)(config)
@@ -113,6 +114,7 @@ class System:
     def build_smoother(self, config: DiverConfig) -> SmoothingDiverTracker: ...
     @overload
     def build_smoother(self, config: Config) -> SmoothingTracker: ...
+
     def build_smoother(self, config: Config) -> SmoothingTracker:
         """The tracker that can look back at the end of a recording.
 
@@ -153,8 +155,8 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
-            kernels={'pings': (21, 629)},
-            all_kernels=(21, 629),
+            kernels={'pings': (21, 632), 'surfaces': (14, 379)},
+            all_kernels=(29, 898),
         ),
         System(
             name='diver',

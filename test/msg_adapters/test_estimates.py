@@ -12,19 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+import math
+
 from attrs import evolve
 import numpy as np
 import pytest
 
+from msg_adapters.displays import displays_of
+from msg_adapters.displays.diver import NAMES, write_markers, write_poses
 from msg_adapters.estimates import (
     read_estimate,
     write_estimate,
     write_model_probabilities,
     write_odometry,
 )
+from msg_adapters.soundings import read_soundings, write_soundings
 from msg_adapters.table import encode_table
-from sonar_imm.estimates import Estimate
+from sonar_imm.estimates import Estimate, PLACES
 from sonar_imm.measurements import Rejection
+from sonar_imm.soundings import COLUMNS, LATER, Soundings
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 STATES = ('px', 'py', 'vx', 'vy')
@@ -154,3 +160,153 @@ def test_model_probabilities_are_named_scalars():
     assert message.name == list(first.model_names)
     assert message.position.tolist() == first.probabilities[0].tolist()
     assert len(message.velocity) == len(message.effort) == 0
+
+
+# -- test_soundings --
+
+
+def soundings(n=4):
+    rng = np.random.default_rng(1)
+    columns = {name: (10 * rng.random(n)).astype(kind) for name, kind in COLUMNS.items()}
+    return Soundings(1_700_000_000_000_000_001, 'map', columns)
+
+
+def test_what_is_written_reads_back_bit_for_bit():
+    points = soundings()
+    again = read_soundings(write_soundings(points, ros_message))
+    assert (again.stamp_ns, again.frame_id) == (points.stamp_ns, points.frame_id)
+    for name, column in points.columns.items():
+        assert (again.columns[name] == column).all() and again.columns[name].dtype == column.dtype
+
+
+def test_the_layout_is_what_cube_expects():
+    """The CUBE node walks through the fields as four-byte floats, x y z first, nothing NaN."""
+    message = write_soundings(soundings(), ros_message)
+    names = [field.name for field in message.fields]
+    assert names[:7] == [
+        'x',
+        'y',
+        'z',
+        'vertical_uncertainty',
+        'horizontal_uncertainty',
+        'intensity',
+        'beam_angle',
+    ]
+    assert all(field.datatype == 7 and field.count == 1 for field in message.fields[:7])
+    assert [field.offset for field in message.fields[:7]] == [0, 4, 8, 12, 16, 20, 24]
+    assert message.is_dense and message.height == 1
+
+
+def test_the_topic_reads_back_with_the_reader_of_ros():
+    point_cloud2 = pytest.importorskip('sensor_msgs_py.point_cloud2')
+    messages = pytest.importorskip('sonar_imm.nodes.messages')
+    points = soundings()
+    table = point_cloud2.read_points(write_soundings(points, messages.make), skip_nans=True)
+    for name, column in points.columns.items():
+        assert (table[name] == column).all()
+
+
+def test_older_soundings_without_exact_places_and_surfaces_are_read():
+    points = soundings()
+    later = (*PLACES, *LATER)
+    older = {name: column for name, column in points.columns.items() if name not in later}
+    again = read_soundings(encode_table(older, stamp_ns=1, frame_id='map', make=ros_message))
+    assert list(again.columns) == list(COLUMNS) and again.columns['py'].dtype == np.float64
+    assert (again.columns['py'] == points.columns['y']).all()
+    assert (again.columns['surface'] == 1).all() and (again.columns['existence'] == 0.0).all()
+
+
+def test_no_soundings_are_a_message_too():
+    assert len(read_soundings(write_soundings(soundings(0), ros_message))) == 0
+
+
+@pytest.mark.parametrize('broken', ['missing', 'double'])
+def test_other_tables_are_refused_by_one_sentence(broken):
+    columns = dict(soundings().columns)
+    if broken == 'missing':
+        del columns['vertical_uncertainty']
+    else:
+        columns['z'] = columns['z'].astype(np.float64)
+    message = encode_table(columns, stamp_ns=1, frame_id='map', make=ros_message)
+    with pytest.raises(Rejection):
+        read_soundings(message)
+
+
+# -- Displays of several divers at once: poses, and markers that end when their track does --
+
+
+ADD, DELETE, DELETE_ALL = 0, 2, 3
+
+
+def an_estimate(ids, states=None, covariance=None):
+    rows = len(ids)
+    state = np.array([[10.0 * i, -5.0, 0.6, 0.8] for i in ids]).reshape(rows, 4)
+    whole = np.diag([4.0, 1.0, 0.1, 0.1])
+    if covariance is not None:
+        whole[:2, :2] = covariance
+    return Estimate(
+        stamp_ns=5 * 10**9,
+        frame_id='map',
+        xyz=np.column_stack([state[:, :2], np.full(rows, -4.0)]).astype(np.float32),
+        state_names=('px', 'py', 'vx', 'vy'),
+        state=state,
+        covariance=np.tile(whole, (rows, 1, 1)),
+        model_names=('hover',),
+        probabilities=np.ones((rows, 1)),
+        extras={
+            'track_id': np.array(ids, np.uint32),
+            'track_state': np.array(states or [1] * rows, np.uint8),
+        },
+    )
+
+
+def test_all_divers_are_in_one_message_each_turned_to_where_he_swims():
+    message = write_poses(an_estimate([3, 7]), [0, 1], ros_message)
+    assert message.header.frame_id == 'map' and message.header.stamp.sec == 5
+    assert [pose.position.x for pose in message.poses] == [30.0, 70.0]
+    q = message.poses[0].orientation
+    assert 2.0 * math.atan2(q.z, q.w) == pytest.approx(math.atan2(0.8, 0.6))
+
+
+def test_the_ellipse_holds_nine_of_ten_samples_and_lies_along_the_covariance():
+    turn = np.array([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
+    covariance = turn @ np.diag([9.0, 0.25]) @ turn.T
+    place, course, label = write_markers(
+        an_estimate([3], covariance=covariance), [0], ros_message
+    ).markers
+    half = 2.0 * math.atan2(place.pose.orientation.z, place.pose.orientation.w)
+    assert math.cos(half - 0.5) ** 2 == pytest.approx(1.0)
+    samples = np.random.default_rng(1).multivariate_normal([0.0, 0.0], covariance, 20000)
+    long, wide = (samples @ turn).T
+    inside = (2.0 * long / place.scale.x) ** 2 + (2.0 * wide / place.scale.y) ** 2 <= 1.0
+    assert inside.mean() == pytest.approx(0.9, abs=0.01)
+    assert [(end.x, end.y) for end in course.points] == [(30.0, -5.0), (33.0, -1.0)]
+    assert label.text == '3: 1.0 m/s' and label.pose.position.z == -3.0
+    assert {item.id for item in (place, course, label)} == {3}
+
+
+def test_a_diver_that_coasts_is_grey_and_says_so():
+    seen, lost = (
+        write_markers(an_estimate([3], [state]), [0], ros_message).markers for state in (1, 2)
+    )
+    assert seen[0].color != lost[0].color and lost[2].text.endswith('not seen')
+
+
+def drawn(displays, estimate):
+    return [
+        [(marker.ns, marker.id, marker.action) for marker in message.markers]
+        for name, message in displays.of(estimate, ros_message, lambda name: name == 'markers')
+    ]
+
+
+def test_markers_of_a_track_that_is_over_are_deleted_at_once():
+    displays = displays_of('diver')
+    assert drawn(displays, an_estimate([1, 2], [0, 1])) == [[(n, 2, ADD) for n in NAMES]]
+    both = drawn(displays, an_estimate([1, 2]))
+    assert both == [[(n, i, ADD) for i in (1, 2) for n in NAMES]]
+    ended, left = drawn(displays, an_estimate([1]))
+    assert ended == [(n, 2, DELETE) for n in NAMES] and left == [(n, 1, ADD) for n in NAMES]
+    assert drawn(displays, an_estimate([])) == [[(n, 1, DELETE) for n in NAMES]]
+    assert drawn(displays, an_estimate([])) == []
+    ((name, message),) = displays.forget(ros_message)
+    assert name == 'markers' and [marker.action for marker in message.markers] == [DELETE_ALL]

@@ -14,13 +14,28 @@
 
 import math
 
+from helpers.marine import driver_message
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from msg_adapters.fixes import doubt_fix, doubt_height, read_fix, write_fix
-from sonar_imm.measurements import Fix, Rejection
+from msg_adapters.fixes import (
+    doubt_fix,
+    doubt_geodetic,
+    doubt_height,
+    read_fix,
+    read_geodetic,
+    read_start,
+    read_vessel_fix,
+    write_fix,
+    write_geo,
+    write_geodetic,
+    write_start,
+)
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix, GeodeticFix, Rejection, Start, VesselFix
 from sonar_imm_tools.recordings.messages import ros_message
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -221,3 +236,218 @@ def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, fr
         assert np.isfinite(flat).all()
         assert (np.linalg.eigvalsh(flat) >= 0.99e-12).all()
         assert flat.max() <= 1e16
+
+
+# -- Latitude and longitude from messages, and estimates as NavSatFix --
+
+
+STAMP = 1_700_000_000_123_456_789
+
+
+def navsat(**changes):
+    values = {
+        'stamp_ns': STAMP,
+        'latitude': 59.0,
+        'longitude': 10.0,
+        'height': 12.0,
+        'covariance': np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 16.0]]),
+        'frame_id': 'gps',
+    }
+    message = write_geodetic(GeodeticFix(**values), ros_message)
+    for path, value in changes.items():
+        *way, last = path.split('__')
+        target = message
+        for step in way:
+            target = getattr(target, step)
+        object.__setattr__(target, last, value)
+    return message
+
+
+def earth_reason(message, read=read_geodetic):
+    with pytest.raises(Rejection) as caught:
+        read(message)
+    return caught.value.reason
+
+
+def test_a_navsatfix_is_read_as_it_was_written():
+    fix = read_geodetic(navsat())
+    assert (fix.stamp_ns, fix.latitude, fix.longitude, fix.height) == (STAMP, 59.0, 10.0, 12.0)
+    assert fix.covariance[0].tolist() == [4.0, 0.5, 0.1] and fix.frame_id == 'gps'
+    assert isinstance(read_vessel_fix(navsat()), VesselFix)
+
+
+def test_no_fix_is_named_and_left_out():
+    assert earth_reason(navsat(status__status=-1)) == 'no_fix'
+    for status in (0, 1, 2):
+        assert read_geodetic(navsat(status__status=status)).latitude == 59.0
+
+
+@pytest.mark.parametrize(
+    'kind, expected',
+    [
+        (0, None),
+        (1, [4.0, 0.5, 0.1]),
+        (2, [4.0, 0.0, 0.0]),
+        (3, [4.0, 0.5, 0.1]),
+    ],
+)
+def test_the_type_of_a_covariance_decides(kind, expected):
+    covariance = read_geodetic(navsat(position_covariance_type=kind)).covariance
+    assert expected == (None if covariance is None else covariance[0].tolist())
+
+
+def test_a_covariance_that_was_not_filled_in_is_unknown_and_doubted():
+    zero = navsat(position_covariance=np.zeros(9))
+    assert read_geodetic(zero).covariance is None
+    assert doubt_geodetic(zero) == 'zero_covariance' and doubt_geodetic(navsat()) is None
+    assert doubt_geodetic(navsat(position_covariance_type=0)) is None
+    flat = np.diag([1.0, 1.0, 0.0]).ravel()
+    assert read_geodetic(navsat(position_covariance=flat)).covariance[2, 2] > 1e5
+
+
+@pytest.mark.parametrize(
+    'changes, expected',
+    [
+        ({'latitude': float('nan')}, 'nan'),
+        ({'latitude': 91.0}, 'out_of_range'),
+        ({'longitude': 361.0}, 'out_of_range'),
+        ({'altitude': 1e9}, 'out_of_range'),
+        ({'position_covariance': np.full(9, np.nan)}, 'nan'),
+        ({'position_covariance': np.diag([1.0, 1.0, 1e-20]).ravel()}, 'out_of_range'),
+        ({'position_covariance': np.ones(9)}, 'out_of_range'),
+        ({'position_covariance': np.ones(4)}, 'bad_shape'),
+    ],
+)
+def test_what_is_no_position_is_refused(changes, expected):
+    assert earth_reason(navsat(**changes)) == expected
+
+
+def test_height_may_be_unknown():
+    assert np.isnan(read_geodetic(navsat(altitude=float('nan'))).height)
+
+
+@pytest.mark.parametrize(
+    'name, way',
+    [
+        ('GeoPointStamped', 'position'),
+        ('GeoPoseStamped', 'pose__position'),
+        ('GeoPoseWithCovarianceStamped', 'pose__pose__position'),
+    ],
+)
+def test_geographic_messages_are_read_by_their_fields(name, way):
+    message = driver_message(
+        f'geographic_msgs/msg/{name}',
+        header__stamp__sec=7,
+        **{f'{way}__latitude': -33.0, f'{way}__longitude': 151.0, f'{way}__altitude': -4.0},
+    )
+    fix = read_geodetic(message)
+    assert (fix.latitude, fix.longitude, fix.height) == (-33.0, 151.0, -4.0)
+    assert fix.covariance is None
+    if 'Covariance' in name:
+        message.pose.covariance[:15] = np.diag(np.arange(1.0, 7.0)).ravel()[:15]
+        assert np.diag(read_geodetic(message).covariance).tolist() == [1.0, 2.0, 3.0]
+
+
+def estimate(names=('px', 'py', 'vx', 'vy')):
+    n = len(names)
+    state = np.arange(1.0, n + 1.0)[None] * 1000.0
+    covariance = (np.eye(n) + 0.1)[None]
+    return Estimate(
+        stamp_ns=STAMP,
+        frame_id='map',
+        xyz=state[:, :3].astype(np.float32),
+        state_names=names,
+        state=state,
+        covariance=covariance,
+        extras={'track_id': np.array([4], np.uint32)},
+    )
+
+
+def test_an_estimate_is_written_as_navsatfix_and_read_back():
+    origin = Origin(59.0, 10.0, 5.0)
+    message = write_geo(estimate(('px', 'py', 'pz', 'vx', 'vy', 'vz')), 0, origin, ros_message)
+    fix = read_geodetic(message)
+    back = origin.local(fix.latitude, fix.longitude, fix.height)
+    assert back == pytest.approx([1000.0, 2000.0, 3000.0], abs=1e-6)
+    assert fix.frame_id == 'diver_4' and fix.stamp_ns == STAMP
+    turn = origin.turn(fix.latitude, fix.longitude)
+    assert turn @ fix.covariance @ turn.T == pytest.approx(np.eye(3) + 0.1, abs=1e-9)
+
+
+def test_without_depth_the_altitude_is_not_a_number():
+    message = write_geo(estimate(), 0, Origin(59.0, 10.0), ros_message)
+    assert np.isnan(message.altitude)
+    assert message.position_covariance[8] > 1e5 and message.position_covariance_type == 3
+    assert message.position_covariance[0] == pytest.approx(1.1, abs=1e-3)
+
+
+# -- Starts of tracks: what is read, and what is refused with a sentence --
+
+
+def start_message(x=1.0, y=2.0, z=3.0, covariance=None, **values):
+    start = Start(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=np.eye(2), frame_id='map')
+    message = write_start(start, ros_message)
+    place = message.pose.pose.position
+    place.x, place.y, place.z = x, y, z
+    whole = np.zeros((6, 6))
+    whole[:2, :2] = [[4.0, 1.0], [1.0, 9.0]] if covariance is None else covariance
+    message.pose.covariance = whole.ravel()
+    for name, value in values.items():
+        setattr(message.header, name, value)
+    return message
+
+
+def start_reason(message):
+    with pytest.raises(Rejection) as caught:
+        read_start(message)
+    assert caught.value.sentence
+    return caught.value.reason
+
+
+def test_a_start_is_read_and_written():
+    start = read_start(start_message())
+    assert start.stamp_ns == STAMP and start.frame_id == 'map'
+    assert start.position.tolist() == [1.0, 2.0, 3.0]
+    assert start.covariance[:2, :2].tolist() == [[4.0, 1.0], [1.0, 9.0]]
+    again = read_start(write_start(start, ros_message))
+    assert (again.position == start.position).all()
+    assert np.isnan(start.covariance[2]).all() and again.key() == start.key()
+
+
+def test_the_height_of_a_start_is_read_where_it_is_stated():
+    covariance = np.array([[4.0, 1.0, 0.2], [1.0, 9.0, 0.3], [0.2, 0.3, 0.25]])
+    start = Start(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='map')
+    again = read_start(write_start(start, ros_message))
+    assert again.covariance.tolist() == covariance.tolist() and again.key() == start.key()
+
+
+def test_north_east_down_is_turned():
+    start = read_start(start_message(), world_frame='ned')
+    assert start.position.tolist() == [2.0, 1.0, -3.0]
+    assert start.covariance[:2, :2].tolist() == [[9.0, 1.0], [1.0, 4.0]]
+
+
+@pytest.mark.parametrize(
+    'given, code',
+    [
+        ({'x': math.nan}, 'nan'),
+        ({'y': math.inf}, 'nan'),
+        ({'x': 2e8}, 'out_of_range'),
+        ({'covariance': np.zeros((2, 2))}, 'no_covariance'),
+        ({'covariance': [[-1.0, 0.0], [0.0, -1.0]]}, 'no_covariance'),
+        ({'covariance': [[math.nan, 0.0], [0.0, 1.0]]}, 'nan'),
+        ({'covariance': [[1.0, 2.0], [2.0, 1.0]]}, 'bad_covariance'),
+        ({'covariance': [[1.0, 0.5], [0.0, 1.0]]}, 'bad_covariance'),
+        ({'covariance': np.eye(2) * 1e-20}, 'out_of_range'),
+        ({'covariance': np.eye(2) * 1e20}, 'out_of_range'),
+        ({'frame_id': 'map_ned'}, 'frame_ned'),
+    ],
+)
+def test_a_start_that_cannot_be_used_is_refused(given, code):
+    assert start_reason(start_message(**given)) == code
+
+
+def test_a_start_without_a_stamp_is_refused():
+    message = start_message()
+    message.header.stamp.sec = message.header.stamp.nanosec = 0
+    assert start_reason(message) == 'bad_stamp'

@@ -12,15 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+import os
+from pathlib import Path
 import subprocess
 import sys
 from typing import get_args
 
 from helpers.marine import driver_message, OTHERS
+import numpy as np
 import pytest
 
+import msg_adapters
 from msg_adapters.inputs import inputs_of
-from sonar_imm.measurements import Measurement, Rejection
+from msg_adapters.inputs.topic import Labels, tag_numbers
+import sonar_imm
+from sonar_imm.measurements import Fix, Fixes, Measurement, NOBODY, Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 
@@ -69,3 +75,114 @@ def test_each_class_of_measurements_is_heard_under_one_name():
 def test_an_unknown_system_has_no_inputs():
     with pytest.raises(ModuleNotFoundError):
         inputs_of('whale')
+
+
+# -- Names of tags and sensors, from topics and frames --
+
+
+BOTH = ('tags', 'sensors')
+
+
+def fix(frame_id='map', **values):
+    return Fix(stamp_ns=5, position=(1.0, 2.0, 0.0), frame_id=frame_id, **values)
+
+
+def label(topic, measurement, **settings):
+    labels = Labels.of(topic, settings, BOTH)
+    return measurement if labels is None else labels(measurement)
+
+
+def test_tags_are_numbers_or_their_place_in_the_list():
+    assert tag_numbers(['12', '7']) == {'12': 12, '7': 7}
+    assert tag_numbers(['amy', '7']) == {'amy': 1, '7': 2}
+    assert tag_numbers(['amy', 'bob', 'amy']) == {'amy': 1, 'bob': 2}
+    assert tag_numbers([]) == {}
+
+
+def test_a_part_of_the_topic_is_a_name_and_a_part_of_that_is_none():
+    tags = {'tags': ['amy', 'bob']}
+    assert label('/divers/bob/fix', fix(), **tags).target_id == 2
+    assert label('/divers/bobby/fix', fix(), **tags).target_id == NOBODY
+    assert label('bob/fix', fix(), **tags).target_id == 2
+
+
+def test_a_frame_is_a_name_and_then_the_frame_is_the_map():
+    named = label('/fix', fix('amy'), tags=['amy'], map_frame='odom')
+    assert (named.target_id, named.frame_id) == (1, 'odom')
+    other = label('/fix', fix('map'), tags=['amy'])
+    assert (other.target_id, other.frame_id) == (NOBODY, 'map')
+
+
+def test_what_a_message_says_itself_stays():
+    assert label('/bob/fix', fix(target_id=40), tags=['bob']).target_id == 40
+
+
+def test_sensors_are_labelled_and_scans_are_no_tags():
+    scan = Fixes(stamp_ns=5, position=np.empty((0, 3)))
+    labels = Labels.of('/radar/fixes', {'sensors': ['radar'], 'tags': ['amy']}, ('sensors',))
+    assert labels(scan).sensor == 'radar'
+    assert label('/radar/fix', fix(), sensors=['radar']).sensor == 'radar'
+
+
+def test_without_names_nothing_is_labelled():
+    assert Labels.of('/bob/fix', {'tags': [], 'sensors': []}, BOTH) is None
+
+
+def test_each_name_has_a_topic_of_its_own():
+    by_name = {entry.name: entry for entry in inputs_of('diver')}
+    settings = {'tags': ['amy'], 'sensors': ['radar']}
+    assert by_name['fix'].instances(settings) == ('fix', 'amy/fix', 'radar/fix')
+    assert by_name['fixes'].instances(settings) == ('fixes', 'radar/fixes')
+    assert by_name['nav'].instances(settings) == ('nav',)
+
+
+# -- the owner of the module --
+
+
+ROOT = str(Path(sonar_imm.__file__).parent.parent)
+
+
+def import_with(*path):
+    return subprocess.run(
+        [sys.executable, '-c', 'import sonar_imm'],
+        capture_output=True,
+        text=True,
+        cwd='/',
+        check=False,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
+    )
+
+
+def test_our_own_adapters_are_ours():
+    assert msg_adapters.__owner__ == 'sonar_imm'
+    assert msg_adapters.__version__ == sonar_imm.__version__
+    assert import_with(ROOT).returncode == 0
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        '',
+        "__owner__ = 'someone'\n__version__ = '9'\n",
+        "__owner__ = 'sonar_imm'\n__version__ = '0.0.0'\n",
+        None,
+    ],
+)
+def test_foreign_adapters_are_refused_and_both_places_named(tmp_path, content):
+    foreign = tmp_path / 'msg_adapters'
+    foreign.mkdir()
+    if content is not None:
+        (foreign / '__init__.py').write_text(content)
+        path = [str(tmp_path), ROOT]
+    else:  # a folder without __init__.py is a module too when nothing better is found
+        if 'site-packages' in ROOT:
+            pytest.skip('ours is installed here, and a bare folder never comes before it')
+        house = tmp_path / 'house'
+        house.mkdir()
+        (house / 'sonar_imm').symlink_to(Path(ROOT) / 'sonar_imm')
+        path = [str(tmp_path), str(house)]
+    result = import_with(*path)
+    assert result.returncode == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith('ImportError') and str(foreign) in last
+    assert os.path.join('sonar_imm', '__init__.py') in last

@@ -14,6 +14,8 @@
 
 """Poses and altitudes of a vehicle."""
 
+import math
+
 from helpers import marine
 import numpy as np
 import pytest
@@ -29,8 +31,11 @@ from msg_adapters.navigation import (
     write_navigation,
     write_range,
 )
-from sonar_imm.measurements import Altitude, Navigation, Rejection
-from sonar_imm_tools.recordings.messages import ros_message
+from msg_adapters.transforms import read_transforms, write_transforms
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import Altitude, Navigation, Rejection, StaticTransforms
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 TURNED = Rotation.from_euler('ZYX', [0.7, -0.2, 0.4])
 
@@ -240,3 +245,57 @@ def test_doppler_logs_of_simulators_give_their_altitude(make):
 
 def test_a_log_that_tracks_the_water_knows_no_altitude():
     assert reason(read_dave_dvl, dave(30.0, 'DVL_TARGET_WATER_MASS')) == 'no_bottom'
+
+
+# -- Transforms as messages: TFMessage of a recording, TransformStamped where tf2 is missing --
+
+
+def message(parent='base_link', child='sonar', rpy=(0.1, -0.4, 2.9)):
+    pose = Pose(np.array([1.0, 0.5, -0.2]), geometry.rotation(*rpy))
+    return write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_what_is_written_reads_back(seed):
+    rng = np.random.default_rng(seed)
+    rpy = rng.uniform(-np.pi, np.pi, size=3)
+    rpy[1] /= 2.0
+    made = message(rpy=rpy)
+    name = made.__msgtype__
+    again = typestore().deserialize_cdr(typestore().serialize_cdr(made, name), name)
+    parent, pose = read_transforms(again).poses['sonar']
+    assert parent == 'base_link' and pose.position.tolist() == [1.0, 0.5, -0.2]
+    assert pose.R == pytest.approx(geometry.rotation(*rpy), abs=1e-12)
+
+
+def test_one_transform_alone_is_read_and_a_leading_slash_dropped():
+    (item,) = message(parent='/base_link', child='/sonar').transforms
+    assert list(read_transforms(item).poses) == ['sonar']
+    assert read_transforms(item).poses['sonar'][0] == 'base_link'
+
+
+@pytest.mark.parametrize(
+    'spoil, code',
+    [
+        (lambda item: setattr(item.transform.translation, 'x', math.nan), 'nan'),
+        (lambda item: setattr(item.transform.rotation, 'w', math.inf), 'nan'),
+        (lambda item: setattr(item.transform.rotation, 'w', 7.0), 'out_of_range'),
+        (lambda item: setattr(item.transform.rotation, 'x', 1e300), 'out_of_range'),
+        (lambda item: setattr(item.transform.translation, 'y', 1e9), 'out_of_range'),
+        (lambda item: setattr(item.header, 'frame_id', ''), 'no_frame'),
+        (lambda item: setattr(item, 'child_frame_id', 'base_link'), 'no_frame'),
+        (lambda item: setattr(item, 'child_frame_id', 'f' * 1001), 'too_large'),
+        (lambda item: setattr(item.header, 'frame_id', 'f' * 1001), 'too_large'),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_reason(spoil, code):
+    made = message()
+    spoil(made.transforms[0])
+    with pytest.raises(Rejection) as caught:
+        read_transforms(made)
+    assert caught.value.reason == code
+
+
+def test_a_message_without_any_is_refused():
+    with pytest.raises(Rejection):
+        read_transforms(write_transforms(StaticTransforms(poses={}), ros_message))

@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.detections import read_detections_3d
-from msg_adapters.fixes import UNKNOWN_VARIANCE
-from msg_adapters.geodetic import read_geodetic
+from msg_adapters.fixes import read_geodetic, UNKNOWN_VARIANCE
 from msg_adapters.neighbours import CONTACT, CONTACTS, DETECTIONS, GEO_POSE, Neighbours, TOPICS
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate

@@ -18,14 +18,14 @@ from helpers.marine import driver_message
 import numpy as np
 import pytest
 
-from msg_adapters.relative import (
+from msg_adapters.fixes import (
     read_beacon,
     read_modem,
     read_relative,
     read_usbl_data,
     write_relative,
 )
-from msg_adapters.vessel import read_heading, read_vessel_pose, write_heading
+from msg_adapters.navigation import read_heading, read_vessel_pose, write_heading
 from sonar_imm.acoustics.geometry import flip_quaternion, rotation_of_quaternion
 from sonar_imm.measurements import NOBODY, Rejection, RelativeFix, VesselHeading, VesselPose
 from sonar_imm_tools.recordings.messages import ros_message

@@ -14,6 +14,10 @@
 
 """What `ros2 param dump` writes of a live node loads again, in the node and in ``track``."""
 
+import contextlib
+from pathlib import Path
+from xml.etree import ElementTree
+
 import pytest
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters
@@ -21,7 +25,11 @@ from rclpy.parameter import parameter_value_to_python
 import yaml
 
 from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.bathymetry import BathymetryNode
+from sonar_imm.nodes.diver import DiverNode
+from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
+from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.parameters import ConfigError, sections_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
@@ -117,3 +125,69 @@ def test_the_command_takes_a_dump_as_it_is(tmp_path, capsys):
         main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), '--params', str(file)]) == 0
     )
     assert '"sound_speed": 1480.0' in (tmp_path / 'run' / 'run.json').read_text()
+
+
+# -- The policies of SROS 2 allow what the nodes do, and nothing else --
+
+
+FOLDER = Path(__file__).resolve().parents[2] / 'config' / 'sros2'
+# So that the nodes start, and hear the same, where messages of others are not installed.
+FRAMES = ['-p', 'tf_static_type:=geometry_msgs/msg/TransformStamped']
+EXTRA = {
+    'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image'],
+    **dict.fromkeys(('bathymetry', 'diver', 'obstacle'), FRAMES),
+}
+PROGRAMS = {
+    'bathymetry': BathymetryNode,
+    'diver': DiverNode,
+    'fathometer': FathometerNode,
+    'fls_detector': FlsDetectorNode,
+    'obstacle': ObstacleNode,
+}
+
+
+def allowed(name, node):
+    """Absolute names by what is allowed, from the file."""
+    policy = ElementTree.parse(FOLDER / f'{name}.xml').getroot()
+    assert (policy.tag, policy.get('version')) == ('policy', '0.2.0')
+    (enclave,) = policy.findall('enclaves/enclave')
+    assert enclave.get('path') == f'/sonar_imm/{name}'
+    (profile,) = enclave.findall('profiles/profile')
+    assert (profile.get('ns'), profile.get('node')) == ('/', name)
+    rules = {}
+    for group in profile:
+        ((rule, word),) = group.attrib.items()
+        assert word == 'ALLOW'
+        names = [item.text.replace('~', f'/{node.get_name()}') for item in group]
+        assert not any('*' in name for name in names)  # nothing wholesale
+        rules[group.tag, rule] = set(names)
+    return rules
+
+
+@pytest.mark.parametrize('name', PROGRAMS)
+def test_a_policy_allows_what_its_node_does_and_nothing_else(name, make_bench):
+    bench = make_bench('-p', 'use_sim_time:=true', *EXTRA.get(name, []))
+    node = bench.add(PROGRAMS[name](context=bench.context))
+    given = allowed(name, node)
+    who = node.get_name(), node.get_namespace()
+    graph = {
+        ('topics', 'publish'): node.get_publisher_names_and_types_by_node,
+        ('topics', 'subscribe'): node.get_subscriber_names_and_types_by_node,
+        ('services', 'reply'): node.get_service_names_and_types_by_node,
+        ('services', 'request'): node.get_client_names_and_types_by_node,
+    }
+    for rule, ask in graph.items():
+        # The graph hears of a node's own endpoints a little later.
+        with contextlib.suppress(AssertionError):
+            bench.spin_until(
+                lambda rule=rule, ask=ask: given.get(rule, set()) == {n for n, _ in ask(*who)}, 5.0
+            )
+        assert given.get(rule, set()) == {item for item, _ in ask(*who)}, rule
+    assert '/rosout' in given['topics', 'publish']
+    assert '/parameter_events' in given['topics', 'publish']
+    assert '/clock' in given['topics', 'subscribe']
+    assert f'/{name}/get_type_description' in given['services', 'reply']
+
+
+def test_every_node_has_a_policy():
+    assert {path.stem for path in FOLDER.iterdir()} == PROGRAMS.keys()

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from msg_adapters.geodetic import write_geodetic
+from msg_adapters.fixes import write_geodetic
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import GeodeticFix

@@ -21,8 +21,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from msg_adapters.fixes import write_fix
-from msg_adapters.geodetic import write_geodetic
+from msg_adapters.fixes import write_fix, write_geodetic
 from msg_adapters.navigation import write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.acoustics.geodesy import Origin

@@ -14,6 +14,7 @@
 
 """Playing bags: pace, selection, clock, pause and lock-step, with real publishers."""
 
+import os
 import threading
 import time
 
@@ -24,12 +25,19 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+from msg_adapters.fixes import write_fix
+from sonar_imm.measurements import Fix
 from sonar_imm.nodes.qos import profiles_of
 from sonar_imm.parameters import ConfigError
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.reader import BagError, BagReader
 from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.replay import harness
 from sonar_imm_tools.replay import player as player_module
-from sonar_imm_tools.replay.link import Link
+from sonar_imm_tools.replay.harness import LockstepResult, reserved_domain_id, run_lockstep
+from sonar_imm_tools.replay.link import Link, LinkError
+from sonar_imm_tools.replay.lockstep import Counts
 from sonar_imm_tools.replay.player import NAME, Pace, play, Player, PlayOptions
 
 
@@ -207,3 +215,128 @@ def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
         (101, 'map', 1.0),
         (102, 'map', 2.0),
     ]
+
+
+# -- The harness around real nodes; what needs a process is tested in test/system --
+
+
+def result(delays):
+    return LockstepResult([], Counts(0, 0, 0), tuple(delays), 0, '', ())
+
+
+def test_latency_percentiles_are_milliseconds():
+    latency = result(np.arange(1, 102) / 1000.0).latency_ms()
+    assert latency == pytest.approx({'p50': 51.0, 'p99': 100.0})
+    assert np.isnan(result([]).latency_ms()['p99'])
+
+
+def test_reserved_domains_differ_and_come_free_again():
+    with reserved_domain_id() as first, reserved_domain_id() as second:
+        assert first != second
+        assert 1 <= first <= 100
+    with reserved_domain_id():
+        pass
+
+
+def test_a_domain_of_a_killed_process_is_reserved_last(tmp_path, monkeypatch):
+    monkeypatch.setattr(harness, '_SHARED_MEMORY', tmp_path)
+    for domain in {*range(1, 101)} - {37}:
+        (tmp_path / f'fastrtps_port{7400 + 250 * domain + 11}').touch()
+    with reserved_domain_id() as first, reserved_domain_id() as second:
+        assert first == 37 != second
+
+
+def test_an_input_recorded_with_two_types_cannot_be_played_to_one_node(tmp_path):
+    fix = write_fix(Fix(stamp_ns=10**9, position=(1.0, 2.0, 0.0), frame_id='map'), ros_message)
+    point = ros_message(
+        'geometry_msgs/msg/PointStamped', header=fix.header, point=fix.pose.pose.position
+    )
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/usbl/fix', fix, 10**9)
+        writer.write('/gps/fix', point, 10**9)
+    with pytest.raises(LinkError, match="the input 'fix' would come as"):
+        run_lockstep(tmp_path / 'bag', 'diver')
+
+
+def test_a_bag_without_input_is_a_bag_error_and_the_environment_is_as_before(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/note', ros_message('std_msgs/msg/String', data='x'), 10**9)
+    before = dict(os.environ)
+    with pytest.raises(BagError, match='no topic for the diver tracker'):
+        run_lockstep(tmp_path / 'bag', 'diver')
+    assert dict(os.environ) == before
+
+
+def test_waiting_ends_by_the_limit_or_by_trouble():
+    with Link('waiter') as link:
+        assert not link.wait_for(lambda: False, 0.05)
+        assert link.wait_for(lambda: True, 0.0)
+        with pytest.raises(LinkError, match='the peer has sunk'):
+            link.wait_for(lambda: False, 10.0, lambda: 'the peer has sunk')
+
+
+# -- The words on the command line of ``play``, and its file of qualities of service --
+
+
+@pytest.mark.parametrize(
+    'text, sentence',
+    [
+        ('/fix: {depth: many}', "depth must be a whole number, got 'many'"),
+        ('/fix: {reliability: often}', "reliability is one of .*, got 'often'"),
+        ('/fix: {deadline: 1}', "'deadline' is none of depth, history"),
+        ('/fix: 5', 'a mapping of policies for each topic'),
+        ('{[', 'not a YAML file'),
+    ],
+)
+def test_files_of_qualities_of_service_are_checked(text, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        profiles_of(text)
+
+
+def test_a_file_of_qualities_of_service_says_what_it_says_and_the_rest_is_reliable():
+    lines = (
+        '/all: {history: keep_all}',
+        '/quick: {reliability: best_effort, depth: 3}',
+        '/rest: {}',
+    )
+    profiles = profiles_of('\n'.join(lines))
+    values = {
+        topic: (profile.history.name, profile.reliability.name, profile.durability.name)
+        for topic, profile in profiles.items()
+    }
+    assert values == {
+        '/all': ('KEEP_ALL', 'RELIABLE', 'VOLATILE'),
+        '/quick': ('KEEP_LAST', 'BEST_EFFORT', 'VOLATILE'),
+        '/rest': ('KEEP_LAST', 'RELIABLE', 'VOLATILE'),
+    }
+    assert (profiles['/quick'].depth, profiles['/rest'].depth) == (3, 10)
+
+
+@pytest.mark.parametrize(
+    'words, topics, excluded, remaps',
+    [
+        (('--topics', '/a', '/b'), ('/a', '/b'), (), {}),
+        (('--topics', '/a', '--topics', '/b'), ('/a', '/b'), (), {}),
+        (('--exclude-topics', '/a', '/b', '-l'), (), ('/a', '/b'), {}),
+        (('-m', '/a:=/c', '/b:=/d', '--rate', '2'), (), (), {'/a': '/c', '/b': '/d'}),
+    ],
+)
+@pytest.mark.parametrize('bag_first', [True, False])
+def test_options_take_several_words_as_those_of_ros2_bag_play(
+    tmp_path, monkeypatch, words, topics, excluded, remaps, bag_first
+):
+    asked = []
+
+    def played(path, options, progress):
+        asked.append(options)
+        return player_module.PlayResult(0, ())
+
+    monkeypatch.setattr(player_module, 'play', played)
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        writer.write('/a', ros_message('std_msgs/msg/String', data='x'), 10**9)
+    arguments = [str(bag), *words] if bag_first else [*words, str(bag)]
+    assert main(['play', *arguments]) == 0
+    (options,) = asked
+    assert (options.topics, options.exclude_topics) == (topics, excluded)
+    assert options.remap == remaps

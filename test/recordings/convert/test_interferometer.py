@@ -22,8 +22,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
-from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.navigation import write_navigation
+from msg_adapters.snapshots import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.sonar_images import DTYPES
 from sonar_imm.measurements import Navigation, Rejection, Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker

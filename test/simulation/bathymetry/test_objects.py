@@ -26,7 +26,6 @@ from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
 from sonar_imm_tools.simulation.bathymetry.objects import (
     above,
     FACE,
@@ -35,7 +34,7 @@ from sonar_imm_tools.simulation.bathymetry.objects import (
     surfaces_of,
 )
 from sonar_imm_tools.simulation.bathymetry.ship import ship_of
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 
 def seen(**values):

@@ -14,8 +14,11 @@
 
 """The executor of the nodes: what it leaves for later still comes."""
 
+import subprocess
+import sys
 import time
 
+import pytest
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
@@ -70,3 +73,26 @@ def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
     assert 2 <= len(looks) <= 4
     asked = [waitable for waitable in node.waitables if executor.can_execute(waitable)]
     assert len(list(node.waitables)) >= 3 and not asked
+
+
+# -- How the process of a node ends --
+
+
+PROGRAM = """
+import atexit, sys
+from sonar_imm.nodes.stopping import Stopper
+atexit.register(print, 'modules are taken down')
+stopper = Stopper()
+stopper.asked = {asked}
+print('said')
+sys.exit(stopper.end(3))
+"""
+
+
+@pytest.mark.parametrize('asked', [True, False])
+def test_a_process_that_was_told_to_stop_does_not_take_its_modules_down(asked):
+    """That takes seconds on a busy machine, in which no watchdog lives."""
+    command = [sys.executable, '-c', PROGRAM.format(asked=asked)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 3 and done.stdout.startswith('said\n') and not done.stderr
+    assert ('taken down' in done.stdout) != asked
