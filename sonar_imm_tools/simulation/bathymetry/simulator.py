@@ -363,7 +363,8 @@ def _level(config: BathymetryScenario) -> float:
     return config.water_level - config.sonar_depth - config.sonar_height
 
 
-def _axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
+def array_axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
+    """How the array looks from the ship."""
     mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
     return sounding.array_axes(side, math.radians(config.tilt_deg), mount)
 
@@ -374,7 +375,7 @@ def _look(
     """How the array of a ship looks at a ping sent at a time in s."""
     received = ship.pose(sent + 2.0 * ranges / config.sound_speed)
     lever = np.array(config.sonar_lever)
-    return sounding.looks(_axes(config, side), lever, ship.pose(np.array(sent)), received)
+    return sounding.looks(array_axes(config, side), lever, ship.pose(np.array(sent)), received)
 
 
 def _floor_below(
@@ -403,7 +404,7 @@ def _floor_below(
         since_start,
         ranges,
         config.sound_speed,
-        _axes(config, side),
+        array_axes(config, side),
     )
     valid = seen.reached & _lit(config, ranges)
     return TrueProfile(
