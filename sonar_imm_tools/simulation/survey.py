@@ -36,11 +36,11 @@ from sonar_imm.acoustics.geometry import rotation
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
-from sonar_imm.truth import Received, Scene, TrueProfile
+from sonar_imm.truth import Received, Scene
 
 from ..recordings.export.points import Points
-from .bathymetry.ship import navigation_of, see, Ship, ship_of, Terrain, Waves
-from .bathymetry.simulator import array_axes, BathymetryScenario, hear
+from .bathymetry.ship import navigation_of, Ship, ship_of, Terrain, Waves
+from .bathymetry.simulator import BathymetryScenario, hear, profile_below
 from .scenario import Scenario
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
@@ -266,23 +266,12 @@ def _swaths(
     received, truth = [], []
     for ping in range(sonar.pings):
         sent = ping / sonar.ping_rate
-        stamp = first_ns + round(1e9 * sent)
         for side in ('port', 'starboard'):
-            axes = array_axes(sonar, side)
-            seen = see(sonar, ship, ground, np.zeros(count), sent, ranges, SOUND_SPEED, axes)
-            profile = TrueProfile(
-                stamp_ns=stamp,
-                frame_id='map',
-                range=ranges,
-                height=seen.place[:, 2],
-                angle=np.where(seen.reached, np.arcsin(np.clip(seen.sine, -1.0, 1.0)), np.nan),
-                patch=seen.patch,
-                valid=seen.reached,
-                xyz=np.where(seen.reached[:, None], seen.place, np.nan),
-                namespace=side,
+            profile = profile_below(
+                sonar, ship, ground, np.zeros(count), first_ns, sent, ranges, side, side
             )
             truth.append(profile)
-            received.append(Received(stamp + heard, hear(sonar, profile, rng), side))
+            received.append(Received(profile.stamp_ns + heard, hear(sonar, profile, rng), side))
     stated = navigation_of(
         sonar, _as_reported(ship, correction), first_ns, sonar.pings / sonar.ping_rate, rng, 'map'
     )

@@ -363,10 +363,9 @@ def _level(config: BathymetryScenario) -> float:
     return config.water_level - config.sonar_depth - config.sonar_height
 
 
-def array_axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
-    """How the array looks from the ship."""
+def _axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
     mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
-    return sounding.array_axes(side, math.radians(config.tilt_deg), mount)
+    return sounding._axes(side, math.radians(config.tilt_deg), mount)
 
 
 def _look(
@@ -375,7 +374,7 @@ def _look(
     """How the array of a ship looks at a ping sent at a time in s."""
     received = ship.pose(sent + 2.0 * ranges / config.sound_speed)
     lever = np.array(config.sonar_lever)
-    return sounding.looks(array_axes(config, side), lever, ship.pose(np.array(sent)), received)
+    return sounding.looks(_axes(config, side), lever, ship.pose(np.array(sent)), received)
 
 
 def _floor_below(
@@ -396,19 +395,31 @@ def _floor_below(
     def rough(along: FloatArray, off: FloatArray) -> BoolArray:
         return in_outline(config, along, off, config.patch_start, config.patch_end)
 
-    seen = see(
-        config,
-        ship,
-        Terrain(_level(config), ship.course, rise, rough),
-        _roughness(config, len(ranges), rng),
-        since_start,
-        ranges,
-        config.sound_speed,
-        array_axes(config, side),
+    terrain = Terrain(_level(config), ship.course, rise, rough)
+    roughness = _roughness(config, len(ranges), rng)
+    first = FIRST_STAMP_NS
+    return profile_below(
+        config, ship, terrain, roughness, first, since_start, ranges, side, namespace
     )
+
+
+def profile_below(
+    config: BathymetryScenario,
+    ship: Ship,
+    terrain: Terrain,
+    roughness: FloatArray,
+    first_ns: int,
+    since_start: float,
+    ranges: FloatArray,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    """The terrain that a ping sees which is sent some seconds after `first_ns`."""
+    axes = _axes(config, side)
+    seen = see(config, ship, terrain, roughness, since_start, ranges, config.sound_speed, axes)
     valid = seen.reached & _lit(config, ranges)
     return TrueProfile(
-        stamp_ns=FIRST_STAMP_NS + round(since_start * 1e9),
+        stamp_ns=first_ns + round(since_start * 1e9),
         frame_id='map',
         range=ranges,
         height=seen.place[:, 2],
