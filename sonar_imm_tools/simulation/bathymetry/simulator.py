@@ -365,7 +365,7 @@ def _level(config: BathymetryScenario) -> float:
 
 def _axes(config: BathymetryScenario, side: str) -> sounding.ArrayAxes:
     mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
-    return sounding._axes(side, math.radians(config.tilt_deg), mount)
+    return sounding.array_axes(side, math.radians(config.tilt_deg), mount)
 
 
 def _look(

@@ -70,6 +70,15 @@ def test_a_ledge_has_its_face_before_the_foot_and_its_top_with_the_floor():
     np.testing.assert_array_equal(beside, number > 1)
 
 
+def test_a_level_sonar_hears_each_facet_from_its_height():
+    config = scenario('ledge', {'object': 'wall', 'object_size': 3.0})
+    ranges = config.first_range + config.bin_width * np.arange(1200)
+    facets = facets_of(config, ranges, np.full(1200, 100.0))
+    below = ranges[facets.bin] * np.sin(math.radians(config.tilt_deg) + np.arcsin(facets.sine))
+    np.testing.assert_allclose(config.sonar_height - below, facets.height, atol=1e-9)
+    assert facets.height.max() == 3.0
+
+
 @pytest.mark.parametrize('kind', ['box', 'wall', 'boulder'])
 def test_an_object_has_a_shadow(kind):
     ranges, _, power, _ = seen(object=kind, object_distance=30.0, object_size=3.0)
