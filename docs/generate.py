@@ -49,7 +49,7 @@ MARKDOWN = """\
 {summary}.
 Written by `make docs` from the configuration classes, as is `config/{name}.yaml`, ready to copy.
 
-A *live* parameter may change while the node runs, and the tracks are kept; others are read at start.
+A *live* parameter may change while the node runs, and tracks are kept; others are read at start.
 
 ## The ten that matter
 
@@ -66,8 +66,8 @@ The live node takes these besides, and [those of every node](nodes.md).
 NODES = """\
 # Parameters of every node
 
-Written by `make docs` from the configuration classes. Offline tracking ignores them. A wrong value is refused with one sentence,
-a misspelt name is warned about.
+Written by `make docs` from the configuration classes. Offline tracking ignores them. A wrong value
+is refused with one sentence, a misspelt name is warned about.
 
 {node}"""
 

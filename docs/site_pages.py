@@ -200,10 +200,12 @@ def notebook(path: Path) -> str:
 def last_value(code: str, name: str, space: dict[str, Any]) -> Any:
     """Run a cell in `space`; gives the value of its last line, or None when that has none."""
     tree = ast.parse(code, name)
-    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
-    exec(compile(tree, name, 'exec'), space)
-    if last is None:
+    last = tree.body[-1]
+    if not isinstance(last, ast.Expr):
+        exec(compile(tree, name, 'exec'), space)
         return None
+    del tree.body[-1]
+    exec(compile(tree, name, 'exec'), space)
     return eval(compile(ast.Expression(last.value), name, 'eval'), space)
 
 

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -39,7 +39,7 @@ from scipy.sparse.linalg import spsolve
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 
 from ... import SECOND
-from ..conversion import ConversionReport
+from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
 from ..csv_table import BadRow, CsvTable, Row
 from .arrivals import Arrival, Places, read_places, Stations, write_pings
@@ -85,16 +85,12 @@ class Clocks(NamedTuple):
         return received.stamp_ns - shift, known
 
 
-def convert_detections(
-    path: str | Path, out: str | Path, receivers: str | Path, **values: Any
-) -> ConversionReport:
-    """Convert rows of receiver, tag and time to the topic ``/arrivals``, one message per ping.
-
-    values: as in `DetectionsOptions`. Fixed tags are not written. Raises `BagError`.
-    """
-    how = DetectionsOptions(receivers=receivers, **values)
-    report = ConversionReport(Path(out))
-    places, origin = read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
+@converter(DetectionsOptions)
+def convert_detections(path: Path, how: DetectionsOptions, report: ConversionReport) -> None:
+    """Convert rows of receiver, tag and time to the topic ``/arrivals``, one message per ping."""
+    places, origin = read_places(
+        how.receivers, report, how.receiver_options, how.origin, 'receiver'
+    )
     fixed: Places = {}
     if how.sync is not None:
         fixed = read_places(how.sync, report, how.receiver_options, origin, 'tag')[0]
@@ -149,7 +145,7 @@ def convert_detections(
             ]
     if not pings and fixed:
         report.problems.append('there is no tag beside the fixed ones')
-    return write_pings(table, pings, Stations(places, places, origin), True, report, how)
+    write_pings(table, pings, Stations(places, places, origin), True, report, how)
 
 
 def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> None:

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from msg_adapters.array_records import write_pressure
 from sonar_imm.measurements import Pressure, Rejection
 
 from ... import SECOND
-from ..conversion import ConversionReport, provenance
+from ..conversion import ConversionReport, converter, provenance
 from ..convert_options import HydrophonesOptions
 from ..csv_table import BadRow, moment_ns
 from ..messages import ros_message
@@ -46,16 +46,12 @@ FULL_SCALE = 2**15
 _NAMED = re.compile(r'(?<!\d)(?:20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
 
 
-def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(HydrophonesOptions)
+def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionReport) -> None:
     """Convert the channels of a sound file to the topic ``/pressure``, block by block.
 
     The bag gets ``parameters.yaml`` with the number of hydrophones.
-
-    values: as in `HydrophonesOptions`. Needs soundfile. A file that ends early keeps what could be
-    read. Raises `BagError`.
     """
-    how = HydrophonesOptions(**values)
-    path, report = Path(path), ConversionReport(Path(out))
     with _opened(path) as audio:
         channels = _channels(audio, how.channels)
         start_ns = _start_ns(path, how)
@@ -79,8 +75,7 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
         with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
             _write_blocks(audio, bag, report, how, channels, start_ns, rows)
             if not bag.count:
-                raise BagError(f'{path} holds no block of sound that could be converted')
-    return report
+                raise report.nothing(path)
 
 
 def _write_blocks(
@@ -119,7 +114,7 @@ def _write_blocks(
             report.bad_row(source, f'{done / audio.samplerate:.1f} s', error)
             continue
         bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
-        report.messages['/pressure'] = report.messages.get('/pressure', 0) + 1
+        report.messages['/pressure'] += 1
 
 
 def _opened(path: Path) -> soundfile.SoundFile:

@@ -127,7 +127,7 @@ def converted(folder, rows, **options):
         (folder / f'{name}.csv').write_text(f'{head},x,y,z\n' + '\n'.join(lines) + '\n')
     options = {'sync': folder / 'sync.csv', 'sound_speed': SPEED, **options}
     return convert_detections(
-        folder / 'vue.csv', folder / 'out', folder / 'stations.csv', **options
+        folder / 'vue.csv', folder / 'out', receivers=folder / 'stations.csv', **options
     )
 
 
@@ -173,5 +173,7 @@ def test_bad_rows_are_counted(tmp_path, row):
     (tmp_path / 'd.csv').write_text(
         f'time_utc,receiver,tag\n2024-05-31 10:00:00,r1,T\n{row}\n2024-05-31 10:00:01,r2,T\n'
     )
-    report = convert_detections(tmp_path / 'd.csv', tmp_path / 'out', tmp_path / 'stations.csv')
+    report = convert_detections(
+        tmp_path / 'd.csv', tmp_path / 'out', receivers=tmp_path / 'stations.csv'
+    )
     assert report.bad_rows == 1 and report.messages == {'/arrivals': 1}
