@@ -12,19 +12,173 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Traces from archives, tables and SEG-Y; what cannot be read is one sentence."""
+"""Numpy archives of snapshots and traces, traces as CSV and SEG-Y."""
 
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.convert import convert_segy, convert_traces, KINDS
+from sonar_imm_tools.recordings.convert import (
+    convert_segy,
+    convert_snapshots,
+    convert_traces,
+    KINDS,
+)
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+
+
+@pytest.fixture
+def convert(tmp_path):
+    """Save arrays, convert them, and give the report, the snapshots and the truth."""
+
+    def run(options=None, **arrays):
+        np.savez(tmp_path / 'pings.npz', **arrays)
+        out = tmp_path / 'bag'
+        report = convert_snapshots(tmp_path / 'pings.npz', out, **(options or {}))
+        with BagReader(out) as bag:
+            received = [item.measurement for item in measurements_of(bag, 'bathymetry')]
+            truth = [
+                read_estimate(item.message)
+                for item in bag.messages()
+                if item.topic == '/truth/estimate'
+            ]
+        return report, received, truth
+
+    return run
+
+
+def samples(*shape):
+    rng = np.random.default_rng(0)
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
+
+
+RANGE = 17.0 + 0.25 * np.arange(10)
+
+
+def test_one_ping(convert):
+    iq = samples(10, 4)
+    report, (item,), truth = convert(
+        iq=iq, range=RANGE, sound_speed=1500.0, frequency=450e3, spacing_wavelengths=0.5
+    )
+    assert KINDS['snapshots'] is convert_snapshots and report.messages == {'/snapshot': 1}
+    assert (item.iq == iq).all() and (item.range == RANGE).all() and not truth
+    assert item.spacing_wavelengths == pytest.approx(0.5, rel=1e-6)
+    assert item.element_spacing == pytest.approx(1500.0 / 900e3, rel=1e-6)
+
+
+def test_many_pings_with_stamps_and_own_variances(convert):
+    iq, noise = samples(3, 10, 4), np.array([1.0, 2.0, 3.0])[:, None] * np.ones(10)
+    report, received, _ = convert(
+        iq=iq, range=RANGE, stamp=[5.0, 6.5, 7.0], noise_variance=noise, snr=np.arange(1.0, 11.0)
+    )
+    assert report.rows == 3
+    assert [item.stamp_ns for item in received] == [5 * 10**9, 65 * 10**8, 7 * 10**9]
+    for k, entry in enumerate(received):
+        assert (entry.iq == iq[k]).all() and (entry.noise_variance == k + 1.0).all()
+        assert np.allclose(entry.signal_variance, (k + 1.0) * np.arange(1.0, 11.0))
+
+
+def test_without_stamps_pings_follow_the_rate(convert):
+    _, received, _ = convert({'ping_rate': 4.0}, Y=samples(3, 10, 4), time=RANGE / 750.0)
+    assert np.diff([item.stamp_ns for item in received]).tolist() == [250_000_000] * 2
+    assert np.allclose(received[0].range, RANGE)
+
+
+def test_the_truth_of_a_test_vector(convert):
+    h = np.linspace(0.0, 1.0, 10)
+    report, _, (truth,) = convert(
+        Y=samples(10, 8), r=RANGE, h=h, patch=h > 0.5, H=15.0, tilt=0.5, dlam=0.5, sn2=1.0
+    )
+    assert report.messages == {'/snapshot': 1, '/truth/estimate': 1}
+    assert report.notes['element_spacing_wavelengths'] == '0.5'
+    extras = truth.extras
+    assert (extras['height'] == h).all() and (extras['range'] == RANGE).all()
+    assert extras['patch'].tolist() == [0] * 5 + [1] * 5 and extras['valid'].all()
+    assert np.allclose(extras['angle'], np.arcsin((15.0 - h) / RANGE) - 0.5)
+    assert np.allclose(truth.xyz[:, 2], h - 15.0)
+
+
+def test_channels_are_added_up_to_staves(convert):
+    iq = samples(10, 4)
+    _, (item,), _ = convert({'staves': [[0, 3], [1, 2]]}, quadrants=iq, range_m=RANGE)
+    assert np.allclose(item.iq, np.stack([iq[:, 0] + iq[:, 3], iq[:, 1] + iq[:, 2]], axis=1))
+
+
+def test_bad_pings_are_left_out_and_named(convert):
+    iq = samples(3, 10, 4)
+    iq[1] = np.nan
+    report, received, _ = convert(iq=iq, range=RANGE)
+    assert len(received) == 2 and report.bad_rows == 1 and 'ping 1' in report.problems[0]
+
+
+@pytest.mark.parametrize(
+    'options, arrays, word',
+    [
+        ({}, {'range': RANGE}, 'no array iq or'),
+        ({}, {'iq': samples(10, 4)}, 'no array time'),
+        ({}, {'iq': np.ones((10, 4)), 'range': RANGE}, 'complex'),
+        ({}, {'iq': samples(10), 'range': RANGE}, 'shape'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE[:9]}, 'nothing that could be converted'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1.0, 2.0]}, 'stamps'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [np.inf]}, 'stamps'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': [1e300]}, 'before 2038'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'stamp': np.array(['M8', 's'])}, 'no numbers'),
+        ({}, {'iq': samples(10, 4), 'range': RANGE, 'c': np.array('x')}, "'c' holds no numbers"),
+        ({}, {'iq': samples(10, 4), 'range': RANGE.astype('m8[s]')}, "'range' holds no numbers"),
+        (
+            {},
+            {'iq': samples(10, 4), 'range': RANGE, 'sound_speed': np.ones(3)},
+            'one finite number',
+        ),
+        ({'staves': [[0, 4], [1]]}, {'iq': samples(10, 4), 'range': RANGE}, 'channels 0 to 3'),
+        ({'names': {'iq': 'data'}}, {'iq': samples(10, 4), 'range': RANGE}, "no array 'data'"),
+        ({'names': {'data': 'iq'}}, {'iq': samples(10, 4), 'range': RANGE}, 'unknown array'),
+        ({}, {'iq': np.array([{}]), 'range': RANGE}, 'more than plain arrays'),
+    ],
+)
+def test_what_cannot_be_converted_is_said_in_a_sentence(convert, options, arrays, word):
+    with pytest.raises(BagError, match=word):
+        convert(options, **arrays)
+
+
+def test_archives_that_unpack_to_far_more_or_hold_others_cost_a_sentence(tmp_path):
+    head = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%d,)}"
+    npy = head % 10**15 + b' ' * 64
+    inner = tmp_path / 'inner.npz'
+    np.savez(inner, iq=samples(10, 4))
+    cases = {
+        'bomb': ({'iq.npy': bytes(140_000_000)}, zipfile.ZIP_BZIP2, 'unpacks to more than'),
+        'claims': ({'iq.npy': npy[:128]}, zipfile.ZIP_STORED, 'damaged'),
+        'nested': ({'iq.zip': inner.read_bytes()}, zipfile.ZIP_STORED, 'more than plain arrays'),
+        'renamed': ({'iq.npy': inner.read_bytes()}, zipfile.ZIP_STORED, 'more than plain arrays'),
+    }
+    for name, (parts, method, words) in cases.items():
+        with zipfile.ZipFile(tmp_path / name, 'w', method) as archive:
+            for part, content in parts.items():
+                archive.writestr(part, content)
+        with pytest.raises(BagError, match=words):
+            convert_snapshots(tmp_path / name, tmp_path / 'bag')
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(BagError, match='cannot be read'):
+        convert_snapshots(tmp_path / 'nothing.npz', tmp_path / 'bag')
+    np.save(tmp_path / 'single.npy', np.ones(3))
+    with pytest.raises(BagError, match='not a numpy archive'):
+        convert_snapshots(tmp_path / 'single.npy', tmp_path / 'bag')
+    np.savez_compressed(tmp_path / 'cut.npz', iq=samples(500, 4), range=np.arange(500.0))
+    data = (tmp_path / 'cut.npz').read_bytes()
+    broken = data[:200] + bytes(len(data) // 2) + data[200 + len(data) // 2 :]
+    (tmp_path / 'cut.npz').write_bytes(broken)
+    with pytest.raises(BagError, match='damaged'):
+        convert_snapshots(tmp_path / 'cut.npz', tmp_path / 'bag')
+
 
 DEPTH = 120.0 + 0.25 * np.arange(40)
 ONES = np.ones((3, 40))
