@@ -106,7 +106,7 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS)
+	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
 	CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)

@@ -55,8 +55,7 @@ from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
     outlines,
 )
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
-from sonar_imm_tools.evaluation.diver.series import Series, series_of  # noqa: E402
-from sonar_imm_tools.evaluation.diver.truth import Truth, TruthPath  # noqa: E402
+from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth, TruthPath  # noqa: E402
 from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
     RECEIVERS,
     scenario,

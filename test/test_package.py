@@ -114,7 +114,7 @@ HEADER = """\
 """
 LONGEST = 600
 """Lines of a file that is one idea, the licence not counted."""
-MOST_WITH_ONE_IMPORTER = 72
+MOST_WITH_ONE_IMPORTER = 70
 """Modules that only one other imports; most of them are part of that one. This only falls."""
 MOST_ARGUMENTS = 12
 # Function, as module:name: why it takes more positional arguments.
@@ -252,6 +252,14 @@ def test_ci_files_call_what_has_to_pass() -> None:
     assert {'run': '.ci/run', 'env': {'PYTHON': 'python'}} in hub['jobs']['run']['steps']
     lab = yaml.safe_load((ROOT / '.gitlab-ci.yml').read_text(encoding='utf-8'))
     assert 'PYTHON=python3 .ci/run' in lab['.run']['script']
+
+
+def test_tests_that_start_processes_lie_where_make_looks_for_them() -> None:
+    """Collecting all the others takes longer than many of them."""
+    marked = [
+        path for path in (ROOT / 'test').rglob('*.py') if f'mark.{"system"}' in path.read_text()
+    ]
+    assert {path.relative_to(ROOT / 'test').parts[0] for path in marked} == {'system'}
 
 
 def test_a_release_is_told_what_only_its_owner_can_fill_in(tmp_path: Path) -> None:
