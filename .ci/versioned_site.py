@@ -30,7 +30,7 @@ import sys
 
 
 def publish(site: Path, pages: Path, version: str) -> list[str]:
-    """Copy `site` to its version, in place of an earlier copy; gives all versions, newest first."""
+    """Copy `site` to its version, in place of an earlier copy; gives all, newest first."""
     shutil.rmtree(pages / version, ignore_errors=True)
     shutil.copytree(site, pages / version)
     found = [path.parent.name for path in pages.glob('*/index.html')]
