@@ -208,6 +208,20 @@ class TestXtf:
         assert convert_xtf(path, tmp_path / 'bag').messages['/detections'] == 2
         assert not (tmp_path / 'sprung').exists()
 
+    def test_where_there_are_no_files_of_descriptors(self, tmp_path, monkeypatch):
+        """As on Windows: the file is read by its name, unless an index lies beside it."""
+        path, there = xtf(tmp_path / 'a.xtf', some(3)), os.path.exists
+        monkeypatch.setattr(
+            foreign.os.path,
+            'exists',
+            lambda each: not str(each).startswith('/dev') and there(each),
+        )
+        pings = list(foreign.READERS['xtf'](str(path)))
+        assert [ping['kind'] for ping in pings] == ['ping'] * 3
+        (tmp_path / 'a.pyxtf_idx').write_bytes(b'')
+        with pytest.raises(ValueError, match='index of pyxtf beside it'):
+            list(foreign.READERS['xtf'](str(path)))
+
     def test_a_reader_that_hangs_is_stopped(self, tmp_path, monkeypatch):
         monkeypatch.setattr(foreign, 'SILENCE', 3.0)
         os.mkfifo(tmp_path / 'a.xtf')
