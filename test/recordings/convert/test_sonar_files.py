@@ -171,7 +171,7 @@ class TestXtf:
             (b'', 'ended|gives up|shorter'),
             (b'\x7b' + bytes(100), 'gives up'),
             (b'\x7a' + bytes(2000), 'version of the file is 122'),
-            (b'\x7b' + bytes(1023), 'holds no ping'),
+            (b'\x7b' + bytes(1023), 'holds nothing that could be converted'),
         ],
     )
     def test_nothing_of_use_is_one_sentence(self, tmp_path, content, wanted):
