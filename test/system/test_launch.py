@@ -102,9 +102,11 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
 
     def say(*words, told=''):
         """What a command prints; asked again until `told` is part of it, as discovery needs."""
-        end, done = time.monotonic() + 60.0, None
+        end, done = time.monotonic() + 120.0, None
         while done is None or (told not in done.stdout and time.monotonic() < end):
-            done = subprocess.run([ros2, *words], env=domain, capture_output=True, text=True)
+            done = subprocess.run(
+                [ros2, *words], env=domain, capture_output=True, text=True, timeout=120.0
+            )
         assert told in done.stdout, (words, done.stdout, done.stderr)
         return done.stdout
 
@@ -121,7 +123,7 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
         say('param', 'get', f'/{name}', 'stale_after', told='7.5')
         say('param', 'describe', f'/{name}', 'stale_after', told='Description: ')
         say('topic', 'info', f'/{name}/processed', told='Publisher count: 1')
-        say('topic', 'echo', '--once', '--qos-durability', 'transient_local', f'/{name}/processed')
+        say('topic', 'echo', '--once', f'/{name}/processed', told='point_step')
         if managed:
             reset = say('service', 'call', f'/{name}/reset', managed, told='success=True')
             assert 'forgotten' in reset
