@@ -112,6 +112,8 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
 
     file = tmp_path / f'{name}.yaml'
     run = [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
+    if name == 'fls_detector':  # the default needs a package
+        run += ['-p', 'image_type:=sensor_msgs/msg/Image']
     managed = 'std_srvs/srv/Trigger' if name in SYSTEMS else ''
     with started([*run, '-p', 'autostart:=false'], domain) as output:
         say('node', 'list', told=f'/{name}\n')
