@@ -106,7 +106,7 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS)
+	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
 	CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
@@ -121,7 +121,7 @@ generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the cod
 
 docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/
 	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo 'Open site/index.html. For its search: python3 -m http.server --bind 127.0.0.1 -d site'
+	@echo 'Open site/index.html.'
 
 docs-numbers: venv ## check that the tables of docs/ still hold the numbers of docs/results/
 	$(BIN)/python docs/check_numbers.py

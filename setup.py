@@ -45,6 +45,7 @@ REQUIRES = [
     'rich>=13.0',
     'rosbags>=0.11,<0.12',
     'scipy>=1.11',
+    'tzdata; sys_platform == "win32"',  # zones by name, which other systems have
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],

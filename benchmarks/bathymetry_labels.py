@@ -21,11 +21,12 @@ sets of models: the default, `height_bank` and `scatter_bank`. The patch lies at
 or 58 to 68 m; its heights are white, or correlated as exp(-distance / length). `exact`: what can
 be had at most, by the exact smoother that is told the level of the floor and the law of the
 heights, and the share of bins of which it is not sure (.1 to .9). `floors`: the same
-on slopes and undulations, and with Gaussian correlation. `calibration`: bins of all cells in which
-roughness of the patch is detectable, by the probability of rough floor: how many, the mean
-probability and the share that is rough. `verdicts`: bins called smooth and rough, and how many of
-them are; the smooth ones by whether the patch is as rough as `rough_std`. `amplitude`: with the
-power of the echoes as further evidence, where the patch is brighter by so much, and known to be.
+on slopes and undulations, and with Gaussian correlation, a fourth of the pings. `calibration`:
+bins of all cells in which roughness of the patch is detectable, by the probability of rough floor:
+how many, the mean probability and the share that is rough. `verdicts`: bins called smooth and
+rough, and how many of them are; the smooth ones by whether the patch is as rough as `rough_std`.
+`amplitude`: with the power of the echoes as further evidence, where the patch is brighter by so
+much, and known to be; a fourth of the pings.
 """
 
 from __future__ import annotations
@@ -292,7 +293,7 @@ def amplitude(
     return rows
 
 
-def main(count: int = 3, seed: int = 1, only: str = '') -> Parts:
+def main(count: int = 40, seed: int = 1, only: str = '') -> Parts:
     yield {'pings': count, 'seed': seed}
     if only in ('', 'cells'):
         whole = {name: Labels() for name in SETS}
@@ -316,14 +317,14 @@ def main(count: int = 3, seed: int = 1, only: str = '') -> Parts:
         yield {'verdicts': {name: verdicts(labels) for name, labels in whole.items()}}
     if only in ('', 'floors'):
         for name, changes in FLOORS.items():
-            found = labelled(changes, count, seed, WHOLE)
+            found = labelled(changes, max(count // 4, 1), seed, WHOLE)
             for title, labels in found.items():
                 yield {'floors': {f'{name}, {title}': labels.row()}}
     if only in ('', 'amplitude'):
         far = {'patch_start': 58.0, 'patch_end': 68.0}
         for name, decibels in CONTRASTS.items():
             for std in (0.3, 0.0):
-                rows = amplitude({**far, 'patch_std': std}, decibels, count, seed)
+                rows = amplitude({**far, 'patch_std': std}, decibels, max(count // 4, 1), seed)
                 for kind, row in rows.items():
                     yield {'amplitude': {f'{name}, patch of {std:g} m, {kind}': row}}
 

@@ -36,14 +36,13 @@ from benchmarks.study import Parts, study
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
 from sonar_imm_tools.simulation.bathymetry.objects import (
     Facets,
     facets_of,
     second_of,
     surfaces_of,
 )
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 SIZES = {'ledge': (0.8, 3.0), 'box': (1.0, 4.0), 'wall': (2.0, 6.0), 'boulder': (0.6, 2.0)}
 FAINT = {'snr_near_db': 20.0, 'snr_far_db': 0.0}
@@ -72,6 +71,8 @@ FLAT: dict[str, tuple[str, dict[str, Any]]] = {
     '0.5 % differ': ('thermal', {'decorrelation': 0.005}),
     '2 staves': ('thermal', {'staves': 2}),
     '4 staves': ('thermal', {'staves': 4}),
+    'surface echoes, not told': ('multipath', THERMAL),
+    'surface echoes at -10 dB, not told': ('multipath', {'multipath_level_db': -10.0, **THERMAL}),
 }
 
 

@@ -29,7 +29,8 @@ and below its nearest one, where nothing is. `facets`: the same against the near
 `rays`: two level surfaces along 120 bins below a ship, as the array of `moving` and of
 `moving_profile` has their directions, under which rays bend.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
-what the tracker reaches along 60 bins. `cost`: CPU time, see `benchmarks.speed.bathymetry`.
+what the tracker reaches along 60 bins. `oversampled`: ledges whose pulse spans several
+bins, judged at every so many bins, and flat floors alike.
 """
 
 from __future__ import annotations
@@ -40,20 +41,20 @@ from typing import Any
 
 from attrs import evolve
 import numpy as np
+from scipy.signal import resample
 
 from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
 from benchmarks.layover_tables import circular
-from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.acoustics import array
+from sonar_imm.acoustics.layover import GATE
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm.truth import TrueProfile
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
 from sonar_imm_tools.simulation.bathymetry.objects import Facets, second_of, surfaces_of
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 SETTINGS: dict[str, dict[str, Any]] = {
     '8 staves, 30-10 dB': {},
@@ -242,12 +243,12 @@ def two_levels(name: str, up: float, pings: int, seed: int) -> dict[str, float]:
             measurement, number = evolve(measurement, iq=y.astype(np.complex64)), number + 1
         made += tracker.process(measurement)
     off, sd, caught, false = [], [], 0, 0
-    for estimate, *levels in zip(made, *floors):
+    for estimate, levels in zip(made, zip(*floors)):
         here = in_stretch(levels[0].range)
         pair = estimate.extras['surfaces'] == 2
         caught, false = caught + int((pair & here).sum()), false + int((pair & ~here).sum())
-        for end, level in zip(('', '_2'), levels):
-            off.append((estimate.extras[f'pz{end}'] - level.height)[pair & here])
+        for end, surface in zip(('', '_2'), levels):
+            off.append((estimate.extras[f'pz{end}'] - surface.height)[pair & here])
             sd.append(np.sqrt(estimate.extras[f'vertical_uncertainty{end}'][pair & here]))
     errors, stds = np.concatenate(off), np.concatenate(sd)
     bins = len(made) * int(in_stretch(floors[0][0].range).sum())
@@ -309,9 +310,38 @@ def reached(apart: float, decibels: float, pings: int, seed: int) -> dict[str, f
     return {'caught': caught / (pings * at.sum()), 'rmse_m': rms(np.concatenate(off))}
 
 
-def main(pings: int = 40, seed: int = 4) -> Parts:
+def oversampled(times: int, pings: int, seed: int) -> dict[str, float]:
+    """Bins marked beside ledges and on a flat floor, where a pulse spans `times` bins: samples
+    between bins are interpolated with their band, judged are the bins themselves."""
+    double = caught = single = lost = 0
+    for snapshot, facets in objects('ledge', pings, seed, {}):
+        marked = finer(snapshot, times).extras['existence_2'][::times] > GATE
+        power, height = surfaces_of(facets, len(snapshot))
+        two, one = second_of(power, height)[0] >= 2, (power > 0.0).sum(axis=1) == 1
+        double, caught = double + int(two.sum()), caught + int((marked & two).sum())
+        single, lost = single + int(one.sum()), lost + int((marked & one).sum())
+    flat = simulate(scenario('thermal', {'patch_std': 0.0, 'pings': pings}), seed).measurements
+    marks = [finer(item.measurement, times).extras['existence_2'] > GATE for item in flat]
+    row = {'caught': caught / double, 'lost': lost / single}
+    return {**row, 'lost_flat': float(np.mean(marks))}
+
+
+def finer(snapshot: Snapshot, times: int) -> Estimate:
+    """The estimate of a snapshot with so many times as many bins."""
+    bins, width = len(snapshot), snapshot.range[1] - snapshot.range[0]
+    assert snapshot.noise_variance is not None
+    return tracked(
+        evolve(
+            snapshot,
+            range=snapshot.range[0] + width / times * np.arange(bins * times),
+            iq=resample(snapshot.iq, bins * times, axis=0).astype(np.complex64),
+            noise_variance=np.repeat(snapshot.noise_variance, times),
+        )
+    )
+
+
+def main(pings: int = 40, seed: int = 7) -> Parts:
     yield {'pings': pings, 'seed': seed}
-    yield {'cost': bench_layover()}
     stated: list[FloatArray] = []
     true: list[BoolArray] = []
     for name, changes in SETTINGS.items():
@@ -339,6 +369,9 @@ def main(pings: int = 40, seed: int = 4) -> Parts:
             name = f'{decibels:g} dB, {apart:g} m'
             row = reached(apart, decibels, max(pings // 4, 1), seed)
             yield {'bound': {name: {'one_bin_m': bound(apart, decibels), **row}}}
+    for times in (1, 2, 4):
+        row = oversampled(times, max(pings // 2, 1), seed)
+        yield {'oversampled': {f'{times} bins per pulse': row}}
     for name in FLAT:
         yield {'floors': {name: floors(name, pings, seed)}}
 

@@ -244,7 +244,7 @@ def smoothing(runs: int) -> dict[str, dict[str, float]]:
     return table
 
 
-def whole_tracker(runs: int, **values: str) -> dict[str, dict[str, float]]:
+def whole_tracker(runs: int, **values: Any) -> dict[str, dict[str, float]]:
     """Gating, track logic and all, defaults but for `values`: RMSE of the confirmed track, scans
     without one, identities."""
     table = {}

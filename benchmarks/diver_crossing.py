@@ -36,8 +36,7 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import Series, series_of
-from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 CASES = ((0.9, 2.0), (0.9, 10.0), (0.7, 2.0), (0.7, 10.0))

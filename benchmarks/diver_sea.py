@@ -224,13 +224,14 @@ def bearing_cells() -> Cells:
     ):
         for bias in (0.0, 1.0, 2.0, 4.0):
             stated = {'bearing_bias_std_deg': bias or 2.0}
-            for column, config in {
+            ways: dict[str, dict[str, Any]] = {
                 'ignore': {},
                 'consider': stated,
                 'estimate': {**stated, 'systematic_errors': 'estimate'},
-            }.items():
+            }
+            for column, values in ways.items():
                 scene = {'divers': 1, 'bearing_bias_std_deg': bias}
-                config = {'model_set': 'families', **known, **config}
+                config = {'model_set': 'families', **known, **values}
                 cells.append((f'{what}, off by {bias:g} degrees', column, name, scene, config))
     return cells
 
@@ -280,7 +281,7 @@ def warned(name: str, config: Values, runs: int) -> dict[str, Any]:
         made = simulate(scenario(name, {'duration': FIRST}), seed)
         tracker, when = DiverTracker(DiverConfig(**config)), np.nan
         first = made.measurements[0].measurement.stamp_ns
-        final = {}
+        final: dict[int, Any] = {}
         for item in made.measurements:
             estimates = tracker.process(item.measurement)
             final.update((each.stamp_ns, each) for each in estimates)

@@ -20,12 +20,11 @@ Each run is one drift as cross-spectra (seven to nine reflectors over 300 record
 (MVDR and conventional) and tracked by every configuration. OSPA has a cutoff of 2 m and order 2;
 a reflector within 0.4 m of a true one is neither false nor missed. Birth delay: records from the
 presence of a new reflector to the first of three records in a row that have it. Making the traces
-takes about 15 minutes a run, so they can be kept (`--cache`).
+takes about 15 minutes per run.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,75 +106,25 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
     return made
 
 
-def drift(seed: int, records: int, cache: Path | None) -> Drift:
+def drift(seed: int, records: int) -> Drift:
     """Traces of one run by processor, and the true depths and ids of each record."""
-    file = cache / f'drift_{seed}_{records}.npz' if cache else None
-    if file is None or not file.exists():
-        scale = records / 300
-        config = FathometerScenario(
-            records=records,
-            appearing=(int(140 * scale), int(262 * scale)),
-            fading=(int(85 * scale),),
-        )
-        traces: dict[str, list[Trace]] = {}
-        truth = []
-        # Cross-spectra of a whole drift would not fit into memory, nor does `check` let them.
-        rng = np.random.default_rng(seed)
-        floor = drift_of(config, rng)
-        for record in range(records):
-            spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
-            for name, trace in responses(spectra).items():
-                traces.setdefault(name, []).append(trace)
-            here = floor.present[record]
-            truth.append((np.flatnonzero(here), floor.depth[record, here]))
-        if file:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            _save(file, traces, truth)
-        return traces, truth
-    return _load(file)
-
-
-def _save(file: Path, traces: dict[str, list[Trace]], truth: Truth) -> None:
-    amplitudes: dict[str, Any] = {
-        name: np.array([trace.amplitude for trace in each]) for name, each in traces.items()
-    }
-    sigmas: dict[str, Any] = {
-        f'{name}_sigma': [_noise(trace) for trace in each] for name, each in traces.items()
-    }
-    np.savez_compressed(
-        file,
-        count=np.array([len(ids) for ids, _ in truth]),
-        ids=np.concatenate([ids for ids, _ in truth]),
-        true_depth=np.concatenate([depth for _, depth in truth]),
-        reference=np.array([trace.reference_depth for trace in traces['mvdr']]),
-        **amplitudes,
-        **sigmas,
+    scale = records / 300
+    config = FathometerScenario(
+        records=records,
+        appearing=(int(140 * scale), int(262 * scale)),
+        fading=(int(85 * scale),),
     )
-
-
-def _noise(trace: Trace) -> float:
-    assert trace.sigma is not None
-    return float(trace.sigma[0])
-
-
-def _load(file: Path) -> Drift:
-    with np.load(file) as kept:
-        ends = np.cumsum(kept['count'])[:-1]
-        truth = list(zip(np.split(kept['ids'], ends), np.split(kept['true_depth'], ends)))
-        depth, reference = DEPTHS[0] + DEPTHS[1] * np.arange(DEPTHS[2]), kept['reference']
-        traces = {
-            name: [
-                Trace(
-                    stamp_ns=(k + 1) * 90 * 10**9,
-                    depth=depth,
-                    amplitude=amplitude,
-                    sigma=np.full(len(depth), sigma),
-                    reference_depth=float(reference[k]),
-                )
-                for k, (amplitude, sigma) in enumerate(zip(kept[name], kept[f'{name}_sigma']))
-            ]
-            for name in ('mvdr', 'envelope', 'conventional', 'conventional_envelope')
-        }
+    traces: dict[str, list[Trace]] = {}
+    truth = []
+    # Cross-spectra of a whole drift would not fit into memory, nor does `check` let them.
+    rng = np.random.default_rng(seed)
+    floor = drift_of(config, rng)
+    for record in range(records):
+        spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
+        for name, trace in responses(spectra).items():
+            traces.setdefault(name, []).append(trace)
+        here = floor.present[record]
+        truth.append((np.flatnonzero(here), floor.depth[record, here]))
     return traces, truth
 
 
@@ -213,12 +162,10 @@ def _delay(history: list[tuple[int, bool]]) -> int:
     return len(there)
 
 
-def main(
-    runs: int = 3, records: int = 300, particles: int = 20_000, cache: Path | None = None
-) -> Parts:
+def main(runs: int = 3, records: int = 300, particles: int = 20_000) -> Parts:
     scores: dict[str, list[dict[str, float]]] = {}
     for seed in range(runs):
-        traces, truth = drift(seed, records, cache)
+        traces, truth = drift(seed, records)
         for label, (processor, values) in CONFIGURATIONS.items():
             exact = {'particles': particles, 'sound_speed_std': 0.0}
             config = FathometerConfig(**{**exact, **values}, seed=seed)
@@ -235,4 +182,4 @@ def main(
 
 
 if __name__ == '__main__':
-    study(main, cache={'type': Path, 'help': 'folder to keep traces in'})
+    study(main)

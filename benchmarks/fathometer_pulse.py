@@ -102,7 +102,12 @@ def layers(
     seed: int, records: int, signs: np.ndarray, hydrophones: int = 16
 ) -> tuple[FathometerScenario, Drift, np.random.Generator]:
     """The six layers under 16 hydrophones, or 80 m deeper and weaker under the 32 of the drift."""
-    changes = {'level': 'csdm', 'records': records, 'snapshots': 100, 'snapshot_seconds': 0.35}
+    changes: dict[str, Any] = {
+        'level': 'csdm',
+        'records': records,
+        'snapshots': 100,
+        'snapshot_seconds': 0.35,
+    }
     config, first, strength = scenario('pressure', changes), DEPTHS, STRENGTHS
     if hydrophones == 32:
         config = FathometerScenario(**{**changes, 'snapshots': 256})

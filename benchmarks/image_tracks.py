@@ -41,8 +41,7 @@ from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
-from sonar_imm_tools.evaluation.obstacle.motion import motion_metrics
-from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.scoring import motion_metrics, score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm_tools.simulation.obstacle.simulator import (
     ObstacleScenario,

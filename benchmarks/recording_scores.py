@@ -29,6 +29,7 @@ ways.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -196,7 +197,7 @@ def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[
 
     yield 'default', lambda: DiverTracker(DiverConfig(**stated))
     for name, values in SINGLE.items():
-        yield name, lambda values=values: ours(values)
+        yield name, partial(ours, values)
     if kind == 'fixes' and 'estimate_covariance_scale' not in stated:
         yield 'FilterPy, CV Kalman', lambda: Peer(stated.get('covariance_scale', 1.0))
     if kind in BOATS:

@@ -37,9 +37,12 @@ from matplotlib import pyplot as plt  # noqa: E402
 from sonar_imm.acoustics import array, spatial  # noqa: E402
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
-from sonar_imm_tools.simulation.bathymetry.hearing import snr  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.objects import facets_of, surfaces_of  # noqa: E402
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.simulation.bathymetry.simulator import (  # noqa: E402
+    scenario,
+    simulate,
+    snr,  # noqa: E402
+)
 
 IMAGES = ROOT / 'docs' / 'images'
 BLUE, RED, AMBER, INK = '#0072B2', '#D55E00', '#E69F00', '#1b2733'

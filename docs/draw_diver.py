@@ -55,8 +55,7 @@ from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
     outlines,
 )
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
-from sonar_imm_tools.evaluation.diver.series import Series, series_of  # noqa: E402
-from sonar_imm_tools.evaluation.diver.truth import Truth, TruthPath  # noqa: E402
+from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth, TruthPath  # noqa: E402
 from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
     RECEIVERS,
     scenario,
@@ -131,7 +130,7 @@ def draw_front() -> None:
     top.plot(*fixes.state[:, :2].T, 'x', color=GREY, ms=6, mew=1.2, label='raw fixes')
     outline = outlines(series.state[:, :2], series.covariance[:, :2, :2])
     shapes = outline[np.isfinite(outline[:, 0])].reshape(-1, 40, 2)
-    top.fill(*shapes.transpose(2, 1, 0), facecolor=BLUE, alpha=0.12, lw=0)
+    top.fill(*shapes.transpose(2, 1, 0), facecolor=BLUE, alpha=0.3, lw=0)
     top.plot(*truth.paths[0].state[:, :2].T, color=INK, lw=1.4, ls='--', label='truth')
     top.plot(*series.state[:, :2].T, color=BLUE, lw=2, label='track with 95 % ellipses')
     top.set(

@@ -248,6 +248,7 @@ def drift(seed, shown=range(300), ship_pass=()):
 def draw_paper(processed) -> None:
     """As the paper's Figure 1: both processors, the tracks over them, the amplitudes, each drawn
     upwards from where its reflector lies."""
+    plt.rcParams['font.size'] = 13
     figure, axes = plt.subplots(3, 2, figsize=(12, 13), sharex=True, sharey=True)
     for name, column in zip(('conventional', 'mvdr'), axes.T):
         records, value, depth = processed[name]
@@ -272,14 +273,15 @@ def draw_paper(processed) -> None:
                 column[2].fill_between(there, base, line, color=colour, alpha=0.25, lw=0)
                 column[2].plot(there, line, lw=0.9, color=colour)
         unit = {'conventional': 1.0, 'mvdr': 2.0}[name]
-        column[2].plot([296, 296], [128.0, 128.0 - unit * scale], color=INK, lw=3)
-        column[2].text(292, 128.0 - unit * scale / 2, f'amplitude {unit:g}', ha='right')
+        column[2].plot([6, 6], [170.0, 170.0 - unit * scale], color=INK, lw=3)
+        column[2].text(11, 170.0, f'amplitude {unit:g}')
         column[2].set(xlabel='record')
     for axis in axes[:, 0]:
         axis.set_ylabel('depth [m]')
     for axis, letter in zip(axes.ravel(), 'abcdef'):
         axis.set_title(f'({letter})', loc='left')
     save(figure, 'fathometer_paper.png')
+    plt.rcParams['font.size'] = 9
 
 
 def draw_orders(processed) -> None:

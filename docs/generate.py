@@ -47,12 +47,9 @@ MARKDOWN = """\
 # Parameters of the {what}
 
 {summary}.
-Written by `make docs` from the configuration classes; `ros2 param describe` shows the same.
-`config/{name}.yaml` holds the defaults, ready to copy.
+Written by `make docs` from the configuration classes, as is `config/{name}.yaml`, ready to copy.
 
-A *live* parameter may change while the node runs, and the tracks are kept; every other one is
-read at start.
-A wrong value is refused with one sentence that names it, a misspelt name is warned about.
+A *live* parameter may change while the node runs, and tracks are kept; others are read at start.
 
 ## The ten that matter
 
@@ -62,7 +59,15 @@ A wrong value is refused with one sentence that names it, a misspelt name is war
 {tracker}
 ## Node
 
-The live node takes these besides; offline tracking ignores them.
+The live node takes these besides, and [those of every node](nodes.md).
+
+{node}"""
+
+NODES = """\
+# Parameters of every node
+
+Written by `make docs` from the configuration classes. Offline tracking ignores them. A wrong value
+is refused with one sentence, a misspelt name is warned about.
 
 {node}"""
 
@@ -139,6 +144,8 @@ MATTER = {
 def generated() -> dict[str, str]:
     """Give every generated file: its text by its path below the project root."""
     files = {}
+    shared = shared_specs()
+    files['docs/parameters/nodes.md'] = NODES.format(node=markdown_table(shared))
     for system in SYSTEMS.values():
         tracker = system.config_type().specs()
         files[f'config/{system.name}.yaml'] = parameter_file(system)
@@ -149,7 +156,7 @@ def generated() -> dict[str, str]:
             summary=system.summary[0].upper() + system.summary[1:],
             matter=matter_table(system.name, tracker),
             tracker=markdown_table(tracker),
-            node=markdown_table(node_specs(system)),
+            node=markdown_table(spec for spec in node_specs(system) if spec not in shared),
         )
     detector = DetectorConfig.specs()
     node = (*type_specs('fls_detector'), *DetectorNodeConfig.specs())
@@ -161,7 +168,7 @@ def generated() -> dict[str, str]:
         summary=DETECTOR,
         matter=matter_table('fls_detector', detector),
         tracker=markdown_table(detector),
-        node=markdown_table(node),
+        node=markdown_table(spec for spec in node if spec not in shared),
     )
     return files
 
@@ -190,6 +197,12 @@ def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     own = {spec.name for spec in system.config_type().specs()}
     specs = (*type_specs(system.name), *node_config_type(system).specs())
     return tuple(spec for spec in specs if spec.name not in own)
+
+
+def shared_specs() -> tuple[ParameterSpec, ...]:
+    """Give the parameters that the live nodes of all systems have alike."""
+    first, *others = (node_specs(system) for system in SYSTEMS.values())
+    return tuple(spec for spec in first if all(spec in other for other in others))
 
 
 def _entry(spec: ParameterSpec) -> str:

@@ -21,6 +21,7 @@ from the command and from the trackers.
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterable
 import contextlib
 import io
@@ -31,6 +32,9 @@ import sys
 import tempfile
 from typing import Any
 
+import plotly.graph_objects
+import plotly.offline
+
 ROOT = Path(__file__).resolve().parents[1]
 
 OUTSIDE = {
@@ -39,6 +43,9 @@ OUTSIDE = {
     'CHANGELOG.rst': 'changelog.md',
 }
 """Pages that lie in the root of the project, where people and tools look for them."""
+
+PLOTLYJS = 'javascripts/plotly.js'
+"""Once for all notebooks."""
 
 API = {
     'estimation': (
@@ -72,12 +79,30 @@ def on_files(files: Any, config: Any) -> Any:
 
     for name, text in made_pages().items():
         files.append(File.generated(config, name, content=text))
+    files.append(File.generated(config, PLOTLYJS, content=plotly.offline.get_plotlyjs()))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Called by mkdocs with each page: show where the numbers of its tables come from."""
     return captioned(markdown, '../' * page.file.src_uri.count('/'))
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Called by mkdocs with each page as HTML: cells know the head of their column."""
+    return re.sub(r'<table>.*?</table>', labelled, html, flags=re.DOTALL)
+
+
+def labelled(found: re.Match[str]) -> str:
+    """A table for a phone, where each cell is a line: all but the first of a row have a label."""
+    head, _, body = found.group().partition('</thead>')
+    labels = [re.sub(r'<[^>]+>|"', '', text) for text in re.findall(r'<th[ >].*?</th>', head)]
+
+    def cells(row: re.Match[str]) -> str:
+        named = iter(labels)
+        return re.sub(r'<td', lambda _: f'<td data-label="{next(named, "")}"', row.group())
+
+    return f'{head}</thead>' + re.sub(r'<tr>.*?</tr>', cells, body, flags=re.DOTALL)
 
 
 def caption(mark: str, up: str) -> str:
@@ -89,10 +114,14 @@ def caption(mark: str, up: str) -> str:
         return ''
     if kind.startswith('read '):
         return f'*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`'
-    source = known_sources()[kind]
-    return (
-        f'*Values of {source["date"]} ({aged(kind)}), [{kind}]({up}results/{kind}):* '
-        f'`{source["command"]}`'
+    sources = known_sources()
+    named = dict.fromkeys(
+        name for name in re.findall(r'[a-z_0-9]+\.json', mark) if name in sources
+    )
+    return '<br>'.join(
+        f'*Values of {sources[name]["date"]} ({aged(name)}), [{name}]({up}results/{name}):* '
+        f'`{sources[name]["command"]}`'
+        for name in named
     )
 
 
@@ -150,14 +179,34 @@ def made_pages() -> dict[str, str]:
 
 
 def notebook(path: Path) -> str:
-    """The cells of a notebook as a page, without outputs."""
-    cells = json.loads(path.read_text(encoding='utf-8'))['cells']
-    texts = [
-        text if cell['cell_type'] == 'markdown' else f'```python\n{text}\n```'
-        for cell in cells
-        for text in [''.join(cell['source'])]
-    ]
-    return '\n\n'.join([*texts, f'The notebook is `examples/{path.name}`.']) + '\n'
+    """The cells of a notebook as a page, with what they give when they are run."""
+    space: dict[str, Any] = {}
+    parts = []
+    for number, cell in enumerate(json.loads(path.read_text(encoding='utf-8'))['cells']):
+        text = ''.join(cell['source'])
+        if cell['cell_type'] == 'markdown':
+            parts.append(text)
+            continue
+        parts.append(f'```python\n{text}\n```')
+        value = last_value(text, f'{path.name}, cell {number}', space)
+        if isinstance(value, plotly.graph_objects.Figure):
+            drawn = value.to_html(full_html=False, include_plotlyjs=False, default_height=360)
+            parts += [f'<script src="../{PLOTLYJS}"></script>', drawn]
+        elif value is not None:
+            parts.append(f'```text\n{value!r}\n```')
+    return '\n\n'.join([*parts, f'The notebook is `examples/{path.name}`.']) + '\n'
+
+
+def last_value(code: str, name: str, space: dict[str, Any]) -> Any:
+    """Run a cell in `space`; gives the value of its last line, or None when that has none."""
+    tree = ast.parse(code, name)
+    last = tree.body[-1]
+    if not isinstance(last, ast.Expr):
+        exec(compile(tree, name, 'exec'), space)
+        return None
+    del tree.body[-1]
+    exec(compile(tree, name, 'exec'), space)
+    return eval(compile(ast.Expression(last.value), name, 'eval'), space)
 
 
 def at_the_root(name: str) -> str:

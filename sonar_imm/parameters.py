@@ -378,16 +378,15 @@ def _sections(tree: Mapping[Any, Any], before: str) -> Iterable[str]:
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
     """The table of `specs` for the documentation, one row a parameter; *live* ones may change
     while a node runs."""
-    rows = ['| parameter | type | default | unit | range | what |', '|---|---|---|---|---|---|']
+    rows = ['| parameter | type, default | range | what |', '|---|---|---|---|']
     for spec in specs:
         between = spec.range_text().removeprefix('between ').replace(' and ', ' to ')
         limits = ', '.join(f'`{choice}`' for choice in spec.choices) or between
         default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
         default = str(default).lower() if isinstance(default, bool) else default
         text = spec.description + ('' if spec.read_only else ' (*live*)')
-        rows.append(
-            f'| `{spec.name}` | {spec.ros_kind} | `{default}` | {spec.unit} | {limits} | {text} |'
-        )
+        value = f'{spec.ros_kind} `{default}` {spec.unit}'.rstrip()
+        rows.append(f'| `{spec.name}` | {value} | {limits} | {text} |')
     return '\n'.join(rows) + '\n'
 
 

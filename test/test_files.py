@@ -138,8 +138,9 @@ def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
 def test_the_command_runs_without_the_modules_of_unix(tmp_path):
     blocked = ('fcntl', 'grp', 'pwd', 'resource', 'termios')
     program = (
-        'import sys\n'
+        'import os, signal, sys\n'
         f'sys.modules.update(dict.fromkeys({blocked!r}))\n'
+        'del signal.SIGHUP, signal.SIGKILL, os.sched_getaffinity, os.fork, os.nice\n'
         'from sonar_imm_tools.cli import main\n'
         f"sys.exit(main(['track', 'bags/diver_table1', {str(tmp_path / 'run')!r}]))"
     )

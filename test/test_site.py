@@ -140,8 +140,28 @@ def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
         '*Read on 2026-11-20 (age unknown):* `sonar-imm bench`\n\nAfter.\n'
     )
     text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
+    text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')
     shown = made.captioned(text, '../')
+    assert '[tune.json](../results/tune.json)' in shown
     assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
+
+
+def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
+    page = (
+        '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n'
+        '</tr>\n</thead>\n'
+        '<tbody>\n<tr>\n<td>1</td>\n<td style="x">2</td>\n</tr>\n</tbody>\n</table></p><td>'
+    )
+    shown = made.on_page_content(page, None, None, None)
+    assert '<td data-label="a">1</td>\n<td data-label="b c" style="x">2</td>' in shown
+    assert shown.endswith('<td>')
+
+
+def test_the_search_needs_no_server() -> None:
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    (script,) = config['extra']['polyfills']
+    assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
+    assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
 
 
 def test_the_numbers_below_the_picture_of_the_front_are_those_of_the_run() -> None:

@@ -109,11 +109,7 @@ def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):
 
 
 @pytest.mark.parametrize(
-    'start',
-    [
-        ('-m', 'sonar_imm.nodes.diver'),
-        ('-c', INSTALLED.format('obstacle')),
-    ],
+    'start', [('-m', 'sonar_imm.nodes.diver'), ('-c', INSTALLED.format('obstacle'))]
 )
 def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
     """Its parameters are refused, so it ends by itself; the middleware has threads of its own, and

@@ -273,7 +273,7 @@ def under_way(
 
 def bench_layover(rounds: int = 7) -> dict[str, Any]:
     """Bins per second of CPU time with and without an object, at rest and on a ship that moves,
-    by what is made of bins with two surfaces; what a bin of a stretch costs in `resolved`."""
+    by what is made of bins with two surfaces; what a bin of a stretch costs."""
     methods: dict[str, Timed] = {}
     share = 0.0
     for scene in ('thermal', 'ledge', 'moving_ledge'):
@@ -288,7 +288,7 @@ def bench_layover(rounds: int = 7) -> dict[str, Any]:
                     parts = stretches(possible)
                     share = sum(end - first for first, end in parts) / timed[1]
     speed = rates(methods, rounds, clock=time.process_time)
-    slow, fast = (speed[f'ledge, particles, {name}'] for name in ('resolved', 'gated'))
+    slow, fast = (speed[f'{scene}, particles, resolved'] for scene in ('ledge', 'thermal'))
     return {
         'bins_per_second': speed,
         'stretch_share': share,

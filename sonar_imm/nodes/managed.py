@@ -83,7 +83,7 @@ class Warming:
         self._process: jit.Elsewhere | None = None
         self._jit, self._progress = jit, jit.Progress()
         self._start = time.monotonic()
-        self._said = -self.PERIOD
+        self._logged = -self.PERIOD
         self._doing, self._ready = 'what is published', False
         self._stopped = threading.Event()
         self._error: Exception | None = None
@@ -121,9 +121,9 @@ class Warming:
     def due_sentence(self) -> str:
         """The same when it is time to say it (again), else empty."""
         now = time.monotonic()
-        if now - self._start < self.PATIENCE or now - self._said < self.PERIOD:
+        if now - self._start < self.PATIENCE or now - self._logged < self.PERIOD:
             return ''
-        self._said = now
+        self._logged = now
         return self.sentence()
 
     def _run(self) -> None:

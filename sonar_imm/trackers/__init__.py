@@ -155,8 +155,8 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
-            kernels={'pings': (21, 629)},
-            all_kernels=(21, 629),
+            kernels={'pings': (21, 632), 'surfaces': (14, 379)},
+            all_kernels=(29, 898),
         ),
         System(
             name='diver',

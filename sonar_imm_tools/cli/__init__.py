@@ -64,6 +64,8 @@ COMMANDS = {
 }
 
 
+ENDING = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, 'SIGHUP') else [])]
+"""Signals that end a program; Windows has no SIGHUP."""
 READER_GONE = 141
 """Exit code when the reader of the output went away: that of SIGPIPE in a shell."""
 
@@ -134,7 +136,7 @@ def _signals_unwind() -> Iterator[None]:
     was started would live on. Handlers that a program has set itself are kept."""
     ours = []
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGHUP):
+        for number in ENDING:
             if signal.getsignal(number) is signal.SIG_DFL:
                 signal.signal(number, _leave)
                 ours.append(number)
@@ -147,7 +149,7 @@ def _signals_unwind() -> Iterator[None]:
 
 def _leave(number: int, _frame: object) -> NoReturn:
     # A second signal must not interrupt the unwinding.
-    for item in (signal.SIGTERM, signal.SIGHUP):
+    for item in ENDING:
         signal.signal(item, signal.SIG_IGN)
     sys.unraisablehook = functools.partial(_quiet_on_half_made, sys.unraisablehook)
     raise SystemExit(128 + number)
@@ -195,8 +197,12 @@ def _user_error(error: Exception) -> str | None:
     from sonar_imm.measurements import Rejection
     from sonar_imm.parameters import ConfigError
 
-    from ..recordings.reader import BagError
+    from ..recordings.sources import BagError, NoRecordingError
 
+    if isinstance(error, NoRecordingError):
+        from ..recordings.sniffing import hint
+
+        return f'{error}{hint(error.path)}'
     if isinstance(error, (ConfigError, Rejection, BagError)):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and error.name:

@@ -63,8 +63,7 @@ class Convert(click.Group):
             guess = sniff(source, _named_columns(args))
             taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
             click.echo(visible(taken), err=True)
-            # Where no bag is named it is made in the folder of the command.
-            args = [guess.kind, *args, *([f'{source.stem}.bag'] if len(args) == 1 else [])]
+            args = [guess.kind, *args]
         elif source.suffix:
             ctx.fail(f'{source} does not exist')
         return super().resolve_command(ctx, args)
@@ -99,9 +98,11 @@ def command(ctx: click.Context) -> None:
 
 
 def _add_subcommand(kind: str, options: type) -> None:
-    def run(source: Path, out_bag: Path, jobs: int, as_json: bool, **values: Any) -> None:
+    def run(source: Path, out_bag: Path | None, jobs: int, as_json: bool, **values: Any) -> None:
         chosen = _collected(options, values)
         several = _sources(kind, source)
+        # Where no bag is named it is made in the folder of the command.
+        out_bag = out_bag or Path(f'{source.stem}.{"bag" if several is None else "bags"}')
         if several is not None:
             _convert_all(kind, several, out_bag, chosen, jobs, as_json)
             return
@@ -113,7 +114,7 @@ def _add_subcommand(kind: str, options: type) -> None:
         kind, callback=run, help=inspect.getdoc(options), epilog=example(*examples)
     )
     click.argument('source', metavar='IN', type=BAG)(subcommand)
-    click.argument('out_bag', type=BAG)(subcommand)
+    click.argument('out_bag', type=BAG, required=False)(subcommand)
     for decorate in _click_options(options):
         decorate(subcommand)
     click.option(
@@ -131,7 +132,10 @@ def _click_options(
     options: type, prefix: str = '', what: str = '', inside: str = ''
 ) -> Iterable[Callable[..., Any]]:
     """The options of a class for click; the name of a value is the path of its field."""
-    for attribute in attrs.fields(options):
+    fields = attrs.fields_dict(options)
+    # What is special of a kind comes first, what all have last.
+    names = [name for each in options.__mro__ for name in inspect.get_annotations(each)]
+    for attribute in (fields[name] for name in names if name in fields):
         spec, name = spec_of(attribute), f'{inside}{attribute.name}'
         if isinstance(spec, Group):
             yield from _click_options(spec.options, spec.prefix, spec.what, f'{name}.')
@@ -280,6 +284,7 @@ def _described(report: ConversionReport) -> dict[str, Any]:
         'bad_rows': report.bad_rows,
         'reasons': dict(report.reasons),
         'problems': report.problems,
+        'questions': report.questions,
         'notes': report.notes,
     }
 
@@ -297,6 +302,8 @@ def _print(report: ConversionReport) -> None:
         say(f'  note: {key}: {value}')
     for problem in report.problems:
         say(f'  left out: {problem}')
+    for question in report.questions:
+        say(f'  question: {question}')
     if report.bad_rows:
         why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
         say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))

@@ -16,22 +16,28 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
+import time
+from typing import Any
 
 import click
 
 from .common import example, json_option, print_json, say
+
+NAME = 'sonar_imm_fuse'
 
 
 @click.command(
     epilog=example(
         'sonar-imm fuse port starboard both',
         'sonar-imm evaluate both',
+        'sonar-imm fuse --live /port/diver/estimate /starboard/diver/estimate',
     )
 )
 @click.argument('first', metavar='RUN_A', type=click.Path(path_type=Path))
 @click.argument('second', metavar='RUN_B', type=click.Path(path_type=Path))
-@click.argument('out', type=click.Path(path_type=Path))
+@click.argument('out', type=click.Path(path_type=Path), required=False)
 @click.option(
     '--max-age',
     type=click.FloatRange(0.0, 600.0),
@@ -46,27 +52,57 @@ from .common import example, json_option, print_json, say
     show_default=True,
     help='How fast velocities change while an estimate is carried on, m/s^1.5.',
 )
+@click.option('--live', is_flag=True, help='RUN_A and RUN_B are topics of running nodes.')
+@click.option(
+    '--wait',
+    type=click.FloatRange(0.0, 60.0),
+    default=1.0,
+    show_default=True,
+    help='With --live: seconds that an estimate waits for the other node to come as far.',
+)
+@click.option(
+    '--timeout',
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=60.0,
+    show_default=True,
+    metavar='SECONDS',
+    help='With --live: end with 1 when nothing is heard for so long from the start.',
+)
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
     first: Path,
     second: Path,
-    out: Path,
+    out: Path | None,
     max_age: float,
     noise: float,
+    live: bool,
+    wait: float,
+    timeout: float,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Fuse the diver tracks of two runs into one run in the folder OUT.
+    """Fuse the diver tracks of two runs into one run in the folder OUT, or of two nodes, live.
 
     RUN_A and RUN_B are folders of `track`: of two nodes that watched the same divers, in the same
     frame. Confirmed tracks that keep the same place are one diver, and their estimates are joined
     by covariance intersection, which is consistent however the errors of the two are correlated.
     Others stay as they are. The truth is that of RUN_A's recording.
+
+    With --live RUN_A and RUN_B are topics (/diver/estimate), there is no OUT, and what comes is
+    published as /sonar_imm_fuse/estimate. Ctrl-C ends it.
     """
     from ..offline.fusing import write_fused
     from ..offline.run_folder import RunFolder
 
+    if live == (out is not None):
+        raise click.UsageError('OUT is for two runs' if live else 'name OUT, or --live')
+    if live:
+        if first == second:
+            raise click.UsageError('RUN_A and RUN_B are the same topic')
+        _fuse_live((str(first), str(second)), (noise, max_age, wait), timeout)
+        return
+    assert out is not None
     if first.resolve() == second.resolve():
         raise click.UsageError('RUN_A and RUN_B are the same folder')
     if out.resolve() in (first.resolve(), second.resolve()):
@@ -84,3 +120,47 @@ def command(
         f'{out}: {run["estimates"]} estimates; {len(made["pairs"])} pairs of tracks, '
         f'{share:.0%} of the rows fused'
     )
+
+
+def _fuse_live(
+    topics: tuple[str, str], settings: tuple[float, float, float], timeout: float
+) -> None:
+    """Publish what two nodes say as what one would."""
+    from msg_adapters.estimates import write_estimate
+    from sonar_imm.nodes.messages import make, message_class
+    from sonar_imm.nodes.qos import output_qos
+
+    from ..offline.fusing import LiveFusion
+    from ..replay.link import Link
+    from ..replay.listening import TableListener
+
+    fusion = LiveFusion(*settings)
+    sides = {f'/{topic.lstrip("/")}': side for side, topic in enumerate(topics)}
+    known: set[tuple[int, int]] = set()
+    with Link(NAME) as link, contextlib.suppress(KeyboardInterrupt):
+        cloud = message_class('sensor_msgs/msg/PointCloud2')
+        output: Any = link.node.create_publisher(cloud, f'/{NAME}/estimate', output_qos())
+        told = 0
+        for table in TableListener(link, topics).tables(timeout):
+            if table is not None:
+                fusion.take(sides[table.topic], _estimate(table), time.monotonic())
+            for estimate in fusion.ready(time.monotonic()):
+                output.publish(write_estimate(estimate, make))
+            for pair in sorted(fusion.pairs - known):
+                say(f'track {pair[0]} of {topics[0]} and {pair[1]} of {topics[1]} are one diver')
+            known |= fusion.pairs
+            if fusion.late > 2 * told:
+                told = fusion.late
+                say(f'{told} estimates came too late and are left out: try a longer --wait')
+
+
+def _estimate(table: Any) -> Any:
+    """The divers of a table that was heard."""
+    from sonar_imm.estimates import Estimate
+
+    from ..replay.link import LinkError
+
+    columns = table.columns or {}
+    if not {'px', 'py', 'vx', 'vy', 'track_id', 'track_state'} <= columns.keys():
+        raise LinkError(f'{table.topic}: {table.problem or "no estimates of divers"}')
+    return Estimate.from_columns(columns, stamp_ns=table.stamp_ns, frame_id=table.frame_id)

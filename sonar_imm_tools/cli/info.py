@@ -75,7 +75,9 @@ def _print(found: dict[str, Any]) -> None:
         purpose = 'or as something else' if number else 'to track it'
         say(f'{purpose}: {track_line(found["bag"], system, named)}')
     if not found['systems']:
-        say('no tracker can use it')
+        images = any(topic['type'].endswith('SonarImage') for topic in found['topics'])
+        hint = '; of amplitude and phase sonar-imm convert interferometer makes snapshots'
+        say('no tracker can use it' + (hint if images else ''))
 
 
 def _scans(scans: dict[str, int] | None) -> str:

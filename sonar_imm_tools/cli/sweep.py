@@ -120,7 +120,7 @@ def command(
         coming = sweeps.run_on_cluster(
             sweep, seeds, scheduler, lambda sentence: click.echo(sentence, err=True)
         )
-    elif (count := min(runs, workers or len(os.sched_getaffinity(0)))) == 1:
+    elif (count := min(runs, workers or _processors())) == 1:
         coming = sweeps.run_here(sweep, seeds)
     else:
         coming = sweeps.run_on_processes(sweep, seeds, count)
@@ -135,6 +135,13 @@ def command(
     print_json(content) if as_json else _print(content, out)
     if 2 * len(content['failures']) > runs:
         raise click.exceptions.Exit(1)
+
+
+def _processors() -> int:
+    """Those that this process may use, where the system says it (not macOS, nor Windows)."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def planned(

@@ -94,7 +94,8 @@ def command(
 
     Serves the topics on a WebSocket that Foxglove (desktop or web) connects to, with its own play,
     pause and jump for what is recorded; Ctrl-C ends it. A run is shown with the recording it was
-    made of. Needs foxglove-sdk: pip install 'sonar_imm[view]'.
+    made of. Needs foxglove-sdk (pip install 'sonar_imm[view]') and, for Foxglove, an account
+    there; its page in the browser needs the network too. --browser and --rerun need neither.
     """
     if live == (source is not None):
         raise click.UsageError('say either a BAG or RUN, or --live')
@@ -182,7 +183,7 @@ def _announce(server: Any, topics: Sequence[str], layout_file: Path | None) -> N
     from ..viewing.layouts import fitting_layouts, write_layout
 
     say(f'{len(topics)} topics on {server.url}')
-    say(f'open it in Foxglove: {server.app_url}')
+    say(f'open it in Foxglove: {server.app_url} (network and an account; --browser needs neither)')
     layouts = fitting_layouts(topics)
     for system in layouts:
         say(f'layout of {system} (Foxglove: Layouts, Import from file): {layouts[system]}')

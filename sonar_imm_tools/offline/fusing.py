@@ -34,7 +34,7 @@ the covariance as fast as divers turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from attrs import evolve
@@ -59,6 +59,9 @@ MEMORY = 0.8
 
 STAYS = 4.0
 """By so much another partner must fit better, distance squared, than the one of now."""
+
+MANY_LATE = 20
+"""Estimates in a row that come too late where clocks were set back."""
 
 
 class Intersection(NamedTuple):
@@ -278,25 +281,87 @@ def _estimate(stamp_ns: int, like: Estimate, rows: list[dict[str, Any]]) -> Esti
     )
 
 
+class Joined:
+    """Two streams of estimates as one, stamp by stamp in order; max_age: seconds for which an
+    estimate is carried on."""
+
+    def __init__(self, fuser: Fuser, max_age: float):
+        self.fuser, self._most_ns = fuser, max_age * 1e9
+        self.newest: dict[int, Estimate] = {}
+
+    def at(self, stamp_ns: int, heard: Mapping[int, Estimate]) -> Estimate:
+        """At the stamp of what was `heard`, by stream (0 or 1)."""
+        self.newest.update(heard)
+        young = {
+            side: each
+            for side, each in self.newest.items()
+            if stamp_ns - each.stamp_ns <= self._most_ns
+        }
+        return self.fuser.fuse(young.get(0), young.get(1), stamp_ns)
+
+
 def fused(
     first: Sequence[Estimate], second: Sequence[Estimate], fuser: Fuser, max_age: float
 ) -> Iterator[Estimate]:
-    """The estimates of two runs as those of one, at every stamp of either; max_age: seconds for
-    which an estimate is carried on."""
-    newest: list[Estimate | None] = [None, None]
-    events = sorted(
-        [(each.stamp_ns, 0, k) for k, each in enumerate(first)]
-        + [(each.stamp_ns, 1, k) for k, each in enumerate(second)]
-    )
-    for place, (stamp_ns, side, k) in enumerate(events):
-        newest[side] = (first, second)[side][k]
-        if place + 1 < len(events) and events[place + 1][0] == stamp_ns:
-            continue
-        young = [
-            each if each is not None and stamp_ns - each.stamp_ns <= max_age * 1e9 else None
-            for each in newest
-        ]
-        yield fuser.fuse(young[0], young[1], stamp_ns)
+    """The estimates of two runs as those of one, at every stamp of either; max_age as above."""
+    heard: dict[int, dict[int, Estimate]] = {}
+    for side, run in enumerate((first, second)):
+        for each in run:
+            heard.setdefault(each.stamp_ns, {})[side] = each
+    joined = Joined(fuser, max_age)
+    for stamp_ns in sorted(heard):
+        yield joined.at(stamp_ns, heard[stamp_ns])
+
+
+class LiveFusion:
+    """Estimates of two nodes, fused as they come. Each waits until the other node has come as far,
+    `wait` seconds at most; what comes after its stamp was passed is left out, and counted as
+    `late`. `MANY_LATE` of them in a row are clocks that were set back: all begins anew."""
+
+    def __init__(self, noise: float, max_age: float, wait: float):
+        self._settings, self._wait, self.late = (noise, max_age), wait, 0
+        self._begin()
+
+    def _begin(self) -> None:
+        noise, max_age = self._settings
+        self._joined = Joined(Fuser(noise), max_age)
+        self._waiting: dict[int, tuple[float, dict[int, Estimate]]] = {}
+        self._reached, self._passed, self._in_a_row = [-1, -1], -1, 0
+
+    @property
+    def pairs(self) -> set[tuple[int, int]]:
+        """The tracks of both that were one."""
+        return self._joined.fuser.pairs
+
+    def take(self, side: int, estimate: Estimate, now: float) -> None:
+        """An estimate of a node (0 or 1) that came at the time `now`, s. Raises `BagError` for one
+        that does not fit the other's."""
+        for other in self._joined.newest.values():
+            if len(other) and len(estimate) and other.frame_id != estimate.frame_id:
+                raise BagError(
+                    f'the nodes are in different frames ({other.frame_id} and {estimate.frame_id})'
+                )
+            if other.state_names != estimate.state_names:
+                raise BagError('one node estimates depth and the other does not')
+        late = estimate.stamp_ns <= self._passed
+        self.late += late
+        self._in_a_row = self._in_a_row + 1 if late else 0
+        if self._in_a_row >= MANY_LATE:
+            self._begin()
+        elif late:
+            return
+        self._waiting.setdefault(estimate.stamp_ns, (now, {}))[1][side] = estimate
+        self._reached[side] = max(self._reached[side], estimate.stamp_ns)
+
+    def ready(self, now: float) -> Iterator[Estimate]:
+        """What need not wait any longer."""
+        for stamp_ns in sorted(self._waiting):
+            since, heard = self._waiting[stamp_ns]
+            if stamp_ns > min(self._reached) and now - since < self._wait:
+                return
+            del self._waiting[stamp_ns]
+            self._passed = stamp_ns
+            yield self._joined.at(stamp_ns, heard)
 
 
 def write_fused(

@@ -42,7 +42,7 @@ from sonar_imm.parameters import Config
 from sonar_imm.trackers import System
 
 from .. import SECOND
-from ..recordings.measurements import Heard, measurements_of
+from ..recordings.measurements import measurements_of, Received
 from ..recordings.reader import BagError, BagReader
 from ..recordings.topics import fitting_topics
 from .jobs import processes
@@ -214,7 +214,7 @@ class OfflineRun:
         made: list[Estimate] = self.tracker.take(found)
         return made
 
-    def read(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Heard]:
+    def read(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Received]:
         """What the messages hold, in order: measurements and refusals. `advance` hears of each
         message."""
         for item in measurements_of(

@@ -18,15 +18,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+import functools
 import math
 from pathlib import Path
+import re
 from typing import Any, TypeVar
-import zipfile
-import zlib
 
 from attrs import define, Factory
 import numpy as np
-from numpy.typing import NDArray
 
 from msg_adapters.inputs import InputTopic
 from sonar_imm.acoustics.geodesy import Origin
@@ -34,8 +33,7 @@ from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
 from .csv_table import BadRow, Row, Table
-from .mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
-from .messages import ros_message
+from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
 from .sources import BagError
 from .writer import BagWriter
@@ -43,6 +41,7 @@ from .writer import BagWriter
 T = TypeVar('T')
 Record = tuple[int, str, Any]
 """(stamp in ns, topic, rosbags message)"""
+Converter = Callable[[Path, Any, 'ConversionReport'], None]
 
 JUMP = 3600 * SECOND
 """A clock that goes further than this from one ping to the next is off, or was set."""
@@ -52,6 +51,7 @@ MOST_OFF = 0.1
 """Of more records than this share that seem off, it is the order of the file that is another."""
 FASTEST, NEAR = 100.0, 1000.0
 """No ship is faster, m/s, or jumps further, m."""
+NEIGHBOURS = 5
 MOST_NAMED = 20
 """At most this many bad rows are listed; all are counted."""
 
@@ -61,16 +61,17 @@ class ConversionReport:
     """What a conversion did.
 
     messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
-    each of the first bad rows and for the file as a whole; reasons: bad rows by a word, of those
-    that have one; notes: facts worth telling, such as the
-    origin of local coordinates, also kept in the bag.
+    each of the first bad rows and for the file as a whole; questions: what is kept and looks
+    wrong; reasons: bad rows by a word, of those that have one; notes: facts worth telling, such as
+    the origin of local coordinates, also kept in the bag.
     """
 
     path: Path
     rows: int = 0
     bad_rows: int = 0
-    messages: dict[str, int] = Factory(dict)
+    messages: Counter[str] = Factory(Counter)
     problems: list[str] = Factory(list)
+    questions: list[str] = Factory(list)
     notes: dict[str, str] = Factory(dict)
     reasons: Counter[str] = Factory(Counter)
 
@@ -83,6 +84,11 @@ class ConversionReport:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
+
+    def nothing(self, what: object) -> BagError:
+        """The error of a file without a usable record."""
+        first = f' (the first problem: {self.problems[0]})' if self.problems else ''
+        return BagError(f'{what} holds nothing that could be converted{first}')
 
     def read_rows(self, table: Table, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
         """Yield the rows of `table` that `parse` accepts; count and name the others."""
@@ -101,8 +107,30 @@ class ConversionReport:
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken
         self.problems += table.problems
+        header = table.header('z')
+        if table.has('z') and re.search('depth|tiefe|down', header.lower()):
+            self.questions.append(
+                f'{table.path.name}: z counts up and {header} sounds like a depth; is --column '
+                f"'depth={header}' meant?"
+            )
         if left:
             self.notes[f'ignored columns of {table.path.name}'] = left
+
+
+def converter(options: type[Any]) -> Callable[[Converter], Callable[..., ConversionReport]]:
+    """Makes ``convert(path, out, **values)`` of a function of path, options and report; values: as
+    in `options`. It raises `BagError`."""
+
+    def decorate(work: Converter) -> Callable[..., ConversionReport]:
+        @functools.wraps(work)
+        def convert(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+            report = ConversionReport(Path(out))
+            work(Path(path), options(**values), report)
+            return report
+
+        return convert
+
+    return decorate
 
 
 @define
@@ -128,11 +156,29 @@ class Leaps:
 
     def tell(self, path: Path, report: ConversionReport) -> None:
         if self.count:
-            report.problems.append(
+            report.questions.append(
                 f'{path.name}: {self.count} times the vessel was further from its last position '
-                f'than {FASTEST:g} m/s would bring it; does the file hold two vessels? They are '
-                'kept'
+                f'than {FASTEST:g} m/s would bring it; does the file hold two vessels?'
             )
+
+
+def ask_for_units(
+    stamp_ns: Sequence[int], position: Sequence[Any], path: Path, report: ConversionReport
+) -> None:
+    """Ask where positions (n, 2), m, are too far from each of the `NEIGHBOURS` before them: there
+    may be several targets, in turn."""
+    times, places = np.array(stamp_ns) / SECOND, np.array(position)
+    speed = np.full(len(times), np.inf)
+    for k in range(1, min(NEIGHBOURS + 1, len(times))):
+        far = np.linalg.norm(places[k:] - places[:-k], axis=1)
+        passed = np.abs(times[k:] - times[:-k])
+        speed[k:] = np.minimum(speed[k:], far / np.where(passed > 0.0, passed, np.nan))
+    known = speed[np.isfinite(speed)]
+    if len(known) and (usual := float(np.median(known))) > FASTEST:
+        report.questions.append(
+            f'{path.name}: from row to row the positions move at {usual:.3g} m/s; is their unit, '
+            'or that of the time, right?'
+        )
 
 
 def _wrong_stamps(
@@ -178,23 +224,25 @@ def write_bag(
     which each clock of the file said them, by default those of each topic. Raises `BagError`
     when there is nothing to write or the bag cannot be made.
     """
-    records = list(records)
+    # Bytes take less room than messages.
+    packed = [
+        (stamp, topic, message.__msgtype__, cdr_of(message)) for stamp, topic, message in records
+    ]
     if streams is None:
-        topics = dict.fromkeys(topic for _, topic, _ in records if 'truth/' not in topic)
+        topics = dict.fromkeys(topic for _, topic, *_ in packed if 'truth/' not in topic)
         streams = {
-            each: [stamp for stamp, topic, _ in records if topic == each] for each in topics
+            each: [stamp for stamp, topic, *_ in packed if topic == each] for each in topics
         }
     off = _wrong_stamps(streams, source, report)
-    kept = (record for record in records if record[0] not in off)
+    kept = (record for record in packed if record[0] not in off)
     ordered = sorted(kept, key=lambda record: record[0])
     if not ordered:
-        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
-        raise BagError(f'{source} has nothing that could be converted{first}')
+        raise report.nothing(source)
     notes = provenance(source, report.notes)
     with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
-        for stamp_ns, topic, message in ordered:
-            bag.write(topic, message, stamp_ns)
-            report.messages[topic] = report.messages.get(topic, 0) + 1
+        for stamp_ns, topic, kind, raw in ordered:
+            bag.write_raw(topic, kind, raw, stamp_ns)
+            report.messages[topic] += 1
     return report
 
 
@@ -229,7 +277,7 @@ def write_from_bag(
             if written is not None:
                 topic, message = written
                 made.write(topic, message, item.log_ns)
-                report.messages[topic] = report.messages.get(topic, 0) + 1
+                report.messages[topic] += 1
 
 
 def companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[str, str]:
@@ -250,42 +298,3 @@ def copied(entry: InputTopic, type_name: str, message: Any) -> Any:
     ned = str(message.header.frame_id).endswith('_ned')
     measurement = entry.readers[type_name](message, world_frame='ned' if ned else 'enu')
     return entry.write(measurement, ros_message)
-
-
-def read_npz(path: Path) -> dict[str, NDArray]:
-    """Every array of a numpy archive (npz) by name. Raises `BagError`."""
-    try:
-        with path.open('rb') as file:
-            if not zipfile.is_zipfile(file):
-                raise BagError(f'{path} is not a numpy archive (npz)')
-        with zipfile.ZipFile(path) as packed:
-            size = sum(part.file_size for part in packed.infolist())
-        if size > max(MAX_UNPACKED, MAX_RATIO * path.stat().st_size):
-            raise BagError(f'{path} {TOO_LARGE}')
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError('numpy gives the bytes of anything else, such as an archive')
-        return arrays
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
-    except (ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile):
-        raise BagError(f'{path} is damaged, or holds more than plain arrays') from None
-
-
-def numbers_of(path: Path, name: str, array: NDArray) -> NDArray:
-    """The array `name` of an archive, where it holds numbers. Raises `BagError`."""
-    if array.dtype.kind not in 'biufc':
-        raise BagError(f"{path}: the array '{name}' holds no numbers")
-    return array
-
-
-def stamps_of(path: Path, seconds: NDArray, count: int, what: str) -> list[int]:
-    """Nanoseconds of the stamps of `count` messages, `what` names them. Raises `BagError` for
-    those that a message cannot hold."""
-    values = numbers_of(path, 'stamp', seconds).ravel()
-    if len(values) != count or not (np.abs(values) < 2.0**31).all():
-        raise BagError(
-            f'{path}: {count} {what} need as many finite stamps, in seconds before 2038'
-        )
-    return [round(float(stamp) * 1e9) for stamp in values.real]

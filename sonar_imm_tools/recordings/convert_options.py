@@ -25,7 +25,7 @@ from attrs import frozen, NOTHING
 
 from .csv_table import CsvOptions
 from .options import group, nanoseconds, option
-from .polar_rows import BEARINGS
+from .places import BEARINGS
 
 
 def _origin(text: str) -> tuple[float, ...]:
@@ -60,42 +60,41 @@ def _staves(text: str) -> list[list[int]]:
         raise ValueError(f"'{text}' is not of the form 0+3,1+2") from None
 
 
-def _storage() -> Any:
-    return option('mcap', '', 'Storage of the bag.', choices=('mcap', 'sqlite3'))
-
-
-def _map_frame() -> Any:
-    return option('map', '', 'Frame of the positions, east-north-up.')
-
-
-def _origin_option() -> Any:
-    help = 'Origin of local metres; by default the first good row.'
-    return option(None, 'LAT,LON[,HEIGHT]', help, parse=_origin)
-
-
-def _truth_file() -> Any:
-    return option(None, '', 'CSV of true positions for the same bag.', kind='file')
-
-
 # fmt: off
+@frozen(kw_only=True)
+class _Options:
+    storage: str = option('mcap', '', 'Storage of the bag.', choices=('mcap', 'sqlite3'))
+
+
+@frozen(kw_only=True)
+class _Places(_Options):
+    frame_id: str = option('map', '', 'Frame of the positions, east-north-up.')
+    origin: tuple[float, ...] | None = option(None, 'LAT,LON[,HEIGHT]',
+        'Origin of local metres; by default the first good row.', parse=_origin)
+
+
+@frozen(kw_only=True)
+class _WithTruth(_Places):
+    truth: Path | str | None = option(None, '',
+        'CSV of true positions for the same bag.', kind='file')
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+
+
+@frozen(kw_only=True)
+class _OfSonar(_Options):
+    frame_id: str = option('sonar', '', 'Frame of the sonar.')
+
+
+@frozen(kw_only=True)
+class _Detecting(_OfSonar):
+    parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
+        'Change one parameter of the detector; may be given several times.', flag='set',
+        kind='pairs')
+
+
 def _bearings(default: str) -> Any:
     help = 'Where bearings count from: bow or north, clockwise, or east, counter-clockwise.'
     return option(default, '', help, choices=BEARINGS)
-
-
-def _range_std() -> Any:
-    help = 'Standard deviation of ranges, for rows that state none.'
-    return option(None, 'METRES', help, kind='float', above=0.0)
-
-
-def _bearing_std() -> Any:
-    help = 'Standard deviation of bearings, for rows that state none.'
-    return option(None, 'DEGREES', help, flag='bearing-std', kind='float', above=0.0)
-
-
-def _detector() -> Any:
-    help = 'Change one parameter of the detector; may be given several times.'
-    return option({}, 'NAME=VALUE', help, flag='set', kind='pairs')
 
 
 def _element_spacing() -> Any:
@@ -112,7 +111,24 @@ def _phase_scale() -> Any:
 
 
 @frozen(kw_only=True)
-class FixesOptions:
+class _Polar(_WithTruth):
+    options: CsvOptions = group(CsvOptions)
+    range_std: float | None = option(None, 'METRES',
+        'Standard deviation of ranges, for rows that state none.', kind='float', above=0.0)
+    bearing_std_deg: float | None = option(None, 'DEGREES',
+        'Standard deviation of bearings, for rows that state none.', flag='bearing-std',
+        kind='float', above=0.0)
+
+
+@frozen(kw_only=True)
+class _Receivers(_WithTruth):
+    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
+    options: CsvOptions = group(CsvOptions)
+    receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
+
+
+@frozen(kw_only=True)
+class FixesOptions(_Polar):
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
 
     Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
@@ -129,19 +145,11 @@ class FixesOptions:
         'usbl.csv dive.bag --column x=easting --column y=northing',
         'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
-    options: CsvOptions = group(CsvOptions)
     bearings: str = _bearings('north')
-    range_std: float | None = _range_std()
-    bearing_std_deg: float | None = _bearing_std()
-    truth: Path | str | None = _truth_file()
-    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class RelativeOptions:
+class RelativeOptions(_Polar):
     """CSV of positions that a vessel has measured from itself, with its own pose in the same row,
     to /relative and /nav, or /nav_fix and /heading.
 
@@ -156,19 +164,11 @@ class RelativeOptions:
         'usbl.csv dive.bag',
         'usbl.csv dive.bag --bearings north --column vessel_x=ship_e --column vessel_y=ship_n',
     )
-    options: CsvOptions = group(CsvOptions)
     bearings: str = _bearings('bow')
-    range_std: float | None = _range_std()
-    bearing_std_deg: float | None = _bearing_std()
-    truth: Path | str | None = _truth_file()
-    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class NmeaOptions:
+class NmeaOptions(_WithTruth):
     """Log of NMEA 0183 sentences and AIS messages to /fixes, /nav_fix and /heading. Needs pyais
     and pynmea2.
 
@@ -182,37 +182,24 @@ class NmeaOptions:
     own: str = option('auto', '',
         'What the positions of the receiver itself are; auto: of the vessel, where there are '
         'targets, else the fixes.', choices=('auto', 'vessel', 'fixes'))
-    truth: Path | str | None = _truth_file()
-    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class ArrivalsOptions:
+class ArrivalsOptions(_Receivers):
     """CSV of arrival times to /arrivals, one message per ping.
 
     Columns: receiver and arrival (or toa and transmitter); ping says which rows belong together.
     """
 
     EXAMPLES: ClassVar = ('arrivals.csv dive.bag --receivers hydrophones.csv',)
-    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
     transmitters: Path | str | None = option(None, '',
         'CSV of transmitter positions.', kind='file')
     toa_std: float | None = option(None, 'SECONDS',
         'Standard deviation of arrival times, for rows that state none.', kind='float', above=0.0)
-    options: CsvOptions = group(CsvOptions)
-    receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
-    truth: Path | str | None = _truth_file()
-    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class DetectionsOptions:
+class DetectionsOptions(_Receivers):
     """Detections of tags by telemetry receivers, a row for each, to /arrivals.
 
     Columns: stamp (or date and time), receiver and tag; the usual names of exports are recognised.
@@ -225,7 +212,6 @@ class DetectionsOptions:
         'vue.csv fish.bag --receivers stations.csv --sync synctags.csv',
         'detections.csv fish.bag --receivers stations.csv --toa-std 0.001',
     )
-    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
     sync: Path | str | None = option(None, '',
         'CSV of the positions of fixed tags, with the column tag.', kind='file')
     window: float = option(1.0, 'SECONDS',
@@ -240,28 +226,18 @@ class DetectionsOptions:
     toa_std: float | None = option(None, 'SECONDS',
         'Standard deviation of arrival times; by default that of the clocks after --sync.',
         kind='float', above=0.0)
-    options: CsvOptions = group(CsvOptions)
-    receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
-    truth: Path | str | None = _truth_file()
-    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class TruthOptions:
+class TruthOptions(_Places):
     """CSV of true positions to /truth/estimate, for `evaluate --truth`."""
 
     EXAMPLES: ClassVar = ('gps.csv truth.bag',)
     options: CsvOptions = group(CsvOptions)
-    frame_id: str = _map_frame()
-    origin: tuple[float, ...] | None = _origin_option()
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class AutoferryOptions:
+class AutoferryOptions(_Options):
     """Detections of the Autoferry data set (JSON) to /fixes: boats in clutter."""
 
     EXAMPLES: ClassVar = (
@@ -275,12 +251,11 @@ class AutoferryOptions:
     time_offset_ns: int | Mapping[str, int] = option(0, 'SECONDS',
         'Added to the stamps of the detections, of all sensors or as radar=-1.5,lidar=0.1.',
         flag='time-offset', parse=_sensor_offsets)
-    frame_id: str = _map_frame()
-    storage: str = _storage()
+    frame_id: str = option('map', '', 'Frame of the positions, east-north-up.')
 
 
 @frozen(kw_only=True)
-class SnapshotsOptions:
+class SnapshotsOptions(_OfSonar):
     """Array snapshots in a numpy archive (npz) to /snapshot.
 
     Arrays: iq, complex, (bins, staves) or (pings, bins, staves), and range [m] or time [s];
@@ -297,12 +272,10 @@ class SnapshotsOptions:
         'Channels, from 0, of each stave; those joined by + are summed.', parse=_staves)
     ping_rate: float = option(10.0, '',
         'Pings per second, when there are no stamps.', kind='float', range=(0.001, 1000.0))
-    frame_id: str = option('sonar', '', 'Frame of the array.')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class ImagesOptions:
+class ImagesOptions(_Options):
     """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
 
     Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage, pings of the Oculus, echoes
@@ -315,11 +288,10 @@ class ImagesOptions:
     topic: str | None = option(None, '', 'Topic of the images, where several could be.')
     parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
         'Change one parameter; may be given several times.', flag='set', kind='pairs')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class InterferometerOptions:
+class InterferometerOptions(_Options):
     """Bag with images of amplitude and phase, or of each stave, to /snapshot.
 
     Takes RawSonarImage of marine_acoustic_msgs and messages like it: their fields are found by
@@ -350,11 +322,10 @@ class InterferometerOptions:
     order: str = option('range_major', '',
         'Order of the samples in an image with several channels.',
         choices=('range_major', 'beam_major'))
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class HydrophonesOptions:
+class HydrophonesOptions(_Options):
     """Sound of a vertical array, WAV or FLAC with a channel for each hydrophone, to /pressure.
     Needs soundfile.
 
@@ -377,11 +348,10 @@ class HydrophonesOptions:
     block: float = option(1.0, 'SECONDS',
         'Length of a message.', kind='float', range=(0.01, 600.0))
     frame_id: str = option('array', '', 'Frame of the array.')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class SegyOptions:
+class SegyOptions(_Options):
     """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
 
     Stamps come from the trace headers; traces within one second are spread over it.
@@ -405,11 +375,10 @@ class SegyOptions:
     depth_offset: float = option(0.0, 'METRES',
         'Depth of the transducer.', flag='depth', kind='float')
     frame_id: str = option('profiler', '', 'Frame of the traces.')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class TracesOptions:
+class TracesOptions(_Options):
     """Traces in a numpy archive (npz) or CSV to /trace.
 
     Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and
@@ -424,10 +393,9 @@ class TracesOptions:
     rate: float = option(1.0, '',
         'Traces per second, when an archive has no stamps.', kind='float', range=(1e-6, 1e6))
     frame_id: str = option('array', '', 'Frame of the traces.')
-    storage: str = _storage()
 
 @frozen(kw_only=True)
-class XtfOptions:
+class XtfOptions(_Detecting):
     """Side scan in an XTF file to /detections, /nav and /altitude. Needs pyxtf.
 
     Each ping of --side is an image of one beam abeam, in which echoes are found; --set changes the
@@ -444,13 +412,10 @@ class XtfOptions:
         choices=('far', 'near'))
     radians_per_count: float | None = _phase_scale()
     element_spacing: float | None = _element_spacing()
-    parameters: Mapping[str, Any] = _detector()
-    frame_id: str = option('sonar', '', 'Frame of the sonar.')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class Ek80Options:
+class Ek80Options(_OfSonar):
     """Raw file of a Simrad EK80 to /snapshot and /nav. Needs themachinethatgoesping; one of an
     EK60 or ES60 needs ektools.
 
@@ -464,12 +429,10 @@ class Ek80Options:
     staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
         'Sectors, from 0, of each stave; those joined by + are summed.', parse=_staves)
     element_spacing: float | None = _element_spacing()
-    frame_id: str = option('sonar', '', 'Frame of the array.')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class KongsbergOptions:
+class KongsbergOptions(_Options):
     """Soundings of a KMALL or .all file of a Kongsberg multibeam to /ground, and /nav. Needs
     themachinethatgoesping.
 
@@ -478,11 +441,10 @@ class KongsbergOptions:
     """
 
     EXAMPLES: ClassVar = ('0077.kmall reference.bag', '0077.all reference.bag')
-    storage: str = _storage()
 
 
 @frozen(kw_only=True)
-class PicturesOptions:
+class PicturesOptions(_Detecting):
     """Folder of PNG and JPEG pictures of a forward-looking sonar to /detections and /nav. Needs
     Pillow.
 
@@ -502,30 +464,17 @@ class PicturesOptions:
     fov: float | None = option(None, 'DEGREES',
         'Width of the sector, for rows that state none.', kind='float', range=(0.1, 360.0))
     options: CsvOptions = group(CsvOptions)
-    parameters: Mapping[str, Any] = _detector()
-    frame_id: str = option('sonar', '', 'Frame of the sonar.')
-    storage: str = _storage()
 # fmt: on
 
 
 OPTIONS: dict[str, type] = {
-    'fixes': FixesOptions,
-    'relative': RelativeOptions,
-    'nmea': NmeaOptions,
-    'arrivals': ArrivalsOptions,
-    'detections': DetectionsOptions,
-    'truth': TruthOptions,
-    'autoferry': AutoferryOptions,
-    'snapshots': SnapshotsOptions,
-    'images': ImagesOptions,
-    'interferometer': InterferometerOptions,
-    'segy': SegyOptions,
-    'xtf': XtfOptions,
-    'ek80': Ek80Options,
-    'kongsberg': KongsbergOptions,
-    'pictures': PicturesOptions,
-    'hydrophones': HydrophonesOptions,
-    'traces': TracesOptions,
+    options.__name__.removesuffix('Options').lower(): options
+    for options in (
+        *(FixesOptions, RelativeOptions, NmeaOptions, ArrivalsOptions, DetectionsOptions),
+        *(TruthOptions, AutoferryOptions, SnapshotsOptions, ImagesOptions, InterferometerOptions),
+        *(SegyOptions, XtfOptions, Ek80Options, KongsbergOptions, PicturesOptions),
+        *(HydrophonesOptions, TracesOptions),
+    )
 }
 """The options by the kind of conversion."""
 FROM_BAGS = ('images', 'interferometer')

@@ -20,6 +20,7 @@ Columns with other names are mapped by hand. A row that cannot be read raises `B
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import csv
@@ -37,7 +38,7 @@ from attrs import frozen
 from sonar_imm.parameters import did_you_mean
 
 from .options import nanoseconds, option
-from .sources import BagError
+from .sources import BagError, start_of
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
@@ -49,16 +50,17 @@ LOOKED_AT = 1000
 USUAL_NAMES = {
     'stamp': (
         'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
-        'epoch unix_time date_and_time device_time'
+        'epoch unix_time date_and_time device_time zeit zeitstempel uhrzeit'
     ),
-    'date': 'utc_date gps_date date_utc day',
-    'x': 'east easting px pos_x position_x utm_e utm_x e',
-    'y': 'north northing py pos_y position_y utm_n utm_y n',
+    'date': 'utc_date gps_date date_utc day datum',
+    'x': 'east easting px pos_x position_x utm_e utm_x e ost rechtswert',
+    'y': 'north northing py pos_y position_y utm_n utm_y n nord hochwert',
     'z': 'up pz pos_z position_z',
-    'depth': 'down',
-    'latitude': 'lat gps_latitude gps_lat decimal_latitude lat_dd',
+    'depth': 'down tiefe',
+    'latitude': 'lat gps_latitude gps_lat decimal_latitude lat_dd breite',
     'longitude': (
-        'lon lng long gps_longitude gps_lon gps_lng gps_long decimal_longitude lon_dd long_dd'
+        'lon lng long gps_longitude gps_lon gps_lng gps_long decimal_longitude lon_dd long_dd '
+        'laenge'
     ),
     'height': 'altitude alt ellipsoidal_height',
     'var_x': 'var_east xx cov_xx cov_x_x',
@@ -71,7 +73,7 @@ USUAL_NAMES = {
     'std_y': 'std_north sigma_y sigma_north sd_y sy',
     'std_z': 'std_up std_height std_depth sigma_z sigma_up sigma_depth sd_z sz',
     'std': 'sigma accuracy std_xy sigma_xy position_std',
-    'range': 'distance dist',
+    'range': 'distance dist entfernung',
     'std_range': 'sigma_range range_std',
     'forward': 'ahead fwd rel_forward',
     'starboard': 'stbd rel_starboard',
@@ -86,7 +88,7 @@ USUAL_NAMES = {
     'heading': 'hdg vessel_heading ship_heading boat_heading gyro',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
-    'id': 'track_id target target_id tag diver name',
+    'id': 'track_id target target_id tag diver name taucher',
     'valid': 'position_valid is_valid fix_valid validity',
     'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
     'ping': 'ping_id ping_number',
@@ -96,7 +98,7 @@ USUAL_NAMES = {
     'toa': 'travel_time delay tof time_of_flight',
     'var_toa': 'toa_variance var_arrival',
     'std_toa': 'sigma_toa std_arrival sigma_arrival',
-    'bearing': 'azimuth doa brg',
+    'bearing': 'azimuth doa brg peilung',
     'amplitude': 'amp response value',
     'var_bearing': '',
     'std_bearing': 'sigma_bearing bearing_std',
@@ -112,6 +114,7 @@ USUAL_NAMES = {
 }
 ALIASES = {name: (name, *others.split()) for name, others in USUAL_NAMES.items()}
 """The names of the columns of all kinds of table: those by which each quantity is found."""
+_UMLAUTS = str.maketrans({'ä': 'ae', 'ö': 'oe', 'ü': 'ue', 'ß': 'ss'})
 _UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
 
 TIME_TEXT = re.compile(
@@ -266,7 +269,9 @@ class Row:
         """The text of a time, with the date of its own column where it has only a time of day."""
         text = self.text(name)
         if not TIME_OF_DAY.match(text):
-            return text
+            date, _, clock = text.partition(' ')
+            written = not TIME_TEXT.match(text) and TIME_OF_DAY.match(clock.strip())
+            return dated(date, clock.strip(), self.table.header(name)) if written else text
         if not self.table.has('date'):
             raise BadRow(
                 f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
@@ -381,18 +386,17 @@ class CsvTable(Table):
     def __init__(self, path: str | Path, options: CsvOptions | None = None):
         self.path = Path(path)
         self.options = options or CsvOptions()
-        try:
-            with self._open() as file:
-                lines = (line for line in file if line.strip() and not line.startswith('#'))
-                first = next(lines, '')
-        except OSError as error:
-            raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
-        if _wide(self.path):
+        start = start_of(self.path)
+        if start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start[:64]:
             raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
-        if not first or '\0' in first:
-            raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
-        if _binary(self.path):
+        if _binary(start):
             raise BagError(f'{self.path} is no text, not a CSV file')
+        self._encoding = _encoding(start)
+        with self._open() as file:
+            lines = (line for line in file if line.strip() and not line.startswith('#'))
+            first = next(lines, '')
+        if not first:
+            raise BagError(f'{self.path} is empty, not a CSV file')
         likely = max(',;\t|', key=first.count)
         self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
         headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
@@ -434,29 +438,29 @@ class CsvTable(Table):
         return {'delimiter': self.delimiter, 'skipinitialspace': True}
 
     def _open(self) -> TextIO:
-        return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
+        return self.path.open(encoding=self._encoding, errors='replace', newline='')
 
 
-def _wide(path: Path) -> bool:
-    """Whether a file begins as text in UTF-16 does."""
-    with path.open('rb') as file:
-        start = file.read(64)
-    return start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start
-
-
-def _binary(path: Path) -> bool:
-    """Whether a file holds something else than text: control characters among its first bytes, or
+def _binary(start: bytes) -> bool:
+    """Whether the first bytes are something else than text: control characters are among them, or
     many that are no UTF-8. A byte of another alphabet here and there is text all the same."""
-    with path.open('rb') as file:
-        start = file.read(4096)
     controls = sum(byte < 32 and byte not in b'\t\n\r\f\x1a' for byte in start)
     strange = start.decode('utf-8', errors='replace').count('\ufffd')
     return controls > 0 or 10 * strange > len(start)
 
 
+def _encoding(start: bytes) -> str:
+    """UTF-8, or else what spreadsheets of western Europe write."""
+    try:
+        codecs.getincrementaldecoder('utf-8')().decode(start)  # its end may be cut
+    except UnicodeDecodeError:
+        return 'cp1252'
+    return 'utf-8-sig'
+
+
 def _plain(header: str) -> str:
     """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
-    name = re.sub(r'[\[(].*', '', header.lower()).strip()
+    name = re.sub(r'[\[(].*', '', header.lower().translate(_UMLAUTS)).strip()
     return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
 
 

@@ -103,7 +103,12 @@ def _xtf(path: str) -> Iterator[Record]:
 
     # Beside a file the library would unpickle an index; a file descriptor has nothing beside it.
     with open(path, 'rb') as file:
-        packets = pyxtf.xtf_read_gen(f'/dev/fd/{file.fileno()}')
+        place = f'/dev/fd/{file.fileno()}'
+        if not os.path.exists(place):  # Windows
+            place = path
+            if os.path.exists(f'{os.path.splitext(path)[0]}.pyxtf_idx'):
+                raise ValueError('the index of pyxtf beside it is not opened; move it away')
+        packets = pyxtf.xtf_read_gen(place)
         head = next(packets)
         if head.FileFormat != 0x7B:
             raise ValueError(f'the version of the file is {head.FileFormat}, not 123')

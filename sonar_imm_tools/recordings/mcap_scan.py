@@ -53,13 +53,13 @@ from .mcap_records import (
     records,
     SCHEMA,
     STATISTICS,
+    summary_is_right,
     text,
     TOO_LARGE,
     TooLargeError,
     unpack,
     zstd,
 )
-from .mcap_sums import summary_is_right
 
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
 _UNCHUNKED = -1

@@ -29,7 +29,7 @@ from .reader import BagReader
 from .topics import fitting_topics
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """What one message gave: a measurement, the `Rejection` that says why there is none, or None
     when it takes more messages to make one."""
 
@@ -47,7 +47,7 @@ def measurements_of(
     order: str = 'recorded',
     settings: Mapping[str, Any] | None = None,
     detector: Mapping[str, Any] | None = None,
-) -> Iterator[Heard]:
+) -> Iterator[Received]:
     """Yield the measurements for the tracker `system` in an open recording, in replay order.
 
     `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
@@ -71,7 +71,7 @@ def measurements_of(
         entry = chosen[item.topic]
         if item.type_name not in entry.readers:  # one topic name recorded with two types
             sentence = f'{item.topic} carries {item.type_name}, not readable as {entry.name}'
-            yield Heard(item.topic, Rejection('bad_type', sentence), item.log_ns)
+            yield Received(item.topic, Rejection('bad_type', sentence), item.log_ns)
             continue
         try:
             measurement = readers[item.topic, item.type_name](item.message)
@@ -79,7 +79,7 @@ def measurements_of(
                 doubts[item.topic, code] += 1
         except Rejection as rejection:
             measurement = rejection
-        yield Heard(item.topic, measurement, item.log_ns)
+        yield Received(item.topic, measurement, item.log_ns)
     for (topic, code), count in doubts.items():
         bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
 

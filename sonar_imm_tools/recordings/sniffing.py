@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 from pathlib import Path
 import zipfile
 
@@ -23,14 +24,14 @@ from attrs import frozen
 
 from sonar_imm.trackers import SYSTEMS
 
+from .convert.archives import NAMES as SNAPSHOT_NAMES
 from .convert.arrivals import names_tags
 from .convert.nmea import SENTENCE
-from .convert.snapshots import NAMES as SNAPSHOT_NAMES
 from .csv_table import CsvOptions, CsvTable
 from .reader import BagReader
-from .sources import BagError, SUFFIXES
+from .sources import BagError, is_recording, start_of, SUFFIXES
 from .topics import made_topics
-from .track_files import kind_of_text, START
+from .track_files import kind_of_text
 
 SONAR_FILES = {
     'ek80': 'a raw file of a Simrad EK60 or EK80',
@@ -38,6 +39,7 @@ SONAR_FILES = {
     'xtf': 'side scan or soundings in XTF',
 }
 """Binary files of sonars, by the kind of conversion."""
+STATE_IT = 'where you know what it is, sonar-imm convert KIND IN OUT_BAG states it'
 PICTURES = ('.png', '.jpg', '.jpeg')
 
 
@@ -52,15 +54,13 @@ class Guess:
 def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
     """What a file is; columns: headers of a table that its user names, as in `CsvOptions`. Raises
     `BagError` with what it could be and what would settle it."""
-    if path.is_dir() and any(each.suffix.lower() in PICTURES for each in path.iterdir()):
+    if path.is_dir() and of_pictures(path):
         return Guess('pictures', 'a folder of pictures')
+    if path.is_dir() and not is_recording(path):
+        return _of_folder(path)
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return _of_bag(path)
-    try:
-        with path.open('rb') as file:
-            start = file.read(START)
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+    start = start_of(path)
     if not start:
         raise BagError(f'{path} is empty')
     if start[:4] == b'RIFF' and start[8:12] == b'WAVE' or start[:4] in (b'fLaC', b'RF64'):
@@ -77,7 +77,40 @@ def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
         return Guess('fixes', f'a {kind.upper()} file of positions')
     if _is_nmea(start):
         return Guess('nmea', 'NMEA 0183 or AIS sentences')
-    return _of_table(CsvTable(path, CsvOptions(columns=columns or {})))
+    try:
+        table = CsvTable(path, CsvOptions(columns=columns or {}))
+    except BagError as error:
+        raise BagError(f'{error}; {STATE_IT}') from None
+    return _of_table(table)
+
+
+def hint(path: Path) -> str:
+    """What makes a recording of a file, or a folder of pictures, that is none."""
+    if path.is_dir() and not of_pictures(path):
+        return ''
+    try:
+        why = sniff(path).why
+    except BagError as error:
+        return f'; {error}' if path.is_file() else ''
+    return f'; it looks like {why}: sonar-imm convert {path} OUT_BAG makes one of it'
+
+
+def of_pictures(folder: Path) -> bool:
+    return any(each.suffix.lower() in PICTURES for each in folder.iterdir())
+
+
+def _of_folder(folder: Path) -> Guess:
+    """What the files of a folder are, where those that are known are of one kind."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.is_file() or is_recording(path):
+            with contextlib.suppress(BagError):
+                found.setdefault(sniff(path).kind, path)
+    if len(found) == 1:
+        ((kind, first),) = found.items()
+        return Guess(kind, f'a folder of files such as {first.name}')
+    kinds = ', '.join(f'{path.name} ({kind})' for kind, path in found.items())
+    raise BagError(f'{folder} holds {kinds or "nothing that is known"}; {STATE_IT}')
 
 
 def _of_bag(path: Path) -> Guess:
@@ -156,10 +189,13 @@ def _of_table(table: CsvTable) -> Guess:
     places = (('x', 'y'), ('latitude', 'longitude'), ('range', 'bearing'))
     if table.has('stamp') and any(table.has(*pair) for pair in places):
         return Guess('fixes', why)
-    missing = 'a time' if not table.has('stamp') else 'a position'
-    flag = next(name for name in ('stamp', 'x', 'y') if not table.has(name))
+    wanted = {} if table.has('stamp') else {'a time': ['stamp']}
+    if not any(table.has(*pair) for pair in places):
+        wanted['a position'] = ['x', 'y']
+    missing = ' and '.join(wanted)
+    flags = ' '.join(f'--column {name}=HEADER' for names in wanted.values() for name in names)
     raise BagError(
         f'{table.path} is {why}: no name among them stands for {missing}. It could be fixes of '
-        f'divers (sonar-imm convert IN OUT --column {flag}=HEADER), or relative, arrivals, '
+        f'divers (sonar-imm convert IN OUT {flags}), or relative, arrivals, '
         'detections or traces; sonar-imm convert lists them'
     )

@@ -33,9 +33,8 @@ from rosbags.typesys.store import Typestore
 from sonar_imm.parameters import ConfigError, yaml_tree
 from sonar_imm.texts import in_one_line
 
-from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack, zstd
+from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack, wrong_sums, zstd
 from .mcap_scan import Channel, McapScan
-from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
 
 MOST_LINES = 4000
@@ -50,6 +49,17 @@ class BagError(Exception):
     def __init__(self, sentence: str):
         self.sentence = in_one_line(sentence)
         super().__init__(self.sentence)
+
+
+class NoRecordingError(BagError):
+    """What lies at a path is something else."""
+
+    def __init__(self, path: Path, sentence: str):
+        super().__init__(sentence)
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:  # it goes from one process to another
+        return NoRecordingError, (self.path, self.sentence)
 
 
 @frozen
@@ -298,9 +308,10 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.name == 'metadata.yaml':
             return open_sources(path.parent)
         if path.suffix not in SUFFIXES:
-            raise BagError(
+            raise NoRecordingError(
+                path,
                 f'{path} is not a recording: the names of recordings end in '
-                f'{", ".join(SUFFIXES)}{packed_hint([path])}{convert_hint(path)}'
+                f'{", ".join(SUFFIXES)}{packed_hint([path])}',
             )
         return _open_files([path], [])
     return _open_directory(path)
@@ -323,11 +334,12 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             source.close()
     files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
     if not files:
-        raise BagError(
-            problems[0]
-            if problems
-            else f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
-            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}'
+        if problems:
+            raise BagError(problems[0])
+        raise NoRecordingError(
+            path,
+            f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
+            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}',
         )
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
@@ -456,13 +468,13 @@ def advice(file: Path) -> str:
     return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
 
 
-def convert_hint(path: Path) -> str:
-    """Which conversion makes a recording of a file of another kind."""
-    kinds = {'fixes': ('.csv', '.txt'), 'snapshots': ('.npz',), 'segy': ('.sgy', '.segy', '.seg')}
-    found = [kind for kind, suffixes in kinds.items() if path.suffix.lower() in suffixes]
-    if not found:
-        return ''
-    return f'; sonar-imm convert makes one, e.g. sonar-imm convert {found[0]} {path} OUT_BAG'
+def start_of(path: Path, size: int = 4096) -> bytes:
+    """The first bytes of a file. Raises `BagError`."""
+    try:
+        with path.open('rb') as file:
+            return file.read(size)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
 
 
 def packed_hint(files: Iterable[Path]) -> str:

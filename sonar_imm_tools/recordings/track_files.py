@@ -24,10 +24,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from .csv_table import CsvOptions, CsvTable, Table
-from .sources import BagError
+from .sources import BagError, start_of
 
-START = 4096
-"""Bytes by which a file is told from others."""
 LARGEST_JSON = 200_000_000
 """Bytes of a GeoJSON file, which is read as a whole."""
 PLACE = ('stamp', 'latitude', 'longitude', 'height', 'id')
@@ -76,12 +74,7 @@ def open_table(path: str | Path, options: CsvOptions | None = None) -> Table:
 def kind_of_text(path: Path) -> str:
     """gpx, kml, json, geojson or '' by the first bytes of a file. Raises `BagError` where it
     cannot be read."""
-    try:
-        with path.open('rb') as file:
-            start = file.read(START)
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from None
-    text = start.removeprefix(b'\xef\xbb\xbf').lstrip()
+    text = start_of(path).removeprefix(b'\xef\xbb\xbf').lstrip()
     if text.startswith(b'<'):
         return next((kind for kind in ('gpx', 'kml') if f'<{kind}'.encode() in text), '')
     if text[:1] in (b'{', b'['):
@@ -96,11 +89,10 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
     is damaged ends with a word about it."""
     names: list[str] = []
     marks: list[ElementTree.Element] = []
-    with path.open('rb') as file:
-        if b'<!' in file.read(START).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
-            raise BagError(
-                f'{path} declares entities, which {kind.upper()} has not and which may multiply'
-            )
+    if b'<!' in start_of(path).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
+        raise BagError(
+            f'{path} declares entities, which {kind.upper()} has not and which may multiply'
+        )
     try:
         for event, element in ElementTree.iterparse(path, events=('start', 'end')):
             tag = element.tag.rpartition('}')[2]

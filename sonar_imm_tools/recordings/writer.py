@@ -36,7 +36,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 
 from sonar_imm.files import whole
 
-from .mcap_sums import seal
+from .mcap_records import seal
 from .messages import cdr_of, ros_message, typestore
 from .own_files import write_own_parameters
 from .sources import BagError

@@ -234,20 +234,6 @@ def test_singular_matrices_are_said_so():
         coherence(np.eye(M)[None] + 0j, w, 'capon')
 
 
-def test_sampled_cross_spectra_scatter_as_wishart():
-    R, _ = single_layer()
-    rng = np.random.default_rng(0)
-    for snapshots in (8, 64):
-        drawn = sample_csdm(np.repeat(R, 4000, axis=0), snapshots, rng)
-        assert np.allclose(drawn.mean(axis=0), R[0], atol=0.02)
-        assert np.var(drawn[:, 3, 3].real) == pytest.approx(
-            R[0, 3, 3].real ** 2 / snapshots, rel=0.1
-        )
-        assert np.mean(np.abs(drawn[:, 0, 9] - R[0, 0, 9]) ** 2) == pytest.approx(
-            R[0, 0, 0].real * R[0, 9, 9].real / snapshots, rel=0.1
-        )
-
-
 def test_the_spectrum_of_an_echo_is_smooth_finite_and_of_mean_one(band):
     frequency, R = band
     w = steering(frequency, HEIGHTS, C)

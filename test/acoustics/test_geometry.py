@@ -200,8 +200,7 @@ def test_differential_form_is_the_derivative_of_the_exact_one(moved, model):
     images = []
     for step in (-h, h):
         after = Pose(
-            geometry.apply(R, velocity) * step,
-            R @ Rotation.from_rotvec(turn * step).as_matrix(),
+            geometry.apply(R, velocity) * step, R @ Rotation.from_rotvec(turn * step).as_matrix()
         )
         seen = geometry.predict(m, Pose(np.zeros(3), R), after)
         images.append([*geometry.project(seen, model), geometry.vertical_offset(seen, after.R)])

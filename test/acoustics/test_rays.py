@@ -19,13 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.rays import (
-    launch_table,
-    look_up_each,
-    profile_of,
-    profile_problem,
-    trace,
-)
+from sonar_imm.acoustics.rays import launch_table, look_up_each, profile_of, profile_problem, trace
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'rays.npz'
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)

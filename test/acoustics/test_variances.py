@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics import variances
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 
 @pytest.fixture(scope='module')

@@ -16,6 +16,7 @@
 by estimates that are changed on purpose."""
 
 import shutil
+from types import SimpleNamespace
 
 from attrs import evolve
 from helpers.dive_bags import write_dive
@@ -25,6 +26,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from sonar_imm_tools.cli import checking, main  # noqa: E402
+from sonar_imm_tools.cli.check import run_checks  # noqa: E402
 from sonar_imm_tools.evaluation.judging import Check  # noqa: E402
 from sonar_imm_tools.offline.run_folder import RunFolder  # noqa: E402
 from sonar_imm_tools.recordings.own_files import own_limit  # noqa: E402
@@ -163,3 +165,16 @@ def test_the_exit_code_is_one_when_anything_fell_short(dive, monkeypatch, capsys
     monkeypatch.setattr('sonar_imm_tools.cli.check.run_checks', lambda *_, **__: checked)
     assert main(['check', 'diver', *(['--json'] if as_json else [])]) == int(not all(good))
     assert as_json or capsys.readouterr().out.count('FAIL') == len(good) - sum(good)
+
+
+def test_one_recording_shows_how_far_it_is_unless_it_is_told_not_to(dive, monkeypatch, tmp_path):
+    asked = []
+
+    def played(*_, quiet, **__):
+        asked.append(quiet)
+        return SimpleNamespace(judged=lambda: 'checked')
+
+    monkeypatch.setattr(checking, 'play_recording', played)
+    assert run_checks(('diver',), tmp_path, bag=dive) == ['checked']
+    run_checks(('diver',), tmp_path, bag=dive, quiet=True)
+    assert asked == [False, True]

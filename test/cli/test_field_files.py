@@ -128,11 +128,58 @@ def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alon
     assert 'no track was made' in output
 
 
-def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch):
+@pytest.mark.parametrize('options', [[], ['--ignore', 'id', '--time-offset', '1']])
+def test_the_bag_is_named_after_the_file_where_nobody_names_it(tmp_path, monkeypatch, options):
     MADE['usbl.csv'].make(tmp_path / 'usbl.csv', line())
     monkeypatch.chdir(tmp_path)
-    assert main(['convert', 'usbl.csv']) == 0
+    assert main(['convert', 'usbl.csv', *options]) == 0
     assert (tmp_path / 'usbl.bag').is_dir()
+
+
+def test_a_folder_of_files_of_one_kind_becomes_a_folder_of_bags(tmp_path, monkeypatch, capsys):
+    for name in ('a.csv', 'b.csv'):
+        (tmp_path / 'dives').mkdir(exist_ok=True)
+        MADE['usbl.csv'].make(tmp_path / 'dives' / name, line())
+    monkeypatch.chdir(tmp_path)
+    assert main(['convert', 'dives', '--jobs', '2']) == 0
+    assert 'files such as a.csv: convert fixes' in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / 'dives.bags').iterdir()} == {'a', 'b'}
+    MADE['gps.log'].make(tmp_path / 'dives' / 'gps.log', line())
+    assert main(['convert', 'dives', 'others']) == 2
+    assert 'a.csv (fixes), gps.log (nmea)' in capsys.readouterr().err
+
+
+GERMAN = 'Zeitstempel;Breite;Länge;Tiefe (m)\n' + ''.join(
+    f'31.05.2024 10:00:{k:02d};54,00{k:02d};10,00{k:02d};12,5\n' for k in range(30)
+)
+
+
+@pytest.mark.parametrize('encoding', ['utf-8', 'latin-1'])
+def test_a_german_table(tmp_path, monkeypatch, encoding, capsys):
+    """Headers, commas, dates and letters as a German spreadsheet writes them."""
+    (tmp_path / 'usbl.csv').write_text(GERMAN, encoding=encoding)
+    monkeypatch.chdir(tmp_path)
+    assert main(['convert', 'usbl.csv', '--time-zone', 'Europe/Berlin']) == 0
+    assert 'longitude = Länge' in capsys.readouterr().out
+    with BagReader('usbl.bag') as bag:
+        fixes = [item.measurement for item in measurements_of(bag, 'diver')]
+    assert fixes[0].stamp_ns == (BEGIN - 7200) * 10**9
+    assert fixes[0].position == pytest.approx([0.0, 0.0, -12.5], abs=1e-6)
+    assert fixes[-1].position[1] == pytest.approx(29e-4 * 111_300, rel=1e-2)
+
+
+def test_what_is_kept_and_looks_wrong_is_asked(tmp_path, monkeypatch, capsys):
+    rows = ''.join(f'{k},{600 * k},{100 * (k % 7)},12\n' for k in range(1, 40))  # millimetres
+    (tmp_path / 'usbl.csv').write_text('time,x,y,Depth (m)\n' + rows)
+    monkeypatch.chdir(tmp_path)
+    assert main(['convert', 'usbl.csv', '--column', 'z=Depth (m)']) == 0
+    printed = capsys.readouterr().out
+    assert 'move at 601 m/s; is their unit, or that of the time, right?' in printed
+    assert "is --column 'depth=Depth (m)' meant?" in printed
+    two = ''.join(f'{k},{500 * (k % 2)},{0.8 * k}\n' for k in range(1, 40))  # divers in turn
+    (tmp_path / 'two.csv').write_text('time,x,y\n' + two)
+    assert main(['convert', 'two.csv']) == 0
+    assert 'question' not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

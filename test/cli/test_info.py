@@ -18,6 +18,7 @@ import json
 import shlex
 
 from helpers.dive_bags import write_dive
+from helpers.field_files import FORMATS, line
 from helpers.source import ROOT
 import numpy as np
 import pytest
@@ -174,11 +175,23 @@ def test_both_sides_of_a_side_scan(tmp_path, capsys):
     assert run(command, tmp_path / 'named', capsys, *few)['estimates'] == 4
 
 
-@pytest.mark.parametrize(
-    'name, kind', [('a.csv', 'fixes'), ('a.npz', 'snapshots'), ('b.SGY', 'segy')]
-)
-def test_a_file_of_another_kind_names_convert(name, kind, tmp_path, capsys):
-    (tmp_path / name).write_text('1,2\n')
-    assert main(['track', str(tmp_path / name), str(tmp_path / 'out')]) == 2
-    errors = capsys.readouterr().err
-    assert f'sonar-imm convert {kind} {tmp_path / name} OUT_BAG' in errors
+@pytest.mark.parametrize('name', ['usbl.csv', 'dive.gpx', 'gps.log', 'line.seg', 'frames'])
+@pytest.mark.parametrize('command', ['info', 'track'])
+def test_a_file_of_another_kind_is_named_with_the_command_that_converts_it(
+    command, name, tmp_path, capsys
+):
+    (each,) = (each for each in FORMATS if each.name == name)
+    each.make(tmp_path / name, line(30))
+    assert (
+        main([command, str(tmp_path / name), *([str(tmp_path / 'out')] * (command == 'track'))])
+        == 2
+    )
+    suggested = capsys.readouterr().err.split('sonar-imm convert ')[1].split(' makes one')[0]
+    words = suggested.replace('OUT_BAG', str(tmp_path / 'bag')).split()
+    assert main(['convert', *words, *each.options]) == 0
+
+
+def test_a_file_of_no_known_kind_says_what_it_lacks(tmp_path, capsys):
+    (tmp_path / 'a.csv').write_text('Wann;Wo\n1;2\n')
+    assert main(['info', str(tmp_path / 'a.csv')]) == 2
+    assert '--column stamp=HEADER --column x=HEADER' in capsys.readouterr().err

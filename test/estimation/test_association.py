@@ -172,7 +172,6 @@ def test_nearest_in_all_beats_nearest_for_each():
 
 
 # -- life of tracks -------------------------------------------------------------------------------
-# ---------------------
 
 
 def live(pattern, rules=RULES, dt=1):

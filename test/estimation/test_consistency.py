@@ -72,7 +72,6 @@ def test_coverage_of_honest_and_of_boastful_intervals():
 
 
 # -- sets of targets ------------------------------------------------------------------------------
-# ---------------------
 
 POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
 NOTHING = np.empty((0, 2))

@@ -68,33 +68,11 @@ def imm_pass(transition, F, Q, B, H, R, x, P, mu, Z):
     return tuple(np.array(part) for part in zip(*steps))
 
 
-# -- Rauch-Tung-Striebel
-# -----------------------------------------------------------------------------------------------
-
-
-def joint_by_precision(F, Q, B, H, R, x0, P0, Z):
-    """All states at once: the block-tridiagonal precision of the trajectory, inverted densely."""
-    K, n = len(Z), len(x0)
-    J, h = np.zeros((K * n, K * n)), np.zeros(K * n)
-    J[:n, :n] += np.linalg.inv(P0)
-    h[:n] += np.linalg.inv(P0) @ x0
-    for k in range(K):
-        here = slice(k * n, (k + 1) * n)
-        J[here, here] += H.T @ np.linalg.inv(R) @ H
-        h[here] += H.T @ np.linalg.inv(R) @ Z[k]
-        if k:
-            both = slice((k - 1) * n, (k + 1) * n)
-            A = np.hstack([-F[k], np.eye(n)])
-            J[both, both] += A.T @ np.linalg.inv(Q[k]) @ A
-            h[both] += A.T @ np.linalg.inv(Q[k]) @ B[k]
-    C = np.linalg.inv(J)
-    return (C @ h).reshape(K, n), np.array(
-        [C[k * n : (k + 1) * n, k * n : (k + 1) * n] for k in range(K)]
-    )
+# -- Rauch-Tung-Striebel --------------------------------------------------------------------------
 
 
 def joint_by_covariance(F, Q, B, H, R, x0, P0, Z):
-    """The same by conditioning the joint covariance, which may be singular."""
+    """All states at once: the joint covariance, which may be singular, conditioned on all data."""
     K, n, m = len(Z), len(x0), len(R)
     mean, C = np.zeros((K, n)), np.zeros((K, n, K, n))
     mean[0], C[0, :, 0] = x0, P0
@@ -126,10 +104,9 @@ def test_rts_equals_the_joint_gaussian(seed):
         rng.normal(size=(K, 2)),
     )
     x, P = rts_smooth(*kalman_pass(F, Q, B, H, R, x0, P0, Z), F, Q, B)
-    for joint in (joint_by_precision, joint_by_covariance):
-        expected_x, expected_P = joint(F, Q, B, H, R, x0, P0, Z)
-        np.testing.assert_allclose(x, expected_x, rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(P, expected_P, rtol=1e-7, atol=1e-8)
+    expected_x, expected_P = joint_by_covariance(F, Q, B, H, R, x0, P0, Z)
+    np.testing.assert_allclose(x, expected_x, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(P, expected_P, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.04])
@@ -155,20 +132,7 @@ def test_rts_with_a_velocity_without_memory_and_without_noise(noise):
     np.testing.assert_allclose(P, expected_P, atol=1e-9)
 
 
-def test_rts_of_a_batch_is_its_members():
-    rng = np.random.default_rng(2)
-    K, n = 5, 2
-    x, P = rng.normal(size=(K, 3, n)), covariance(rng, K, 3, n)
-    F, Q = rng.normal(size=(K, 3, n, n)), covariance(rng, K, 3, n)
-    whole_x, whole_P = rts_smooth(x, P, F, Q)
-    for t in range(3):
-        alone_x, alone_P = rts_smooth(x[:, t], P[:, t], F[:, t], Q[:, t])
-        np.testing.assert_allclose(whole_x[:, t], alone_x, atol=1e-12)
-        np.testing.assert_allclose(whole_P[:, t], alone_P, atol=1e-12)
-
-
 # -- IMM: exact cases -----------------------------------------------------------------------------
-# ---------------------
 
 
 @pytest.mark.parametrize('models', [1, 3])
@@ -252,8 +216,7 @@ def test_nothing_to_smooth(K):
     np.testing.assert_array_equal(smoothed.mu, mu)
 
 
-# -- IMM: short sequences, every sequence of models enumerated
-# ---------------------------------------------------------
+# -- IMM: short sequences, every sequence of models enumerated ------------------------------------
 
 
 def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
@@ -411,7 +374,6 @@ def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):
 
 
 # -- IMM: Monte Carlo -----------------------------------------------------------------------------
-# ---------------------
 
 
 def test_on_the_heading_set_smoothing_lowers_the_error_and_stays_honest():

@@ -183,10 +183,7 @@ def test_a_batch_is_its_members():
 
 @pytest.mark.parametrize(
     'P, function',
-    [
-        (np.full((2, 2), np.nan), range_bearing),
-        (np.eye(2), lambda points: points * np.inf),
-    ],
+    [(np.full((2, 2), np.nan), range_bearing), (np.eye(2), lambda points: points * np.inf)],
 )
 def test_what_is_not_finite_is_refused(P, function):
     with np.errstate(invalid='ignore'), pytest.raises(CovarianceError, match='not finite'):

@@ -18,8 +18,10 @@ from html.parser import HTMLParser
 import json
 
 from helpers.dive_scenes import single_run
+from helpers.report_pages import figures as figures_of
 from helpers.report_pages import unpacked
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 
 from msg_adapters.fixes import write_fix
@@ -28,14 +30,15 @@ from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.diver import figures
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sentence
-from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
-from sonar_imm_tools.evaluation.plotting import in_degrees, scale_length
+from sonar_imm_tools.evaluation.plotting import in_degrees, nis_figure, scale_length, thin
 from sonar_imm_tools.evaluation.report import (
     front_html,
+    LEAST_GL_POINTS,
+    MOST_GL_FIGURES,
     page_names,
     Part,
     PLOTLYJS,
@@ -245,6 +248,11 @@ def test_a_part_of_another_system_makes_a_page():
     assert 'Length' in front_html([part(), other], ['1.html', '2.html'])
 
 
+def test_a_topic_of_another_name_is_told_with_what_it_was_read_as():
+    run = {**RUN, 'topics': {'/boat/fix': 'fix', '/gps': 'fix'}}
+    assert Part(run=run, metrics={}, summary='').input == '/boat/fix, /gps as fix'
+
+
 SCRIPT = '<script>alert(1)</script>'
 
 
@@ -269,3 +277,35 @@ def test_what_a_recording_names_is_text_on_the_page(tmp_path):
     text = page.read_text()
     assert '&lt;script&gt;alert(1)' in text
     assert 'script>alert(1)' not in text
+
+
+def kinds(sizes):
+    """The kinds of traces on a page with a figure of each size."""
+    drawn = [go.Figure(go.Scattergl(x=list(range(n)), y=list(range(n)))) for n in sizes]
+    run = {'system': 'diver', 'bag': 'run', 'topics': {}}
+    sections = [Section('figure', 'text', figure) for figure in drawn]
+    html = report_html(Part(run=run, metrics={}, summary='', sections=sections))
+    return [figure['data'][0]['type'] for figure in figures_of(html)]
+
+
+def test_only_the_largest_figures_use_the_graphics_card():
+    sizes = [LEAST_GL_POINTS + k for k in range(MOST_GL_FIGURES + 3)]
+    assert kinds(sizes) == 3 * ['scatter'] + MOST_GL_FIGURES * ['scattergl']
+
+
+def test_small_figures_never_do():
+    assert kinds([10, 100, LEAST_GL_POINTS - 1]) == 3 * ['scatter']
+
+
+@pytest.mark.parametrize('count, most', [(0, 10), (10, 10), (11, 10), (99, 10)])
+def test_thinning_keeps_at_most_what_it_says(count, most):
+    left = len(np.arange(count)[thin(count, most)])
+    assert left <= most and left >= min(count, most // 2)
+
+
+def test_hits_with_different_degrees_of_freedom_are_divided_by_them():
+    time, nis = np.arange(4.0), np.array([2.0, 9.0, 4.0, 1.0])
+    same, mixed = (nis_figure(time, nis, np.array(dof)) for dof in ([2] * 4, [2, 3, 2, 1]))
+    np.testing.assert_allclose(same.data[0].y, nis)
+    np.testing.assert_allclose(mixed.data[0].y, [1.0, 3.0, 2.0, 1.0])
+    assert len(same.layout.shapes) == 1 and len(mixed.layout.shapes) == 0

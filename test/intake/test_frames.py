@@ -17,14 +17,7 @@
 import pytest
 
 from sonar_imm.intake import KnownFrames
-from sonar_imm.measurements import (
-    Altitude,
-    ArrayDepth,
-    Detections,
-    Fix,
-    Navigation,
-    Rejection,
-)
+from sonar_imm.measurements import Altitude, ArrayDepth, Detections, Fix, Navigation, Rejection
 
 
 def fix(frame_id):

@@ -20,14 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.intake import RepeatFilter
-from sonar_imm.measurements import (
-    Fix,
-    Fixes,
-    GeodeticFix,
-    Rejection,
-    RelativeFix,
-    VesselFix,
-)
+from sonar_imm.measurements import Fix, Fixes, GeodeticFix, Rejection, RelativeFix, VesselFix
 
 SECOND = 10**9
 

@@ -19,7 +19,7 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.intake.transforms import MOST_FRAMES, moved, TransformTree
+from sonar_imm.intake import MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
     Altitude,
     Arrivals,

@@ -162,7 +162,7 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     assert rig.node.tracker.counts['blocks'] == 20
 
 
-HEARD = (
+RECORD = (
     'phones:=12',
     'element_spacing:=0.36',
     'frequency_max:=2000.0',
@@ -204,7 +204,7 @@ def spectra_of(messages, stamp_ns):
 
 
 def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):
-    rig = rig_of(make_bench, *HEARD)
+    rig = rig_of(make_bench, *RECORD)
     rig.send('pressure', *received)
     assert len(rig.tables) == 1 and not rig.node._meter.refused
     live = read_estimate(rig.tables[0])
@@ -226,7 +226,7 @@ def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, received):
 
 
 def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, received):
-    rig = rig_of(make_bench, *HEARD)
+    rig = rig_of(make_bench, *RECORD)
     more = [write_pressure(item, make) for item in follow(received, 3)]
     blocks = [*received, *more]
     order = [0, 1, 1, 2, 4, 3, 5, *range(7, len(blocks))]
@@ -266,35 +266,6 @@ def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
     assert not rig.node._meter.refused
 
 
-def test_hostile_records_are_named_and_counted_and_harm_nobody(rig):
-    flat = np.zeros((6, 2 * 64), np.float32)
-    frequency = np.float32(100.0 * np.arange(1, 7))
-    depth = np.float32(120.0 + 0.1 * np.arange(60))
-    upper = np.tile(
-        (np.eye(8) + np.triu(0.5 * np.ones((8, 8)), 1)).astype(np.complex64), (6, 1, 1)
-    )
-    lopsided = upper.reshape(6, -1).view(np.float32)
-    rig.send('csdm', table(frequency=frequency, csdm=flat))
-    rig.send('csdm', table(frequency=frequency, csdm=np.full_like(flat, np.nan)))
-    rig.send('csdm', table(frequency=frequency, csdm=lopsided))
-    rig.send('csdm', table(frequency=frequency, csdm=flat[:, :30]))
-    rig.send('trace', table(depth=depth[:1], amplitude=depth[:1]))
-    rig.send('pressure', table(p=np.zeros((10, 8), np.float32)))
-    refused = rig.node._meter.refused
-    assert refused == {
-        'silent': 1,
-        'nan': 1,
-        'not_hermitian': 1,
-        'bad_field': 1,
-        'too_short': 1,
-        'missing_column': 1,
-    }
-    assert not rig.tables and not rig.node._errors
-    measured, _ = traces(fading=(), layers=4)
-    rig.send('trace', write_trace(measured[0], make))
-    assert len(rig.tables) == 1
-
-
 def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     rig = rig_of(make_bench, *SMALL, 'loading:=0.0', 'diagnostics_period:=0.05')
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
@@ -326,26 +297,9 @@ def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     rig.bench.spin_until(lambda: newest().get('refused: not_hermitian') == '1')
     values = newest()
     assert values['count: singular'] == '1' and values['count: dead_hydrophones_masked'] == '3'
-    assert values['count: used'] == '4' and len(rig.tables) == 4
+    assert values['count: used'] == '4' and len(rig.tables) == 4 and not rig.node._errors
     offset = np.abs(read_estimate(rig.tables[-1]).state[:, :1] - scene.truth[-1].depth)
     assert (offset.min(axis=1) < 0.2).all()
-
-
-def test_an_array_of_another_size_is_counted_and_a_dead_hydrophone_masked(rig):
-    scene = simulate(scenario('small', {'records': 2, 'fading': (), 'depth_companion': False}), 2)
-    first, second = (item.measurement for item in scene.measurements)
-    wrong = simulate(
-        scenario('small', {'records': 1, 'fading': (), 'phones': 6, 'depth_companion': False}), 2
-    )
-    rig.send('csdm', write_csdm(wrong.measurements[0].measurement, make))
-    assert rig.node.tracker.counts['wrong_hydrophones'] == 1 and not rig.tables
-    dead = np.array(second.csdm)
-    dead[:, 5], dead[:, :, 5] = 0.0, 0.0
-
-    rig.send('csdm', write_csdm(attrs.evolve(second, csdm=dead), make))
-    assert rig.node.tracker.counts['dead_hydrophones_masked'] == 1
-    assert len(rig.tables) == 1 and not rig.node._errors
-    assert first.hydrophones == 8
 
 
 def test_offline_says_the_same_to_the_bit(rig):

@@ -116,7 +116,7 @@ def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
     )
 
 
-@pytest.mark.parametrize('half, text', [(1.9, '+3.0 \N{PLUS-MINUS SIGN} 1.9'), (2.1, '+3 ')])
+@pytest.mark.parametrize('half, text', [(1.9, '+3.0 \N{PLUS-MINUS SIGN} 1.9'), (2.0, '+3 ')])
 def test_a_label_says_decimetres_where_the_band_is_within_two_metres(half, text):
     found = an_estimate([7], [1])
     ends = {'vertical_offset_lo': np.array([3.0 - half]), 'vertical_offset_hi': [3.0 + half]}

@@ -20,14 +20,24 @@ import json
 from pathlib import Path
 from typing import Any
 
+from attrs import evolve
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import estimate_at, SECOND, START_NS
+from helpers.estimates import same
 import numpy as np
 import pytest
 
 from sonar_imm.estimates import Estimate
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.offline.fusing import best_weight, covariance_intersection, fused, Fuser
+from sonar_imm_tools.offline.fusing import (
+    best_weight,
+    covariance_intersection,
+    fused,
+    Fuser,
+    LiveFusion,
+    MANY_LATE,
+)
+from sonar_imm_tools.recordings.reader import BagError
 
 
 def spd(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -195,6 +205,56 @@ def test_names_settle_who_is_who() -> None:
     assert all(each.extras['target_id'].tolist() == [5] for each in made)
 
 
+# -- live -----------------------------------------------------------------------------------------
+
+
+def seconds(estimate: Estimate) -> float:
+    return (estimate.stamp_ns - START_NS) / SECOND
+
+
+def test_what_comes_within_the_wait_is_fused_live_as_afterwards() -> None:
+    """Each node in the order of its stamps, one of them late by up to the wait."""
+    first = [node({1: (0.0, 0.0), 2: (9.0, 0.0)}, k, seed=1) for k in range(20)]
+    second = [node({4: (9.0, 0.0)}, k + 0.4, seed=2) for k in range(20)]
+    rng = np.random.default_rng(3)
+    heard = [(seconds(each), 0, each) for each in first]
+    came = np.maximum.accumulate([seconds(each) + rng.uniform(0.0, 1.9) for each in second])
+    heard += [(float(now), 1, each) for now, each in zip(came, second)]
+    live, made = LiveFusion(0.6, 5.0, wait=2.0), []
+    for now, side, each in sorted(heard, key=lambda item: item[0]):
+        live.take(side, each, now)
+        made += live.ready(now)
+    made += live.ready(30.0)
+    afterwards, fuser = both(first, second)
+    assert live.late == 0 and live.pairs == fuser.pairs == {(2, 4)}
+    assert len(made) == len(afterwards) and all(map(same, made, afterwards))
+
+
+def test_a_node_that_stays_silent_is_not_waited_for_long() -> None:
+    live = LiveFusion(0.6, 5.0, wait=1.0)
+    live.take(0, node({1: (0.0, 0.0)}, 3.0, seed=1), 10.0)
+    assert not list(live.ready(10.9)) and len(list(live.ready(11.0))) == 1
+    live.take(1, node({1: (0.0, 0.0)}, 2.5, seed=1), 11.1)
+    assert live.late == 1 and not list(live.ready(20.0))
+
+
+def test_clocks_that_were_set_back_begin_anew() -> None:
+    live = LiveFusion(0.6, 5.0, wait=0.0)
+    live.take(0, node({1: (0.0, 0.0)}, 100.0, seed=1), 0.0)
+    assert len(list(live.ready(0.0))) == 1
+    for k in range(MANY_LATE + 1):
+        live.take(0, node({1: (0.0, 0.0)}, k, seed=1), 1.0)
+    assert [seconds(each) for each in live.ready(1.0)] == [MANY_LATE - 1.0, MANY_LATE]
+
+
+def test_nodes_in_two_frames_are_not_fused() -> None:
+    live = LiveFusion(0.6, 5.0, wait=0.0)
+    live.take(0, node({1: (0.0, 0.0)}, 0.0, seed=1), 0.0)
+    list(live.ready(0.0))
+    with pytest.raises(BagError, match='different frames'):
+        live.take(1, evolve(node({1: (0.0, 0.0)}, 1.0, seed=1), frame_id='odom'), 0.0)
+
+
 # -- the command ----------------------------------------------------------------------------------
 
 
@@ -234,6 +294,8 @@ def test_what_does_not_fit_is_said(runs: Path, capsys: pytest.CaptureFixture[str
     a, b = str(runs / 'a'), str(runs / 'b')
     assert main(['fuse', a, a, str(runs / 'x')]) == 2
     assert 'the same folder' in capsys.readouterr().err
+    assert main(['fuse', a, b]) == 2 and main(['fuse', a, b, a, '--live']) == 2
+    assert 'OUT is for two runs' in capsys.readouterr().err
     assert main(['fuse', a, b, a, '--overwrite']) == 2
     assert 'OUT is one of the runs' in capsys.readouterr().err
     assert main(['fuse', a, str(runs / 'nothing'), str(runs / 'x')]) == 2

@@ -30,10 +30,7 @@ def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatAr
 
 
 def adapt_counts(
-    counts: FloatArray,
-    expected: FloatArray,
-    posterior: FloatArray,
-    nominal: FloatArray,
+    counts: FloatArray, expected: FloatArray, posterior: FloatArray, nominal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal
     matrix predicts for the same step.

@@ -22,8 +22,7 @@ import zlib
 import numpy as np
 import pytest
 
-from sonar_imm_tools.recordings.mcap_records import CHUNK, MAGIC, RECORD, records
-from sonar_imm_tools.recordings.mcap_sums import seal, wrong_sums
+from sonar_imm_tools.recordings.mcap_records import CHUNK, MAGIC, RECORD, records, seal, wrong_sums
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.reader import BagError, BagReader
 from sonar_imm_tools.recordings.sources import RosbagsSource

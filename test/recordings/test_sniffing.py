@@ -76,8 +76,8 @@ def test_archives(tmp_path):
     'content, wanted',
     [
         (b'', 'is empty'),
-        (b'Zeit,Ost,Nord\n1,2,3\n', '--column stamp=HEADER'),
-        (b'stamp,Rechtswert,Hochwert\n', '--column x=HEADER'),
+        (b'Wann,Rechts,Hoch\n1,2,3\n', '--column stamp=HEADER'),
+        (b'stamp,Rechts,Hoch\n', '--column x=HEADER'),
         (bytes(range(256)) * 4, 'no text'),
         (b'PK\x03\x04 and nothing', 'damaged archive'),
     ],
@@ -90,8 +90,8 @@ def test_what_is_not_known_is_said_with_what_would_help(tmp_path, content, wante
 
 def test_columns_that_are_named_settle_it_without_the_kind(tmp_path, capsys):
     table, bag = tmp_path / 'ausgabe.csv', tmp_path / 'bag'
-    table.write_text('Zeit,Ost,Nord\n0,1,2\n1,2,3\n')
-    named = ('--column', 'stamp=Zeit', '--column=x=Ost', '--column', 'y=Nord')
+    table.write_text('Wann,Rechts,Hoch\n0,1,2\n1,2,3\n')
+    named = ('--column', 'stamp=Wann', '--column=x=Rechts', '--column', 'y=Hoch')
     assert main(['convert', str(table), str(bag), *named]) == 0
     assert 'convert fixes' in capsys.readouterr().err
     with BagReader(bag) as made:

@@ -157,7 +157,7 @@ class Output:
     def __init__(self, process: subprocess.Popen[str]):
         self._process = process
         self._lines: queue.Queue[str] = queue.Queue()
-        self._said = ''
+        self._printed = ''
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -165,21 +165,21 @@ class Output:
         for line in self._process.stdout:
             self._lines.put(line)
 
-    def wait_for(self, said_by, names: list[str]) -> None:
-        """Read on until a line has come for which `said_by(line, name)` holds, for every name."""
+    def wait_for(self, matches, names: list[str]) -> None:
+        """Read on until a line has come for which `matches(line, name)` holds, for every name."""
         waiting, end = set(names), time.monotonic() + START_LIMIT
         while waiting and time.monotonic() < end and self._process.poll() is None:
             try:
                 line = self._lines.get(timeout=0.5)
             except queue.Empty:
                 continue
-            self._said += line
-            waiting = {name for name in waiting if not said_by(line, name)}
-        assert not waiting, self._said
+            self._printed += line
+            waiting = {name for name in waiting if not matches(line, name)}
+        assert not waiting, self._printed
 
     def rest(self) -> str:
         """Everything that was printed, once the process has ended."""
         self._reader.join(STOP_LIMIT)
         while not self._lines.empty():
-            self._said += self._lines.get()
-        return self._said
+            self._printed += self._lines.get()
+        return self._printed

@@ -222,10 +222,7 @@ def test_beside_the_built_in_ones(installed):
 @pytest.mark.parametrize(
     'model_set, problem',
     [
-        (
-            'tiny_nostart',
-            r'\(sonar_imm.models: tiny_models:NoStart\).* lacks start',
-        ),
+        ('tiny_nostart', r'\(sonar_imm.models: tiny_models:NoStart\).* lacks start'),
         ('tiny_curved', 'a motion depends on the state'),
         ('tiny_narrow', 'transition needs a row for each of 3 models'),
         ('tiny_broken', 'RuntimeError: no licence'),

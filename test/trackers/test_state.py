@@ -26,11 +26,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers import state_file, SYSTEMS
-from sonar_imm.trackers.state_file import (
-    read_state,
-    tracker_from,
-    write_state,
-)
+from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
 from sonar_imm.trackers.state_values import frozen_state, put, restore, StateError
 
 

@@ -166,23 +166,18 @@ def look(ping: Ping) -> Look:
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
-    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two. To
-    resolve them, also of bins with much power, which the gate for one wave passes over."""
+    """Second surfaces, of bins with an echo alone: a burst of noise is no plane wave, nor two.
+    With enough staves also of bins with much power, which the gate for one wave passes over."""
     if ping.config.layover_used == 'ignored':
         return None
     snapshot, echo, loud = ping.snapshot, likelihood.echo, None
-    if _resolves(ping):
+    if snapshot.staves >= FEWEST_STAVES:
         loud = snapshot.usable & ~echo & np.logical_or.accumulate(echo)
         loud &= variances.mean_power(snapshot.iq) > LOUD * likelihood.noise
     has_echo = echo if loud is None else echo | loud
     iq = np.where(has_echo[:, None], snapshot.iq, 0.0)
     spacing = swath.geometry.spacing
     return layover(iq, likelihood.signal, likelihood.noise, echo, spacing, loud)
-
-
-def _resolves(ping: Ping) -> bool:
-    """Whether both surfaces of bins are wanted, and the staves are enough."""
-    return ping.config.layover_used == 'resolved' and ping.snapshot.staves >= FEWEST_STAVES
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:
@@ -322,7 +317,7 @@ def summarise(seen: Look, track: Track) -> Answer:
         int(beyond.sum()),
         int((beyond & ~echo).sum()),
         common_mode(snapshot.iq, echo),
-        config.layover_used == 'resolved' and not _resolves(seen.ping),
+        config.layover_used == 'resolved' and snapshot.staves < FEWEST_STAVES,
     )
     made = estimate_of(seen, track)
     if seen.layover is not None:
@@ -351,10 +346,9 @@ def floor_of(seen: Look, track: Track) -> Floor:
     return seen.swath.floor(track.mean[:, 0], track.covariance[:, 0, 0])
 
 
-def _resolved(seen: Look, track: Track) -> Surfaces | None:
-    """Both surfaces where a bin may hold two; None where `layover` does not ask for them, or where
-    there are too few staves."""
-    if seen.layover is None or not _resolves(seen.ping):
+def _surfaces(seen: Look, track: Track) -> Surfaces | None:
+    """Both surfaces where a bin may hold two; None where there are too few staves."""
+    if seen.layover is None or seen.ping.snapshot.staves < FEWEST_STAVES:
         return None
     iq, geometry = seen.ping.snapshot.iq, seen.swath.of_heights.geometry
     return resolve(iq, seen.likelihood, geometry, seen.layover, floor_of(seen, track).height)
@@ -383,21 +377,22 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     doubt = ~ping.echo
     second: dict[str, np.ndarray] = {}
     if seen.layover is not None:
-        surfaces = _resolved(seen, track)
+        surfaces = _surfaces(seen, track)
         found = seen.layover.existence if surfaces is None else surfaces.existence
         has_echo = ping.echo
         if surfaces is not None:
             has_echo = has_echo | seen.layover.usable & (found >= EXISTS)
         existence = np.where(has_echo, found, 0.0)
-        two = existence > GATE if surfaces is None else existence >= EXISTS
-        doubt = ~has_echo | (existence > GATE) & ((existence < EXISTS) | (surfaces is None))
+        both = surfaces if config.layover_used == 'resolved' else None
+        two = existence > GATE if both is None else existence >= EXISTS
+        doubt = ~has_echo | (existence > GATE) & ((both is None) | ~two)
         second = {
             'existence_2': existence.astype(np.float32),
             'surfaces': np.where(has_echo, 1 + two, 0).astype(np.uint8),
         }
-        if surfaces is not None:
-            second |= _upper(seen, surfaces, two)
-            track = _with_lower(seen, track, surfaces, two)
+        if both is not None:
+            second |= _upper(seen, both, two)
+            track = _with_lower(seen, track, both, two)
     floor, covariance = floor_of(seen, track), track.covariance
     of_heights = models.state_names[0] == 'height'
     other = ('angle', floor.angle) if of_heights else ('height', floor.height)

@@ -139,17 +139,29 @@ class BathymetryTracker:
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
         if inputs is not None and Snapshot not in inputs:
             return []
-        return [('pings', self._warm_pings)]
+        steps: list[WarmStep] = [('pings', self._warm_pings)]
+        # A flat floor does without these: the first pings do not wait for them.
+        later = inputs is None and self.config.layover_used == 'gated'
+        if later or self.config.layover_used == 'resolved':
+            steps.append(('surfaces', self._warm_surfaces))
+        return steps
+
+    def _short_ping(self) -> Snapshot:
+        return Snapshot(
+            stamp_ns=1,
+            range=self.config.sonar_height * (1.1 + 0.01 * np.arange(8)),
+            iq=np.ones((8, 8), np.complex64),
+            noise_variance=np.full(8, 0.1),
+        )
+
+    def _warm_surfaces(self) -> None:
+        snapshot, everywhere = self._short_ping(), Layover(np.ones(8), 0.0, np.ones(8, bool))
+        seen = look(Ping(self.config, snapshot, None))
+        geometry = seen.swath.of_heights.geometry
+        resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(8))
 
     def _warm_pings(self) -> None:
-        T, P = 8, 8
-        snapshot = Snapshot(
-            stamp_ns=1,
-            range=self.config.sonar_height * (1.1 + 0.01 * np.arange(T)),
-            iq=np.ones((T, P), np.complex64),
-            noise_variance=np.full(T, 0.1),
-        )
-        tracker = BathymetryTracker(self.config)
+        snapshot, tracker = self._short_ping(), BathymetryTracker(self.config)
         if self.config.navigation != 'ignored':
             # With and without poses: the kernels are the same, those of the rays come in besides.
             for stamp in (1, 60_000_000_000):
@@ -162,11 +174,6 @@ class BathymetryTracker:
             for posed in tracker._queue.ready(gap):
                 track_ping(Ping(tracker.config, posed.snapshot, posed))
         track_ping(Ping(tracker.config, snapshot, None))
-        if self.config.layover_used == 'resolved':
-            seen = look(Ping(tracker.config, snapshot, None))
-            everywhere = Layover(np.ones(T), 0.0, np.ones(T, bool))
-            geometry = seen.swath.of_heights.geometry
-            resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(T))
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
@@ -207,7 +214,7 @@ class BathymetryTracker:
         errors = [ping.array_error for ping in self._loud if math.isfinite(ping.array_error)]
         if errors and (typical := float(np.median(errors))) > MUCH_ARRAY_ERROR:
             sentences.append(
-                f'{typical:.1%} of the power of loud echoes is no plane wave, counted three times '
+                f'{typical:.1%} of the power of loud echoes is no plane wave, counted twice '
                 'for safety: second surfaces in a bin (layover) are mostly missed; check the '
                 'calibration of the staves, noise_variance, decorrelation and '
                 'element_spacing_wavelengths'

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Both heights where a range bin holds two surfaces (``layover: resolved``).
+"""Whether a range bin holds two surfaces (``gated``), and the height of both (``resolved``).
 
 Only stretches of a ping are looked at in which `acoustics.layover` finds a second surface
 possible. There an exact filter and smoother runs on a grid of heights. A bin is of order 1, one

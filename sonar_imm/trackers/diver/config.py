@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from attrs import evolve, frozen
+from attrs import evolve, fields, frozen
 
 from ...acoustics.geodesy import Origin
 from ...parameters import inherited, live, MODELS, parameter
@@ -513,7 +513,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     def velocity_std_at_fix(self) -> float:
         """`velocity_std` of a track that begins at a fix, in m/s. Positions from arrival times
         have ghosts, which a wide one would let move."""
-        usual = next(spec.default for spec in self.specs() if spec.name == 'velocity_std')
+        usual = fields(type(self)).velocity_std.default
         anything = self.model_set == 'families' and self.target == 'diver'
         return AFLOAT if anything and self.velocity_std == usual else self.velocity_std
 

@@ -144,8 +144,10 @@ def joint_weights(
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
     looked = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
-    ratio, detected = mixture / (fixes.clutter + fixes.births), np.ones(1)
-    detected = detected * config.detection_probability
+    # Where as many divers are tracked as there may be, a fix is of none that is yet to come.
+    full = int((now.life.status != TENTATIVE).sum()) >= config.max_tracks
+    ratio = mixture / (fixes.clutter + (0.0 if full else fixes.births))
+    detected = np.ones(1) * config.detection_probability
     if seen is not None:
         detected = np.maximum(seen.tracks, LEAST_DETECTED)
         ratio = ratio * seen.fixes[None] / detected[:, None]

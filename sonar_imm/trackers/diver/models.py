@@ -28,8 +28,14 @@ heading_speed_lateral
 families
     State (x, y, s, unused) or (x, y, vx, vy): two heading_speed sets and three constant velocities
     in one filter, in copies for covariances that are too small; see `families`.
+world_headings
+    To compare with: state (px, py, vx, vy), but v is drawn afresh around s u_j, s given.
+relative_headings
+    To compare with: v' = R(a_j) v, p += dt v': model j turns by a_j once; model 0 goes straight.
+cv, cv_cv, cv_ct
+    Single-direction baselines: white-noise acceleration, quiet and lively, or with turns.
 others
-    Of other packages, see `own_models`; or to compare with, see `baselines`.
+    Of other packages, see `own_models`.
 
 Source: docs/diver.md; the multi-directional set after the paper, whose equations are partly lost:
 these are reconstructions.
@@ -41,10 +47,10 @@ from attrs import evolve
 import numpy as np
 
 from ...estimation import markov
+from ...estimation.adaptation import Chain
 from ...estimation.arrays import FloatArray
-from ...estimation.motion import Motion
+from ...estimation.motion import Motion, turning, white_acceleration
 from ..own_models import diver_models
-from .baselines import relative_headings, single_direction, world_headings
 from .config import DiverConfig
 from .families import families
 from .state_space import (
@@ -59,6 +65,9 @@ from .state_space import (
 
 __all__ = ['build_models']
 
+BASELINE_NOISE = {'cv': (0.25,), 'cv_cv': (0.05, 0.6), 'cv_ct': (0.1, 0.3, 0.3)}
+"""Acceleration noise, m/s^2, that suits divers: tuned on the scene of the paper's Table 1."""
+
 
 def build_models(config: DiverConfig) -> ModelSet:
     """The model set that `config` names, with the depth and the bias of fixes that it asks for."""
@@ -66,11 +75,11 @@ def build_models(config: DiverConfig) -> ModelSet:
         'families': _families,
         'heading_speed': _heading_speed,
         'heading_speed_lateral': _heading_speed_lateral,
-        'world_headings': world_headings,
-        'relative_headings': relative_headings,
-        'cv': single_direction,
-        'cv_cv': single_direction,
-        'cv_ct': single_direction,
+        'world_headings': _world_headings,
+        'relative_headings': _relative_headings,
+        'cv': _single_direction,
+        'cv_cv': _single_direction,
+        'cv_ct': _single_direction,
     }.get(config.model_set, _own)(config)
     if config.dimensions == 3:
         models = with_depth(models, config)
@@ -181,5 +190,104 @@ def _heading_speed_lateral(config: DiverConfig) -> ModelSet:
         np.append(base.start_mean, 0.0),
         np.append(base.start_variance, variance),
         base.initial,
+        motion,
+    )
+
+
+# -- to compare with ------------------------------------------------------------------------------
+
+
+def _velocity_state(M: int) -> FloatArray:
+    return np.tile(np.eye(4), (M, 1, 1))
+
+
+def _world_headings(config: DiverConfig) -> ModelSet:
+    u, _, names = headings(config)
+    M, T = len(names), config.reference_step
+    P = markov.persistent_headings(
+        config.directions, config.stay_probability, config.heading_concentration
+    )
+    variance = config.velocity_noise**2
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.zeros((4, 4)), np.zeros((4, 4))
+        F[:2, :2] = np.eye(2)
+        Q[:2, :2] = variance * T * dt * np.eye(2)
+        Q[2:, 2:] = variance * np.eye(2)
+        Q[:2, 2:] = Q[2:, :2] = variance * min(T, dt) * np.eye(2)
+        return Motion(
+            np.tile(F, (M, 1, 1)),
+            np.tile(Q, (M, 1, 1)),
+            config.fixed_speed * np.hstack([dt * u, u]),
+        )
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        rate_chain(config, P),
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        initial_probabilities(config, M),
+        motion,
+    )
+
+
+def _relative_headings(config: DiverConfig) -> ModelSet:
+    u, _, _ = headings(config)
+    M, T = len(u), config.reference_step
+    names = tuple(f'turn_{360 * j // M:03d}' for j in range(M))
+    turning = markov.persistent_headings(M, config.stay_probability, config.heading_concentration)[
+        0
+    ]
+    chain: Chain = (
+        rate_chain(config, turning[None].repeat(M, 0))
+        if config.transition_matrix
+        else markov.EventChain(turning, T)
+    )
+    R = np.stack([np.stack([u[:, 0], -u[:, 1]], -1), np.stack([u[:, 1], u[:, 0]], -1)], -2)
+    rate = config.velocity_noise**2 / T
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.tile(np.eye(4), (M, 1, 1)), white_acceleration(rate, 0.0, dt)
+        F[:, :2, 2:], F[:, 2:, 2:] = dt * R, R
+        return Motion(F, np.tile(Q, (M, 1, 1)), np.zeros((M, 4)))
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        chain,
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        initial_probabilities(config, M),
+        motion,
+    )
+
+
+def _single_direction(config: DiverConfig) -> ModelSet:
+    turn = np.deg2rad(config.turn_rate_deg)
+    names, turns = {
+        'cv': (('cv',), (0.0,)),
+        'cv_cv': (('cv_quiet', 'cv_lively'), (0.0, 0.0)),
+        'cv_ct': (('cv', 'ct_left', 'ct_right'), (0.0, turn, -turn)),
+    }[config.model_set]
+    M = len(names)
+    noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
+    rates = [value**2 * config.reference_step for value in noise]
+    P = markov.persistent(M, config.baseline_stay_probability)
+
+    def motion(dt: float) -> Motion:
+        return Motion(
+            np.stack([turning(turn, dt) for turn in turns]),
+            np.stack([white_acceleration(*both, dt) for both in zip(rates, turns)]),
+            np.zeros((M, 4)),
+        )
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        rate_chain(config, P),
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        initial_probabilities(config, M),
         motion,
     )

@@ -74,8 +74,8 @@ DEPTHS, SHARE = (0.25, 0.5, 0.75), 0.7
 """Depths, as shares of the water column, whose paths are compared with those of the depth in use;
 the share of all evidence from which a single cause is named."""
 
-SOUND = len(DEPTHS)
-CAUSES = SOUND + 1
+SOUND_SPEED = len(DEPTHS)
+CAUSES = SOUND_SPEED + 1
 """Places in the score: depths, the sound speed, then the pairs."""
 
 EVERY, DEPTH = 'every', 'target_z (or dimensions: 3)'
@@ -94,7 +94,7 @@ WEAK = 0.05
 out: how far they are off is in the covariance of the filter."""
 
 
-class Heard(NamedTuple):
+class RecentPairs(NamedTuple):
     """The pairs (R,), as (transmitter, receiver), whose echoes tracks took lately: tx (R, 3), NaN
     of tags, rx (R, 3), variance (R,) of the path, m^2, and age (R,) in pings."""
 
@@ -104,7 +104,7 @@ class Heard(NamedTuple):
     variance: FloatArray = np.zeros(0)
     age: FloatArray = np.zeros(0)
 
-    def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> Heard:
+    def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
         """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
         rows = {
             pair: (self.tx[k], self.rx[k], self.variance[k], self.age[k] + 1.0)
@@ -117,10 +117,10 @@ class Heard(NamedTuple):
                 measured = ping.measured
                 rows[a, b] = measured.tx[c], measured.rx[c], measured.variance[c], 0.0
         if not rows:
-            return Heard()
+            return RecentPairs()
         pairs = sorted(rows)
         columns = (np.array(column) for column in zip(*(rows[pair] for pair in pairs)))
-        return Heard(tuple(pairs), *columns)
+        return RecentPairs(tuple(pairs), *columns)
 
     def spread(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
         """What `ASSUMED` errors do to a place (3,), of whose coordinates the first `known` are
@@ -145,7 +145,7 @@ class Heard(NamedTuple):
 class Offsets(NamedTuple):
     """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
     = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
-    square and freedom: of all t, and how many there were; heard: where pings put divers."""
+    square and freedom: of all t, and how many there were; recent: the pairs of the last pings."""
 
     pairs: tuple[tuple[int, int], ...] = ()
     score: FloatArray = np.zeros(CAUSES)
@@ -153,7 +153,7 @@ class Offsets(NamedTuple):
     length: FloatArray = np.zeros(0)
     square: float = 0.0
     freedom: float = 0.0
-    heard: Heard = Heard()
+    recent: RecentPairs = RecentPairs()
 
     def after(
         self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
@@ -181,7 +181,7 @@ class Offsets(NamedTuple):
         for at, share in enumerate(DEPTHS):
             deep = np.append(place[:2], -config.depth_min - share * span)
             D[:, at] = _lengths(ping, chosen, deep) - length
-        D[:, SOUND] = length
+        D[:, SOUND_SPEED] = length
         std = np.sqrt(ping.measured.variance[chosen])
         N = np.linalg.qr(H / std[:, None], mode='complete')[0][:, k:]
         t, shown = N.T @ (residual / std), N.T @ (D / std[:, None])
@@ -196,20 +196,20 @@ class Offsets(NamedTuple):
             lengths,
             keep**2 * now.square + float(t @ t),
             keep**2 * now.freedom + len(t),
-            now.heard,
+            now.recent,
         )
 
     def widened(self, mean: FloatArray, covariance: FloatArray, config: DiverConfig) -> FloatArray:
         """The covariances (T, q, q) of outputs mean (T, q), position first, with what is assumed
         of the instruments: nothing where something is stated, or fixes say where divers are."""
         exact = config.systematic_errors == 'exact'
-        if not self.heard.pairs or exact or any(getattr(config, name) for name in STDS):
+        if not self.recent.pairs or exact or any(getattr(config, name) for name in STDS):
             return covariance
         # Depths that are states may be seen by elevations and sensors, which are not among these.
         covariance, known = covariance.copy(), 2
         for t, row in enumerate(mean):
             place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
-            spread = self.heard.spread(place, known, config.sound_speed)
+            spread = self.recent.spread(place, known, config.sound_speed)
             covariance[t, :known, :known] += spread
         return covariance
 
@@ -247,9 +247,9 @@ class Offsets(NamedTuple):
         rank = int(sure.sum())
         # Noise that is larger than stated lasts no longer than the ping.
         scatter = max((self.square - every) / max(self.freedom - rank, 1.0), 1.0)
-        found = {EVERY: (every / scatter, rank), 'sound_speed': (z[SOUND] ** 2 / scatter, 1)}
+        found = {EVERY: (every / scatter, rank), 'sound_speed': (z[SOUND_SPEED] ** 2 / scatter, 1)}
         if config.dimensions == 2:
-            deep = max(float(z[:SOUND].max()), 0.0)
+            deep = max(float(z[:SOUND_SPEED].max()), 0.0)
             found[DEPTH] = deep**2 / scatter, 1
         return found
 
@@ -301,7 +301,7 @@ def watched(
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
-    found = found._replace(heard=found.heard.after(seen, taken, ids))
+    found = found._replace(recent=found.recent.after(seen, taken, ids))
     for track, place in places.items():
         good = took[track]
         echo = np.flatnonzero(seen.echo)

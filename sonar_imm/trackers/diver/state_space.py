@@ -320,9 +320,9 @@ class Instruments:
         variances: list[float] = []
         estimated: list[bool] = []
         errors = config.systematic_errors
-        sound = -1
+        speed = -1
         if config.sound_speed_std:
-            sound = n
+            speed = n
             variances.append((config.sound_speed_std / config.sound_speed) ** 2)
             estimated.append(errors != 'consider')
         offsets, clocks, bearings = {}, {}, {}
@@ -344,7 +344,7 @@ class Instruments:
         H[0, :, :, :n] = models.fix
         mask = np.array([True] * n + estimated)
         scales = np.array(models.scales)
-        places = sound, offsets, clocks, bearings
+        places = speed, offsets, clocks, bearings
         return Layout(n, np.array(variances), mask, H, scales, *places)
 
 
@@ -353,8 +353,8 @@ class Layout:
     """n states of motion, then q constants with prior `variances` (q,).
 
     mask (n + q,): True for what an update may move, False for what is only considered; H
-    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`; sound,
-    offsets, clocks, bearings: places in the whole state, -1 or absent for none.
+    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`;
+    sound_speed, offsets, clocks, bearings: places in the whole state, -1 or absent for none.
     """
 
     n: int
@@ -362,7 +362,7 @@ class Layout:
     mask: BoolArray
     H: FloatArray
     scales: FloatArray
-    sound: int
+    sound_speed: int
     offsets: dict[int | str, int]
     clocks: dict[int | str, int]
     bearings: dict[int | str, int]
@@ -378,7 +378,7 @@ class Layout:
         the emission stands last."""
         out = np.full((len(receivers), 7), -1)
         out[:, X], out[:, Y], out[:, Z] = 0, 1, models.height
-        out[:, SOUND_SPEED_ERROR] = self.sound
+        out[:, SOUND_SPEED_ERROR] = self.sound_speed
         out[:, OFFSET] = [self.offsets.get(receiver, -1) for receiver in receivers.tolist()]
         out[:, CLOCK] = [
             (self.bearings if angle else self.clocks).get(receiver, -1)

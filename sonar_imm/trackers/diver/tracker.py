@@ -56,7 +56,7 @@ from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .jipda import Association
 from .models import build_models
-from .offsets import Heard
+from .offsets import RecentPairs
 from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments
@@ -388,7 +388,7 @@ class DiverTracker:
             innovations = mean, covariance, z, R, tracks, row
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = now.fixes.after(sums, scale, tentative[tracks])
-            now = now._replace(offsets=now.offsets._replace(heard=Heard()))
+            now = now._replace(offsets=now.offsets._replace(recent=RecentPairs()))
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask

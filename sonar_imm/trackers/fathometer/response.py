@@ -196,7 +196,9 @@ def trace_response(
     """Put a trace onto the lattice; where it does not reach, the response is zero. Raises
     `Rejection` when it has no noise to compare with, or lies elsewhere."""
     amplitude = np.where(np.isfinite(trace.amplitude), trace.amplitude, 0.0)
-    loudest = max(float(np.max(np.abs(amplitude))), _loudest_noise(trace))
+    loudest = float(np.max(np.abs(amplitude)))
+    if trace.sigma is not None:
+        loudest = float(np.max(trace.sigma[np.isfinite(trace.sigma)], initial=loudest))
     if loudest > LOUDEST:
         raise Rejection(
             'out_of_range', f'the trace holds {loudest:.3g}; {LOUDEST:g} is possible at most'
@@ -228,11 +230,6 @@ def trace_response(
         reference_depth,
         noise_unknown=noise_unknown,
     )
-
-
-def _loudest_noise(trace: Trace) -> float:
-    sigma = trace.sigma
-    return 0.0 if sigma is None else float(np.max(sigma[np.isfinite(sigma)], initial=0.0))
 
 
 def residual_sigma(response: Response, fitted: FloatArray) -> Response:
@@ -424,41 +421,32 @@ def array_coherence(
         csdm[there], frequency[there], power[there]
     )
     aperture = float(heights[-1] - heights[0])
-    share = np.full(len(gamma), np.nan)
-    share[index[use][there]] = _echo_share(
-        csdm[there], frequency[there], heights, record.snapshots, config
-    )
+    share = np.ones(len(gamma))
     turns, inverse = np.ones((1, len(gamma)), np.complex128), np.ones(1)
-    if _sees_processor(config, heights) and below is not None and config.output != 'printed':
+    processor = config.pulse == 'processor' and config.processor == 'mvdr' and len(heights) > 1
+    if processor:
+        share[index[use][there]] = fathometer.surface_share(
+            csdm[there], frequency[there], heights, config.sound_speed
+        )
+    if processor and record.snapshots > 0.0:
+        share[index[use][there]] *= fathometer.sampled_share(
+            csdm[there], config.loading, record.snapshots
+        )
+    if processor and below is not None and config.output != 'printed':
         far, near = (1.0 / max(float(below[k]), aperture) for k in (-1, 0))
         inverse = np.linspace(far, near, _PHASES)
-        sound = config.sound_speed, config.loading
         phase = fathometer.echo_phase(
-            csdm[there], frequency[there], heights, 1.0 / inverse, *sound
+            csdm[there],
+            frequency[there],
+            heights,
+            1.0 / inverse,
+            config.sound_speed,
+            config.loading,
         )
         turns = np.ones((_PHASES, len(gamma)), np.complex128)
         turns[:, index[use][there]] = np.exp(-1j * phase)
     first = float(record.frequency[rows[0]])
     return ArrayCoherence(gamma, first, spacing, aperture, weight, share, turns, inverse)
-
-
-def _sees_processor(config: FathometerConfig, heights: NDArray[np.floating[Any]]) -> bool:
-    return config.pulse == 'processor' and config.processor == 'mvdr' and len(heights) > 1
-
-
-def _echo_share(
-    csdm: NDArray[np.complexfloating],
-    frequency: FloatArray,
-    heights: NDArray[np.floating[Any]],
-    snapshots: float,
-    config: FathometerConfig,
-) -> FloatArray:
-    if not _sees_processor(config, heights):
-        return np.ones(len(csdm))
-    share = fathometer.surface_share(csdm, frequency, heights, config.sound_speed)
-    if snapshots > 0.0:
-        share = share * fathometer.sampled_share(csdm, config.loading, snapshots)
-    return share
 
 
 def _near_one(

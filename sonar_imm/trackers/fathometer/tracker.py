@@ -102,6 +102,8 @@ __all__ = ['FathometerConfig', 'FathometerTracker']
 _RECORDS, _LEAST = 100, 10
 _INTERVALS, LONGEST_GAP = 15, 5000
 _FULL, _UNEXPLAINED, _NEGATIVE = 0.5, 0.05, 1e-9
+_LEFT, _DEEP, _OF_STRONGEST = 0.5, 6.0, 0.25
+"""Share of records with a negative echo; how deep it is, in sigma and of the strongest one."""
 
 
 @frozen(eq=False)
@@ -430,10 +432,22 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
-        self._fit.add(step.ok, reflectors, response, float(pmf[-1]))
+        negative = self.config.polarity == 'positive' and self._left_negative(reflectors, response)
+        self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config, records))
         return [*self._smoothed(step), newest]
+
+    def _left_negative(self, reflectors: Reflectors, response: Response) -> bool:
+        """Whether a negative echo is left where no reflector is, that no side lobe explains."""
+        with np.errstate(all='ignore'):
+            b = response.amplitude / response.sigma
+        least = max(_DEEP, _OF_STRONGEST * float(b.max()))
+        deep = np.flatnonzero(b < -least)
+        away = response.depth[deep, None] - reflectors.depth - reflectors.heave
+        echoes = (response.pulse or self.pulse)(away) @ reflectors.amplitude
+        left = b[deep] - echoes / response.sigma[deep] < -least
+        return bool(np.any(left & (np.abs(away) > self.config.min_separation).all(axis=1)))
 
     def _preview(self, response: Response) -> Estimate:
         response, step, records = self._filtered(response)
@@ -501,20 +515,25 @@ class Fit:
     A filter with another pulse, or a noise that is too low, does not fail: it fills the record
     with reflectors up to its limit, or finds no set that explains the record. Kept are whether a
     set explained each record, how probable the greatest number of reflectors was, and whether it
-    has negative samples."""
+    has negative samples, and negative echoes that nothing explains."""
 
     def __init__(self) -> None:
         self._explained: deque[bool] = deque(maxlen=_RECORDS)
         self._full: deque[float] = deque(maxlen=_RECORDS)
         self._found: deque[int] = deque(maxlen=_RECORDS)
         self._signed: deque[bool] = deque(maxlen=_RECORDS)
+        self._negative: deque[bool] = deque(maxlen=_RECORDS)
 
-    def add(self, ok: bool, reflectors: Reflectors, response: Response, full: float) -> None:
-        """One record; full: the probability of the greatest number of reflectors."""
+    def add(
+        self, ok: bool, reflectors: Reflectors, response: Response, full: float, negative: bool
+    ) -> None:
+        """One record; full: the probability of the greatest number of reflectors; negative: an
+        echo of that sign is left."""
         self._explained.append(ok)
         self._full.append(full)
         self._found.append(len(reflectors.depth))
         self._signed.append(bool(np.min(response.amplitude) < -_NEGATIVE))
+        self._negative.append(negative)
 
     def warnings(self, config: FathometerConfig) -> list[str]:
         """What is wrong, with the parameters that it may come from."""
@@ -537,6 +556,13 @@ class Fit:
             sentences.append(
                 f'no set of reflectors explains {100.0 * unexplained:.0f} % of the records; '
                 f'{advice}'
+            )
+        negative = float(np.mean(self._negative))
+        if negative > _LEFT:
+            sentences.append(
+                f'{100.0 * negative:.0f} % of the records have negative echoes, of multiples or '
+                'of layers that are softer than what is above: polarity both follows them, for '
+                'an array with pulse processor'
             )
         return sentences
 

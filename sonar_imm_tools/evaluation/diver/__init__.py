@@ -36,9 +36,8 @@ from sonar_imm.trackers.diver.georeferencing import Georeferencer
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .scoring import fix_series, score
-from .series import series_of
+from .series import series_of, Truth
 from .summary import METRICS, seen, summary_sentence
-from .truth import Truth
 
 if TYPE_CHECKING:
     from ..report import Section

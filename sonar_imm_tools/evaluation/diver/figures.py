@@ -48,8 +48,7 @@ from ..plotting import (
 )
 from ..report import Section
 from .matching import match, Matching
-from .series import Series
-from .truth import Truth
+from .series import Series, Truth
 
 MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12

@@ -32,8 +32,7 @@ from scipy.optimize import linear_sum_assignment
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import identity_switches
 
-from .series import IntArray, Series
-from .truth import Truth
+from .series import IntArray, Series, Truth
 
 
 @frozen(eq=False, kw_only=True)

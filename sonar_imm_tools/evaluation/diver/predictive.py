@@ -37,8 +37,8 @@ import numpy as np
 from sonar_imm.estimation import imm_kernels
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver.baselines import BASELINE_NOISE
 from sonar_imm.trackers.diver.config import BASELINES, DiverConfig, MODEL_SETS
+from sonar_imm.trackers.diver.models import BASELINE_NOISE
 from sonar_imm.trackers.diver.scan import Positions
 from sonar_imm.trackers.diver.state import DiverState
 from sonar_imm.trackers.diver.tracker import Association, DiverTracker

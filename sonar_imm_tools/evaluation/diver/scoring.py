@@ -49,8 +49,7 @@ from ..numbers import (
     usable_nees,
 )
 from .matching import match, Matching, track_summary
-from .series import Series
-from .truth import Truth
+from .series import Series, Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0

@@ -12,7 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Estimates of divers, or their true states, as flat arrays."""
+"""Estimates of divers as flat arrays, and truth at their stamps.
+
+Truth has its own rate (GPS once per second, a simulation at each step). Between two points
+position and velocity are interpolated linearly. Beyond the ends, and in gaps longer than a limit,
+truth is unknown and nothing is scored.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +29,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
+from ... import SECOND
 from ..columns import column, covariance_of, read_rows, Rows
 
 STATES = ('px', 'py', 'vx', 'vy')
@@ -82,3 +88,79 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
         model_names=next(iter(models), ()),
     )
     return evolve(series, scan_ns=np.unique(series.scan_ns))
+
+
+@frozen(eq=False)
+class TruthPath:
+    """One true target: stamp_ns (n,) strictly increasing; state (n, 4), unknown velocity NaN;
+    z (n,), None where it is not known: 0 throughout is a height that nobody filled in."""
+
+    track_id: int
+    stamp_ns: IntArray
+    state: FloatArray
+    z: FloatArray | None = None
+
+    def at(self, stamp_ns: IntArray, *, max_gap: float) -> FloatArray:
+        """(m, 4) state at `stamp_ns`; NaN outside the path and inside gaps over `max_gap` s."""
+        wanted = np.asarray(stamp_ns, np.int64)
+        after = np.searchsorted(self.stamp_ns, wanted, side='left')
+        inside = after < len(self.stamp_ns)
+        after = np.minimum(after, len(self.stamp_ns) - 1)
+        exact = inside & (self.stamp_ns[after] == wanted)
+        before = np.maximum(after - 1, 0)
+        gap = self.stamp_ns[after] - self.stamp_ns[before]
+        inside &= exact | ((after > 0) & (gap <= max_gap * SECOND))
+        # Differences of int64 stamps first: a float64 of an absolute stamp is only good to 0.2 us.
+        fraction = (wanted - self.stamp_ns[before]) / np.maximum(gap, 1)
+        state = self.state[before] + fraction[:, None] * (self.state[after] - self.state[before])
+        state[exact] = self.state[after[exact]]
+        state[~inside] = np.nan
+        return state
+
+
+@frozen(eq=False)
+class Truth:
+    """All true targets of a recording."""
+
+    paths: tuple[TruthPath, ...]
+    max_gap: float = 60.0
+
+    @classmethod
+    def from_series(cls, series: Series, *, max_gap: float = 60.0) -> Truth:
+        """Split a truth `series` by track id.
+
+        Of several rows of one target with one stamp the last counts. Rows with a position that is
+        not finite are left out.
+        """
+        good = series.pick(np.isfinite(series.state[:, :2]).all(axis=1))
+        paths = (
+            TruthPath(target, rows.stamp_ns, rows.state, rows.z if rows.z.any() else None)
+            for target, rows in good.by_track()
+        )
+        return cls(tuple(paths), max_gap)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def shifted(self, lag: float) -> Truth:
+        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
+        lag."""
+        shift = round(lag * SECOND)
+        paths = (evolve(path, stamp_ns=path.stamp_ns - shift) for path in self.paths)
+        return evolve(self, paths=tuple(paths))
+
+    def at(self, stamp_ns: IntArray) -> FloatArray:
+        """(paths, m, 4) states at `stamp_ns`, NaN where unknown."""
+        empty = np.empty((0, len(stamp_ns), 4))
+        return np.concatenate(
+            [empty, *[path.at(stamp_ns, max_gap=self.max_gap)[None] for path in self.paths]]
+        )
+
+    def heights(self, stamp_ns: IntArray) -> FloatArray:
+        """(paths, m) z at `stamp_ns`, NaN where unknown."""
+        out = np.full((len(self.paths), len(stamp_ns)), np.nan)
+        for row, path in zip(out, self.paths):
+            if path.z is not None:
+                upright = evolve(path, state=path.z[:, None].astype(np.float64))
+                row[:] = upright.at(stamp_ns, max_gap=self.max_gap)[:, 0]
+        return out

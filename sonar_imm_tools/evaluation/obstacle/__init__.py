@@ -15,9 +15,8 @@
 """How runs of the obstacle tracker are judged: heights and 90 % bands against the truth.
 
 `series` lays estimates end to end and says which track is which obstacle. `scoring` says how
-large the errors are and whether the stated uncertainty holds, `motion` the same of velocities,
-behaviours and collisions, `deferred` what the paper's deferred estimate would have been.
-`summary` and `figures` present it.
+large the errors are and whether what is stated holds, `deferred` what the paper's deferred
+estimate would have been. `METRICS`, `summary_sentence` and `figures` present it.
 """
 
 from __future__ import annotations
@@ -28,15 +27,14 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from ..numbers import chi2, counted, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
 from .deferred import deferred_estimates
-from .motion import motion_metrics
-from .scoring import score
+from .scoring import motion_metrics, NEAR, score
 from .series import Matching, series_of, TruePath, truth_of
-from .summary import METRICS, seen, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -112,4 +110,106 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
         near['rmse_m'],
         at_most=at_most,
         remark=f' (band holds {100 * metrics["consistency"]["band_coverage"]:.0f} % of the truth)',
+    )
+
+
+METRICS = (
+    Metric(
+        card='Confirmed obstacles',
+        value='{tracks_confirmed}',
+        remark='{pings} pings in {span_s:.0f} s',
+        when=lambda metrics: not look_up(metrics, 'range.n'),
+    ),
+    error('range', 'range error'),
+    error('bearing', 'bearing error', 'deg'),
+    error('vertical_offset', 'vertical offset error'),
+    error(
+        'vertical_offset_near',
+        f'the same within {NEAR:.0f} m',
+        card=f'Height error within {NEAR:.0f} m, RMS',
+        front=True,
+    ),
+    chi2('consistency.nees_offset', 'NEES, vertical offset', card='NEES of the offset'),
+    chi2('consistency.nees_state', 'NEES, whole state'),
+    chi2('consistency.nis', 'NIS', card='NIS of the hits'),
+    Metric(
+        label='truth inside the 90 % band',
+        line='{consistency.band_coverage:.0%}',
+        card='Truth inside the 90 % band',
+        value='{consistency.band_coverage:.0%}',
+        remark='90 % would be perfect',
+        front=True,
+        covers=('consistency.band_coverage', 0.9),
+    ),
+    Metric(label='Brier score of P(above)', line='{above.brier:.3f}'),
+    *(
+        metric
+        for name in ('moving', 'still')
+        for metric in (
+            Metric(
+                label=f'velocity error, {name}, RMSE per axis',
+                line=f'{{velocity.{name}.rmse_m_s:.3f}} m/s',
+            ),
+            chi2(f'velocity.{name}.nees', 'NEES, velocity'),
+        )
+    ),
+    *(
+        Metric(
+            label=f'P({name}) of what is',
+            line=f'{{behaviours.confusion.{name}.{name}:.3f}} '
+            f'({{behaviours.confusion.{name}.n}} rows)',
+        )
+        for name in BEHAVIOURS
+    ),
+    Metric(
+        label='Brier score of collisions',
+        line='{collisions.brier:.3f}, of a guess {collisions.brier_of_a_guess:.3f} '
+        '({collisions.n} forecasts, {collisions.happened:.0%} happened)',
+    ),
+    Metric(
+        label='GOSPA',
+        line='{gospa.mean_m:.2f} m',
+        card='GOSPA',
+        value='{gospa.mean_m:.2f} m',
+        front=True,
+        remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping',
+    ),
+    Metric(
+        label='vertical offset: online / RMSD / of both sides / refitted',
+        line='{deferred.online_m:+.2f} / {deferred.rmsd_m:+.2f} / '
+        '{deferred.rmsd_both_sides_m:+.2f} / {deferred.refit_m:+.2f} m',
+    ),
+    Metric(label='vertical offset, truth', line='{deferred.truth_m:+.2f} m'),
+    *each(
+        'tracks',
+        ('true_obstacles', 'found_obstacles', 'tracks', 'false_tracks', 'identity_switches'),
+    ),
+)
+
+
+def seen(metrics: Mapping[str, Any]) -> str:
+    """What was tracked, in a few words."""
+    true = look_up(metrics, 'tracks.true_obstacles')
+    found = counted(metrics['tracks_confirmed'], 'obstacle')
+    if true is not None:
+        found = f'{metrics["tracks"]["found_obstacles"]} of {counted(true, "obstacle")}'
+    return fill(f'{found}, {{pings}} pings in {{span_s:.0f}} s', metrics)
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in a few sentences."""
+    if not look_up(metrics, 'vertical_offset.n'):
+        return fill('{tracks_confirmed} confirmed obstacles in {span_s:.0f} s. ', metrics) + (
+            UNMATCHED if 'scored_rows' in metrics else NO_TRUTH
+        )
+    near = (
+        f'Within {NEAR:.0f} m the height of an obstacle is right to '
+        '{vertical_offset_near.rmse_m:.2f} m (RMS). '
+    )
+    return fill(
+        (near if metrics['vertical_offset_near']['n'] else '')
+        + 'Its 90 % band holds the truth {consistency.band_coverage:.0%} of the time. '
+        '{tracks.found_obstacles} of {tracks.true_obstacles} obstacles were found, '
+        '{tracks.false_tracks} tracks were false.',
+        metrics,
     )

@@ -24,21 +24,20 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ..conversion import ConversionReport
+from ..convert_options import OPTIONS
 from ..csv_table import CsvOptions
+from .archives import convert_snapshots, convert_traces
 from .arrivals import convert_arrivals
 from .autoferry import convert_autoferry
+from .bag_images import convert_images, convert_interferometer
 from .detections import convert_detections
 from .echo_sounders import convert_ek80, convert_kongsberg
 from .fixes import convert_fixes
 from .hydrophones import convert_hydrophones
-from .images import convert_images
-from .interferometer import convert_interferometer
 from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
 from .side_scan import convert_pictures, convert_xtf
-from .snapshots import convert_snapshots
-from .traces import convert_traces
 from .truth import convert_truth
 
 __all__ = [
@@ -65,22 +64,6 @@ __all__ = [
 ]
 
 KINDS: dict[str, Callable[..., ConversionReport]] = {
-    'fixes': convert_fixes,
-    'relative': convert_relative,
-    'nmea': convert_nmea,
-    'arrivals': convert_arrivals,
-    'detections': convert_detections,
-    'truth': convert_truth,
-    'autoferry': convert_autoferry,
-    'snapshots': convert_snapshots,
-    'images': convert_images,
-    'interferometer': convert_interferometer,
-    'segy': convert_segy,
-    'xtf': convert_xtf,
-    'ek80': convert_ek80,
-    'kongsberg': convert_kongsberg,
-    'pictures': convert_pictures,
-    'hydrophones': convert_hydrophones,
-    'traces': convert_traces,
+    kind: globals()[f'convert_{kind}'] for kind in OPTIONS
 }
 """The converters by the name that the command gives them."""

@@ -35,18 +35,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
 from ..csv_table import BadRow, CsvOptions, CsvTable, Row, Table
-from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
+from ..places import LocalFrame, origin_parameters
 from ..sources import BagError
 from .truth import number_names, truth_records
 
@@ -72,18 +72,12 @@ class Arrival(NamedTuple):
     tag: str = ''
 
 
-def convert_arrivals(
-    path: str | Path, out: str | Path, receivers: str | Path, **values: Any
-) -> ConversionReport:
-    """Convert a CSV of arrivals to the topic ``/arrivals``, one message per ping.
-
-    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z). values: as in
-    `ArrivalsOptions`; transmitters are looked up among the receivers by default, and
-    receiver_options are for both position files. Raises `BagError`.
-    """
-    how = ArrivalsOptions(receivers=receivers, **values)
-    report = ConversionReport(Path(out))
-    places, origin = read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
+@converter(ArrivalsOptions)
+def convert_arrivals(path: Path, how: ArrivalsOptions, report: ConversionReport) -> None:
+    """Convert a CSV of arrivals to the topic ``/arrivals``, one message per ping."""
+    places, origin = read_places(
+        how.receivers, report, how.receiver_options, how.origin, 'receiver'
+    )
     senders = (
         places
         if how.transmitters is None
@@ -98,7 +92,7 @@ def convert_arrivals(
         key = (arrival.ping if table.has('ping') else arrival.time_ns, arrival.tag)
         pings.setdefault(key, []).append(arrival)
     stations = Stations(places, senders, origin)
-    return write_pings(table, pings, stations, passive, report, how)
+    write_pings(table, pings, stations, passive, report, how)
 
 
 class Stations(NamedTuple):

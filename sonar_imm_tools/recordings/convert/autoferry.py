@@ -36,7 +36,7 @@ from msg_adapters.scans import write_scan
 from sonar_imm.measurements import Fixes, Rejection
 from sonar_imm.truth import TrueTrack
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import AutoferryOptions
 from ..csv_table import BadRow
 from ..messages import ros_message
@@ -48,15 +48,11 @@ from .truth import difference_velocity
 SENSORS = {'lidar': 1, 'radar': 2}
 
 
-def convert_autoferry(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(AutoferryOptions)
+def convert_autoferry(path: Path, how: AutoferryOptions, report: ConversionReport) -> None:
     """Convert the detections of a scenario (JSON) to the topic ``/fixes``, east-north-up; of two
     sensors to ``/radar/fixes`` and ``/lidar/fixes``, so that each may have numbers of its own.
-
-    values: as in `AutoferryOptions`. The truth goes to ``/truth/estimate``, with velocities by
-    central differences. Without std the fixes have no covariance, because the data set states
-    none. Raises `BagError` for a file of another kind.
     """
-    how = AutoferryOptions(**values)
     late = how.time_offset_ns
     if not isinstance(late, Mapping):
         late = dict.fromkeys(SENSORS, late)
@@ -65,10 +61,7 @@ def convert_autoferry(path: str | Path, out: str | Path, **values: Any) -> Conve
     numbers = {SENSORS[name] for name in how.sensors}
     names = {number: name for name, number in SENSORS.items()}
     offsets = {**dict.fromkeys(SENSORS, 0), **late}
-    report = ConversionReport(
-        Path(out),
-        notes={'sensors': ', '.join(sorted(how.sensors)), 'targets': 'boats, not divers'},
-    )
+    report.notes |= {'sensors': ', '.join(sorted(how.sensors)), 'targets': 'boats, not divers'}
     covariance = None if how.std is None else np.eye(2) * how.std**2
     records: list[Record] = []
     for index, record in enumerate(_json_list(path, report)):
@@ -86,10 +79,10 @@ def convert_autoferry(path: str | Path, out: str | Path, **values: Any) -> Conve
             topic = f'/{names[record["sensorID"]]}/fixes' if len(numbers) > 1 else '/fixes'
             records.append((scan.stamp_ns, topic, write_scan(scan, ros_message)))
         except (KeyError, TypeError, ValueError) as error:  # covers BadRow and Rejection
-            report.bad_row(Path(path), f'record {index}', _why(error))
+            report.bad_row(path, f'record {index}', _why(error))
     if how.truth is not None:
         records += _truth_records(how.truth, report, how.frame_id)
-    return write_bag(out, records, report, source=Path(path).name, storage=how.storage)
+    write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
 
 def _east_north(record: Any) -> NDArray[np.float64]:

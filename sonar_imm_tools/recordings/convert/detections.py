@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -39,7 +39,7 @@ from scipy.sparse.linalg import spsolve
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 
 from ... import SECOND
-from ..conversion import ConversionReport
+from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
 from ..csv_table import BadRow, CsvTable, Row
 from .arrivals import Arrival, Places, read_places, Stations, write_pings
@@ -54,7 +54,7 @@ LEAST = 1e-6
 """Seconds; no clock is compared better."""
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """Detections: receiver (n,), an index; tag (n,), an index; stamp_ns (n,)."""
 
     receiver: IntArray
@@ -73,7 +73,7 @@ class Clocks(NamedTuple):
     std: float
     used: int
 
-    def right(self, received: Heard) -> tuple[IntArray, BoolArray]:
+    def right(self, received: Received) -> tuple[IntArray, BoolArray]:
         """Stamps (n,) by one clock, and whether (n,) they could be told."""
         seconds = (received.stamp_ns - self.begin_ns) / SECOND
         late = np.zeros(len(seconds))
@@ -85,16 +85,12 @@ class Clocks(NamedTuple):
         return received.stamp_ns - shift, known
 
 
-def convert_detections(
-    path: str | Path, out: str | Path, receivers: str | Path, **values: Any
-) -> ConversionReport:
-    """Convert rows of receiver, tag and time to the topic ``/arrivals``, one message per ping.
-
-    values: as in `DetectionsOptions`. Fixed tags are not written. Raises `BagError`.
-    """
-    how = DetectionsOptions(receivers=receivers, **values)
-    report = ConversionReport(Path(out))
-    places, origin = read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
+@converter(DetectionsOptions)
+def convert_detections(path: Path, how: DetectionsOptions, report: ConversionReport) -> None:
+    """Convert rows of receiver, tag and time to the topic ``/arrivals``, one message per ping."""
+    places, origin = read_places(
+        how.receivers, report, how.receiver_options, how.origin, 'receiver'
+    )
     fixed: Places = {}
     if how.sync is not None:
         fixed = read_places(how.sync, report, how.receiver_options, origin, 'tag')[0]
@@ -114,7 +110,7 @@ def convert_detections(
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))
     number = {tag: k for k, tag in enumerate(tags)}
-    received = Heard(
+    received = Received(
         np.array([receiver for receiver, _, _ in rows], np.int64),
         np.array([number[tag] for _, tag, _ in rows], np.int64),
         np.array([stamp for _, _, stamp in rows], np.int64),
@@ -149,7 +145,7 @@ def convert_detections(
             ]
     if not pings and fixed:
         report.problems.append('there is no tag beside the fixed ones')
-    return write_pings(table, pings, Stations(places, places, origin), True, report, how)
+    write_pings(table, pings, Stations(places, places, origin), True, report, how)
 
 
 def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> None:
@@ -193,7 +189,11 @@ def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArr
 
 
 def compare_clocks(
-    received: Heard, receivers: FloatArray, tags: FloatArray, sound_speed: float, interval: float
+    received: Received,
+    receivers: FloatArray,
+    tags: FloatArray,
+    sound_speed: float,
+    interval: float,
 ) -> Clocks:
     """Compare the clocks of receivers (R, 3) by tags (T, 3), NaN for those that move; m, s.
 
@@ -232,7 +232,7 @@ def compare_clocks(
 
 
 def _sync_groups(
-    received: Heard,
+    received: Received,
     seconds: FloatArray,
     receivers: FloatArray,
     tags: FloatArray,

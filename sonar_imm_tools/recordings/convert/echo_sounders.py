@@ -29,27 +29,23 @@ import numpy as np
 from msg_adapters.snapshots import write_snapshot
 from sonar_imm.measurements import Rejection, Snapshot
 
-from ..conversion import ConversionReport
+from ..conversion import ConversionReport, converter
 from ..convert_options import Ek80Options, KongsbergOptions
 from ..foreign import Record
 from ..messages import ros_message
-from ..sources import BagError
+from ..sources import start_of
 from .sonar_files import ground_message, Message, speed_of, write_pings
 
 HALVES: dict[int, Sequence[Sequence[int]]] = {4: ((0, 3), (1, 2)), 3: ((0,), (1,))}
 """The sectors of a split beam that make its starboard and its port half, by their number."""
 
 
-def convert_ek80(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(Ek80Options)
+def convert_ek80(path: Path, how: Ek80Options, report: ConversionReport) -> None:
     """Convert the complex samples, or the power and angles, of a split-beam echo sounder to
     ``/snapshot``.
-
-    values: as in `Ek80Options`. Needs themachinethatgoesping, for an EK60 ektools. Raises
-    `BagError`.
     """
-    how = Ek80Options(**values)
-    reader = 'ek60' if _start(path)[4:8] == b'CON0' else 'ek80'
-    report = ConversionReport(Path(out))
+    reader = 'ek60' if start_of(path, 8)[4:8] == b'CON0' else 'ek80'
     others: set[str] = set()
     chosen = ''
 
@@ -64,20 +60,15 @@ def convert_ek80(path: str | Path, out: str | Path, **values: Any) -> Conversion
         snapshot = _split_beam(ping, how)
         yield Message('/snapshot', write_snapshot(snapshot, ros_message))
 
-    write_pings(Path(path), reader, report, how, messages)
+    write_pings(path, reader, report, how, messages)
     report.notes['channel'] = chosen
     if others:
         report.notes['other channels'] = ', '.join(sorted(others))
-    return report
 
 
-def convert_kongsberg(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
-    """Convert the soundings of a KMALL or .all file to ``/ground``, beside ``/nav``.
-
-    values: as in `KongsbergOptions`. Needs themachinethatgoesping. Raises `BagError`.
-    """
-    how = KongsbergOptions(**values)
-    report = ConversionReport(Path(out))
+@converter(KongsbergOptions)
+def convert_kongsberg(path: Path, how: KongsbergOptions, report: ConversionReport) -> None:
+    """Convert the soundings of a KMALL or .all file to ``/ground``, beside ``/nav``."""
 
     def messages(ping: Record) -> Iterator[Message]:
         if ping['soundings'] is None:
@@ -95,22 +86,13 @@ def convert_kongsberg(path: str | Path, out: str | Path, **values: Any) -> Conve
         )
         yield ground_message(ping, offset)
 
-    reader = 'kmall' if _start(path)[4:5] == b'#' else 'all'
+    reader = 'kmall' if start_of(path, 8)[4:5] == b'#' else 'all'
     profiles: dict[str, dict[str, Any]] = {'bathymetry': {}}
-    write_pings(Path(path), reader, report, how, messages, profiles)
+    write_pings(path, reader, report, how, messages, profiles)
     if 'sound_speed_profile' in profiles['bathymetry']:
         report.notes['sound speed'] = (
             'the last profile is in parameters.yaml beside the bag, for --params of other bags'
         )
-    return report
-
-
-def _start(path: str | Path) -> bytes:
-    try:
-        with Path(path).open('rb') as file:
-            return file.read(8)
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from None
 
 
 def _split_beam(ping: Record, how: Ek80Options) -> Snapshot:

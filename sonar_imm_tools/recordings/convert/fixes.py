@@ -17,9 +17,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import itertools
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,12 +28,11 @@ from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
 from ..csv_table import BadRow, Row, Table
-from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
-from ..polar_rows import PolarRows
+from ..places import LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError
 from ..track_files import open_table
 from .truth import number_names, truth_records
@@ -42,26 +41,20 @@ REPEAT_TIME = 5.0
 """Seconds within which the same position is a repeated poll: the default of the tracker."""
 
 
-def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(FixesOptions)
+def convert_fixes(path: Path, how: FixesOptions, report: ConversionReport) -> None:
     """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
 
-    Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
-    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; for z
-    ``var_z`` (and ``cov_xz cov_yz``) or ``std_z``, else its variance is not stated; ``id``: whose
-    position it is, a number or a name. In place of x and y ``range`` [m] and ``bearing`` from a
-    sensor at the origin, see `PolarRows`. A row with empty uncertainties becomes a fix without
-    covariance, one with a time and no position an empty scan: then all rows become scans,
-    ``/fixes``. Latitudes become metres around the origin, which the tracker finds in
-    ``parameters.yaml`` beside the bag. values: as in `FixesOptions`; truth is a CSV as in
-    `convert_truth`, for the same bag and the same origin.
+    Columns as in `FixesOptions`. Of z the variance is ``var_z`` (``cov_xz cov_yz``) or ``std_z``,
+    else not stated. A row with empty uncertainties becomes a fix without covariance, one with a
+    time and no position an empty scan: then all rows become scans, ``/fixes``. Latitudes become
+    metres around the origin, which the tracker finds in ``parameters.yaml`` beside the bag.
 
     Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
     the same diver again a moment later, see `RepeatFilter`) stay, and are counted: the tracker
     leaves them out.
     """
-    how = FixesOptions(**values)
-    table = open_table(path, how.options)
-    return write_fixes(table, ConversionReport(Path(out)), how)
+    write_fixes(open_table(path, how.options), report, how)
 
 
 def write_fixes(
@@ -112,29 +105,36 @@ def write_fixes(
             repeated.append(row.line)
         return stamp_ns, fix, name
 
-    read = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
-    rows = [(row, fix, name) for row, _, fix, name in read if fix is not None]
-    empty = [(row, stamp_ns) for row, stamp_ns, fix, _ in read if fix is None]
+    read = [(row.line, *parsed) for row, parsed in report.read_rows(table, parse)]
+    rows = [(line, fix, name) for line, _, fix, name in read if fix is not None]
+    empty = [(line, stamp_ns) for line, stamp_ns, fix, _ in read if fix is None]
     if polar:
         polar.check_unit()
+    fixes = [fix for _, fix, _ in rows]
+    ask_for_units(
+        [fix.stamp_ns for fix in fixes], [fix.position[:2] for fix in fixes], table.path, report
+    )
     if not rows:
-        for row, _ in empty:
-            report.bad_row(table.path, f'line {row.line}', f'{" and ".join(place)} are empty')
+        for line, _ in empty:
+            report.bad_row(table.path, f'line {line}', f'{" and ".join(place)} are empty')
         empty = []
     named = _names_divers(table, rows, report)
+    records: Iterable[Record]
     if named or empty:
-        records = _scans(rows, [stamp for _, stamp in empty], named, report, how.frame_id)
+        stamps = [stamp for _, stamp in empty]
+        records = _scans(rows, stamps, named, table.path, report, how.frame_id)
     else:
-        records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for _, fix, _ in rows]
+        records = ((fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for fix in fixes)
     if frame:
         origin = frame.origin
         report.notes.update(frame.notes())
-    if how.truth is not None and records:
-        records += truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
+    truth: list[Record] = []
+    if how.truth is not None and rows:
+        truth = truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
     if empty:
         report.notes['empty scans'] = (
             f'{len(empty)} rows have a time and no position, the first in line '
-            f'{empty[0][0].line}: nobody was seen then'
+            f'{empty[0][0]}: nobody was seen then'
         )
     if repeated:
         report.notes['repeated'] = (
@@ -143,7 +143,7 @@ def write_fixes(
         )
     return write_bag(
         report.path,
-        [*records, *beside] if records else [],
+        itertools.chain(records, truth, beside) if rows else [],
         report,
         source=table.path.name,
         storage=how.storage,
@@ -165,7 +165,7 @@ def _has_places(table: Table) -> bool:
 
 
 def _names_divers(
-    table: Table, rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport
+    table: Table, rows: Sequence[tuple[int, Fix, str]], report: ConversionReport
 ) -> bool:
     """Whether the column ``id`` says whose the rows are. One that is another in most rows numbers
     the rows."""
@@ -179,9 +179,10 @@ def _names_divers(
 
 
 def _scans(
-    rows: Sequence[tuple[Row, Fix, str]],
+    rows: Sequence[tuple[int, Fix, str]],
     empty: Sequence[int],
     named: bool,
+    path: Path,
     report: ConversionReport,
     frame_id: str,
 ) -> list[Record]:
@@ -191,11 +192,11 @@ def _scans(
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
     by_stamp: dict[int, list[tuple[Fix, int]]] = {stamp_ns: [] for stamp_ns in empty}
-    for row, fix, name in rows:
+    for line, fix, name in rows:
         scan = by_stamp.setdefault(fix.stamp_ns, [])
         number = numbers.get(name, NOBODY)
         if number != NOBODY and any(number == other for _, other in scan):
-            report.bad_row(row.table.path, f'line {row.line}', f'{name} is there at this time')
+            report.bad_row(path, f'line {line}', f'{name} is there at this time')
             continue
         scan.append((fix, number))
     unknown = np.full((3, 3), np.nan)

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from msg_adapters.array_records import write_pressure
 from sonar_imm.measurements import Pressure, Rejection
 
 from ... import SECOND
-from ..conversion import ConversionReport, provenance
+from ..conversion import ConversionReport, converter, provenance
 from ..convert_options import HydrophonesOptions
 from ..csv_table import BadRow, moment_ns
 from ..messages import ros_message
@@ -46,30 +46,26 @@ FULL_SCALE = 2**15
 _NAMED = re.compile(r'(?<!\d)(?:20)?(\d\d)(\d\d)(\d\d)[T_\-.]?(\d\d)(\d\d)(\d\d)(?!\d)')
 
 
-def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(HydrophonesOptions)
+def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionReport) -> None:
     """Convert the channels of a sound file to the topic ``/pressure``, block by block.
 
     The bag gets ``parameters.yaml`` with the number of hydrophones.
-
-    values: as in `HydrophonesOptions`. Needs soundfile. A file that ends early keeps what could be
-    read. Raises `BagError`.
     """
-    how = HydrophonesOptions(**values)
-    path, report = Path(path), ConversionReport(Path(out))
-    with _opened(path) as sound:
-        channels = _channels(sound, how.channels)
+    with _opened(path) as audio:
+        channels = _channels(audio, how.channels)
         start_ns = _start_ns(path, how)
-        rows = max(2, round(how.block * sound.samplerate))
-        if rows * sound.channels > LONGEST_BLOCK:
+        rows = max(2, round(how.block * audio.samplerate))
+        if rows * audio.channels > LONGEST_BLOCK:
             raise BagError(
-                f'blocks of {how.block:g} s have {rows * sound.channels} samples; say a shorter '
+                f'blocks of {how.block:g} s have {rows * audio.channels} samples; say a shorter '
                 '--block'
             )
         report.notes['sound'] = (
-            f'{sound.channels} channels, {sound.samplerate} Hz, '
-            f'{sound.frames / sound.samplerate:.1f} s, {sound.subtype}'
+            f'{audio.channels} channels, {audio.samplerate} Hz, '
+            f'{audio.frames / audio.samplerate:.1f} s, {audio.subtype}'
         )
-        if 'should be' in sound.extra_info:  # words of libsndfile
+        if 'should be' in audio.extra_info:  # words of libsndfile
             report.problems.append(
                 f'{path.name} is shorter than it says of itself; what is there is kept'
             )
@@ -77,14 +73,13 @@ def convert_hydrophones(path: str | Path, out: str | Path, **values: Any) -> Con
         notes = provenance(path.name, report.notes)
         own = {'fathometer': {'phones': len(channels)}}
         with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
-            _write_blocks(sound, bag, report, how, channels, start_ns, rows)
+            _write_blocks(audio, bag, report, how, channels, start_ns, rows)
             if not bag.count:
-                raise BagError(f'{path} holds no block of sound that could be converted')
-    return report
+                raise report.nothing(path)
 
 
 def _write_blocks(
-    sound: soundfile.SoundFile,
+    audio: soundfile.SoundFile,
     bag: BagWriter,
     report: ConversionReport,
     how: HydrophonesOptions,
@@ -92,10 +87,10 @@ def _write_blocks(
     start_ns: int,
     rows: int,
 ) -> None:
-    source, whole, done = Path(sound.name), sound.subtype == 'PCM_16', 0
+    source, whole, done = Path(audio.name), audio.subtype == 'PCM_16', 0
     while True:
         try:
-            samples = sound.read(rows, dtype='int16' if whole else 'float32', always_2d=True)
+            samples = audio.read(rows, dtype='int16' if whole else 'float32', always_2d=True)
         except RuntimeError as error:
             report.problems.append(f'{source.name}: the rest cannot be read: {error}')
             return
@@ -104,22 +99,22 @@ def _write_blocks(
         report.rows += len(samples)
         scale = how.full_scale / FULL_SCALE if whole else 0.0
         pressure = samples[:, channels] * np.float32(scale or how.full_scale)
-        stamp_ns = start_ns + round(done * SECOND / sound.samplerate)
+        stamp_ns = start_ns + round(done * SECOND / audio.samplerate)
         done += len(samples)
         try:
             block = Pressure(
                 stamp_ns=stamp_ns,
                 frame_id=how.frame_id,
                 pressure=pressure,
-                sample_rate=float(sound.samplerate),
+                sample_rate=float(audio.samplerate),
                 reference_depth=how.depth,
                 scale=scale,
             )
         except Rejection as error:
-            report.bad_row(source, f'{done / sound.samplerate:.1f} s', error)
+            report.bad_row(source, f'{done / audio.samplerate:.1f} s', error)
             continue
         bag.write('/pressure', write_pressure(block, ros_message), stamp_ns)
-        report.messages['/pressure'] = report.messages.get('/pressure', 0) + 1
+        report.messages['/pressure'] += 1
 
 
 def _opened(path: Path) -> soundfile.SoundFile:
@@ -133,13 +128,13 @@ def _opened(path: Path) -> soundfile.SoundFile:
         raise BagError(f'{path} cannot be read as sound: {error}') from None
 
 
-def _channels(sound: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[int]:
+def _channels(audio: soundfile.SoundFile, wanted: Sequence[int] | None) -> list[int]:
     """The channels of the hydrophones, the deepest first."""
-    channels = list(range(sound.channels)) if wanted is None else list(wanted)
-    if wrong := [k for k in channels if not 0 <= k < sound.channels]:
-        raise BagError(f'{sound.name} has the channels 0 to {sound.channels - 1}, not {wrong[0]}')
+    channels = list(range(audio.channels)) if wanted is None else list(wanted)
+    if wrong := [k for k in channels if not 0 <= k < audio.channels]:
+        raise BagError(f'{audio.name} has the channels 0 to {audio.channels - 1}, not {wrong[0]}')
     if len(channels) < 2:
-        raise BagError(f'{sound.name} has one channel; an array has at least two hydrophones')
+        raise BagError(f'{audio.name} has one channel; an array has at least two hydrophones')
     return channels
 
 

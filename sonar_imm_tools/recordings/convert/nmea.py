@@ -45,11 +45,11 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 
 from ... import SECOND
-from ..conversion import ConversionReport, Leaps, Record
+from ..conversion import ConversionReport, converter, Leaps, Record
 from ..convert_options import FixesOptions, NmeaOptions
 from ..csv_table import BadRow, iso_ns, moment_ns
-from ..local_frame import check_place
 from ..messages import ros_message
+from ..places import check_place
 from ..sources import BagError
 from ..track_files import TrackFile
 from .fixes import write_fixes
@@ -85,16 +85,12 @@ class _Log:
     unread: Counter[str] = Factory(Counter)
 
 
-def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(NmeaOptions)
+def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None:
     """Convert a log of sentences to ``/fixes`` of its targets, and ``/nav_fix`` and ``/heading``
     of the vessel; where it holds no targets, the vessel's positions are the fixes.
-
-    values: as in `NmeaOptions`. Needs pyais and pynmea2. Sentences that are damaged or have no
-    time are counted and named. Raises `BagError`.
     """
-    how = NmeaOptions(**values)
-    report = ConversionReport(Path(out))
-    log = _read(Path(path), report, how.date)
+    log = _read(path, report, how.date)
     as_fixes = how.own == 'fixes' or (how.own == 'auto' and not log.targets)
     rows, beside = log.targets, list[Record]()
     if as_fixes:
@@ -110,13 +106,12 @@ def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> Conversion
         ]
     leaps = Leaps()
     leaps.saw_all(log.own)
-    leaps.tell(Path(path), report)
+    leaps.tell(path, report)
     if log.unread:
         counts = log.unread.most_common(12)
         report.notes['not used'] = ', '.join(f'{count} {name}' for name, count in counts)
     if not rows:
-        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
-        raise BagError(f'{path} holds no position of a target{first}')
+        raise report.nothing(path)
     table = TrackFile(path, None, rows, 'a log of NMEA sentences')
     fixes = FixesOptions(
         truth=how.truth,
@@ -125,7 +120,7 @@ def convert_nmea(path: str | Path, out: str | Path, **values: Any) -> Conversion
         origin=how.origin,
         storage=how.storage,
     )
-    return write_fixes(table, report, fixes, beside)
+    write_fixes(table, report, fixes, beside)
 
 
 def _read(path: Path, report: ConversionReport, day: str) -> _Log:

@@ -31,12 +31,11 @@ from msg_adapters.navigation import write_heading, write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading, VesselPose
 
-from ..conversion import ConversionReport, Leaps, Record, write_bag
+from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import BadRow, CsvTable, Row
-from ..local_frame import check_place, checked_origin, origin_parameters
 from ..messages import ros_message
-from ..polar_rows import PolarRows
+from ..places import check_place, checked_origin, origin_parameters, PolarRows
 from .fixes import by_name
 from .truth import truth_records
 
@@ -54,7 +53,8 @@ class _Parsed(NamedTuple):
     name: str
 
 
-def convert_relative(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(RelativeOptions)
+def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport) -> None:
     """Convert a CSV of positions relative to a vessel to ``/relative``, in a frame of the name
     where ``id`` says whose they are, and the vessel to ``/nav``, or ``/nav_fix`` and ``/heading``.
 
@@ -62,7 +62,6 @@ def convert_relative(path: str | Path, out: str | Path, **values: Any) -> Conver
     has to know (``tags``, ``relative_axes``, the origin) is in ``parameters.yaml`` beside the bag.
     Rows with the same stamp share the pose of the first of them. Raises `BagError`.
     """
-    how = RelativeOptions(**values)
     table = CsvTable(path, how.options)
     table.require('stamp')
     geodetic = table.has('vessel_latitude', 'vessel_longitude')
@@ -75,7 +74,6 @@ def convert_relative(path: str | Path, out: str | Path, **values: Any) -> Conver
     if not levelled:
         table.require('heading')
     place = ('range', 'bearing') if polar else ('forward', 'starboard')
-    report = ConversionReport(Path(out))
 
     def parse(row: Row) -> _Parsed:
         row.require_valid()
@@ -126,11 +124,11 @@ def convert_relative(path: str | Path, out: str | Path, **values: Any) -> Conver
     known |= {'relative_axes': 'enu' if levelled else 'flu', 'map_frame': how.frame_id}
     if tags:
         known['tags'] = list(dict.fromkeys(tags.values()))
-    return write_bag(
-        out,
+    write_bag(
+        report.path,
         records,
         report,
-        source=Path(path).name,
+        source=path.name,
         storage=how.storage,
         parameters={'diver': known},
         streams=by_name((row.name, row.stamp_ns) for row in rows),

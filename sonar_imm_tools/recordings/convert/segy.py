@@ -34,7 +34,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime, timedelta, timezone
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -262,24 +261,18 @@ def _stamps(file: segyio.SegyFile, path: Path) -> list[int]:
 
     fields = segyio.TraceField
     names = ('YearDataRecorded', 'DayOfYear', 'HourOfDay', 'MinuteOfHour', 'SecondOfMinute')
-    columns = [file.attributes(getattr(fields, name))[:] for name in names]
-    try:
-        seconds = [_seconds(*(int(value) for value in row)) for row in zip(*columns)]
-    except (ValueError, OverflowError):
-        raise BagError(f'{path}: the trace headers hold no date') from None
+    year, day, hour, minute, second = (
+        file.attributes(getattr(fields, name))[:].astype(np.int64) for name in names
+    )
+    if ((year < 1) | (year > 9999) | (day < 1)).any():
+        raise BagError(f'{path}: the trace headers hold no date')
+    start = (year - 1970).astype('datetime64[Y]').astype('datetime64[s]').astype(np.int64)
+    seconds = start + 86_400 * (day - 1) + 3600 * hour + 60 * minute + second
     stamps: list[int] = []
-    for second, group in groupby(seconds):
+    for second, group in groupby(seconds.tolist()):
         count = sum(1 for _ in group)
         stamps += [second * SECOND + k * SECOND // count for k in range(count)]
     return stamps
-
-
-def _seconds(year: int, day: int, hour: int, minute: int, second: int) -> int:
-    if day < 1:
-        raise ValueError('days of a year begin with 1')
-    start: Any = datetime(year, 1, 1, tzinfo=timezone.utc)
-    moment = start + timedelta(days=day - 1, hours=hour, minutes=minute, seconds=second)
-    return int(moment.timestamp())
 
 
 def is_envelope(amplitude: FloatArray) -> bool:

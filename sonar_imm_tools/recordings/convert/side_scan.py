@@ -32,13 +32,13 @@ from msg_adapters.snapshots import write_snapshot
 from sonar_imm.measurements import Rejection, Snapshot, SonarImage
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
-from ..conversion import ConversionReport
+from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
 from ..csv_table import BadRow, CsvTable, Row
 from ..foreign import Record
 from ..messages import ros_message
 from ..sources import BagError
-from .images import SYSTEM
+from .bag_images import SYSTEM
 from .sonar_files import ground_message, Message, speed_of, write_pings, write_records
 
 LOOKS = {'starboard': -90.0, 'port': 90.0}
@@ -47,16 +47,13 @@ ABEAM: dict[str, Any] = {'horizontal_fov_deg': 3.0, 'vertical_fov_deg': 80.0}
 """Parameters of the obstacle tracker for the narrow, high beam of a side scan."""
 
 
-def convert_xtf(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(XtfOptions)
+def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
     """Convert the side scan of an XTF file: echoes to ``/detections``, and where a side has a
     channel of phases to ``/port/snapshot`` and ``/starboard/snapshot``. Processed soundings of a
     multibeam become ``/ground``.
-
-    values: as in `XtfOptions`. Needs pyxtf. Raises `BagError`, `ConfigError`.
     """
-    how = XtfOptions(**values)
     config = DetectorConfig.from_mapping(how.parameters)
-    report = ConversionReport(Path(out))
     mount = {**ABEAM, 'sonar_mount_rpy_deg': [0.0, 0.0, LOOKS[how.side]]}
     phases = False
 
@@ -80,26 +77,21 @@ def convert_xtf(path: str | Path, out: str | Path, **values: Any) -> ConversionR
                 phases = True
                 yield Message(f'/{side}/snapshot', write_snapshot(snapshot, ros_message))
 
-    write_pings(Path(path), 'xtf', report, how, messages, {SYSTEM: mount})
+    write_pings(path, 'xtf', report, how, messages, {SYSTEM: mount})
     if set(report.messages) <= {'/nav', '/altitude', '/ground'}:
-        return report
+        return
     other = next(side for side in LOOKS if side != how.side)
     report.notes['side'] = f'echoes of {how.side}; those of the other by --side {other}'
     report.notes['samples'] = (
         'amplitudes and phases' if phases else 'magnitude only: no channel is called a phase'
     )
-    return report
 
 
-def convert_pictures(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
-    """Convert a folder of PNG and JPEG, with a CSV of their stamps, to ``/detections``.
-
-    values: as in `PicturesOptions`. Needs Pillow. Raises `BagError`, `ConfigError`.
-    """
-    how = PicturesOptions(**values)
+@converter(PicturesOptions)
+def convert_pictures(path: Path, how: PicturesOptions, report: ConversionReport) -> None:
+    """Convert a folder of PNG and JPEG, with a CSV of their stamps, to ``/detections``."""
     config = DetectorConfig.from_mapping(how.parameters)
-    folder, report = Path(path), ConversionReport(Path(out))
-    table = CsvTable(_table_of(folder, how.table), how.options)
+    table = CsvTable(_table_of(path, how.table), how.options)
     table.require('stamp', 'file')
 
     def rows() -> Iterator[Record]:
@@ -107,11 +99,10 @@ def convert_pictures(path: str | Path, out: str | Path, **values: Any) -> Conver
             yield {**record, 'where': f'line {row.line}'}
 
     def messages(record: Record) -> Iterator[Message]:
-        image = _picture(folder, record, how.frame_id)
+        image = _picture(path, record, how.frame_id)
         yield Message('/detections', write_detections(detect(image, config), ros_message))
 
-    write_records(folder, rows(), report, how, messages)
-    return report
+    write_records(path, rows(), report, how, messages)
 
 
 def _ground(ping: Record) -> Message:

@@ -42,8 +42,8 @@ from ... import SECOND
 from ..conversion import ConversionReport, JUMP, Leaps, provenance
 from ..csv_table import BadRow
 from ..foreign import LIBRARIES, read_apart, Record
-from ..local_frame import origin_of_detections
 from ..messages import ros_message
+from ..places import origin_of_detections
 from ..sources import BagError
 from ..writer import BagWriter
 
@@ -180,7 +180,7 @@ def write_records(
 
         def write(topic: str, content: Any, stamp_ns: int) -> None:
             bag.write(topic, content, stamp_ns)
-            report.messages[topic] = report.messages.get(topic, 0) + 1
+            report.messages[topic] += 1
 
         for record in _in_time(records, path, report):
             stamp_ns = record['stamp_ns']
@@ -201,8 +201,7 @@ def write_records(
             for system, values in origin_of_detections(place).items():
                 own[system] = {**own.get(system, {}), **values}
         if not set(report.messages) - {'/nav', '/altitude'}:
-            first = f' (the first problem: {report.problems[0]})' if report.problems else ''
-            raise BagError(f'{path} holds no ping that could be converted{first}')
+            raise report.nothing(path)
     if frame.missing:
         report.problems.append(
             f'{path.name}: {frame.missing} pings have no position (0, 0 is none); they have no '

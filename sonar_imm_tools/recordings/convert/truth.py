@@ -22,32 +22,30 @@ second and 0.5 m of noise it is good to about 0.4 m/s. A single position has the
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.truth import TrueTrack
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import TruthOptions
 from ..csv_table import CsvOptions, Row
-from ..local_frame import LocalFrame
+from ..places import LocalFrame
 from ..track_files import open_table
 from ..truth import records_of
 
 
-def convert_truth(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
+@converter(TruthOptions)
+def convert_truth(path: Path, how: TruthOptions, report: ConversionReport) -> None:
     """Convert a CSV of true positions to ``/truth/estimate``.
 
     Columns: ``stamp``, positions as in `convert_fixes`; optional ``vx vy`` [m/s] and ``id`` for
     several targets, whose names become track ids in order of appearance unless they are numbers.
     values: as in `TruthOptions`.
     """
-    how = TruthOptions(**values)
-    report = ConversionReport(Path(out))
     records = truth_records(path, report, how.options, how.frame_id, how.origin)
-    return write_bag(out, records, report, source=Path(path).name, storage=how.storage)
+    write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
 
 def truth_records(

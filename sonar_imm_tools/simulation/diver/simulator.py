@@ -22,15 +22,22 @@ heading ("zigzag with general consistent direction" in the paper).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from attrs import evolve, frozen
 import numpy as np
 
+from sonar_imm.acoustics.localisation import Localisation, localise
+from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.gauss_markov import gauss_markov
+from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.truth import Received, Scene, TrueTrack
 
-from .afloat import namespace_of
-from .crossing import crossing_paths
+from .afloat import namespace_of, sense_from_vessel, sense_geodetic
+from .crossing import crossing_paths, sense_scan
 from .scenarios import DiverScenario, FIRST_STAMP_NS, RECEIVERS, scenario, SCENARIOS, TRANSMITTER
-from .sensors import draw_errors, SENSE
 
 __all__ = [
     'DiverScenario',
@@ -163,4 +170,207 @@ _VELOCITY = {
     'zigzag': _zigzag,
     'stop_and_go': _stop_and_go,
     'still': _still,
+}
+
+
+# -- what sensors make of it ----------------------------------------------------------------------
+
+
+@frozen(eq=False)
+class Errors:
+    """height (n, divers) z of the divers at n times; misplaced (receivers, 2) m, clock
+    (receivers,) s, sound_speed m/s and bearing rad of the whole scene; fix_bias (n, 2) m."""
+
+    height: FloatArray
+    misplaced: FloatArray
+    clock: FloatArray
+    sound_speed: float
+    bearing: float
+    fix_bias: FloatArray
+
+    def at(self, k: int) -> Errors:
+        """Those of time k: fix_bias (2,)."""
+        return evolve(self, fix_bias=self.fix_bias[k])
+
+
+def draw_errors(config: DiverScenario, times: FloatArray, rng: np.random.Generator) -> Errors:
+    """What is drawn once for a scene, and the errors that last, at `times` (n,) s."""
+    shallow, deep = config.depth
+    depth = rng.uniform(shallow, deep, size=config.divers)
+    phase = rng.uniform(0.0, 2.0 * np.pi, size=config.divers)
+    swell = np.sin(2.0 * np.pi * times[:, None] / config.swell_period + phase)
+    misplaced = config.receiver_position_std * rng.normal(size=(len(RECEIVERS), 2))
+    misplaced[0] = 0.0
+    clock = config.receiver_clock_std * rng.normal(size=len(RECEIVERS))
+    sound_speed = config.sound_speed_std * rng.normal()
+    bias = config.fix_bias_std * rng.normal(size=(len(times), 2))
+    for k, dt in enumerate(np.diff(times), start=1):
+        # bias[k] was drawn with the standard deviation for ever
+        fade, _ = gauss_markov(config.fix_bias_std, config.fix_bias_time, dt)
+        bias[k] = fade * bias[k - 1] + np.sqrt(1.0 - fade**2) * bias[k]
+    height = -depth - config.swell_height * swell
+    bearing = np.radians(config.bearing_bias_std_deg) * rng.normal()
+    return Errors(height, misplaced, clock, float(sound_speed), float(bearing), bias)
+
+
+def _sense_polar(
+    config: DiverScenario,
+    errors: Errors,
+    stamp_ns: int,
+    present: FloatArray,
+    rng: np.random.Generator,
+) -> list[Fix]:
+    """Range and bearing from the origin, converted without bias; clutter uniform in the square."""
+    seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
+    outlier = rng.uniform(size=len(seen)) < config.outlier_probability
+    false = rng.poisson(config.clutter)
+    half = config.clutter_range
+    points = np.vstack(
+        [
+            np.where(outlier[:, None], rng.uniform(-half, half, seen.shape), seen),
+            rng.uniform(-half, half, (false, 2)),
+        ]
+    )
+    bearing_std = np.deg2rad(config.bearing_std_deg)
+    ranges = np.hypot(*points.T) + config.range_std * rng.normal(size=len(points))
+    bearings = np.arctan2(points[:, 1], points[:, 0]) + bearing_std * rng.normal(size=len(points))
+    bearings += errors.bearing
+    z, R = unbiased_polar_to_cartesian(ranges, bearings, config.range_std**2, bearing_std**2)
+    return [
+        Fix(
+            stamp_ns=stamp_ns,
+            position=np.append(position, 0.0),
+            covariance=covariance,
+            frame_id='map',
+        )
+        for position, covariance in zip(z, R)
+    ]
+
+
+def _sense_arrivals(
+    config: DiverScenario,
+    errors: Errors,
+    stamp_ns: int,
+    present: FloatArray,
+    rng: np.random.Generator,
+) -> list[Arrivals]:
+    """Echoes of one ping at every receiver."""
+    receivers = RECEIVERS - np.outer(config.receiver_depths, [0.0, 0.0, 1.0])
+    pairs = [
+        (receiver, path)
+        for receiver, rx in enumerate(receivers)
+        for path in _paths(config, rx, errors.misplaced[receiver], present, rng)
+    ]
+    if not pairs:
+        return []
+    receiver = np.array([number for number, _ in pairs])
+    toa = np.array([path for _, path in pairs]) / (config.sound_speed + errors.sound_speed)
+    toa = toa + errors.clock[receiver]
+    n = len(pairs)
+    nothing = np.full(n, np.nan)
+    depth = nothing
+    if config.depth_std and len(present) == 1:
+        depth = np.full(n, -present[0, 2] + config.depth_std * rng.normal())
+    return [
+        Arrivals(
+            stamp_ns=stamp_ns,
+            tx_id=np.zeros(n),
+            rx_id=receiver,
+            tx=np.tile(_transmitter(config), (n, 1)),
+            rx=receivers[receiver],
+            toa=toa,
+            var_toa=np.full(n, config.toa_std**2),
+            bearing=nothing,
+            var_bearing=nothing,
+            depth=depth,
+            var_depth=np.full(n, config.depth_std**2),
+            frame_id='map',
+        )
+    ]
+
+
+def _transmitter(config: DiverScenario) -> FloatArray:
+    return TRANSMITTER - np.array([0.0, 0.0, config.receiver_depths[0]])
+
+
+def _paths(
+    config: DiverScenario,
+    rx: FloatArray,
+    misplaced: FloatArray,
+    present: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Path lengths heard at one receiver, said to be at `rx` (3,) but `misplaced` (2,), metres:
+    divers, some of them late by a reflection, and clutter."""
+    tx = _transmitter(config)
+    there = rx + np.append(misplaced, 0.0)
+    path = np.linalg.norm(present - tx, axis=1) + np.linalg.norm(present - there, axis=1)
+    path = path[rng.uniform(size=len(path)) < config.detection_probability]
+    path = path + config.sound_speed * config.toa_std * rng.normal(size=len(path))
+    outlier = rng.uniform(size=len(path)) < config.outlier_probability
+    path = path + outlier * rng.uniform(5.0, 50.0, len(path))
+    direct = float(np.linalg.norm(rx - tx))
+    false = rng.uniform(direct, direct + 2.0 * config.clutter_range, rng.poisson(config.clutter))
+    return np.concatenate([path, false])
+
+
+def _sense_positions(
+    config: DiverScenario,
+    errors: Errors,
+    stamp_ns: int,
+    present: FloatArray,
+    rng: np.random.Generator,
+) -> list[Fix]:
+    """Positions with a white and a lasting error; the covariance states the white one."""
+    seen = present[rng.uniform(size=len(present)) < config.detection_probability]
+    places = seen[:, :2] + errors.fix_bias + config.fix_std * rng.normal(size=(len(seen), 2))
+    heights, variances = np.zeros(len(seen)), [config.fix_std**2] * 2
+    if config.fix_height_std:
+        heights = seen[:, 2] + config.fix_height_std * rng.normal(size=len(seen))
+        variances.append(config.fix_height_std**2)
+    return [
+        Fix(
+            stamp_ns=stamp_ns,
+            position=np.append(place, height),
+            covariance=np.diag(variances),
+            frame_id='map',
+        )
+        for place, height in zip(places, heights)
+    ]
+
+
+def _sense_multistatic_fixes(
+    config: DiverScenario,
+    errors: Errors,
+    stamp_ns: int,
+    present: FloatArray,
+    rng: np.random.Generator,
+) -> list[Fix]:
+    """One fix per ping and diver, from its own echoes; none where the geometry gives none."""
+    fixes = []
+    for position in present:
+        for ping in _sense_arrivals(config, errors, stamp_ns, position[None], rng):
+            fix = localise(
+                ping.rx, ping.toa, ping.var_toa, tx=ping.tx, sound_speed=config.sound_speed
+            )
+            if isinstance(fix, Localisation):
+                fixes.append(
+                    Fix(
+                        stamp_ns=stamp_ns,
+                        position=np.append(fix.position, 0.0),
+                        covariance=fix.covariance,
+                        frame_id='map',
+                    )
+                )
+    return fixes
+
+
+SENSE: dict[str, Callable[..., Iterable[Any]]] = {
+    'polar': _sense_polar,
+    'positions': _sense_positions,
+    'arrivals': _sense_arrivals,
+    'multistatic_fixes': _sense_multistatic_fixes,
+    'geodetic': sense_geodetic,
+    'usbl': sense_from_vessel,
+    'scans': lambda config, errors, *rest: sense_scan(config, *rest),
 }

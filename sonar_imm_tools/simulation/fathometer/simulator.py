@@ -191,17 +191,6 @@ def _pulses(
     return there + noise, config.noise_sigma
 
 
-def _scattered(
-    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
-) -> tuple[FloatArray, None]:
-    """The envelope of a profiler, which says nothing of its noise."""
-    return _envelope(config, drift, record, _depths(config), rng), None
-
-
-_TRACES = {'response': _response, 'trace': _pulses, 'envelope': _scattered}
-"""Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
-
-
 def pressure_blocks(
     config: FathometerScenario,
     drift: Drift,
@@ -233,14 +222,10 @@ def pressure_blocks(
 
 
 def _envelope(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    depth: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """The stacked envelope (n,) of one record at `depth` (n,) m, evenly spaced, as a sub-bottom
-    profiler records it over a floor that scatters in its volume.
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, None]:
+    """The stacked envelope (n,) of one record, as a sub-bottom profiler records it over a floor
+    that scatters in its volume; it says nothing of its noise.
 
     The pressure behind an envelope is complex. Each layer answers with the pulse, in a phase that
     is drawn anew for each ping, because the layers are rough. Below the first layer everything
@@ -250,7 +235,7 @@ def _envelope(
     lies below three standard deviations of the receiver's noise is written as zero, as instruments
     do.
     """
-    pulse = gaussian_pulse(config.pulse_width)
+    pulse, depth = gaussian_pulse(config.pulse_width), _depths(config)
     n, step = len(depth), config.depth_step
     there = drift.amplitude[record] > 0.0
     place, strength = drift.depth[record, there], drift.amplitude[record, there]
@@ -269,7 +254,11 @@ def _envelope(
         wide = _complex_noise(n + 2 * reach, rng)
         field = field + config.noise_sigma * np.convolve(wide, kernel, 'valid')
         total += np.abs(field)
-    return np.asarray(np.maximum(total / config.stack - _THRESHOLD * config.noise_sigma, 0.0))
+    return np.maximum(total / config.stack - _THRESHOLD * config.noise_sigma, 0.0), None
+
+
+_TRACES = {'response': _response, 'trace': _pulses, 'envelope': _envelope}
+"""Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
 
 
 def _complex_noise(count: int, rng: np.random.Generator) -> FloatArray:

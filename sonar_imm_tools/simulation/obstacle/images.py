@@ -77,13 +77,13 @@ class ImageSonar:
         radius = 0.5 * config.target_size * rng.uniform(size=(10, 1)) ** (1.0 / 3.0)
         self._ball = radius * ball / np.linalg.norm(ball, axis=1, keepdims=True)
 
-    def image(self, sonar: Pose, places: list[FloatArray], sound: float) -> np.ndarray:
+    def image(self, sonar: Pose, places: list[FloatArray], stretch: float) -> np.ndarray:
         """The image (R, B), 0 to 255, that the sonar at `sonar` (NED) makes of obstacles at
-        `places` (3,) NED. `sound` is the scale error of the ranges."""
+        `places` (3,) NED. `stretch` is the scale error of the ranges."""
         mean = self.mean_power(sonar)
         speckle = self._speckle() * np.sqrt(mean)
         for place in places:
-            speckle += self.echo(sonar, place, sound, mean)
+            speckle += self.echo(sonar, place, stretch, mean)
         counts = self.config.image_gain * np.abs(speckle)
         return np.minimum(np.round(counts), 255.0).astype(np.uint8)
 
@@ -118,7 +118,7 @@ class ImageSonar:
         return mean + power * self._texture[i, j]
 
     def echo(
-        self, sonar: Pose, place: FloatArray, sound: float, mean: FloatArray
+        self, sonar: Pose, place: FloatArray, stretch: float, mean: FloatArray
     ) -> ComplexArray | float:
         """Complex amplitudes (R, B) of one obstacle."""
         config = self.config
@@ -141,7 +141,7 @@ class ImageSonar:
         amplitude = phase * fading * np.sqrt(power / (n if config.target == 'float' else 1))
         if config.target in ('chain', 'wreck'):
             amplitude *= np.sqrt(self._share_of_a_beam(float(centre)))
-        along = self._pulse(self.range[:, None] - d * sound)
+        along = self._pulse(self.range[:, None] - d * stretch)
         across = self._beam(self.bearing + azimuth[:, None])
         return (along * amplitude) @ across
 
@@ -185,7 +185,7 @@ def image_pings(
     poses: Pose,
     stamps: np.ndarray,
     places: list[FloatArray],
-    sound: float,
+    stretch: float,
     seed: int,
 ) -> list[Received]:
     """The image of each ping that is not lost. poses: of the sonar at the n `stamps`, NED; places:
@@ -195,7 +195,7 @@ def image_pings(
     received = []
     for k, stamp in enumerate(stamps):
         pose = Pose(poses.position[k], poses.R[k])
-        pixels = sonar.image(pose, [place[k] for place in places], sound)
+        pixels = sonar.image(pose, [place[k] for place in places], stretch)
         late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
         if rng.uniform() < config.ping_loss:
             continue

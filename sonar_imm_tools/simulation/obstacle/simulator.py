@@ -223,13 +223,13 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     stamps = FIRST_STAMP_NS + np.round(_ping_times(config, rng) * 1e9).astype(np.int64)
     times: FloatArray = (stamps - FIRST_STAMP_NS).astype(np.float64) * 1e-9
     obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
-    sound = 1.0 + config.sound_speed_error * rng.normal()
+    stretch = 1.0 + config.sound_speed_error * rng.normal()
     received = _navigate(config, vehicle, rng)
     if config.images:
         places = [path.at(times) for path in obstacles]
-        received += image_pings(config, vehicle.sonar(times), stamps, places, sound, seed)
+        received += image_pings(config, vehicle.sonar(times), stamps, places, stretch, seed)
     else:
-        echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
+        echoes = [_echoes(config, vehicle, times, path, stretch) for path in obstacles]
         received += _pings(config, stamps, echoes, rng)
     received.sort(key=lambda item: item.received_ns)
     truth = tuple(
@@ -414,7 +414,7 @@ def _echoes(
     vehicle: _Vehicle,
     times: FloatArray,
     path: Path,
-    sound: float,
+    stretch: float,
 ) -> tuple[FloatArray, np.ndarray]:
     """Range, azimuth and elevation, positive down, (n, 3) of an obstacle at each ping without
     noise, and whether it is inside the beam (n,)."""
@@ -433,7 +433,7 @@ def _echoes(
         & (np.abs(plane) <= np.radians(0.5 * config.horizontal_fov_deg))
         & (d <= config.max_range)
     )
-    return np.column_stack([d * sound, azimuth, elevation]), inside
+    return np.column_stack([d * stretch, azimuth, elevation]), inside
 
 
 def _pings(

@@ -89,7 +89,7 @@ def test_the_goal_with_both_surfaces_is_met_beside_a_ledge(monkeypatch, resolved
 
     def rates(methods, rounds, clock):
         ran.update({name: (len(run()[0]), bins) for name, (run, bins) in methods.items()})
-        return {name: resolved if name.endswith('resolved') else 50e3 for name in methods}
+        return {name: resolved if name.startswith('ledge') else 50e3 for name in methods}
 
     monkeypatch.setattr(bench, 'rates', rates)
     result = bench.bench_layover(rounds=1)

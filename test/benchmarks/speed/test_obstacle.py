@@ -36,3 +36,16 @@ def test_the_sentence_names_every_variant():
     result = bench.bench_variants(rounds=1, pings=12)
     sentence = bench.BENCHES[1].sentence(result)
     assert all(name in sentence for name in bench.VARIANTS)
+
+
+def test_variants_are_timed_in_three_rounds_at_most(monkeypatch):
+    asked = []
+
+    def ping(rounds, *_, **__):
+        asked.append(rounds)
+        return {'median_ms': 1.0}
+
+    monkeypatch.setattr(bench, 'bench_ping', ping)
+    for rounds in (2, 7):
+        bench.bench_variants(rounds)
+    assert asked == [2] * len(bench.VARIANTS) + [3] * len(bench.VARIANTS)

@@ -21,8 +21,7 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.evaluation.diver.matching import assign, match, track_summary
-from sonar_imm_tools.evaluation.diver.series import series_of
-from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 
 FAR = 1000.0
 

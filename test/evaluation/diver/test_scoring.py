@@ -32,9 +32,8 @@ import pytest
 
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
-from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import series_of, Truth
 from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
-from sonar_imm_tools.evaluation.diver.truth import Truth
 from sonar_imm_tools.evaluation.numbers import lines
 from sonar_imm_tools.offline.run_folder import finite
 
@@ -273,3 +272,17 @@ def test_depth_is_scored_where_both_have_it():
     assert 'depth' not in scored(estimates, there) and 'depth' not in scored(deep, truth)
     wrong = scored(*in_depth(estimates, truth, spread=3.0))['depth']
     assert wrong['rmse_m'] == pytest.approx(6.0, rel=0.1) and not wrong['nees_3d']['believable']
+
+
+def words_of(tracked, raw):
+    return {
+        'position': {'n': 5, 'rmse_m': tracked},
+        'raw_fix': {'n': 5, 'rmse_m': raw},
+        'consistency': {'coverage': {'95': 0.95}, 'verdict': 'consistent'},
+    }
+
+
+def test_the_raw_fixes_may_be_the_truth_itself():
+    assert 'the truth itself' in summary_sentence(words_of(0.5, 0.0))
+    assert 'removes 75 %' in summary_sentence(words_of(0.5, 2.0))
+    assert 'adds 100 %' in summary_sentence(words_of(2.0, 1.0))

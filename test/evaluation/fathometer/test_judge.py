@@ -107,44 +107,11 @@ def test_false_missed_amplitudes_and_switches_are_counted():
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp('fathometer')
-    assert (
-        main(
-            [
-                'simulate',
-                'fathometer',
-                str(folder / 'bag'),
-                '--scenario',
-                'drift_traces',
-                '--seed',
-                '4',
-                '--set',
-                'records=12',
-                '--set',
-                'layers=3',
-                '--set',
-                'fading=',
-                '--set',
-                'appearing=',
-                '--set',
-                'depth_step=0.0625',
-            ]
-        )
-        == 0
-    )
-    assert (
-        main(
-            [
-                'track',
-                str(folder / 'bag'),
-                str(folder / 'out'),
-                '--system',
-                'fathometer',
-                '--set',
-                'particles=4000',
-            ]
-        )
-        == 0
-    )
+    scene = '--scenario drift_traces --seed 4 --set records=12 --set layers=3 --set fading='
+    scene += ' --set appearing= --set depth_step=0.0625'
+    assert main(['simulate', 'fathometer', str(folder / 'bag'), *scene.split()]) == 0
+    how = '--system fathometer --set particles=4000'.split()
+    assert main(['track', str(folder / 'bag'), str(folder / 'out'), *how]) == 0
     return RunFolder(folder / 'out')
 
 

@@ -24,7 +24,7 @@ import pytest
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.evaluation.obstacle.motion import forecast_scores, forecasts, motion_metrics
+from sonar_imm_tools.evaluation.obstacle.scoring import forecast_scores, forecasts, motion_metrics
 from sonar_imm_tools.evaluation.obstacle.series import match, series_of, TruePath
 
 SECOND = 10**9

@@ -232,7 +232,7 @@ class Rig:
         now_ns = time.time_ns()
         assert self.wait_for(lambda: self.diagnostics.newest_ns > now_ns)
 
-    def heard_of(self, words: str) -> None:
+    def warned_of(self, words: str) -> None:
         """Wait until /diagnostics says `words`."""
         assert self.wait_for(lambda: words in ' '.join(self.diagnostics.words))
 

@@ -201,7 +201,7 @@ def unheard_publisher(during: list[Message], qos: QoSProfile) -> list[Step]:
             for step in during:
                 if step.primary:
                     peer.publish(step.moved(0.001).content)
-            rig.heard_of('quality of service')
+            rig.warned_of('quality of service')
         finally:
             rig.link.node.destroy_publisher(peer)
 
@@ -228,7 +228,7 @@ def simulated_clock(seconds: float) -> Disturbance:
 @middle
 def long_enough(during: list[Message]) -> list[Step]:
     """Nothing but time, until the node says that it cannot save its state."""
-    return [*during, Action(lambda rig: rig.heard_of('the state cannot be saved'))]
+    return [*during, Action(lambda rig: rig.warned_of('the state cannot be saved'))]
 
 
 # -- the table ------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def convert(tmp_path):
         if transmitters is not None:
             options['transmitters'] = tmp_path / 'tx.csv'
         return convert_arrivals(
-            tmp_path / 'in.csv', tmp_path / 'out', tmp_path / 'rx.csv', **options
+            tmp_path / 'in.csv', tmp_path / 'out', receivers=tmp_path / 'rx.csv', **options
         )
 
     return run
@@ -136,7 +136,7 @@ def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
     report = convert_arrivals(
         folder / 'arrivals.csv',
         tmp_path / 'bag',
-        folder / 'receivers.csv',
+        receivers=folder / 'receivers.csv',
         truth=folder / 'gps_truth.csv',
     )
     assert report.messages == {'/arrivals': 123, '/truth/estimate': 450} and not report.bad_rows
@@ -163,7 +163,9 @@ def test_a_tag_that_is_named_keeps_its_number(tmp_path):
     ]
     text = '\n'.join(['ping,tag,receiver,arrival', *rows]) + '\n'
     (tmp_path / 'toa.csv').write_text(text)
-    report = convert_arrivals(tmp_path / 'toa.csv', tmp_path / 'bag', tmp_path / 'rx.csv')
+    report = convert_arrivals(
+        tmp_path / 'toa.csv', tmp_path / 'bag', receivers=tmp_path / 'rx.csv'
+    )
     assert report.messages == {'/arrivals': 4}
     assert report.notes['tag'] == 'amy is 1, bob is 2'
     with BagReader(tmp_path / 'bag') as bag:

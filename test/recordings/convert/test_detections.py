@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.recordings.convert import convert_detections
-from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Heard
+from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -67,13 +67,13 @@ def detect(rng, tag, T, place, echoes, receivers):
     return found
 
 
-def heard_of(rows):
-    return Heard(*(np.array(column, np.int64) for column in zip(*rows)))
+def received_of(rows):
+    return Received(*(np.array(column, np.int64) for column in zip(*rows)))
 
 
 def compared(rows):
     places = np.vstack([SYNC, np.full((1, 3), np.nan)])
-    return compare_clocks(heard_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
+    return compare_clocks(received_of(rows), RECEIVERS, places, SPEED, 6 * 3600.0)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -127,7 +127,7 @@ def converted(folder, rows, **options):
         (folder / f'{name}.csv').write_text(f'{head},x,y,z\n' + '\n'.join(lines) + '\n')
     options = {'sync': folder / 'sync.csv', 'sound_speed': SPEED, **options}
     return convert_detections(
-        folder / 'vue.csv', folder / 'out', folder / 'stations.csv', **options
+        folder / 'vue.csv', folder / 'out', receivers=folder / 'stations.csv', **options
     )
 
 
@@ -173,5 +173,7 @@ def test_bad_rows_are_counted(tmp_path, row):
     (tmp_path / 'd.csv').write_text(
         f'time_utc,receiver,tag\n2024-05-31 10:00:00,r1,T\n{row}\n2024-05-31 10:00:01,r2,T\n'
     )
-    report = convert_detections(tmp_path / 'd.csv', tmp_path / 'out', tmp_path / 'stations.csv')
+    report = convert_detections(
+        tmp_path / 'd.csv', tmp_path / 'out', receivers=tmp_path / 'stations.csv'
+    )
     assert report.bad_rows == 1 and report.messages == {'/arrivals': 1}

@@ -114,7 +114,7 @@ def test_without_targets_the_receiver_is_the_target(tmp_path):
     lines = [position('RMC', BEGIN + timedelta(seconds=k)) for k in range(5)]
     report = converted(tmp_path, lines)
     assert report.messages == {'/fix': 5} and 'are the fixes' in report.notes['own']
-    with pytest.raises(BagError, match='no position of a target'):
+    with pytest.raises(BagError, match='nothing that could be converted'):
         convert_nmea(tmp_path / 'log.nmea', tmp_path / 'none', own='vessel')
 
 

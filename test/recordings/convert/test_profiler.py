@@ -14,6 +14,7 @@
 
 """What SEG-Y traces tell of their instrument: pulse, noise, spacing and place."""
 
+from helpers.segy_files import write_segy
 import numpy as np
 import pytest
 import yaml
@@ -31,35 +32,30 @@ from sonar_imm_tools.recordings.convert.segy import (
 from sonar_imm_tools.recordings.positions import read_positions
 from sonar_imm_tools.recordings.reader import BagReader
 
-segyio = pytest.importorskip('segyio')
+pytest.importorskip('segyio')
 T, N = 40, 90
 ARRIVAL = 30 + np.arange(T) // 8
 LAG = np.arange(N) - ARRIVAL[:, None]
 ECHO = 1000.0 * np.exp(-0.5 * np.square(LAG / 1.5)) + np.where(LAG > 6, 200.0, 0.0)
 
 
-def write_segy(path, amplitude, *, interval=66, depth_m=0.0, arcsec=True):
-    spec = segyio.spec()
-    spec.format, spec.tracecount = 1, len(amplitude)
-    spec.samples = np.arange(amplitude.shape[1], dtype=float)
-    with segyio.create(str(path), spec) as file:
-        for k, trace in enumerate(amplitude):
-            file.trace[k] = trace.astype(np.float32)
-            file.header[k] = {
-                segyio.TraceField.TRACE_SAMPLE_INTERVAL: interval,
-                segyio.TraceField.TRACE_SAMPLE_COUNT: amplitude.shape[1],
-                segyio.TraceField.YearDataRecorded: 2018,
-                segyio.TraceField.DayOfYear: 72,
-                segyio.TraceField.HourOfDay: 10,
-                segyio.TraceField.SecondOfMinute: k // 4,
-                segyio.TraceField.ElevationScalar: -10,
-                segyio.TraceField.SourceWaterDepth: round(10.0 * depth_m),
-                segyio.TraceField.SourceGroupScalar: -1000,
-                segyio.TraceField.CoordinateUnits: 2 if arcsec else 1,
-                segyio.TraceField.SourceX: round(-91.64 * 3.6e6) + 40 * (k // 4),
-                segyio.TraceField.SourceY: round(17.13 * 3.6e6),
-            }
-    return path
+def profile(path, amplitude, *, depth_m=0.0, arcsec=True):
+    second = np.arange(len(amplitude)) // 4
+    return write_segy(
+        path,
+        amplitude,
+        TRACE_SAMPLE_INTERVAL=66,
+        YearDataRecorded=2018,
+        DayOfYear=72,
+        HourOfDay=10,
+        SecondOfMinute=second,
+        ElevationScalar=-10,
+        SourceWaterDepth=round(10.0 * depth_m),
+        SourceGroupScalar=-1000,
+        CoordinateUnits=2 if arcsec else 1,
+        SourceX=round(-91.64 * 3.6e6) + 40 * second,
+        SourceY=round(17.13 * 3.6e6),
+    )
 
 
 def test_the_pulse_and_the_noise_are_measured():
@@ -86,7 +82,7 @@ def test_an_impossible_spacing_is_said():
 
 
 def test_an_envelope_brings_its_parameters_and_places(tmp_path):
-    path = write_segy(tmp_path / 'line.seg', ECHO, depth_m=12.8)
+    path = profile(tmp_path / 'line.seg', ECHO, depth_m=12.8)
     report = convert_segy(path, tmp_path / 'bag', stack=2)
     assert 'would fit' in report.notes['sample_interval']
     report = convert_segy(path, tmp_path / 'good', stack=2, sample_spacing=0.4)
@@ -105,11 +101,11 @@ def test_an_envelope_brings_its_parameters_and_places(tmp_path):
 
 
 def test_what_is_no_envelope_is_left_alone(tmp_path):
-    path = write_segy(tmp_path / 'line.seg', ECHO - 100.0, arcsec=False)
+    path = profile(tmp_path / 'line.seg', ECHO - 100.0, arcsec=False)
     report = convert_segy(path, tmp_path / 'bag', sample_spacing=0.4)
     assert report.messages == {'/trace': 40} and 'pulse' not in report.notes
     assert not (tmp_path / 'bag' / 'parameters.yaml').exists()
-    path = write_segy(tmp_path / 'deaf.seg', ECHO[:, 34:])
+    path = profile(tmp_path / 'deaf.seg', ECHO[:, 34:])
     report = convert_segy(path, tmp_path / 'deaf', sample_spacing=0.4)
     assert 'no first arrival stands free' in report.notes['pulse']
 
@@ -157,7 +153,7 @@ def test_noise_that_grows_with_the_depth_is_measured(stack):
 
 
 def test_traces_state_noise_that_grows(tmp_path):
-    write_segy(tmp_path / 'in.sgy', line(growth=3.0))
+    profile(tmp_path / 'in.sgy', line(growth=3.0))
     report = convert_segy(tmp_path / 'in.sgy', tmp_path / 'out', sample_spacing=0.1)
     assert 'growing with the depth' in report.notes['pulse']
     own = yaml.safe_load((tmp_path / 'out' / 'parameters.yaml').read_text())

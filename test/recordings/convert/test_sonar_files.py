@@ -330,7 +330,7 @@ class TestEk80:
     def test_what_cannot_be_used_is_said(self, tmp_path, samples):
         with pytest.raises(BagError, match='whose filters the file does not hold'):
             convert_ek80(ek80(tmp_path / 'a.raw', samples, chirp=True, filters=[]), tmp_path / 'o')
-        with pytest.raises(BagError, match='no ping that could be converted'):
+        with pytest.raises(BagError, match='nothing that could be converted'):
             convert_ek80(ek80(tmp_path / 'b.raw', samples), tmp_path / 'bag', channel='ES38')
 
     def test_what_came_before_the_cut_is_kept(self, tmp_path, samples):

@@ -16,6 +16,7 @@
 
 import sys
 
+from helpers.segy_files import write_segy
 import numpy as np
 import pytest
 
@@ -119,22 +120,19 @@ def test_a_table_has_a_row_a_sample(tmp_path):
 @pytest.fixture
 def line(tmp_path):
     """Seven traces of 30 samples every 100 us, four a second, from a recorder that starts late."""
-    segyio = pytest.importorskip('segyio')
-    spec = segyio.spec()
-    spec.samples, spec.tracecount, spec.format = np.arange(30), 7, 3
-    path = tmp_path / 'line.seg'
-    with segyio.create(str(path), spec) as file:
-        for k in range(7):
-            file.header[k] = {
-                segyio.TraceField.YearDataRecorded: 2018,
-                segyio.TraceField.DayOfYear: 72,
-                segyio.TraceField.HourOfDay: 23,
-                segyio.TraceField.MinuteOfHour: 11,
-                segyio.TraceField.SecondOfMinute: 24 + k // 4,
-                segyio.TraceField.TRACE_SAMPLE_INTERVAL: 100,
-                segyio.TraceField.DelayRecordingTime: 20,
-            }
-            file.trace[k] = (100 * k + np.arange(30)).astype(np.int16)
+    rows, path = np.arange(7), tmp_path / 'line.seg'
+    write_segy(
+        path,
+        100 * rows[:, None] + np.arange(30),
+        3,
+        YearDataRecorded=2018,
+        DayOfYear=72,
+        HourOfDay=23,
+        MinuteOfHour=11,
+        SecondOfMinute=24 + rows // 4,
+        TRACE_SAMPLE_INTERVAL=100,
+        DelayRecordingTime=20,
+    )
     return path
 
 

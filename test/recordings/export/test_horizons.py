@@ -18,6 +18,7 @@ import csv
 import json
 import struct
 
+from helpers.segy_files import write_segy
 import numpy as np
 import pytest
 
@@ -37,30 +38,25 @@ LAYERS = 30.0 + 4.0 * np.sin(np.arange(T) / 12.0), 48.0 + np.zeros(T)
 """Samples of two layers in each trace."""
 
 
-def write_line(path, fmt=3):
-    rng = np.random.default_rng(3)
-    sample = np.arange(N)
-    spec = segyio.spec()
-    spec.format, spec.tracecount, spec.samples = fmt, T, sample.astype(float)
-    with segyio.create(str(path), spec) as file:
-        for k in range(T):
-            trace = 40.0 * np.abs(rng.standard_normal(N))
-            for layer in LAYERS:
-                trace += 3000.0 * np.exp(-0.5 * np.square((sample - layer[k]) / 1.5))
-            file.trace[k] = np.round(trace).astype(file.dtype)
-            file.header[k] = {
-                segyio.TraceField.TRACE_SAMPLE_COUNT: N,
-                segyio.TraceField.TRACE_SAMPLE_INTERVAL: 533,
-                segyio.TraceField.YearDataRecorded: 2018,
-                segyio.TraceField.DayOfYear: 72,
-                segyio.TraceField.SecondOfMinute: k // STACK,
-                segyio.TraceField.SourceGroupScalar: -1000,
-                segyio.TraceField.CoordinateUnits: 2,
-                segyio.TraceField.SourceX: round(-91.64 * 3.6e6) + 40 * (k // STACK),
-                segyio.TraceField.SourceY: round(17.13 * 3.6e6),
-                segyio.TraceField.CDP: 500 + k,
-            }
-    return path
+def write_line(path):
+    rng, sample, rows = np.random.default_rng(3), np.arange(N), np.arange(T)
+    traces = 40.0 * np.abs(rng.standard_normal((T, N)))
+    for layer in LAYERS:
+        traces += 3000.0 * np.exp(-0.5 * np.square((sample - layer[:, None]) / 1.5))
+    return write_segy(
+        path,
+        np.round(traces),
+        3,
+        TRACE_SAMPLE_INTERVAL=533,
+        YearDataRecorded=2018,
+        DayOfYear=72,
+        SecondOfMinute=rows // STACK,
+        SourceGroupScalar=-1000,
+        CoordinateUnits=2,
+        SourceX=round(-91.64 * 3.6e6) + 40 * (rows // STACK),
+        SourceY=round(17.13 * 3.6e6),
+        CDP=500 + rows,
+    )
 
 
 @pytest.fixture(scope='module')

@@ -26,7 +26,6 @@ from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
 from sonar_imm_tools.simulation.bathymetry.objects import (
     above,
     FACE,
@@ -35,7 +34,7 @@ from sonar_imm_tools.simulation.bathymetry.objects import (
     surfaces_of,
 )
 from sonar_imm_tools.simulation.bathymetry.ship import ship_of
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, snr
 
 
 def seen(**values):
@@ -69,6 +68,15 @@ def test_a_ledge_has_its_face_before_the_foot_and_its_top_with_the_floor():
     beside = np.isfinite(second)
     assert (np.abs(second - main)[beside] >= 0.5).all()
     np.testing.assert_array_equal(beside, number > 1)
+
+
+def test_a_level_sonar_hears_each_facet_from_its_height():
+    config = scenario('ledge', {'object': 'wall', 'object_size': 3.0})
+    ranges = config.first_range + config.bin_width * np.arange(1200)
+    facets = facets_of(config, ranges, np.full(1200, 100.0))
+    below = ranges[facets.bin] * np.sin(math.radians(config.tilt_deg) + np.arcsin(facets.sine))
+    np.testing.assert_allclose(config.sonar_height - below, facets.height, atol=1e-9)
+    assert facets.height.max() == 3.0
 
 
 @pytest.mark.parametrize('kind', ['box', 'wall', 'boulder'])

@@ -18,8 +18,7 @@ import pytest
 from sonar_imm.acoustics import array, coherence, variances
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm_tools.simulation.bathymetry.hearing import snr
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate, snr
 
 
 def run(name='paper', seed=1, **overrides):

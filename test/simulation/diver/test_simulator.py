@@ -24,8 +24,8 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
 from sonar_imm_tools.simulation.diver.afloat import ORIGIN
-from sonar_imm_tools.simulation.diver.sensors import draw_errors
 from sonar_imm_tools.simulation.diver.simulator import (
+    draw_errors,
     RECEIVERS,
     scenario,
     simulate,

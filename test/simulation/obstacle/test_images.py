@@ -110,12 +110,12 @@ def test_a_point_is_as_strong_wide_and_long_as_told():
     assert -24.0 < 10.0 * np.log10(sidelobes / peak) < -17.0
 
 
-@pytest.mark.parametrize('sound', [0.96, 1.04])
-def test_an_error_of_the_sound_speed_stretches_all_ranges(sound):
+@pytest.mark.parametrize('stretch', [0.96, 1.04])
+def test_an_error_of_the_sound_speed_stretches_all_ranges(stretch):
     imager = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
     d = imager.range[300]
-    image = imager.image(LEVEL, [LEVEL.position + np.array([d, 0.0, 0.0])], sound)
-    assert imager.range[image.max(axis=1).argmax()] == pytest.approx(sound * d, abs=0.1)
+    image = imager.image(LEVEL, [LEVEL.position + np.array([d, 0.0, 0.0])], stretch)
+    assert imager.range[image.max(axis=1).argmax()] == pytest.approx(stretch * d, abs=0.1)
 
 
 def test_what_lies_above_or_below_the_axis_is_fainter():

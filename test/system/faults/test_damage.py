@@ -67,7 +67,7 @@ def damage(folder, kind, rng):
 @pytest.mark.parametrize('kind', KINDS)
 def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
     """What is tracked without a word is what would have been tracked without the damage."""
-    tries, silent, failed, said_so = count(3, 12), [], [], 0
+    tries, silent, failed, reported = count(3, 12), [], [], 0
     figures.skip_if_measured(tries, what=kind)
     rng = np.random.default_rng(len(kind))
     names = ['diver_table1', 'obstacle_movers'] if long_form() else ['diver_table1']
@@ -84,10 +84,10 @@ def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
         problem = (
             code == 2 or message.count('problem') or any(w in message for w in SIGNALS_OF_DAMAGE)
         )
-        said_so += bool(problem)
+        reported += bool(problem)
         if not problem and estimates != whole[name][2]:
             silent.append((turn, message[-300:]))
-    figures.add({'what': kind}, tried=tries, said=said_so, silent=len(silent), failed=len(failed))
+    figures.add({'what': kind}, tried=tries, said=reported, silent=len(silent), failed=len(failed))
     assert not failed and not silent
 
 

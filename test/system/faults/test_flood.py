@@ -83,7 +83,7 @@ def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flo
             rig.send(entry)
         usual = (time.monotonic() - start) / _USUAL
         many = list(itertools.islice(stream, int(seconds * times / usual) + 1))
-        given = Told(rig)
+        given = Sent(rig)
         before = given.counts()
         start = time.monotonic()
         for k, entry in enumerate(many):
@@ -115,7 +115,7 @@ def flooded(case: Case, max_wait: float, *, times: float, seconds: float) -> Flo
         )
 
 
-class Told:
+class Sent:
     """When messages were sent, and how long it took to hear of each. sent: s of the steady clock,
     latency: s, both by stamp."""
 
@@ -124,7 +124,7 @@ class Told:
         self.sent: dict[int, float] = {}
         self.latency: dict[int, float] = {}
         topic = f'/{rig.case.system}/estimate'
-        rig.link.node.create_subscription(PointCloud2, topic, self._heard, lockstep_qos())
+        rig.link.node.create_subscription(PointCloud2, topic, self._answered, lockstep_qos())
         rig.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
         rig.diagnostics.forget()
 
@@ -148,7 +148,7 @@ class Told:
             lost=given[f'lost on {topic}'] + given[f'lost on /{topic}'],
         )
 
-    def _heard(self, message: PointCloud2) -> None:
+    def _answered(self, message: PointCloud2) -> None:
         stamp = message.header.stamp
         stamp_ns = stamp.sec * SECOND + stamp.nanosec
         if stamp_ns in self.sent:

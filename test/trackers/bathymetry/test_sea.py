@@ -18,18 +18,19 @@ from attrs import evolve
 from helpers.sea import motion_case, navigation, sea_config, snapshots, START_NS, swath_of
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.likelihood_kernels import likelihood_table
 from sonar_imm.estimates import PLACES
-from sonar_imm.measurements import Altitude, Navigation
+from sonar_imm.measurements import Altitude, Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
-from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
 from sonar_imm.trackers.bathymetry.kernels import state_log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
-from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 CASE = motion_case()
 
@@ -350,3 +351,83 @@ def test_navigation_in_another_frame_is_counted():
     tracker.process(Navigation(stamp_ns=1, frame_id='map', **pose))
     tracker.process(Navigation(stamp_ns=2, frame_id='odom', **pose))
     assert tracker.counts['other_frame'] == 1 and tracker.counts['poses'] == 1
+
+
+EXACT = {
+    f'nav_{what}': 0.0
+    for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
+}
+
+
+def tracked(config, measurements):
+    tracker = BathymetryTracker(config)
+    return [each for measurement in measurements for each in tracker.process(measurement)]
+
+
+def test_a_heading_that_passes_through_180_degrees_is_no_jump():
+    """The heading of the case, about 30 degrees, put to south; and quaternions that change their
+    sign, which says nothing."""
+    config = sea_config(CASE, engine='grid')
+    poses, pings = navigation(CASE), list(snapshots(CASE))[:3]
+    plain = tracked(config, [*poses, *pings])
+    heading = np.array(
+        [Rotation.from_quat(np.array(each.orientation)).as_euler('ZYX')[0] for each in poses]
+    )
+    turn = Rotation.from_euler('z', np.pi - np.median(heading))
+    turned = []
+    for k, each in enumerate(poses):
+        q = (turn * Rotation.from_quat(np.array(each.orientation))).as_quat()
+        turned.append(
+            evolve(
+                each, position=turn.apply(np.array(each.position)), orientation=q if k % 2 else -q
+            )
+        )
+    south = np.array(
+        [Rotation.from_quat(np.array(each.orientation)).as_euler('ZYX')[0] for each in turned]
+    )
+    assert (south > 3.0).any() and (south < -3.0).any()
+    found = tracked(config, [*turned, *pings])
+    for a, b in zip(plain, found, strict=True):
+        assert b.state == pytest.approx(a.state, abs=1e-6)
+        assert b.xyz == pytest.approx(turn.apply(np.array(a.xyz, float)), abs=2e-5)
+
+
+def in_summer(**changes):
+    scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
+    made = simulate(scene, 3)
+    config = BathymetryConfig.from_mapping({**scene.instruments(), 'engine': 'grid'})
+    config = config.for_inputs(frozenset({'snapshot', 'nav'}))
+    return made, config, [each.measurement for each in made.measurements]
+
+
+def height_rmse(estimates, truth):
+    error = np.array([each.state[:, 0] for each in estimates]) - [each.height for each in truth]
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+def test_depth_in_the_profile_is_counted_from_the_surface():
+    """The same sea 40 m higher: the floor is 40 m higher, and bends as before."""
+    made, config, measurements = in_summer()
+    lifted = [
+        evolve(each, position=each.position + [0.0, 0.0, 40.0])
+        if isinstance(each, Navigation)
+        else each
+        for each in measurements
+    ]
+    plain = tracked(config, measurements)
+    higher = tracked(evolve(config, water_level=config.water_level + 40.0), lifted)
+    for a, b in zip(plain, higher, strict=True):
+        assert b.state[:, 0] - 40.0 == pytest.approx(a.state[:, 0], abs=1e-6)
+    assert height_rmse(plain, made.truth) < 0.17
+
+
+@pytest.mark.parametrize('mistake', ['from the sonar', 'from the zero of the world'])
+def test_a_profile_counted_from_elsewhere_is_seen(mistake):
+    level = 0.0 if mistake == 'from the sonar' else 10.0
+    made, config, measurements = in_summer(water_level=level)
+    array = level - 5.0  # the array is 5 m deep
+    wrong = evolve(config, water_level=array if mistake == 'from the sonar' else 0.0)
+    pings = sum(isinstance(each, Snapshot) for each in measurements)
+    found, right = (tracked(each, measurements) for each in (wrong, config))
+    assert len(found) == pings
+    assert height_rmse(found, made.truth) > 0.4 > 0.2 > height_rmse(right, made.truth)

@@ -29,6 +29,8 @@ from sonar_imm.measurements import Fix, Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.config import MODEL_SETS
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
@@ -387,3 +389,43 @@ def test_the_system_is_registered():
     assert math.isnan(tracker.health()['effective_sample_size'])
     tracker.reset()
     assert tracker.counts == {} and tracker.health() == {}
+
+
+# -- what once wrote outside of its arrays; NUMBA_BOUNDSCHECK=1 shows where ----------------------
+
+
+@pytest.mark.parametrize('smoothing', ['none', 'states'])
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'sigmas': (0.03, 20.0), 'grid_extent': 0.1},
+        {'sigmas': (0.03, 20.0), 'grid_extent': 0.1, 'sigma_reference_bin': 1e-300},
+        {'sigmas': (0.0, 20.0), 'sigma_reference_bin': 1e-320},
+        {'grid_step': 1e-320, 'grid_extent': 0.1},
+    ],
+)
+def test_a_walk_wider_than_the_grid_is_no_harm(values, smoothing):
+    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(30))
+    table = run(snapshot, engine='grid', smoothing=smoothing, **values).columns()
+    assert (np.abs(table['height']) <= 20.0).all()
+    assert table['prob_rw_smooth'] + table['prob_rw_rough'] == pytest.approx(1.0)
+
+
+def test_a_chain_that_never_switches_is_no_harm():
+    """The probability of the wrong model falls below the smallest number with a reciprocal."""
+    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(1500))
+    table = run(snapshot, stay_probability=1.0, sigmas=(0.01, 5.0)).columns()
+    probability = table['prob_rw_rough']
+    assert ((probability > 0.0) & (probability < 1e-307)).any()
+    assert np.sqrt(np.mean(np.square(table['height']))) < 0.1
+
+
+def test_direction_sines_write_only_those_asked_for():
+    state = np.linspace(-1.0, 1.0, 5)
+    for of_heights in (True, False):
+        geometry = level_geometry(
+            np.full(3, 20.0), 15.0, math.asin(0.6), 0.5, of_heights=of_heights
+        )
+        work, out = np.zeros((2, 9)), np.full(9, -7.0)
+        sines_of(state, 1, geometry, work, out[:5])
+        assert (out[5:] == -7.0).all() and np.isfinite(out[:5]).all()

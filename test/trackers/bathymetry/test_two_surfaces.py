@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Both heights of bins with two surfaces: the likelihood, the smoother, and what becomes of it."""
+"""Bins with two surfaces: the likelihood, the smoother, what is marked and given."""
 
 import math
 from pathlib import Path
@@ -25,13 +25,14 @@ import pytest
 
 from sonar_imm.acoustics import layover
 from sonar_imm.acoustics.variances import mean_power, signal_variance
+from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry import two_surfaces as two
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.ping import look, Ping
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 VECTORS = Path(__file__).parents[2] / 'vectors' / 'layover'
-NEW = ['height_2', 'height_2_std']
+OF_GATED, NEW = ['existence_2', 'surfaces'], ['height_2', 'height_2_std']
 
 
 def step(at=slice(150, 200), up=2.0, **more):
@@ -172,7 +173,7 @@ def test_both_heights_of_a_step(values):
     # The lower height is the state, with its variance, and the place is its own.
     np.testing.assert_allclose(resolved.xyz[:, 2], a['height'] - 15.0, atol=1e-5)
     # Bins that one wave does not explain are no longer silent.
-    assert ((b['surfaces'] == 0) & double).sum() > 3
+    assert ((run(snapshot, 'ignored', **values)[1].extras['valid'] == 0) & double).sum() > 3
     single = ~double
     for name in b:
         if name not in ('existence_2', 'surfaces', 'valid', 'told'):  # told: 2 where gated
@@ -282,8 +283,11 @@ def test_the_grid_holds_both_ends_of_a_stretch():
     assert len(two._cells(20.0 * ledge, 50, 70)) == two.MOST_CELLS
 
 
-def test_warm_compiles_what_resolved_needs():
-    tracker = BathymetryTracker(BathymetryConfig(layover='resolved'))
+@pytest.mark.parametrize('value', ['gated', 'resolved'])
+def test_warm_compiles_what_two_surfaces_need(value):
+    tracker = BathymetryTracker(BathymetryConfig(layover=value))
+    names = [name for name, _ in tracker.warm_steps({Snapshot})]
+    assert names == ['pings', 'surfaces'][: 1 + (value == 'resolved')]
     tracker.warm()
     before = list(two.smooth_stretch.signatures)
     assert before
@@ -293,4 +297,56 @@ def test_warm_compiles_what_resolved_needs():
 
 @pytest.mark.parametrize('values', [{'multipath': True}, {'variant': 'paper'}])
 def test_surface_echoes_and_the_paper_leave_layover_alone(values):
-    assert not set(NEW) & set(run(floor(0.0), **values)[1].extras)
+    assert not {*OF_GATED, *NEW} & set(run(floor(0.0), **values)[1].extras)
+
+
+@pytest.mark.parametrize(
+    'staves, values',
+    [(8, {}), (8, {'model_set': 'height_bank'}), (8, {'engine': 'grid'}), (3, {})],
+)
+def test_a_gated_bin_is_marked_and_nothing_else_changes(staves, values):
+    snapshot = step(P=staves)
+    tracker, gated = run(snapshot, 'gated', **values)
+    ignored_by, ignored = run(snapshot, 'ignored', **values)
+    a, b = gated.columns(), ignored.columns()
+    assert [name for name in a if name not in b] == OF_GATED
+    for name in b:
+        if name not in ('valid', 'told'):
+            np.testing.assert_array_equal(a[name], b[name])
+    double = a['surfaces'] == 2
+    outside = np.delete(double, slice(145, 205)).mean()
+    assert double[150:200].mean() > (0.95 if staves == 8 else 0.5)
+    assert outside == 0.0 if staves == 8 else outside < 0.1
+    np.testing.assert_array_equal(a['valid'], b['valid'] & ~double)
+    np.testing.assert_array_equal(a['told'], np.where(double, 2, b['told']))
+    np.testing.assert_array_equal(a['surfaces'] == 0, (b['valid'] == 0) & ~double)
+    np.testing.assert_array_equal(double, a['existence_2'] > np.float32(layover.GATE))
+    assert a['existence_2'].dtype == np.float32 and a['surfaces'].dtype == np.uint8
+    assert tracker.counts['bins_two'] == double.sum() > 0
+    assert 'bins_two' not in ignored_by.counts and 'array_error' not in ignored_by.health()
+    assert tracker.health()['array_error'] >= layover.LEAST_ERROR
+
+
+@pytest.mark.parametrize('value', ['gated', 'resolved'])
+def test_silent_bins_have_no_second_surface(value):
+    _, made = run(step(shadow=slice(150, 200), at=slice(0, 0)), value)
+    silent = made.extras['surfaces'] == 0
+    assert silent[150:200].mean() > 0.9
+    assert (made.extras['existence_2'][silent] == 0.0).all()
+
+
+@pytest.mark.parametrize('staves', [2, 3, 4])
+def test_a_flat_floor_has_one_surface_whatever_the_staves(staves):
+    tracker, made = run(floor(0.0, P=staves), 'gated')
+    assert tracker.counts['bins_two'] <= 2 and 'surfaces' in made.extras
+
+
+def test_a_wrong_array_is_warned_of():
+    rng = np.random.default_rng(1)
+    snapshot = floor(0.0, snr_db=35.0)
+    off = np.exp(1j * np.radians(rng.normal(0.0, 12.0, 8)))
+    assert not run(snapshot, 'gated')[0].warnings()
+    tracker, made = run(evolve(snapshot, iq=snapshot.iq * off), 'gated')
+    assert any('plane wave' in sentence for sentence in tracker.warnings())
+    assert tracker.health()['array_error'] > 0.01
+    assert (made.extras['surfaces'] == 2).mean() < 0.05

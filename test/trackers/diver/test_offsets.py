@@ -146,7 +146,7 @@ def test_pings_that_any_place_explains_say_nothing():
 # -- what is assumed where nothing is stated -----------------------------------------------------
 
 
-def heard_by(config, place, tag=False):
+def evidence_of(config, place, tag=False):
     """The evidence after one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
     models, everyone = build_models(config), np.ones(4, bool)
     ping = Arrivals(
@@ -184,7 +184,7 @@ def placed(path, guess, receivers, tag):
 def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag):
     """Against draws of receivers, clocks and sound speeds, and least squares of each."""
     config, place = DiverConfig(), np.array([20.0, 30.0])
-    wide = heard_by(config, place, tag).widened(
+    wide = evidence_of(config, place, tag).widened(
         np.array([[*place, 0.0, 0.0]]), np.zeros((1, 4, 4)), config
     )
     rng, found = np.random.default_rng(2), []
@@ -202,7 +202,7 @@ def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag
 def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
     mean, nothing = np.array([[20.0, 30.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
     config = DiverConfig()
-    found = heard_by(config, mean[0, :2])
+    found = evidence_of(config, mean[0, :2])
     assert Offsets().widened(mean, nothing, config) is nothing
     exact = DiverConfig(systematic_errors='exact')
     assert found.widened(mean, nothing, exact) is nothing
@@ -228,7 +228,7 @@ def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
 
 def test_pairs_that_fell_silent_are_forgotten():
     config = DiverConfig()
-    found = heard_by(config, np.array([20.0, 30.0])).heard
+    found = evidence_of(config, np.array([20.0, 30.0])).recent
     nobody = found
     for _ in range(offsets.RECENT):
         nobody = nobody._replace(age=nobody.age + 1.0)

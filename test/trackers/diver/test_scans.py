@@ -95,13 +95,13 @@ def test_no_scan_is_no_evidence():
 
 
 def test_existence_is_published_and_not_a_number_where_hits_are_counted():
-    soft_one, hard = (DiverTracker(DiverConfig(association=name)) for name in ('jipda', 'gnn'))
+    jipda, gnn = (DiverTracker(DiverConfig(association=name)) for name in ('jipda', 'gnn'))
     for second in range(1, 6):
-        for tracker in (soft_one, hard):
+        for tracker in (jipda, gnn):
             (estimate,) = tracker.process(scan(second, (0.0, 0.0)))
             known = estimate.extras['existence']
-            assert len(known) == 1 and (np.isfinite(known).all() == (tracker is soft_one))
-            assert tracker is hard or 0.5 < known[0] <= 1.0
+            assert len(known) == 1 and (np.isfinite(known).all() == (tracker is jipda))
+            assert tracker is gnn or 0.5 < known[0] <= 1.0
 
 
 def test_a_false_fix_in_clutter_is_not_published():
@@ -110,6 +110,21 @@ def test_a_false_fix_in_clutter_is_not_published():
     assert len(estimate) == 0
     (row,) = tracker._stream.state.existence
     assert row == pytest.approx(1.2e-5 / (1.2e-5 + 4e-4))
+
+
+@pytest.mark.parametrize('most', [1, 2])
+def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
+    """The share of one track in one fix, by Bayes: of a second diver only where there may be."""
+    config = DiverConfig(max_tracks=most, clutter_density=1e-5, birth_density=1e-4)
+    tracker = DiverTracker(config)
+    run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
+    now, _ = tracker._predict(tracker._stream.state, 11 * SECOND)
+    (fixes,) = tracker._scan(now, [scan(11, (7.5, 1.9))]).fixes
+    found = tracker._associate(now, fixes)
+    p, r = config.detection_probability, now.existence[0]
+    seen = r * p * np.exp(found.densities.whole[0, 0]) / (1e-5 + (most - 1) * 1e-4)
+    assert 0.01 < found.weights.beta[0, 0] < 0.99
+    assert found.weights.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
 
 
 def test_a_diver_is_confirmed_by_existence_and_evidence():
@@ -163,10 +178,10 @@ def test_late_scans_give_the_same_bits(association):
 def test_crossing_in_clutter_is_better_softly():
     from benchmarks.diver_crossing import case
 
-    hard, soft_one = (case(0.9, 10.0, name, 2) for name in ASSOCIATIONS)
-    assert soft_one['GOSPA, rms'] <= 2.7 < 3.5 < hard['GOSPA, rms']
-    assert soft_one['false tracks/h'] == 0.0 and soft_one['identities kept'] == 1.0
-    assert soft_one['NEES'] < 2.6
+    gnn, jipda = (case(0.9, 10.0, name, 2) for name in ASSOCIATIONS)
+    assert jipda['GOSPA, rms'] <= 2.7 < 3.5 < gnn['GOSPA, rms']
+    assert jipda['false tracks/h'] == 0.0 and jipda['identities kept'] == 1.0
+    assert jipda['NEES'] < 2.6
 
 
 def test_a_smoother_takes_scans_and_hides_what_does_not_exist():

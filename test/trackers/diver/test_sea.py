@@ -64,9 +64,9 @@ def scores(runs):
 
 
 def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
-    told_wrong = judged('at_depth', {}, {})
+    misplaced = judged('at_depth', {}, {})
     rmse, nees, estimates = judged('at_depth', {}, {'dimensions': 3})
-    assert told_wrong[1] > 5.0 and rmse < 0.4 and nees < 2.6
+    assert misplaced[1] > 5.0 and rmse < 0.4 and nees < 2.6
     assert estimates[-1].state_names == ('px', 'py', 'pz', 'vx', 'vy', 'vz')
     assert estimates[-1].model_names[0] == 'steady_heading_000'
     np.testing.assert_allclose(estimates[-1].probabilities.sum(axis=1), 1.0)

@@ -14,64 +14,21 @@
 
 """Noise measured where no echo is: in the mirror window, and in what reflectors leave."""
 
-from collections import Counter
-from pathlib import Path
-
 from helpers.fathometer_runs import run
 from helpers.sea_scenes import score_scene, sea_scene
 import numpy as np
 import pytest
 
 from sonar_imm.acoustics.fathometer import depth_response
-from sonar_imm.measurements import Pressure, Rejection, Trace
+from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import array_response, Lattice, mirror_sigma
+from sonar_imm.trackers.fathometer.response import Lattice, mirror_sigma
 
-SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 
 
-@pytest.fixture(scope='module')
-def vectors():
-    with np.load(SEA / 'pressure.npz') as file:
-        return {name: file[name] for name in file}
-
-
-def config_of(vectors, **changes):
-    return FathometerConfig(
-        phones=16,
-        element_spacing=float(vectors['element_spacing']),
-        snapshot_seconds=float(vectors['snapshot_seconds']),
-        record_seconds=float(vectors['record_seconds']),
-        frequency_min=float(vectors['frequency_min']),
-        frequency_max=float(vectors['frequency_max']),
-        **changes,
-    )
-
-
-@pytest.mark.parametrize('record', [0, 1])
-def test_response_and_noise_from_pressure_are_those_of_the_vectors(vectors, record):
-    config = config_of(vectors, **MIRROR)
-    depth = vectors['depth']
-    lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
-    block = Pressure(
-        stamp_ns=1,
-        pressure=vectors['p'][record] * vectors['scale'][record],
-        sample_rate=float(vectors['sample_rate']),
-    )
-    (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
-    spectra = collected.spectra
-    assert spectra.snapshots == vectors['snapshots']
-    found = array_response(spectra, lattice, config, float(vectors['array_depth'][record]))
-    expected = vectors['response'][record]
-    assert np.abs(found.amplitude - expected).max() < 1e-4 * np.abs(expected).max()
-    assert np.ptp(found.sigma) == 0.0
-    assert found.sigma[0] == pytest.approx(vectors['sigma_mirror'][record], rel=1e-4)
-
-
-def test_the_mirror_lies_at_negative_lags(vectors):
+def test_the_mirror_lies_at_negative_lags():
     """What lies above the array would be seen in the mirror window; what lies below is not."""
     lattice = Lattice(50.0, 0.05, 400)
     rng = np.random.default_rng(0)

@@ -93,7 +93,8 @@ def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
 
 def test_negative_layers_are_found_where_they_are_looked_for():
     scene = sea_scene('negative')
-    _, found = run(scene.traces(), particles=3000, polarity='both')
+    tracker, found = run(scene.traces(), particles=3000, polarity='both')
+    assert tracker.warnings() == []
     score = score_scene(found, scene, after=5)
     assert score.right >= 0.95 and score.ospa <= 0.03
     for stamp, estimate in found.items():
@@ -103,7 +104,8 @@ def test_negative_layers_are_found_where_they_are_looked_for():
             assert np.array_equal(estimate.extras['polarity'], expected)
             assert np.array_equal(np.sign(estimate.state[:, 1]), expected)
             assert estimate.extras['polarity'].dtype == np.int8
-    _, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
+    tracker, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
+    assert 'negative echoes' in ' '.join(tracker.warnings())
     assert score_scene(found, scene, after=5).right == 0.0
     assert all((each.extras['polarity'] >= 0).all() for each in found.values())
 
@@ -114,13 +116,3 @@ def test_envelopes_have_no_negative_reflectors():
     assert FathometerConfig(polarity='positive').negative_share == 0.0
     with pytest.raises(ConfigError, match='negative_probability'):
         FathometerConfig(negative_probability=1.0)
-
-
-def test_threads_do_not_change_a_byte_of_either_sign():
-    scene = sea_scene('negative')
-
-    def columns(**parameters):
-        _, found = run(scene.traces(range(6)), particles=1001, polarity='both', **parameters)
-        return [c.tobytes() for each in found.values() for c in each.columns().values()]
-
-    assert columns() == columns(threads=4)

@@ -21,6 +21,7 @@ from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
+from benchmarks import fathometer_vectors
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.set_filter import Members
@@ -38,19 +39,11 @@ from sonar_imm.trackers.fathometer.reflectors import (
 from sonar_imm.trackers.fathometer.response import Lattice, pulse_of, Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
-SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
+VECTORS = Path(__file__).parents[2] / 'vectors'
 
 
 def test_the_thickness_of_sediment_is_that_of_the_vectors():
-    with np.load(SEA / 'sediment.npz') as file:
-        time, speeds, gradients, thickness = (
-            file[name]
-            for name in ('two_way_time_below_bottom', 'sound_speed', 'gradient', 'thickness')
-        )
-    assert (gradients > 0.0).any() and (gradients == 0.0).any()
-    for speed, gradient, expected in zip(speeds, gradients, thickness, strict=True):
-        found = sediment_thickness(time, float(speed), float(gradient))
-        assert np.abs(found - expected).max() < 1e-9
+    assert fathometer_vectors.sediment(VECTORS)['sediment: m'] < 1e-9
 
 
 def test_sound_takes_as_long_through_the_thickness_as_was_measured():

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from benchmarks.real_navigation import data_folder, dead_reckoned, summary
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.parameters import ConfigError
@@ -386,3 +387,18 @@ def test_at_the_edge_of_the_sector_nothing_is_missed(edge, counted):
     mixture = filter_.begin(z, np.tile(np.diag([0.02, 2e-5]), (2, 1, 1)), sonar)
     in_beam, ahead = filter_.outlook(mixture, sonar)
     assert (in_beam[0] > 0.3) == counted and in_beam[1] > 0.3 and ahead.all()
+
+
+@pytest.mark.statistics
+@pytest.mark.skipif(
+    not (data_folder() / 'dvl.csv').exists(),
+    reason='the recorded navigation is not there (SONAR_IMM_DATA)',
+)
+def test_the_band_holds_the_offset_under_real_motion():
+    found = summary(dead_reckoned(data_folder()), runs=20)
+    assert found['tracked'] == 20
+    assert found['band_coverage'] >= 0.8
+    assert found['nees'] < 2.0
+    # It knows more than where obstacles are drawn, and than its own first answer.
+    assert found['rmse_m'] < 0.9 * min(found['answering_zero_rmse_m'], found['spread_of_truth_m'])
+    assert found['rmse_m'] < 0.9 * found['first_answer_rmse_m']

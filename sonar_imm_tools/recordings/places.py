@@ -12,14 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Positions of CSV rows in local east-north-up metres, also from latitude and longitude."""
+"""Positions of CSV rows in local metres: from latitude and longitude, or by range and bearing."""
 
 from __future__ import annotations
 
 import math
+import re
+
+import numpy as np
 
 from msg_adapters.arrivals import FARTHEST
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
+from sonar_imm.estimation.arrays import FloatArray
 
 from .csv_table import BadRow, Row, Table
 from .sources import BagError
@@ -106,3 +111,69 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
         raise BagError(f'an origin is latitude, longitude and optionally height, got {origin}')
     latitude, longitude, height = (*map(float, origin), 0.0)[:3]
     return latitude, longitude, height
+
+
+BEARINGS = ('bow', 'north', 'east')
+"""Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
+_TURN = 6.3
+
+
+class PolarRows:
+    """Range and bearing of rows as x and y, and their covariance.
+
+    x and y are forward and to port for bearings from the bow, else east and north. range_std, m,
+    and bearing_std_deg are for rows that state none; where those are missing too, a row has no
+    covariance. A bearing is in degrees unless its header says rad.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        counted_from: str,
+        range_std: float | None = None,
+        bearing_std_deg: float | None = None,
+    ):
+        table.require('range', 'bearing')
+        for name, other in (('std_range', 'std_bearing'), ('std_bearing', 'std_range')):
+            if table.has(name) and (range_std, bearing_std_deg) == (None, None):
+                table.require(other)
+        self._table, self._counted_from = table, counted_from
+        self._unit = _radians(table.header('bearing')) or math.radians(1.0)
+        self._std_unit = _radians(table.header('std_bearing')) or self._unit
+        self._range_std = math.nan if range_std is None else range_std
+        self._bearing_std = math.nan if bearing_std_deg is None else math.radians(bearing_std_deg)
+        self._largest = 0.0
+
+    def place(self, row: Row) -> tuple[FloatArray, FloatArray | None]:
+        """x and y (2,), m, and covariance (2, 2) or None. Raises `BadRow`."""
+        distance, bearing = row.number('range'), row.number('bearing')
+        if distance < 0.0:
+            raise BadRow(f'{row.table.header("range")} is {distance:g}, a negative distance')
+        if abs(bearing) * self._unit > 2.0 * _TURN:
+            raise BadRow(f'{row.table.header("bearing")} is {bearing:g}, more than two turns')
+        self._largest = max(self._largest, abs(bearing))
+        angle = bearing * self._unit
+        angle = {'bow': -angle, 'north': 0.5 * math.pi - angle, 'east': angle}[self._counted_from]
+        std_range, std_bearing = row.optional('std_range'), row.optional('std_bearing')
+        std_range = std_range if std_range > 0.0 else self._range_std
+        std_bearing = std_bearing * self._std_unit if std_bearing > 0.0 else self._bearing_std
+        if math.isnan(std_range + std_bearing):
+            return distance * np.array([math.cos(angle), math.sin(angle)]), None
+        if std_bearing > 1.0:
+            raise BadRow(f'the bearing is good to {math.degrees(std_bearing):g} degrees only')
+        return unbiased_polar_to_cartesian(distance, angle, std_range**2, std_bearing**2)
+
+    def check_unit(self) -> None:
+        """Raise `BagError` where neither the header nor the bearings say degrees or radians."""
+        header = self._table.header('bearing')
+        if _radians(header) is None and 0.0 < self._largest <= _TURN:
+            raise BagError(
+                f'{self._table.path}: {header} may be degrees or radians, none is beyond '
+                f'{self._largest:.3g}; write bearing_deg or bearing_rad in the header'
+            )
+
+
+def _radians(header: str) -> float | None:
+    """The unit of an angle that its header names, in radians."""
+    unit = re.search(r'[_ \[(](deg|rad|°)', header.lower())
+    return None if unit is None else 1.0 if unit.group(1) == 'rad' else math.radians(1.0)

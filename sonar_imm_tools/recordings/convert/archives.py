@@ -1,0 +1,401 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Numpy archives (npz): array snapshots, and ready-made traces such as depth responses computed
+elsewhere; traces also as CSV.
+
+The arrays of snapshots are found by their usual names (`NAMES`); other names can be given. Needed
+are the complex samples, (bins, staves) for one ping or (pings, bins, staves), and the range or the
+two-way time of each bin. Where the archive also has the true floor, with the height and tilt of
+the sonar, it goes to ``/truth/estimate``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+import math
+from pathlib import Path
+import zipfile
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters.array_records import write_trace
+from msg_adapters.snapshots import write_snapshot
+from sonar_imm.acoustics import array
+from sonar_imm.measurements import Rejection, Snapshot, Trace
+from sonar_imm.truth import PRESENT, TrueProfile, TrueReflectors
+
+from ..conversion import ConversionReport, converter, Record, write_bag
+from ..convert_options import SnapshotsOptions, TracesOptions
+from ..csv_table import CsvTable, Row
+from ..mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
+from ..messages import ros_message
+from ..sources import BagError
+from ..truth import records_of
+
+NAMES: dict[str, tuple[str, ...]] = {
+    'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
+    'range': ('range', 'range_m', 'ranges', 'r'),
+    'time': ('time', 'two_way_time'),
+    'stamp': ('stamp', 'stamps'),
+    'sound_speed': ('sound_speed', 'c'),
+    'frequency': ('frequency', 'f0'),
+    'element_spacing': ('element_spacing',),
+    'spacing_wavelengths': ('spacing_wavelengths', 'element_spacing_wavelengths', 'dlam'),
+    'sample_rate': ('sample_rate', 'fs'),
+    'noise_variance': ('noise_variance', 'sn2'),
+    'signal_variance': ('signal_variance', 'ss2'),
+    'snr': ('snr', 'rho'),
+    'height': ('height', 'h'),
+    'patch': ('patch',),
+    'sonar_height': ('sonar_height', 'H'),
+    'tilt': ('tilt',),
+}
+"""Usual names of each array; the first one that the archive has is taken. Stamps in seconds,
+spacings in metres or wavelengths, snr linear and at one stave, tilt in radians."""
+
+TRACE_NAMES = {
+    'depth', 'amplitude', 'sigma', 'reference_depth', 'reflector_depth', 'reflector_amplitude',
+}  # fmt: skip
+"""The arrays of traces that are read, beside their stamps."""
+
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+Arrays = dict[str, NDArray]
+_CONSTANTS = ('sound_speed', 'frequency', 'sample_rate')
+
+
+@converter(SnapshotsOptions)
+def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionReport) -> None:
+    """Convert an npz archive to the topic ``/snapshot``, one message per ping."""
+    content = _Archive(path, how.names)
+    samples = _samples(content, how.staves)
+    stamps = _stamps(content.path, content.get('stamp'), len(samples), how.ping_rate, 'pings')
+    constants = {name: content.number(name) for name in _CONSTANTS}
+    constants['element_spacing'] = _element_spacing(content, constants, report)
+    records: list[Record] = []
+    for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
+        report.rows += 1
+        try:
+            snapshot = _snapshot(content, ping, stamp, iq, constants, how.frame_id)
+        except Rejection as error:
+            report.bad_row(content.path, f'ping {ping}', error)
+            continue
+        records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
+        if (profile := _true_floor(content, ping, snapshot)) is not None:
+            records += records_of(profile, '')
+    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+
+
+class _Archive:
+    """The arrays of an npz file, by the names of `NAMES`."""
+
+    def __init__(self, path: str | Path, names: Mapping[str, str]):
+        self.path = Path(path)
+        if unknown := [name for name in names if name not in NAMES]:
+            raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
+        there = read_npz(self.path)
+        wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
+        self._arrays: dict[str, NDArray] = {}
+        for what, candidates in wanted.items():
+            found = [name for name in candidates if name in there]
+            if found:
+                self._arrays[what] = numbers_of(self.path, found[0], there[found[0]])
+            elif what in names:
+                raise BagError(f"{path} has no array '{names[what]}'; it has {', '.join(there)}")
+        self.listed = ', '.join(there)
+
+    def get(self, what: str) -> NDArray | None:
+        return self._arrays.get(what)
+
+    def need(self, what: str) -> NDArray:
+        if what not in self._arrays:
+            raise BagError(
+                f'{self.path} has no array {" or ".join(NAMES[what])}; it has {self.listed}'
+            )
+        return self._arrays[what]
+
+    def number(self, what: str) -> float | None:
+        """Give a scalar; None when the archive has none."""
+        value = self.get(what)
+        if value is None:
+            return None
+        if value.size != 1 or not np.isfinite(value).all():
+            raise BagError(f'{self.path}: {what} has to be one finite number')
+        return float(value.ravel()[0])
+
+    def per_bin(self, what: str, ping: int, bins: int) -> NDArray | None:
+        """Give the row (bins,) of a ping, from one number, (bins,) or (pings, bins); None when the
+        archive has none."""
+        value = self.get(what)
+        if value is None:
+            return None
+        row = value[min(ping, len(value) - 1)] if value.ndim == 2 and len(value) else value
+        if row.size == 1:
+            return np.full(bins, row.ravel()[0])
+        if row.shape != (bins,):
+            raise Rejection('bad_shape', f'{what} has the shape {value.shape} for {bins} bins')
+        return row
+
+
+def _samples(content: _Archive, staves: Sequence[Sequence[int]] | None) -> NDArray:
+    """The samples (pings, bins, staves)."""
+    iq = content.need('iq')
+    if iq.ndim not in (2, 3) or not np.issubdtype(iq.dtype, np.complexfloating):
+        raise BagError(
+            f'{content.path}: the samples are {iq.dtype} of shape {iq.shape}; complex of shape '
+            '(bins, staves) or (pings, bins, staves) are needed'
+        )
+    iq = iq[None] if iq.ndim == 2 else iq
+    if staves is None:
+        return iq
+    channels = iq.shape[2]
+    if wrong := [k for stave in staves for k in stave if not 0 <= k < channels]:
+        raise BagError(f'{content.path} has the channels 0 to {channels - 1}, not {wrong[0]}')
+    return np.stack([iq[:, :, list(stave)].sum(axis=2) for stave in staves], axis=2)
+
+
+def _element_spacing(
+    content: _Archive, constants: Mapping[str, float | None], report: ConversionReport
+) -> float | None:
+    """Metres between staves. A spacing in wavelengths that cannot be converted is noted instead,
+    for the parameters of the tracker."""
+    metres = content.number('element_spacing')
+    wavelengths = content.number('spacing_wavelengths')
+    if metres is not None or wavelengths is None:
+        return metres
+    speed, frequency = constants['sound_speed'], constants['frequency']
+    if speed and frequency:
+        return wavelengths * speed / frequency
+    report.notes['element_spacing_wavelengths'] = f'{wavelengths:g}'
+    return None
+
+
+def _snapshot(
+    content: _Archive,
+    ping: int,
+    stamp: int,
+    iq: NDArray,
+    constants: Mapping[str, float | None],
+    frame_id: str,
+) -> Snapshot:
+    bins = len(iq)
+    ranges, time = content.per_bin('range', ping, bins), None
+    if ranges is None:
+        content.need('time')
+        time = content.per_bin('time', ping, bins)
+        assert time is not None
+        ranges = np.asarray(0.5 * (constants['sound_speed'] or 1500.0) * time)
+    noise = content.per_bin('noise_variance', ping, bins)
+    signal = content.per_bin('signal_variance', ping, bins)
+    ratio = content.per_bin('snr', ping, bins)
+    if signal is None and ratio is not None and noise is not None:
+        signal = ratio * noise
+    return Snapshot(
+        stamp_ns=stamp,
+        frame_id=frame_id,
+        range=ranges,
+        iq=iq,
+        two_way_time=time,
+        noise_variance=noise,
+        signal_variance=signal,
+        sound_speed=constants['sound_speed'],
+        frequency=constants['frequency'],
+        element_spacing=constants['element_spacing'],
+        sample_rate=constants['sample_rate'],
+    )
+
+
+def _true_floor(content: _Archive, ping: int, snapshot: Snapshot) -> TrueProfile | None:
+    """The true floor, when the archive has it and says where the sonar was."""
+    bins = len(snapshot)
+    height = content.per_bin('height', ping, bins)
+    sonar_height, tilt = content.number('sonar_height'), content.number('tilt')
+    if height is None or sonar_height is None or tilt is None or not math.isfinite(tilt):
+        return None
+    depth = sonar_height - height
+    patch = content.per_bin('patch', ping, bins)
+    outward = array.across_track(depth, snapshot.range)
+    return TrueProfile(
+        stamp_ns=snapshot.stamp_ns,
+        frame_id=snapshot.frame_id,
+        range=snapshot.range,
+        height=np.asarray(height, np.float64),
+        angle=array.angle_of_depth(depth, snapshot.range, tilt),
+        patch=np.zeros(bins, bool) if patch is None else np.asarray(patch, bool),
+        valid=np.abs(depth) <= snapshot.range,
+        xyz=np.column_stack([np.zeros(bins), -outward, -depth]),
+    )
+
+
+@converter(TracesOptions)
+def convert_traces(path: Path, how: TracesOptions, report: ConversionReport) -> None:
+    """Convert traces to the topic ``/trace``.
+
+    In an archive (.npz) ``sigma`` is one number, (T,) or (T, n), ``reference_depth`` (T,) of the
+    array; as truth a reflector is present while its amplitude exceeds 0.4 of its largest value.
+    Any other file is a CSV, one row per sample, trace after trace.
+    """
+    if path.suffix.lower() == '.npz':
+        records = _from_archive(report, path, how.rate, how.frame_id)
+    else:
+        records = _from_table(report, CsvTable(path, how.options), how.frame_id)
+    write_bag(report.path, records, report, source=path.name, storage=how.storage)
+
+
+def _from_archive(
+    report: ConversionReport, path: Path, rate: float, frame_id: str
+) -> list[Record]:
+    arrays = read_npz(path)
+    for name in arrays.keys() & TRACE_NAMES:
+        numbers_of(path, name, arrays[name])
+    for name in ('depth', 'amplitude'):
+        if name not in arrays:
+            raise BagError(f"{path} has no array '{name}'; it has {', '.join(arrays)}")
+    amplitude = np.atleast_2d(arrays['amplitude'])
+    depth, T = arrays['depth'], len(amplitude)
+    if amplitude.ndim != 2 or depth.shape != amplitude.shape[1:]:
+        raise BagError(
+            f'{path}: depth has the shape {depth.shape} and amplitude {arrays["amplitude"].shape};'
+            ' (n,) and (traces, n) are needed'
+        )
+    stamps = _stamps(path, arrays.get('stamp'), T, rate, 'traces')
+    sigma = _rows(arrays, path, 'sigma', amplitude.shape)
+    reference = _rows(arrays, path, 'reference_depth', (T,))
+    records: list[Record] = []
+    for k, stamp in enumerate(stamps):
+        report.rows += 1
+        try:
+            trace = Trace(
+                stamp_ns=stamp,
+                frame_id=frame_id,
+                depth=depth,
+                amplitude=amplitude[k],
+                sigma=None if sigma is None else sigma[k],
+                reference_depth=None if reference is None else reference[k],
+            )
+        except Rejection as error:
+            report.bad_row(path, f'trace {k}', error)
+            continue
+        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+    return records + _true_reflectors(arrays, path, stamps, frame_id)
+
+
+def _rows(arrays: Arrays, path: Path, name: str, shape: tuple[int, ...]) -> NDArray | None:
+    """The array `name` broadcast to `shape`, from one number, one per trace or all of them; None
+    when there is none."""
+    value = arrays.get(name)
+    if value is None:
+        return None
+    if value.ndim == 1 and len(shape) == 2 and len(value) == shape[0]:
+        value = value[:, None]
+    try:
+        return np.broadcast_to(value, shape)
+    except ValueError:
+        raise BagError(
+            f'{path}: {name} has the shape {value.shape} for {shape[0]} traces'
+        ) from None
+
+
+def _true_reflectors(arrays: Arrays, path: Path, stamps: list[int], frame_id: str) -> list[Record]:
+    depth, amplitude = arrays.get('reflector_depth'), arrays.get('reflector_amplitude')
+    if depth is None or amplitude is None:
+        return []
+    if depth.ndim != 2 or depth.shape != amplitude.shape or len(depth) != len(stamps):
+        raise BagError(
+            f'{path}: reflector_depth {depth.shape} and reflector_amplitude {amplitude.shape} '
+            f'need one row for each of {len(stamps)} traces'
+        )
+    present = np.isfinite(depth) & (amplitude > PRESENT * np.nanmax(amplitude, axis=0))
+    records = []
+    for k, stamp in enumerate(stamps):
+        there = np.flatnonzero(present[k])
+        true = TrueReflectors(
+            stamp_ns=stamp,
+            frame_id=frame_id,
+            track_id=(1 + there).astype(np.uint32),
+            depth=depth[k, there].astype(np.float64),
+            amplitude=amplitude[k, there].astype(np.float64),
+        )
+        records += records_of(true, '')
+    return records
+
+
+def _from_table(report: ConversionReport, table: CsvTable, frame_id: str) -> list[Record]:
+    table.require('stamp', 'depth', 'amplitude')
+
+    def parse(row: Row) -> tuple[int, float, float, float]:
+        return row.stamp_ns(), row.number('depth'), row.optional('amplitude'), row.optional('std')
+
+    records: list[Record] = []
+    rows = report.read_rows(table, parse)
+    for stamp, group in groupby(rows, key=lambda pair: pair[1][0]):
+        lines = list(group)
+        values = np.array([sample[1:] for _, sample in lines])
+        try:
+            trace = Trace(
+                stamp_ns=stamp,
+                frame_id=frame_id,
+                depth=values[:, 0],
+                amplitude=values[:, 1],
+                sigma=values[:, 2],
+            )
+        except Rejection as error:
+            report.bad_row(table.path, f'trace from line {lines[0][0].line}', error)
+            continue
+        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+    return records
+
+
+def read_npz(path: Path) -> dict[str, NDArray]:
+    """Every array of a numpy archive (npz) by name. Raises `BagError`."""
+    try:
+        with path.open('rb') as file:
+            if not zipfile.is_zipfile(file):
+                raise BagError(f'{path} is not a numpy archive (npz)')
+        with zipfile.ZipFile(path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size > max(MAX_UNPACKED, MAX_RATIO * path.stat().st_size):
+            raise BagError(f'{path} {TOO_LARGE}')
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError('numpy gives the bytes of anything else, such as an archive')
+        return arrays
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
+    except (ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile):
+        raise BagError(f'{path} is damaged, or holds more than plain arrays') from None
+
+
+def numbers_of(path: Path, name: str, array: NDArray) -> NDArray:
+    """The array `name` of an archive, where it holds numbers. Raises `BagError`."""
+    if array.dtype.kind not in 'biufc':
+        raise BagError(f"{path}: the array '{name}' holds no numbers")
+    return array
+
+
+def _stamps(path: Path, seconds: NDArray | None, count: int, rate: float, what: str) -> list[int]:
+    """Nanoseconds of the stamps of `count` messages, `what` names them; `rate` per second without
+    any. Raises `BagError` for those that a message cannot hold."""
+    if seconds is None:
+        return [FIRST_STAMP_NS + round(k * 1e9 / rate) for k in range(count)]
+    values = numbers_of(path, 'stamp', seconds).ravel()
+    if len(values) != count or not (np.abs(values) < 2.0**31).all():
+        raise BagError(
+            f'{path}: {count} {what} need as many finite stamps, in seconds before 2038'
+        )
+    return [round(float(stamp) * 1e9) for stamp in values.real]
