@@ -112,10 +112,11 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
 
     file = tmp_path / f'{name}.yaml'
     run = [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
+    more = []
     if name == 'fls_detector':  # the default needs a package
-        run += ['-p', 'image_type:=sensor_msgs/msg/Image']
+        more = ['-p', 'image_type:=sensor_msgs/msg/Image']
     managed = 'std_srvs/srv/Trigger' if name in SYSTEMS else ''
-    with started([*run, '-p', 'autostart:=false'], domain) as output:
+    with started([*run, '-p', 'autostart:=false', *more], domain) as output:
         say('node', 'list', told=f'/{name}\n')
         assert say('lifecycle', 'get', f'/{name}', told='[').strip() == 'unconfigured [1]'
         say('lifecycle', 'set', f'/{name}', 'configure', told='Transitioning successful')
@@ -132,6 +133,7 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
         file.write_text(say('param', 'dump', f'/{name}', told='ros__parameters'))
         say('lifecycle', 'set', f'/{name}', 'deactivate', told='Transitioning successful')
     assert yaml.safe_load(file.read_text())[f'/{name}']['ros__parameters']['stale_after'] == 7.5
+    # The file comes first: what is told before it, for all nodes, gives way to all of the file.
     with started([*run, '--params-file', file, '-p', 'autostart:=true'], domain) as output:
         output.wait_for(lambda line, node: 'ready, hears' in line, [name])
         again = say('param', 'dump', f'/{name}', told='ros__parameters')
