@@ -30,7 +30,8 @@ and below its nearest one, where nothing is. `facets`: the same against the near
 `moving_profile` has their directions, under which rays bend.
 `bound`: sd of two heights from one bin, the Cramer-Rao bound of normal echoes at known ratios, and
 what the tracker reaches along 60 bins. `oversampled`: ledges whose pulse spans several
-bins, judged at every so many bins, and flat floors alike.
+bins, judged at every so many bins, and flat floors alike. `cost`: CPU time, see
+`benchmarks.speed.bathymetry`.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from scipy.signal import resample
 
 from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
 from benchmarks.layover_tables import circular
+from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.acoustics import array
 from sonar_imm.acoustics.layover import GATE
@@ -342,6 +344,7 @@ def finer(snapshot: Snapshot, times: int) -> Estimate:
 
 def main(pings: int = 40, seed: int = 7) -> Parts:
     yield {'pings': pings, 'seed': seed}
+    yield {'cost': bench_layover()}
     stated: list[FloatArray] = []
     true: list[BoolArray] = []
     for name, changes in SETTINGS.items():

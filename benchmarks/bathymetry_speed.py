@@ -19,7 +19,7 @@
 Whole `process` of a ping of 2000 bins and 8 staves in complex64, best of some rounds in turn:
 particles and grid, at rest and on a ship that moves, with straight and with bent rays, without and
 with the test for a second surface; and other models and sizes at rest. `numpy` is the same filter,
-bin by bin. `layover`: pings of 1200 bins, flat or with a ledge, see `benchmarks.speed.bathymetry`.
+bin by bin.
 """
 
 from __future__ import annotations
@@ -28,15 +28,7 @@ from functools import partial
 import time
 from typing import Any
 
-from benchmarks.speed.bathymetry import (
-    a_ping,
-    bench_layover,
-    cut,
-    numpy_filter,
-    PEER_BINS,
-    rates,
-    Timed,
-)
+from benchmarks.speed.bathymetry import a_ping, cut, numpy_filter, PEER_BINS, rates, Timed
 from benchmarks.study import Parts, study
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
@@ -97,7 +89,6 @@ def main(rounds: int = 5) -> Parts:
             yield {'scenes': {f'{title}, {name}': row}}
     speed = rates(sizes(), rounds, clock=time.process_time)
     yield {'sizes': {name: {'ignored': value} for name, value in speed.items()}}
-    yield {'layover': bench_layover(rounds)}
 
 
 if __name__ == '__main__':

@@ -18,8 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks import unscented
 from sonar_imm.acoustics import geometry
-from sonar_imm.estimation import kalman, unscented
+from sonar_imm.estimation import kalman
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers.obstacle import kernels
 from sonar_imm.trackers.obstacle.config import ObstacleConfig

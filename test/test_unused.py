@@ -24,7 +24,6 @@ ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
 LIBRARY = {
     'sonar_imm.acoustics.arrivals_3d.arrival_angles': 'angles of many receivers at once',
     'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
-    'sonar_imm.estimation.consistency.rmse': 'accuracy of one target',
     'sonar_imm.estimation.imm.gate': 'the readable form of imm_kernels.gate',
     'sonar_imm.estimation.imm_filter.position': 'of the ready filter',
     'sonar_imm.estimation.imm_filter.range_bearing': 'of the ready filter',
@@ -33,9 +32,6 @@ LIBRARY = {
     'sonar_imm.estimation.motion.ct': 'of the ready filter',
     'sonar_imm.estimation.motion.cv': 'of the ready filter',
     'sonar_imm.estimation.motion.hover': 'of the ready filter',
-    'sonar_imm.estimation.particles.covariance': 'of a weighted set',
-    'sonar_imm.estimation.particles.mean': 'of a weighted set',
-    'sonar_imm.estimation.unscented.predict': 'one unscented filter, without models',
 }
 """Public functions that this package does not call itself: what they are there for."""
 

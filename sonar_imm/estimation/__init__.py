@@ -47,5 +47,4 @@ __all__ = [
     'set_shifts',
     'small_matrices',
     'smoothing',
-    'unscented',
 ]

@@ -14,7 +14,7 @@
 
 """Accuracy and consistency of estimates.
 
-*Accuracy*: `rmse` for one target; `gospa` and `ospa` for sets of targets, where some are missed,
+*Accuracy*: `gospa` and `ospa` for sets of targets, where some are missed,
 some are false and the pairing is not known; `identity_switches` along time.
 
 *Consistency*: the squared error, normalised by its own covariance, is chi-square distributed when
@@ -39,11 +39,6 @@ import numpy as np
 
 from .arrays import FloatArray, IntArray
 from .kalman import factorise, log_density
-
-
-def rmse(error: FloatArray) -> float:
-    """Root of the mean over all leading axes of the squared length of `error` (..., n)."""
-    return float(np.sqrt(np.mean(np.sum(np.square(error), axis=-1))))
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -64,9 +64,8 @@ import numpy as np
 
 from . import imm
 from .arrays import BoolArray, FloatArray
-from .covariance import add_jitter, symmetrise, transpose
+from .covariance import add_jitter, CovarianceError, symmetrise, transpose
 from .kalman import apply
-from .unscented import sigma_offsets
 
 # Eigenvalues of a correlation matrix below this are rounding.
 _NEGLIGIBLE = 1e-13
@@ -153,6 +152,27 @@ def _imm_step(
         smoothed_mu / smoothed_mu.sum(),
         repaired,
     )
+
+
+def sigma_offsets(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets (..., 2n + 1, n) of the sigma points from their mean, the centre first, and their
+    weights (2n + 1,), none of them negative: up to three dimensions the fourth moment of the
+    Gaussian is matched, above that it is the cubature rule (Arasaratnam, Haykin, IEEE TAC 54(6),
+    2009).
+
+    Raises CovarianceError when `P` (..., n, n) is not finite. Eigenvalues below zero count as
+    zero.
+    """
+    finite = np.isfinite(P).all(axis=(-1, -2))
+    if not finite.all():
+        raise CovarianceError('covariance is not finite', np.asarray(~finite))
+    n = P.shape[-1]
+    kappa = max(0.0, 3.0 - n)
+    values, vectors = np.linalg.eigh(P)
+    axes = transpose(vectors) * np.sqrt((n + kappa) * np.maximum(values, 0.0))[..., None]
+    weights = np.full(2 * n + 1, 0.5 / (n + kappa))
+    weights[0] = kappa / (n + kappa)
+    return np.concatenate([np.zeros_like(axes[..., :1, :]), axes, -axes], axis=-2), weights
 
 
 def _meet(

@@ -74,6 +74,8 @@ class BaseNode(ManagedNode):
     the first message meets a warm node.
     """
 
+    _warming: Warming | None = None  # also where a constructor that failed is taken back
+
     def __init__(self, name: str, config_types: tuple[type[Config], type[Config]], **options: Any):
         """Declare the parameters: those of what works on the messages, and those of the node.
 
@@ -91,7 +93,6 @@ class BaseNode(ManagedNode):
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
-        self._warming: Warming | None = None
         self._hears = self._warned = False
         self._made: set[Any] = set()
 

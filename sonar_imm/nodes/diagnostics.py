@@ -239,6 +239,21 @@ _Totals = tuple[float | None, Counter[str], Counter[str], int, Counter[str]]
 """Steady seconds of a report, and received, refused, dropped and lost messages until then."""
 
 
+class _Period(NamedTuple):
+    """What happened since the report before. now: steady s; elapsed: s, NaN in the first one;
+    fresh, refused, missing: messages by topic or reason; stale: sentences about what does not
+    come."""
+
+    now: float
+    elapsed: float
+    fresh: Counter[str]
+    refused: Counter[str]
+    dropped: int
+    missing: Counter[str]
+    stale: Sequence[str]
+    enabled: bool
+
+
 class Reporter:
     """Turns a `Meter` and the tracker's own numbers into a DiagnosticArray, once a period."""
 
@@ -284,51 +299,25 @@ class Reporter:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; starting: why
         no input is heard yet, or empty; publishers: how many there are of a topic."""
         then, received_before, refused_before, dropped_before, lost_before = self._before
-        meter = self._meter
-        elapsed = np.nan if then is None else max(now - then, 1e-9)
-        fresh = meter.received - received_before
-        refused = meter.refused - refused_before
-        dropped = meter.dropped.total()
-        missing = Counter(lost) - lost_before
-        self._before = (
+        meter, dropped, all_lost = self._meter, self._meter.dropped.total(), Counter(lost)
+        period = _Period(
             now,
-            meter.received.copy(),
-            meter.refused.copy(),
-            dropped,
-            Counter(lost),
+            np.nan if then is None else max(now - then, 1e-9),
+            meter.received - received_before,
+            meter.refused - refused_before,
+            dropped - dropped_before,
+            all_lost - lost_before,
+            [starting] if starting else self._stale(now, stale_after),
+            enabled,
         )
-
-        stale = [starting] if starting else self._stale(now, stale_after)
+        self._before = now, meter.received.copy(), meter.refused.copy(), dropped, all_lost
+        unused = self._unused.sentence(now, meter.received.total(), counts)
+        said = [*warnings, *filter(None, [unused])]
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
-            self._input_status(
-                now,
-                elapsed,
-                fresh,
-                refused,
-                enabled,
-                stale_after,
-                lost,
-                missing,
-                incompatible,
-                stale,
-                publishers,
-            ),
-            self._tracker_status(
-                fresh.total() == 0,
-                (fresh + missing).total() / elapsed,
-                dropped - dropped_before,
-                enabled,
-                starting,
-                counts,
-                health,
-                [
-                    *warnings,
-                    *filter(None, [self._unused.sentence(now, meter.received.total(), counts)]),
-                ],
-                stale,
-            ),
+            self._input_status(period, stale_after, lost, incompatible, publishers),
+            self._tracker_status(period, starting, counts, health, said),
         ]
         return message
 
@@ -357,24 +346,18 @@ class Reporter:
 
     def _input_status(
         self,
-        now: float,
-        elapsed: float,
-        fresh: Counter[str],
-        refused: Counter[str],
-        enabled: bool,
+        period: _Period,
         stale_after: float,
         lost: Mapping[str, int],
-        missing: Counter[str],
         incompatible: Mapping[str, str],
-        stale: Sequence[str],
         publishers: Callable[[str], int],
     ) -> DiagnosticStatus:
-        meter = self._meter
+        meter, now, fresh, refused = self._meter, period.now, period.fresh, period.refused
         values: dict[str, Any] = {}
         for name, topic in self._topics.items():
             values[f'{name} topic'] = topic
             values[f'{name} received'] = meter.received[name]
-            values[f'{name} rate [Hz]'] = fresh[name] / elapsed
+            values[f'{name} rate [Hz]'] = fresh[name] / period.elapsed
             if meter.dropped[name]:
                 values[f'{name} dropped, waited too long'] = meter.dropped[name]
             values[f'{name} silent for [s]'] = now - meter.last.get(name, np.nan)
@@ -387,7 +370,7 @@ class Reporter:
         }
         found = [
             Finding(silence.split(' for ')[0], STALE, silence, at_once=True, passing=True)
-            for silence in stale
+            for silence in period.stale
         ]
         if refused and refused.total() >= fresh.total():
             sentence = f'every message is refused: {_most(refused)}'
@@ -395,9 +378,9 @@ class Reporter:
         elif refused:
             sentence = f'messages are refused: {_most(refused)}'
             found.append(Finding('refused', WARN, sentence))
-        if missing:
-            many = missing.total() > max(2, MUCH_LOST * fresh.total())
-            found.append(Finding('lost', WARN, _share_lost(missing, fresh), at_once=many))
+        if period.missing:
+            many = period.missing.total() > max(2, MUCH_LOST * fresh.total())
+            found.append(Finding('lost', WARN, _share_lost(period.missing, fresh), at_once=many))
         if incompatible:
             sentence = 'a peer has an incompatible quality of service'
             found.append(Finding('incompatible', WARN, sentence, timed=True))
@@ -411,27 +394,25 @@ class Reporter:
                     'publishers disagree, or one is later'
                 )
                 found.append(Finding(f'clocks {name}', OK, sentence, timed=True))
-        if not stale:
+        if not period.stale:
             gone = self._gone(now, stale_after)
             found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
         counting = self._of_input.settle(found, quiet=not fresh)
         level, text = level_and_text(counting, 'receiving')
-        if not enabled:
+        if not period.enabled:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
 
     def _tracker_status(
         self,
-        quiet: bool,
-        rate: float,
-        dropped: int,
-        enabled: bool,
+        period: _Period,
         starting: str,
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str],
-        stale: Sequence[str],
     ) -> DiagnosticStatus:
+        stale, enabled, dropped = period.stale, period.enabled, period.dropped
+        rate = (period.fresh + period.missing).total() / period.elapsed
         p50, p99 = self._meter.compute_ms()
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
@@ -452,7 +433,7 @@ class Reporter:
         if counts.get('internal_error'):
             sentence = 'an internal error was caught, see the log'
             found.append(Finding('internal_error', ERROR, sentence, at_once=True))
-        counting = self._of_tracker.settle(found, quiet=quiet)
+        counting = self._of_tracker.settle(found, quiet=not period.fresh)
         level, text = level_and_text(counting, 'tracking' if enabled else 'disabled')
         return self._status('tracker', level, text, values)
 

@@ -55,26 +55,19 @@ _POLICIES = {
 
 def input_qos(depth: int) -> QoSProfile:
     """Best effort, the last `depth` messages: what a listener to a sensor should ask for."""
-    return QoSProfile(
-        reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=depth
-    )
+    return QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, depth=depth)
 
 
 def output_qos(depth: int = 10) -> QoSProfile:
     """Reliable, the last `depth` messages."""
-    return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth
-    )
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, depth=depth)
 
 
 def latched_qos(depth: int = 1) -> QoSProfile:
     """Reliable, and the last `depth` messages wait for listeners that come later."""
-    return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE,
-        history=HistoryPolicy.KEEP_LAST,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        depth=depth,
-    )
+    profile = output_qos(depth)
+    profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return profile
 
 
 def transforms_qos() -> QoSProfile:

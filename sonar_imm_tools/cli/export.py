@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
@@ -91,11 +91,8 @@ def command(
     with uncertainty and model), .csv and .parquet; --crs and --origin say where they lie where the
     run does not.
     """
-    from ..offline.run_folder import RunFolder, SOUNDINGS
-    from ..recordings.export.points import read_points, write_las, write_xyz
+    from ..offline.run_folder import RunFolder
     from ..recordings.sources import BagError
-    from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
-    from ..survey.line import budget_of
 
     kind = out.suffix.lower().lstrip('.')
     every = dict.fromkeys(FORMATS + HORIZON_FORMATS + TRACK_FORMATS)
@@ -104,126 +101,120 @@ def command(
         raise click.UsageError(f"'{out.name}' ends in none of {known}")
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
-    record = RunFolder(run).read_run()
+    folder = RunFolder(run)
+    asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
-        _export_map(run, record, out, kind, epsg, origin, as_json)
-        return
-    if kind in TRACK_FORMATS and record['system'] != 'fathometer':
-        _export_tracks(run, out, kind, epsg, origin, as_json)
-        return
-    if kind in HORIZON_FORMATS + TRACK_FORMATS:
-        _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
-        return
-    if not (run / SOUNDINGS).is_file():
+        result, text = _export_map(asked)
+    elif kind in TRACK_FORMATS and asked.record['system'] != 'fathometer':
+        result, text = _export_tracks(asked)
+    elif kind in HORIZON_FORMATS + TRACK_FORMATS:
+        result, text = _export_horizons(asked, original)
+    else:
+        result, text = _export_soundings(asked, cell)
+    print_json({'out': str(out), **result}) if as_json else say(f'{out}: {text}')
+
+
+class _Asked(NamedTuple):
+    """What is to be exported; record: the run.json of the run."""
+
+    run: Path
+    folder: Any
+    record: dict[str, Any]
+    out: Path
+    kind: str
+    epsg: int | None
+    origin: tuple[float, float, float]
+
+
+Told = tuple[dict[str, Any], str]
+"""What was written, as JSON and in words."""
+
+
+def _export_soundings(asked: _Asked, cell: float) -> Told:
+    from ..offline.run_folder import SOUNDINGS
+    from ..recordings.export.points import read_points, write_las, write_xyz
+    from ..recordings.sources import BagError
+    from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
+    from ..survey.line import budget_of
+
+    if not (asked.run / SOUNDINGS).is_file():
         raise BagError(
-            f'{run} holds no soundings: the recording has no navigation, or is of another system'
+            f'{asked.run} holds no soundings: the recording has no navigation, or is of another '
+            'system'
         )
-    points = read_points(run / SOUNDINGS)
-    points = points.moved(origin)
-    result: dict[str, Any] = {'out': str(out), 'soundings': len(points)}
-    with whole(out) as unfinished:
-        if kind == 'tif':
-            chart = chart_of(points, cell, *budget_of(record))
-            write_geotiff(unfinished, chart, epsg, OF_ONE_RUN)
+    points = read_points(asked.run / SOUNDINGS).moved(asked.origin)
+    result: dict[str, Any] = {'soundings': len(points)}
+    shape = ''
+    with whole(asked.out) as unfinished:
+        if asked.kind == 'tif':
+            chart = chart_of(points, cell, *budget_of(asked.record))
+            write_geotiff(unfinished, chart, asked.epsg, OF_ONE_RUN)
             result |= dict(zip(('rows', 'columns'), chart.shape))
-        elif kind == 'xyz':
+            shape = f' in {result["rows"]} by {result["columns"]} cells'
+        elif asked.kind == 'xyz':
             write_xyz(unfinished, points)
         else:
-            write_las(unfinished, points, epsg)
-    if as_json:
-        print_json(result)
-        return
-    shape = f' in {result["rows"]} by {result["columns"]} cells' if 'rows' in result else ''
-    say(f'{out}: {len(points)} soundings{shape}')
+            write_las(unfinished, points, asked.epsg)
+    return result, f'{len(points)} soundings{shape}'
 
 
-def _export_map(
-    run: Path,
-    record: dict[str, Any],
-    out: Path,
-    kind: str,
-    epsg: int | None,
-    origin: tuple[float, float, float],
-    as_json: bool,
-) -> None:
-    """The obstacles that are known at the end of a run; record: its run.json."""
+def _export_map(asked: _Asked) -> Told:
+    """The obstacles that are known at the end of a run."""
     from ..recordings.export.tracks import write_obstacles
     from ..recordings.sources import BagError
 
-    if kind != 'geojson':
+    if asked.kind != 'geojson':
         raise click.UsageError('--map writes .geojson')
-    landmarks = record.get('landmarks', [])
+    landmarks = asked.record.get('landmarks', [])
     if not landmarks:
-        raise BagError(f'{run} knows no obstacles at its end')
-    if epsg is None:
+        raise BagError(f'{asked.run} knows no obstacles at its end')
+    if asked.epsg is None:
         raise click.UsageError(
             'places are in metres: say with --epsg and --origin where their origin lies'
         )
-    with whole(out) as unfinished:
-        write_obstacles(unfinished, landmarks, epsg, origin)
-    if as_json:
-        print_json({'out': str(out), 'obstacles': len(landmarks)})
-        return
-    say(f'{out}: {len(landmarks)} obstacles')
+    with whole(asked.out) as unfinished:
+        write_obstacles(unfinished, landmarks, asked.epsg, asked.origin)
+    return {'obstacles': len(landmarks)}, f'{len(landmarks)} obstacles'
 
 
-def _to_degrees(epsg: int, origin: tuple[float, float, float]) -> Callable[[Any], Any]:
-    """Longitude and latitude (n,) of places (n, 2) in metres from `origin`."""
+def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
+    """Longitude and latitude (n,) of places (n, 2) in metres from the origin; None where nobody
+    says it."""
+    if asked.epsg is None:
+        return None
     import numpy as np
 
     from ..recordings.export.points import degrees_of
 
-    return lambda places: degrees_of(places + np.array(origin[:2]), epsg)
+    epsg, shift = asked.epsg, np.array(asked.origin[:2])
+    return lambda places: degrees_of(places + shift, epsg)
 
 
-def _export_tracks(
-    run: Path,
-    out: Path,
-    kind: str,
-    epsg: int | None,
-    origin: tuple[float, float, float],
-    as_json: bool,
-) -> None:
+def _export_tracks(asked: _Asked) -> Told:
     """Tracks of a run of divers or obstacles."""
-    from ..offline.run_folder import RunFolder
     from ..recordings.export.tracks import tracks_of, write_tracks
 
-    degrees = None if epsg is None else _to_degrees(epsg, origin)
-    folder = RunFolder(run)
-    record = folder.read_run()
-    if degrees is None and (stated := record.get('origin')):
+    degrees = _to_degrees(asked)
+    if degrees is None and (stated := asked.record.get('origin')):
         degrees = Origin(**stated).degrees
-    tracks = tracks_of(folder.read_estimates(), degrees)
-    with whole(out) as unfinished:
-        left_out = write_tracks(unfinished, tracks, kind, run.name)
-    result = {'out': str(out), 'rows': len(tracks), 'left_out': left_out}
-    result['tracks'] = sum(1 for _ in tracks.each())
-    if as_json:
-        print_json(result)
-        return
+    tracks = tracks_of(asked.folder.read_estimates(), degrees)
+    with whole(asked.out) as unfinished:
+        left_out = write_tracks(unfinished, tracks, asked.kind, asked.run.name)
+    count = sum(1 for _ in tracks.each())
     left = f', {left_out} left out that have no place on Earth' if left_out else ''
-    say(f'{out}: {result["tracks"]} tracks, {len(tracks)} rows{left}')
+    result = {'rows': len(tracks), 'left_out': left_out, 'tracks': count}
+    return result, f'{count} tracks, {len(tracks)} rows{left}'
 
 
-def _export_horizons(
-    run: Path,
-    record: dict[str, Any],
-    out: Path,
-    kind: str,
-    epsg: int | None,
-    origin: tuple[float, float, float],
-    original: Path | None,
-    as_json: bool,
-) -> None:
-    """Picks of a run of the fathometer; record: its run.json."""
-
-    from ..offline.run_folder import RunFolder
+def _export_horizons(asked: _Asked, original: Path | None) -> Told:
+    """Picks of a run of the fathometer."""
     from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
     from ..recordings.export.picks import write_picks
     from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader
     from ..recordings.sources import BagError
 
+    run, record, out, kind = asked.run, asked.record, asked.out, asked.kind
     if record['system'] != 'fathometer':
         raise BagError(f'{run} is of {record["system"]}: only the fathometer has horizons')
     if kind not in HORIZON_FORMATS:
@@ -235,12 +226,12 @@ def _export_horizons(
         )
     if segy and original is not None and out.exists() and out.samefile(original):
         raise click.UsageError('OUT is the file given by --segy, which stays as it is')
-    positions, notes = None, {}
+    positions, notes, degrees = None, {}, _to_degrees(asked)
     if Path(record['bag']).exists():
         with BagReader(record['bag']) as bag:
             positions, notes = read_positions(bag), bag.custom_data
-            if positions is None and epsg is not None:
-                positions = read_navigated(bag, _to_degrees(epsg, origin))
+            if positions is None and degrees is not None:
+                positions = read_navigated(bag, degrees)
             elif positions is None and kind == 'geojson' and navigation_topics(bag):
                 raise BagError(
                     'the recording has navigation in metres: say with --epsg and --origin where '
@@ -249,18 +240,16 @@ def _export_horizons(
     elif segy or kind == 'geojson':
         raise BagError(f'{record["bag"]}, the recording of {run}, is gone')
     speed = float(record['parameters'].get('sound_speed', 1500.0))
-    picks = picks_of(RunFolder(run).read_estimates(), speed, positions)
-    result: dict[str, Any] = {'out': str(out), 'picks': len(picks), 'left_out': 0}
-    result['horizons'] = len(set(picks.horizon.tolist()))
+    picks = picks_of(asked.folder.read_estimates(), speed, positions)
+    left_out = 0
     with whole(out) as unfinished:
         if kind == 'csv':
-            write_horizons(unfinished, picks, notes.get('source', run.name), epsg)
+            write_horizons(unfinished, picks, notes.get('source', run.name), asked.epsg)
         elif kind == 'geojson':
-            result['left_out'] = write_geojson(unfinished, picks)
+            left_out = write_geojson(unfinished, picks)
         elif original is not None:
-            result['left_out'] = write_picks(unfinished, picks, original, notes)
-    if as_json:
-        print_json(result)
-        return
-    left = f', {result["left_out"]} left out' if result['left_out'] else ''
-    say(f'{out}: {result["picks"]} picks of {result["horizons"]} horizons{left}')
+            left_out = write_picks(unfinished, picks, original, notes)
+    count = len(set(picks.horizon.tolist()))
+    left = f', {left_out} left out' if left_out else ''
+    result = {'picks': len(picks), 'left_out': left_out, 'horizons': count}
+    return result, f'{len(picks)} picks of {count} horizons{left}'

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-import shlex
 from typing import Any
 
 import click
@@ -88,5 +87,7 @@ def _scans(scans: dict[str, int] | None) -> str:
 
 def track_line(bag: str, system: str, named: dict[str, str]) -> str:
     """The command that tracks the recording, with --topic where the names do not fit."""
-    topics = [f' --topic {shlex.quote(f"{name}={topic}")}' for name, topic in named.items()]
-    return f'sonar-imm track {shlex.quote(bag)} OUT_DIR --system {system}{"".join(topics)}'
+    from ..recordings.sources import quoted
+
+    topics = [f' --topic {quoted(f"{name}={topic}")}' for name, topic in named.items()]
+    return f'sonar-imm track {quoted(bag)} OUT_DIR --system {system}{"".join(topics)}'

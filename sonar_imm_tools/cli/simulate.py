@@ -74,8 +74,8 @@ def command(
 ) -> None:
     """Write a bag of simulated measurements with their truth to OUT_BAG.
 
-    SYSTEM `survey` is many lines over one floor: with --soundings OUT_BAG is a folder of lines,
-    each a folder with soundings.csv, and truth.npz.
+    SYSTEM `survey` is many lines over one floor: OUT_BAG is a folder with a bag of pings for each
+    line, to be tracked, or with --soundings a folder with soundings.csv; and truth.npz.
     """
     if soundings and system != SURVEY:
         raise click.UsageError(f'--soundings is for {SURVEY}')
@@ -86,7 +86,7 @@ def command(
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
     if system == SURVEY:
-        _simulate_survey(scenes, out_bag, scenario, seed, overrides, soundings, as_json)
+        _simulate_survey(scenes, out_bag, scenario, seed, overrides, soundings, compress, as_json)
         return
     from sonar_imm.truth import TrueTrack
 
@@ -139,34 +139,47 @@ def _simulate_survey(
     seed: int,
     overrides: dict[str, str],
     soundings: bool,
+    compress: bool,
     as_json: bool,
 ) -> None:
-    """Folders of lines and truth.npz."""
+    """Folders of lines, or bags, and truth.npz."""
     from sonar_imm.files import whole
 
     from ..recordings.export.points import write_table
+    from ..recordings.own_files import unusual
+    from ..recordings.scenes import write_scene
     from ..recordings.sources import BagError
 
-    if not soundings:
-        raise click.UsageError('a survey is simulated as soundings: say --soundings')
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(scenes.SurveyScenario, overrides))
     if out.exists():
         raise BagError(f'{out} is there already; choose another folder')
-    scene = scenes.simulate(config, seed)
+    system, what, total = 'bathymetry', 'soundings' if soundings else 'messages', 0
+    provenance = {'source': f'simulated: survey {name}', 'seed': str(seed)}
     with whole(out) as folder:
         folder.mkdir()
-        for line, points in zip(scene.names, scene.points):
-            (folder / line).mkdir()
-            write_table(folder / line / 'soundings.csv', points)
+        if soundings:
+            scene = scenes.simulate(config, seed)
+            for line, points in zip(scene.names, scene.points):
+                (folder / line).mkdir()
+                write_table(folder / line / 'soundings.csv', points)
+                total += len(points)
+        else:
+            scene, lines = scenes.pings_of(config, seed)
+            for line, pings, told in lines:
+                known = {system: unusual(told, SYSTEMS[system].config_type())}
+                bag = folder / f'{line}.bag'
+                report = write_scene(
+                    pings, bag, compressed=compress, parameters=known, provenance=provenance
+                )
+                total += sum(report.messages.values())
         scenes.write_truth(folder / 'truth.npz', scene)
-    total = sum(len(points) for points in scene.points)
     result = {'out': str(out), 'scenario': name, 'seed': seed, 'lines': len(scene.names)}
-    result['soundings'] = total
+    result[what] = total
     if as_json:
         print_json(result)
     else:
-        say(f'{out}: {len(scene.names)} lines, {total} soundings ({name}, seed {seed})')
+        say(f'{out}: {len(scene.names)} lines, {total} {what} ({name}, seed {seed})')
 
 
 def _list(scenes: Any, as_json: bool) -> None:

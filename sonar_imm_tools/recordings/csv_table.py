@@ -44,6 +44,8 @@ TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 LONGEST_NS = 10**8 * 10**9
 """A recording is shorter, a date since 1970 longer."""
+LONGEST_LINE = 1 << 20
+"""Characters."""
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
@@ -393,21 +395,30 @@ class CsvTable(Table):
             raise BagError(f'{self.path} is no text, not a CSV file')
         self._encoding = _encoding(start)
         with self._open() as file:
-            lines = (line for line in file if line.strip() and not line.startswith('#'))
+            lines = (line for line in _lines(file) if line.strip() and not line.startswith('#'))
             first = next(lines, '')
         if not first:
             raise BagError(f'{self.path} is empty, not a CSV file')
         likely = max(',;\t|', key=first.count)
         self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
-        headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        try:
+            headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        except csv.Error:
+            raise self._no_table(1) from None
         super().__init__(path, options, headers)
+
+    def _no_table(self, line: int) -> BagError:
+        return BagError(
+            f'{self.path}, line {line} is no line of a CSV file: it holds more than '
+            f'{csv.field_size_limit()} characters in a cell, or bytes that are no text'
+        )
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         ended, width, header_seen = True, 0, False
 
         def lines(file: TextIO) -> Iterator[str]:
             nonlocal ended
-            for line in file:
+            for line in _lines(file):
                 ended = line.endswith(('\n', '\r'))
                 yield line
 
@@ -419,11 +430,7 @@ class CsvTable(Table):
                 except StopIteration:
                     return
                 except csv.Error:
-                    raise BagError(
-                        f'{self.path}, line {reader.line_num} is no line of a CSV file: it holds '
-                        f'more than {csv.field_size_limit()} characters in a cell, or bytes that '
-                        'are no text'
-                    ) from None
+                    raise self._no_table(reader.line_num) from None
                 if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
                     continue
                 if header_seen:
@@ -439,6 +446,11 @@ class CsvTable(Table):
 
     def _open(self) -> TextIO:
         return self.path.open(encoding=self._encoding, errors='replace', newline='')
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """The lines of a file; what is longer than any line of a table comes in parts."""
+    return iter(lambda: file.readline(LONGEST_LINE), '')
 
 
 def _binary(start: bytes) -> bool:

@@ -26,20 +26,14 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 _DTYPES = {
+    **dict.fromkeys(('octet', 'byte', 'char'), np.uint8),
     'bool': np.bool_,
-    'octet': np.uint8,
-    'byte': np.uint8,
-    'char': np.uint8,
-    'int8': np.int8,
-    'uint8': np.uint8,
-    'int16': np.int16,
-    'uint16': np.uint16,
-    'int32': np.int32,
-    'uint32': np.uint32,
-    'int64': np.int64,
-    'uint64': np.uint64,
-    'float32': np.float32,
-    'float64': np.float64,
+    **{
+        f'{kind}{bits}': getattr(np, f'{kind}{bits}')
+        for kind in ('int', 'uint')
+        for bits in (8, 16, 32, 64)
+    },
+    **{'float32': np.float32, 'float64': np.float64},
 }
 _SCALARS = {
     name: bool if name == 'bool' else float if name.startswith('float') else int

@@ -29,7 +29,7 @@ from .convert.arrivals import names_tags
 from .convert.nmea import SENTENCE
 from .csv_table import CsvOptions, CsvTable
 from .reader import BagReader
-from .sources import BagError, is_recording, start_of, SUFFIXES
+from .sources import BagError, is_recording, quoted, start_of, SUFFIXES
 from .topics import made_topics
 from .track_files import kind_of_text
 
@@ -92,7 +92,7 @@ def hint(path: Path) -> str:
         why = sniff(path).why
     except BagError as error:
         return f'; {error}' if path.is_file() else ''
-    return f'; it looks like {why}: sonar-imm convert {path} OUT_BAG makes one of it'
+    return f'; it looks like {why}: sonar-imm convert {quoted(path)} OUT_BAG makes one of it'
 
 
 def of_pictures(folder: Path) -> bool:

@@ -22,13 +22,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
+import os
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+import shlex
+import subprocess
+from typing import Any, NamedTuple
 
 from attrs import frozen
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
-from rosbags.typesys.store import Typestore
 
 from sonar_imm.parameters import ConfigError, yaml_tree
 from sonar_imm.texts import in_one_line
@@ -84,26 +86,6 @@ class RawMessage(NamedTuple):
     type_name: str
     log_ns: int
     raw: bytes
-
-
-class Source(Protocol):
-    """One storage that yields its messages by log time. `types` are those it can decode."""
-
-    types: Typestore
-
-    def topics(self) -> list[TopicInfo]: ...
-
-    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]: ...
-
-    def decode(self, type_name: str, raw: bytes) -> Any: ...
-
-    def rescue(self) -> ScanSource | None:
-        """What can still be read after damage stopped `messages`, from the first one again."""
-        ...
-
-    def span(self) -> tuple[int, int] | None: ...
-
-    def close(self) -> None: ...
 
 
 class _FolderPath(type(Path())):  # type: ignore[misc]
@@ -285,6 +267,10 @@ class ScanSource:
 
     def close(self) -> None:
         self._scan.close()
+
+
+Source = RosbagsSource | ScanSource
+"""One storage that yields its messages by log time. ``types`` are those that it can decode."""
 
 
 def is_recording(path: Path) -> bool:
@@ -475,6 +461,11 @@ def start_of(path: Path, size: int = 4096) -> bytes:
             return file.read(size)
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
+
+
+def quoted(word: object, windows: bool = os.name == 'nt') -> str:
+    """A word of a command as the shell of this machine takes it."""
+    return subprocess.list2cmdline([str(word)]) if windows else shlex.quote(str(word))
 
 
 def packed_hint(files: Iterable[Path]) -> str:

@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Surveys of many lines over one floor, with truth: soundings as a tracker would make them.
+"""Surveys of many lines over one floor, with truth: soundings as a tracker would make them
+(`simulate`), or the pings and navigation that a tracker makes them of (`pings_of`).
 
 Nothing here uses the first-order formulas of `sonar_imm_tools.survey`, which it tests: poses are
 rotations, and sound goes in two straight pieces through two layers of water. The tracker is taken
@@ -22,12 +23,12 @@ same below, where it is wrong. A correction is the true value less the reported 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 import math
 from pathlib import Path
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
@@ -35,8 +36,11 @@ from sonar_imm.acoustics.geometry import rotation
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.parameters import parameter
+from sonar_imm.truth import Received, Scene
 
 from ..recordings.export.points import Points
+from .bathymetry.ship import navigation_of, Ship, ship_of, Terrain, Waves
+from .bathymetry.simulator import BathymetryScenario, hear, profile_below
 from .scenario import Scenario
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
@@ -48,6 +52,8 @@ _STEP = 0.25
 _MARCH, _BISECTIONS = 64, 24
 SOUND_SPEED = 1500.0
 """What the tracker supposes, m/s."""
+KEEL, PAUSE_NS = 2.0, 120_000_000_000
+"""How deep the array is, m, and the time between lines."""
 
 
 @frozen(kw_only=True)
@@ -143,33 +149,150 @@ def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> SurveySce
 def simulate(config: SurveyScenario, seed: int) -> SurveyScene:
     """Run a survey; the same config and seed give the same scene."""
     rng = np.random.default_rng(seed)
-    width = (config.lines - 1) * config.spacing
-    floor = _floor(config, width, rng)
-    starts = [
-        ((0.0, k * config.spacing), 0.0 if k % 2 == 0 else math.pi) for k in range(config.lines)
-    ]
-    starts = [((config.length if c else x, y), c) for (x, y), c in starts]
-    for k in range(config.cross_lines):
-        x = config.length * (k + 1) / (config.cross_lines + 1)
-        starts.append(((x, -0.5 * config.spacing), 0.5 * math.pi))
-    corrections = np.zeros((len(starts), 6))
-    corrections[:, :3] = np.radians([config.roll_bias_deg, config.pitch, config.heading])
-    corrections[:, 3] = config.tide_std * rng.standard_normal(len(starts))
-    spread = config.nav_errors * budget().sound_speed
-    corrections[:, 4] = config.sound_speed_error + spread * rng.standard_normal(len(starts))
-    corrections[:, 5] = config.latency
+    floor, starts, corrections = _plan(config, rng)
     points, bad, fish = [], [], []
     first = FIRST_STAMP_NS
-    for k, (start, course) in enumerate(starts):
-        length = config.length if k < config.lines else width + config.spacing
+    for k, (start, course, length) in enumerate(starts):
         line = _line(config, floor, np.array(start), course, length, corrections[k], first, rng)
         false = _falsify(config, k, line, rng)
         points.append(line)
         bad.append(false[0])
         fish.append(false[1])
-        first = int(line.stamp_ns.max()) + 120_000_000_000
+        first = int(line.stamp_ns.max()) + PAUSE_NS
     names = tuple(f'line_{k:03d}' for k in range(len(starts)))
     return SurveyScene(names, tuple(points), corrections, tuple(bad), tuple(fish), floor)
+
+
+def _plan(
+    config: SurveyScenario, rng: np.random.Generator
+) -> tuple[Floor, list[tuple[tuple[float, float], float, float]], FloatArray]:
+    """The floor, start, course and length of each line, and the corrections (L, 6)."""
+    width = (config.lines - 1) * config.spacing
+    floor = _floor(config, width, rng)
+    starts = [
+        ((0.0, k * config.spacing), 0.0 if k % 2 == 0 else math.pi) for k in range(config.lines)
+    ]
+    lines = [((config.length if c else x, y), c, config.length) for (x, y), c in starts]
+    for k in range(config.cross_lines):
+        x = config.length * (k + 1) / (config.cross_lines + 1)
+        lines.append(((x, -0.5 * config.spacing), 0.5 * math.pi, width + config.spacing))
+    corrections = np.zeros((len(lines), 6))
+    corrections[:, :3] = np.radians([config.roll_bias_deg, config.pitch, config.heading])
+    corrections[:, 3] = config.tide_std * rng.standard_normal(len(lines))
+    spread = config.nav_errors * budget().sound_speed
+    corrections[:, 4] = config.sound_speed_error + spread * rng.standard_normal(len(lines))
+    corrections[:, 5] = config.latency
+    return floor, lines, corrections
+
+
+def pings_of(
+    config: SurveyScenario, seed: int
+) -> tuple[SurveyScene, Iterator[tuple[str, Scene, Mapping[str, Any]]]]:
+    """The same survey as pings of both sides with navigation: what is true of it, without points,
+    and each line by its name with what its tracker is told. False echoes are those of the
+    tracker's own; biases are in the navigation, and sound bends as the tracker is not told."""
+    rng = np.random.default_rng(seed)
+    floor, lines, corrections = _plan(config, rng)
+    names = tuple(f'line_{k:03d}' for k in range(len(lines)))
+    nothing = (np.zeros(0, bool),)
+
+    def scenes() -> Iterator[tuple[str, Scene, Mapping[str, Any]]]:
+        first = FIRST_STAMP_NS
+        for name, line, correction in zip(names, lines, corrections):
+            sonar = _sonar(config, line, float(correction[4]))
+            scene = _swaths(sonar, floor, line[0], correction, first, rng)
+            first = scene.measurements[-1].received_ns + PAUSE_NS
+            told = evolve(sonar, sound_speed_profile=())
+            yield name, scene, told.instruments()
+
+    return SurveyScene(names, (), corrections, nothing, nothing, floor), scenes()
+
+
+def _sonar(
+    config: SurveyScenario, line: tuple[tuple[float, float], float, float], error: float
+) -> BathymetryScenario:
+    """Sonar and ship of a line; the mean speed of sound is wrong by `error`."""
+    height = config.depth - KEEL
+    layer, below = KEEL + height / 3.0, SOUND_SPEED + 1.5 * error
+    stated, errors = budget(), config.nav_errors
+    return BathymetryScenario(
+        moving=True,
+        side='both',
+        pings=max(round(line[2] / config.speed / config.ping_interval), 1),
+        ping_rate=1.0 / config.ping_interval,
+        speed=config.speed,
+        course_deg=math.degrees(line[1]),
+        sonar_depth=KEEL,
+        sonar_height=height,
+        sonar_lever=(0.0, 0.0, 0.0),
+        sonar_mount_rpy_deg=(0.0, 0.0, 0.0),
+        first_range=0.5 * height,
+        last_range=1.1 * height * math.hypot(1.0, config.reach),
+        bin_width=0.1,
+        sound_speed=SOUND_SPEED,
+        sound_speed_profile=(0.0, SOUND_SPEED, layer, SOUND_SPEED, layer + 0.1, below),
+        noise_fades=False,
+        nav_attitude_error_deg=errors * math.degrees(stated.attitude),
+        nav_heading_error_deg=errors * math.degrees(stated.heading),
+        nav_heave_error=errors * stated.heave,
+        nav_position_error=errors * stated.position,
+    )
+
+
+class _Ground(Terrain):
+    """A floor whose `rise` gives z by east and north."""
+
+    def at(self, place: FloatArray, roughness: FloatArray) -> tuple[FloatArray, BoolArray]:
+        return self.rise(place[..., 0], place[..., 1]), np.zeros(place.shape[:-1], bool)
+
+
+def _swaths(
+    sonar: BathymetryScenario,
+    floor: Floor,
+    start: tuple[float, float],
+    correction: FloatArray,
+    first_ns: int,
+    rng: np.random.Generator,
+) -> Scene:
+    """Pings and navigation of a line."""
+    ship = ship_of(sonar, sonar.sonar_depth, rng)
+    ship = ship._replace(start=ship.start + [*start, 0.0])
+    ground = _Ground(
+        -KEEL - sonar.sonar_height, ship.course, floor.at, lambda along, off: off > np.inf
+    )
+    count = round((sonar.last_range - sonar.first_range) / sonar.bin_width)
+    ranges = sonar.first_range + sonar.bin_width * np.arange(count, dtype=np.float64)
+    heard = round(2e9 * ranges[-1] / SOUND_SPEED)
+    received, truth = [], []
+    for ping in range(sonar.pings):
+        sent = ping / sonar.ping_rate
+        for side in ('port', 'starboard'):
+            profile = profile_below(
+                sonar, ship, ground, np.zeros(count), first_ns, sent, ranges, side, side
+            )
+            truth.append(profile)
+            received.append(Received(profile.stamp_ns + heard, hear(sonar, profile, rng), side))
+    stated = navigation_of(
+        sonar, _as_reported(ship, correction), first_ns, sonar.pings / sonar.ping_rate, rng, 'map'
+    )
+    received += [Received(each.stamp_ns, each) for each in stated]
+    received.sort(key=lambda item: item.received_ns)
+    return Scene(tuple(received), tuple(truth), frame_id='map')
+
+
+def _as_reported(ship: Ship, correction: FloatArray) -> Ship:
+    """The ship as its navigation has it, before errors that change: true less the corrections."""
+
+    def less(waves: Waves, bias: float) -> Waves:
+        constant = -bias, 0.0, 0.5 * math.pi
+        return Waves(*(np.append(part, value) for part, value in zip(waves, constant)))
+
+    return ship._replace(
+        start=ship.start - [0.0, 0.0, correction[3]] - correction[5] * ship.velocity,
+        roll=less(ship.roll, correction[0]),
+        pitch=less(ship.pitch, correction[1]),
+        yaw=less(ship.yaw, correction[2]),
+    )
 
 
 def write_truth(path: Path, scene: SurveyScene) -> None:

@@ -45,7 +45,6 @@ an outlier that is alone has no other depth beside it."""
 HALO = 6
 """Cells around a tile whose soundings its nodes need."""
 LEAST_GAP = 0.25
-EMPTY_LABEL = 255
 
 
 @frozen(eq=False)

@@ -114,6 +114,9 @@ def test_loud_stretches_of_the_water_are_no_noise():
     assert kept.sum() > 200
     level = variances.noise_variance(spoilt, kept)
     assert level == pytest.approx(variances.noise_variance(noise, quiet), rel=0.15)
+    spoilt[:224] *= 30.0  # what rings for most of the column
+    kept = variances.quiet_stretches(spoilt, quiet)
+    assert not kept[:224].any() and kept[224:320].all()
 
 
 @pytest.mark.parametrize('staves', [2, 8])

@@ -28,6 +28,7 @@ from sonar_imm.measurements import GeodeticFix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import quoted
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 SHIPPED = sorted(path.name for path in (ROOT / 'bags').iterdir() if path.is_dir())
@@ -195,3 +196,22 @@ def test_a_file_of_no_known_kind_says_what_it_lacks(tmp_path, capsys):
     (tmp_path / 'a.csv').write_text('Wann;Wo\n1;2\n')
     assert main(['info', str(tmp_path / 'a.csv')]) == 2
     assert '--column stamp=HEADER --column x=HEADER' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'path, here, on_windows',
+    [
+        ('dive.bag', 'dive.bag', 'dive.bag'),
+        ('my dive.bag', "'my dive.bag'", '"my dive.bag"'),
+        ('C:\\dives\\a.bag', "'C:\\dives\\a.bag'", 'C:\\dives\\a.bag'),
+    ],
+)
+def test_a_suggested_command_is_one_that_the_shell_takes(path, here, on_windows):
+    assert (quoted(path, windows=False), quoted(path, windows=True)) == (here, on_windows)
+
+
+def test_images_of_an_interferometer_name_their_conversion(tmp_path, capsys):
+    (each,) = (each for each in FORMATS if each.name == 'swath.bag')
+    each.make(tmp_path / 'swath.bag', line(3))
+    assert main(['info', str(tmp_path / 'swath.bag')]) == 1
+    assert 'sonar-imm convert interferometer' in capsys.readouterr().out

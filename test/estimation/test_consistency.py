@@ -33,14 +33,9 @@ from sonar_imm.estimation.consistency import (
     NIS_MEMORY,
     NisMemory,
     ospa,
-    rmse,
     switches_by_scan,
     switching_gospa,
 )
-
-
-def test_rmse():
-    assert rmse(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(12.5), rel=1e-15)
 
 
 def test_nees_by_hand():

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Weighted particles: log weights, effective sample size, moments."""
+"""Weighted particles: log weights, effective sample size, resampling."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,7 +21,7 @@ import pytest
 from scipy.special import logsumexp
 
 from sonar_imm.estimation import particles
-from sonar_imm.estimation.particles import invert, SCHEMES
+from sonar_imm.estimation.particles import invert, systematic
 
 
 def test_normalise_survives_what_underflows():
@@ -41,48 +41,34 @@ def test_effective_sample_size_lies_between_one_and_all():
     assert particles.effective_sample_size(np.eye(1, 50)[0]) == pytest.approx(1.0)
 
 
-def test_moments_are_those_of_numpy():
-    rng = np.random.default_rng(1)
-    x, w = rng.normal(size=(3, 2, 40)), rng.random((3, 40))
-    w /= w.sum(axis=1, keepdims=True)
-    mean, covariance = particles.mean(x, w), particles.covariance(x, w)
-    for j in range(3):
-        assert mean[j] == pytest.approx(np.average(x[j], axis=1, weights=w[j]))
-        assert covariance[j] == pytest.approx(np.cov(x[j], aweights=w[j], ddof=0))
-
-
-# -- resampling schemes: unbiased, bounded scatter, hostile weights -------------------------------
+# -- resampling: unbiased, bounded scatter, hostile weights ---------------------------------------
 
 
 W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
-schemes = pytest.mark.parametrize('name', SCHEMES)
 
 
-@schemes
-def test_each_particle_is_drawn_as_often_as_its_weight_says(name):
+def test_each_particle_is_drawn_as_often_as_its_weight_says():
     rng = np.random.default_rng(1)
     runs, count = 20_000, 7
     copies = np.zeros((runs, len(W)))
     for run in range(runs):
-        copies[run] = np.bincount(SCHEMES[name](W, count, rng), minlength=len(W))
+        copies[run] = np.bincount(systematic(W, count, rng), minlength=len(W))
     error = copies.std(axis=0) / np.sqrt(runs)
     assert (np.abs(copies.mean(axis=0) - count * W) <= 4.5 * error + 1e-12).all()
     assert (copies[:, 1] == 0).all()
 
 
-@schemes
-def test_indices_are_as_many_as_wanted_and_ascend(name):
+def test_indices_are_as_many_as_wanted_and_ascend():
     rng = np.random.default_rng(2)
     for count in (0, 1, 5, 1000):
-        indices = SCHEMES[name](W, count, rng)
+        indices = systematic(W, count, rng)
         assert indices.shape == (count,)
         assert (np.diff(indices) >= 0).all()
 
 
-@schemes
-def test_scale_of_the_weights_does_not_matter(name):
-    first = SCHEMES[name](W, 50, np.random.default_rng(3))
-    other = SCHEMES[name](1e-200 * W, 50, np.random.default_rng(3))
+def test_scale_of_the_weights_does_not_matter():
+    first = systematic(W, 50, np.random.default_rng(3))
+    other = systematic(1e-200 * W, 50, np.random.default_rng(3))
     assert np.array_equal(first, other)
 
 
@@ -95,39 +81,17 @@ def test_scale_of_the_weights_does_not_matter(name):
 def test_systematic_copies_differ_from_the_expectation_by_less_than_one(weights, count, seed):
     w = np.array(weights)
     expected = count * w / w.sum()
-    copies = np.bincount(
-        SCHEMES['systematic'](w, count, np.random.default_rng(seed)), minlength=len(w)
-    )
+    copies = np.bincount(systematic(w, count, np.random.default_rng(seed)), minlength=len(w))
     assert (copies >= np.floor(expected - 1e-9)).all()
     assert (copies <= np.ceil(expected + 1e-9)).all()
 
 
-def test_copies_scatter_least_when_systematic_and_most_when_independent():
-    w = np.random.default_rng(4).random(100)
-    w /= w.sum()
-    scatter = {
-        name: np.mean(
-            [
-                np.square(np.bincount(scheme(w, 100, rng), minlength=100) - 100 * w).mean()
-                for rng in map(np.random.default_rng, range(400))
-            ]
-        )
-        for name, scheme in SCHEMES.items()
-    }
-    fraction = 100 * w % 1.0
-    assert scatter['systematic'] == pytest.approx((fraction * (1.0 - fraction)).mean(), rel=0.05)
-    assert scatter['multinomial'] == pytest.approx((100 * w * (1.0 - w)).mean(), rel=0.05)
-    assert scatter['systematic'] < scatter['stratified'] < scatter['residual']
-    assert scatter['residual'] < scatter['multinomial']
-
-
-@schemes
 @pytest.mark.parametrize(
     'weights', [[], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf], [[1.0, 2.0]]]
 )
-def test_what_are_no_weights_is_refused(name, weights):
+def test_what_are_no_weights_is_refused(weights):
     with pytest.raises(ValueError, match='weights'):
-        SCHEMES[name](weights, 3, np.random.default_rng(0))
+        systematic(weights, 3, np.random.default_rng(0))
 
 
 def test_a_point_on_a_boundary_belongs_to_what_begins_there():

@@ -14,7 +14,7 @@
 
 """Whatever a wire brings and a parameter file says, a tracker goes on and tells the truth.
 
-2,000 messages for each system here; ``make fuzz`` sends 100,000.
+1,000 messages for each system here; ``make fuzz`` sends 100,000.
 """
 
 import json

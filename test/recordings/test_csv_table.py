@@ -12,6 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+import tracemalloc
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -257,3 +259,17 @@ def test_text_in_utf_16_is_said(tmp_path):
     (tmp_path / 'wide.csv').write_bytes('stamp,x,y\n1,2,3\n'.encode('utf-16'))
     with pytest.raises(BagError, match='is text in UTF-16'):
         CsvTable(tmp_path / 'wide.csv')
+
+
+def test_a_line_without_an_end_takes_no_room(tmp_path):
+    """Text of 64 MB without a line feed: what is held of it is a part of a megabyte or so."""
+    path = tmp_path / 'endless.csv'
+    for head in (b'', b'stamp,x,y\n'):
+        path.write_bytes(head + b'1' * (1 << 26))
+        tracemalloc.start()
+        with pytest.raises(BagError, match='no line of a CSV file|no column'):
+            made = CsvTable(path)
+            made.require('stamp')
+            list(made)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24
+        tracemalloc.stop()

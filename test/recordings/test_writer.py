@@ -12,10 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+"""Writing recordings, and the messages of rosbags."""
+
 import filecmp
 
+import numpy as np
 import pytest
 
+from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.writer import BagWriter
@@ -104,3 +108,40 @@ def test_programming_errors_are_told(tmp_path, fix_message):
         BagWriter(tmp_path / 'bag', storage='zip')
     with BagWriter(tmp_path / 'bag') as bag, pytest.raises(ValueError, match='log time'):
         bag.write('/fix', fix_message(0), -1)
+
+
+def test_every_common_message_can_be_made_empty_and_survives_cdr():
+    for name in typestore().types:
+        if '/msg/' not in name:
+            continue
+        message = ros_message(name)
+        raw = bytes(typestore().serialize_cdr(message, name))
+        again = decode_cdr(typestore(), name, raw)
+        assert bytes(typestore().serialize_cdr(again, name)) == raw, name
+
+
+def test_fields_are_cast_strictly():
+    message = ros_message(
+        'sensor_msgs/msg/JointState', name=('a',), position=[1, 2], velocity=np.float32([0.5])
+    )
+    assert message.position.dtype == np.float64 and message.velocity.dtype == np.float64
+    cloud = ros_message('sensor_msgs/msg/PointCloud2', data=b'\x01\x02', height=np.int64(3))
+    assert cloud.data.tolist() == [1, 2] and type(cloud.height) is int
+    pose = ros_message('geometry_msgs/msg/PoseWithCovariance', covariance=np.eye(6))
+    assert pose.covariance.shape == (36,)
+
+
+def test_an_unknown_field_is_named():
+    with pytest.raises(TypeError, match='sek'):
+        ros_message('builtin_interfaces/msg/Time', sek=1)
+
+
+def test_spare_alignment_bytes_are_no_damage_but_damage_is():
+    name = 'sensor_msgs/msg/JointState'
+    raw = bytes(typestore().serialize_cdr(ros_message(name, position=[2.5]), name))
+    for spare in (0, 4, 8, 12):
+        assert decode_cdr(typestore(), name, raw + bytes(spare)).position.tolist() == [2.5]
+    with pytest.raises(Exception, match='size mismatch'):
+        decode_cdr(typestore(), name, raw + bytes(100))
+    with pytest.raises(Exception, match='JointState'):
+        decode_cdr(typestore(), name, raw[:20])

@@ -14,12 +14,16 @@
 
 """Simulated surveys: what is known without the formulas that they test."""
 
+import json
+
+from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points
-from sonar_imm_tools.simulation.survey import budget, scenario, simulate
+from sonar_imm_tools.simulation.survey import budget, pings_of, scenario, simulate
 from sonar_imm_tools.survey.line import line_of
 
 EXACT = {
@@ -110,6 +114,34 @@ def test_the_same_seed_is_the_same_survey():
     assert 0.005 < np.concatenate(item.bad[:1]).mean() < 0.1
 
 
+@pytest.mark.parametrize(
+    'changes, off, spread',
+    [
+        ({}, 0.0, 0.06),
+        ({'tide_std': 1.0}, None, 0.06),
+        ({'roll_bias_deg': 1.0}, 0.0, 0.8),
+        ({'sound_speed_error': 10.0}, -0.33, 0.5),
+    ],
+)
+def test_pings_of_a_survey_are_tracked_to_its_floor_less_what_is_wrong(changes, off, spread):
+    exact = {'nav_errors': 0.0, 'roll_bias_deg': 0.0, 'tide_std': 0.0, 'sound_speed_error': 0.0}
+    small = {'lines': 1, 'cross_lines': 0, 'length': 12.0, 'terrain': 'slope'}
+    true, lines = pings_of(scenario('survey', {**small, **exact, **changes}), 3)
+    ((name, scene, told),) = lines
+    assert name == 'line_000' and len(scene.truth) == 12
+    config = BathymetryConfig.from_mapping(told).for_inputs(frozenset({'nav', 'snapshot'}))
+    tracker, error = BathymetryTracker(config), []
+    for item in scene.measurements:
+        each = item.measurement
+        for made in tracker.process(evolve(each, side=item.namespace) if item.namespace else each):
+            x, y, z = (made.extras[f'p{axis}'][made.extras['valid'] > 0] for axis in 'xyz')
+            error.append(z - true.floor.at(x, y))
+    errors = np.concatenate(error)
+    expected = -true.corrections[0, 3] if off is None else off
+    assert errors.mean() == pytest.approx(expected, abs=0.08)
+    assert 0.5 * spread < errors.std() < spread
+
+
 def test_the_command_writes_lines_and_truth(tmp_path, capsys):
     small = ['--set', 'lines=2', '--set', 'cross_lines=0', '--set', 'length=40']
     out = tmp_path / 'survey'
@@ -130,11 +162,19 @@ def test_the_command_writes_lines_and_truth(tmp_path, capsys):
     capsys.readouterr()
     for arguments, words in (
         ([str(out), '--soundings'], 'is there already'),
-        ([str(tmp_path / 'b')], 'say --soundings'),
         ([str(tmp_path / 'b'), '--soundings', '--set', 'lines=0'], 'lines'),
     ):
         assert main(['simulate', 'survey', *arguments]) == 2
         error = capsys.readouterr().err
         assert words in error and 'Traceback' not in error
     assert not (tmp_path / 'b').exists()
+    shorter = ['--set', 'lines=1', '--set', 'cross_lines=0', '--set', 'length=10', '--json']
+    assert main(['simulate', 'survey', str(tmp_path / 'bags'), *shorter]) == 0
+    assert json.loads(capsys.readouterr().out)['messages'] > 100
+    bag = tmp_path / 'bags' / 'line_000.bag'
+    assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
+    line = read_points(tmp_path / 'run' / 'soundings.csv')
+    assert set(line['side']) == {0, 1}
+    with np.load(tmp_path / 'bags' / 'truth.npz') as known:
+        assert known['names'].tolist() == ['line_000'] and not len(known['bad'])
     assert main(['simulate', 'diver', str(tmp_path / 'b'), '--soundings']) == 2

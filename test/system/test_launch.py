@@ -102,16 +102,21 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
 
     def say(*words, told=''):
         """What a command prints; asked again until `told` is part of it, as discovery needs."""
-        end, done = time.monotonic() + 60.0, None
+        end, done = time.monotonic() + 120.0, None
         while done is None or (told not in done.stdout and time.monotonic() < end):
-            done = subprocess.run([ros2, *words], env=domain, capture_output=True, text=True)
+            done = subprocess.run(
+                [ros2, *words], env=domain, capture_output=True, text=True, timeout=120.0
+            )
         assert told in done.stdout, (words, done.stdout, done.stderr)
         return done.stdout
 
     file = tmp_path / f'{name}.yaml'
     run = [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
+    more = []
+    if name == 'fls_detector':  # the default needs a package
+        more = ['-p', 'image_type:=sensor_msgs/msg/Image']
     managed = 'std_srvs/srv/Trigger' if name in SYSTEMS else ''
-    with started([*run, '-p', 'autostart:=false'], domain) as output:
+    with started([*run, '-p', 'autostart:=false', *more], domain) as output:
         say('node', 'list', told=f'/{name}\n')
         assert say('lifecycle', 'get', f'/{name}', told='[').strip() == 'unconfigured [1]'
         say('lifecycle', 'set', f'/{name}', 'configure', told='Transitioning successful')
@@ -121,13 +126,14 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
         say('param', 'get', f'/{name}', 'stale_after', told='7.5')
         say('param', 'describe', f'/{name}', 'stale_after', told='Description: ')
         say('topic', 'info', f'/{name}/processed', told='Publisher count: 1')
-        say('topic', 'echo', '--once', '--qos-durability', 'transient_local', f'/{name}/processed')
+        say('topic', 'echo', '--once', f'/{name}/processed', told='point_step')
         if managed:
             reset = say('service', 'call', f'/{name}/reset', managed, told='success=True')
             assert 'forgotten' in reset
         file.write_text(say('param', 'dump', f'/{name}', told='ros__parameters'))
         say('lifecycle', 'set', f'/{name}', 'deactivate', told='Transitioning successful')
     assert yaml.safe_load(file.read_text())[f'/{name}']['ros__parameters']['stale_after'] == 7.5
+    # The file comes first: what is told before it, for all nodes, gives way to all of the file.
     with started([*run, '--params-file', file, '-p', 'autostart:=true'], domain) as output:
         output.wait_for(lambda line, node: 'ready, hears' in line, [name])
         again = say('param', 'dump', f'/{name}', told='ros__parameters')

@@ -26,6 +26,7 @@ from collections.abc import Callable
 from ..conversion import ConversionReport
 from ..convert_options import OPTIONS
 from ..csv_table import CsvOptions
+from ..truth import convert_truth
 from .archives import convert_snapshots, convert_traces
 from .arrivals import convert_arrivals
 from .autoferry import convert_autoferry
@@ -38,7 +39,6 @@ from .nmea import convert_nmea
 from .relative import convert_relative
 from .segy import convert_segy
 from .side_scan import convert_pictures, convert_xtf
-from .truth import convert_truth
 
 __all__ = [
     'convert_arrivals',

@@ -48,27 +48,27 @@ from ..csv_table import BadRow, CsvOptions, CsvTable, Row, Table
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters
 from ..sources import BagError
-from .truth import number_names, truth_records
+from ..truth import number_names, truth_records
 
 _NOWHERE = (math.nan, math.nan, math.nan)
 Places = Mapping[str, tuple[float, float, float]]
 
 
+OPTIONAL = (
+    'var_toa', 'bearing', 'var_bearing', 'elevation', 'var_elevation', 'depth', 'var_depth',
+)  # fmt: skip
+
+
 class Arrival(NamedTuple):
-    """One line; `time_ns` is the absolute arrival, or the transmission when `toa` is a number."""
+    """One line; `time_ns` is the absolute arrival, or the transmission when `toa` is a number;
+    optional: as in `OPTIONAL`, NaN for what is not stated."""
 
     ping: str
     time_ns: int
     toa: float
     transmitter: str
     receiver: str
-    var_toa: float
-    bearing: float
-    var_bearing: float
-    elevation: float
-    var_elevation: float
-    depth: float
-    var_depth: float
+    optional: tuple[float, ...]
     tag: str = ''
 
 
@@ -179,22 +179,13 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
         raise BadRow('the ping is empty')
     time_ns = row.stamp_ns('arrival' if passive else 'stamp')
     toa = math.nan if passive else row.seconds_ns('toa') * 1e-9
+    optional = dict.fromkeys(OPTIONAL, math.nan)
+    for name in ('bearing', 'elevation', 'depth'):
+        optional |= {name: row.optional(name), f'var_{name}': _variance(row, name)}
     var_toa = _variance(row, 'toa')
-    return Arrival(
-        ping,
-        time_ns,
-        toa,
-        transmitter,
-        receiver,
-        default if math.isnan(var_toa) else var_toa,
-        row.optional('bearing'),
-        _variance(row, 'bearing'),
-        row.optional('elevation'),
-        _variance(row, 'elevation'),
-        row.optional('depth'),
-        _variance(row, 'depth'),
-        row.text('tag') if passive and names_tags(row.table) else '',
-    )
+    optional['var_toa'] = default if math.isnan(var_toa) else var_toa
+    tag = row.text('tag') if passive and names_tags(row.table) else ''
+    return Arrival(ping, time_ns, toa, transmitter, receiver, tuple(optional.values()), tag)
 
 
 def names_tags(table: Table) -> bool:
@@ -236,13 +227,7 @@ def _of_ping(
         rx_id=[numbers[arrival.receiver] for arrival in ping],
         tx=np.array([_NOWHERE if passive else senders[arrival.transmitter] for arrival in ping]),
         rx=np.array([places[arrival.receiver] for arrival in ping]),
-        var_toa=[arrival.var_toa for arrival in ping],
-        bearing=[arrival.bearing for arrival in ping],
-        var_bearing=[arrival.var_bearing for arrival in ping],
-        elevation=[arrival.elevation for arrival in ping],
-        var_elevation=[arrival.var_elevation for arrival in ping],
-        depth=[arrival.depth for arrival in ping],
-        var_depth=[arrival.var_depth for arrival in ping],
+        **dict(zip(OPTIONAL, zip(*(arrival.optional for arrival in ping)))),
     )
 
 

@@ -42,8 +42,7 @@ from ..csv_table import BadRow
 from ..messages import ros_message
 from ..sources import BagError
 from ..track_files import whole_items
-from ..truth import records_of
-from .truth import difference_velocity
+from ..truth import difference_velocity, records_of
 
 SENSORS = {'lidar': 1, 'radar': 2}
 

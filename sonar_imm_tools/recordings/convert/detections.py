@@ -164,11 +164,8 @@ def _note(report: ConversionReport, clocks: Clocks, names: Sequence[str]) -> Non
 
 
 def _arrival(stamp_ns: int, receiver: str, tag: str, std: float | None) -> Arrival:
-    nothing = float('nan')
-    var = nothing if std is None else std * std
-    return Arrival(
-        '', stamp_ns, nothing, '', receiver, var, *(nothing,) * 6, tag
-    )  # fmt: skip
+    var = np.nan if std is None else std * std
+    return Arrival('', stamp_ns, np.nan, '', receiver, (var, *(np.nan,) * 6), tag)
 
 
 def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArray]:

@@ -35,7 +35,7 @@ from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError
 from ..track_files import open_table
-from .truth import number_names, truth_records
+from ..truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
 """Seconds within which the same position is a repeated poll: the default of the tracker."""

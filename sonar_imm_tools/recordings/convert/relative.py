@@ -36,8 +36,8 @@ from ..convert_options import RelativeOptions
 from ..csv_table import BadRow, CsvTable, Row
 from ..messages import ros_message
 from ..places import check_place, checked_origin, origin_parameters, PolarRows
+from ..truth import truth_records
 from .fixes import by_name
-from .truth import truth_records
 
 TRANSCEIVER = 'transceiver'
 """Frame of a position that does not say whose it is."""

@@ -395,19 +395,31 @@ def _floor_below(
     def rough(along: FloatArray, off: FloatArray) -> BoolArray:
         return in_outline(config, along, off, config.patch_start, config.patch_end)
 
-    seen = see(
-        config,
-        ship,
-        Terrain(_level(config), ship.course, rise, rough),
-        _roughness(config, len(ranges), rng),
-        since_start,
-        ranges,
-        config.sound_speed,
-        _axes(config, side),
+    terrain = Terrain(_level(config), ship.course, rise, rough)
+    roughness = _roughness(config, len(ranges), rng)
+    first = FIRST_STAMP_NS
+    return profile_below(
+        config, ship, terrain, roughness, first, since_start, ranges, side, namespace
     )
+
+
+def profile_below(
+    config: BathymetryScenario,
+    ship: Ship,
+    terrain: Terrain,
+    roughness: FloatArray,
+    first_ns: int,
+    since_start: float,
+    ranges: FloatArray,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    """The terrain that a ping sees which is sent some seconds after `first_ns`."""
+    axes = _axes(config, side)
+    seen = see(config, ship, terrain, roughness, since_start, ranges, config.sound_speed, axes)
     valid = seen.reached & _lit(config, ranges)
     return TrueProfile(
-        stamp_ns=FIRST_STAMP_NS + round(since_start * 1e9),
+        stamp_ns=first_ns + round(since_start * 1e9),
         frame_id='map',
         range=ranges,
         height=seen.place[:, 2],

@@ -30,10 +30,10 @@ from sonar_imm_tools.recordings.convert import (
     CsvOptions,
     KINDS,
 )
-from sonar_imm_tools.recordings.convert.truth import difference_velocity, number_names
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.truth import difference_velocity, number_names
 
 
 @pytest.fixture

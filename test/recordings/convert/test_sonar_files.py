@@ -171,7 +171,7 @@ class TestXtf:
             (b'', 'ended|gives up|shorter'),
             (b'\x7b' + bytes(100), 'gives up'),
             (b'\x7a' + bytes(2000), 'version of the file is 122'),
-            (b'\x7b' + bytes(1023), 'holds no ping'),
+            (b'\x7b' + bytes(1023), 'holds nothing that could be converted'),
         ],
     )
     def test_nothing_of_use_is_one_sentence(self, tmp_path, content, wanted):
@@ -207,6 +207,20 @@ class TestXtf:
         (tmp_path / 'a.pyxtf_idx').write_bytes(pickle.dumps(Trap()))
         assert convert_xtf(path, tmp_path / 'bag').messages['/detections'] == 2
         assert not (tmp_path / 'sprung').exists()
+
+    def test_where_there_are_no_files_of_descriptors(self, tmp_path, monkeypatch):
+        """As on Windows: the file is read by its name, unless an index lies beside it."""
+        path, there = xtf(tmp_path / 'a.xtf', some(3)), os.path.exists
+        monkeypatch.setattr(
+            foreign.os.path,
+            'exists',
+            lambda each: not str(each).startswith('/dev') and there(each),
+        )
+        pings = list(foreign.READERS['xtf'](str(path)))
+        assert [ping['kind'] for ping in pings] == ['ping'] * 3
+        (tmp_path / 'a.pyxtf_idx').write_bytes(b'')
+        with pytest.raises(ValueError, match='index of pyxtf beside it'):
+            list(foreign.READERS['xtf'](str(path)))
 
     def test_a_reader_that_hangs_is_stopped(self, tmp_path, monkeypatch):
         monkeypatch.setattr(foreign, 'SILENCE', 3.0)

@@ -422,7 +422,7 @@ def test_a_swaying_obstacle_stays_about_its_place():
 
 
 def test_a_mover_moves_as_its_velocity_says_and_is_seen():
-    seen = []
+    seen, ways = [], []
     for seed in range(12):
         truth = simulate(scenario('mover'), seed).truth[0]
         dt = np.diff(truth.stamp_ns) * 1e-9
@@ -430,7 +430,9 @@ def test_a_mover_moves_as_its_velocity_says_and_is_seen():
         assert_allclose(step, truth.velocity[1:], atol=1e-5)
         assert 0.3 <= np.linalg.norm(truth.velocity[0]) <= 1.5
         seen.append(truth.in_beam.mean())
+        ways.append(truth.velocity[0] / np.linalg.norm(truth.velocity[0]))
     assert np.mean(seen) > 0.5
+    assert (np.ptp(ways, axis=0) > 1.0).all()  # they go any way
 
 
 @pytest.mark.statistics

@@ -12,13 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+"""Numpy archives of snapshots and traces, traces as CSV and SEG-Y."""
+
+import sys
 import zipfile
 
+from helpers.segy_files import write_segy
 import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm_tools.recordings.convert import convert_snapshots, KINDS
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.convert import (
+    convert_segy,
+    convert_snapshots,
+    convert_traces,
+    KINDS,
+)
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
@@ -169,3 +179,152 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / 'cut.npz').write_bytes(broken)
     with pytest.raises(BagError, match='damaged'):
         convert_snapshots(tmp_path / 'cut.npz', tmp_path / 'bag')
+
+
+DEPTH = 120.0 + 0.25 * np.arange(40)
+ONES = np.ones((3, 40))
+SECOND = 10**9
+
+
+def traces_in(path):
+    with BagReader(path) as bag:
+        return [item.measurement for item in measurements_of(bag, 'fathometer')]
+
+
+@pytest.fixture
+def archive(tmp_path):
+    def write(**arrays):
+        np.savez(tmp_path / 'in.npz', **arrays)
+        return tmp_path / 'in.npz', tmp_path / 'bag'
+
+    return write
+
+
+def test_an_archive_with_truth(archive):
+    amplitude = np.sin(DEPTH) * np.ones((3, 1))
+    strength = np.array([[1.0, 0.3], [0.9, 0.5], [0.39, np.nan]])
+    path, out = archive(
+        depth=DEPTH,
+        amplitude=amplitude,
+        sigma=[1.0, 2.0, 3.0],
+        stamp=[5.0, 6.5, 7.0],
+        reference_depth=[70.0, np.nan, 71.0],
+        reflector_amplitude=strength,
+        reflector_depth=np.array([[121.0, 125.0], [121.1, 125.1], [121.2, 125.2]]),
+    )
+    report = KINDS['traces'](path, out)
+    assert report.messages == {'/trace': 3, '/truth/estimate': 3}
+    traces = traces_in(out)
+    assert [trace.stamp_ns for trace in traces] == [5 * SECOND, 65 * SECOND // 10, 7 * SECOND]
+    assert [trace.reference_depth for trace in traces] == [70.0, None, 71.0]
+    assert (traces[1].sigma == 2.0).all() and np.allclose(traces[1].amplitude, np.sin(DEPTH))
+    with BagReader(out) as bag:
+        truth = [
+            read_estimate(item.message).columns() for item in bag.messages(['/truth/estimate'])
+        ]
+    # The second is there with 0.6 and more of its greatest, the first no longer with 0.39.
+    assert [list(item['track_id']) for item in truth] == [[1, 2], [1, 2], []]
+    assert list(truth[1]['depth']) == [121.1, 125.1]
+
+
+def test_bad_traces_are_left_out_by_name(archive):
+    amplitude = np.ones((3, 40))
+    amplitude[1] = np.nan
+    path, out = archive(depth=DEPTH, amplitude=amplitude)
+    report = convert_traces(path, out, rate=2.0)
+    assert report.bad_rows == 1 and 'trace 1: ' in report.problems[0]
+    stamps = [item.stamp_ns for item in traces_in(out)]
+    assert stamps[1] - stamps[0] == SECOND
+
+
+@pytest.mark.parametrize(
+    'arrays, words',
+    [
+        ({'depth': DEPTH}, "no array 'amplitude'"),
+        ({'depth': DEPTH[:5], 'amplitude': ONES}, r'\(traces, n\) are needed'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1.0]}, '3 traces need as many'),
+        (
+            {'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'sigma': np.ones(7)},
+            'sigma has the shape',
+        ),
+        ({'depth': DEPTH, 'amplitude': np.zeros((3, 40))}, 'silent'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1e300] * 3}, '3 traces need as many'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [3e9] * 3}, 'before 2038'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': ['a'] * 3}, "'stamp' holds no numbers"),
+        ({'depth': DEPTH, 'amplitude': ONES, 'sigma': 'x'}, "'sigma' holds no numbers"),
+    ],
+)
+def test_archives_that_make_no_sense_are_one_sentence(archive, arrays, words):
+    path, out = archive(**arrays)
+    with pytest.raises(BagError, match=words):
+        convert_traces(path, out)
+
+
+def test_a_table_has_a_row_a_sample(tmp_path):
+    lines = ['time,depth,amplitude,sigma']
+    lines += [f'{stamp},{z:.2f},{k},0.5' for stamp in (3, 4) for k, z in enumerate(DEPTH)]
+    lines[50] = '4,far,1,1'
+    (tmp_path / 'in.csv').write_text('\n'.join(lines))
+    report = convert_traces(tmp_path / 'in.csv', tmp_path / 'bag')
+    assert report.rows == 80 and report.bad_rows == 1 and 'line 51' in report.problems[0]
+    first, second = traces_in(tmp_path / 'bag')
+    assert len(first) == 40 and len(second) == 39 and (first.sigma == 0.5).all()
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Seven traces of 30 samples every 100 us, four a second, from a recorder that starts late."""
+    rows, path = np.arange(7), tmp_path / 'line.seg'
+    write_segy(
+        path,
+        100 * rows[:, None] + np.arange(30),
+        3,
+        YearDataRecorded=2018,
+        DayOfYear=72,
+        HourOfDay=23,
+        MinuteOfHour=11,
+        SecondOfMinute=24 + rows // 4,
+        TRACE_SAMPLE_INTERVAL=100,
+        DelayRecordingTime=20,
+    )
+    return path
+
+
+def test_segy_traces_have_their_depth_and_time(line, tmp_path):
+    report = convert_segy(line, tmp_path / 'bag', depth_offset=2.0)
+    traces = traces_in(tmp_path / 'bag')
+    assert report.messages == {'/trace': 7}
+    assert np.allclose(traces[0].depth, 2.0 + 15.0 + 0.075 * np.arange(30), atol=1e-5)
+    assert list(traces[3].amplitude) == list(300.0 + np.arange(30))
+    start = 1520982684 * SECOND  # 2018-03-13 23:11:24 UTC
+    assert [trace.stamp_ns - start for trace in traces[:5]] == [
+        0,
+        SECOND // 4,
+        SECOND // 2,
+        3 * SECOND // 4,
+        SECOND,
+    ]
+
+
+def test_segy_traces_are_cut_and_stacked(line, tmp_path):
+    convert_segy(line, tmp_path / 'bag', sample_spacing=0.376, first_sample=12, samples=8, stack=3)
+    traces = traces_in(tmp_path / 'bag')
+    assert len(traces) == 2 and len(traces[0]) == 8
+    assert np.allclose(traces[0].depth[0], 15.0 + 12 * 0.376)
+    assert list(traces[1].amplitude) == list(400.0 + np.arange(12, 20))
+
+
+def test_what_is_no_segy_is_one_sentence(tmp_path):
+    pytest.importorskip('segyio')
+    (tmp_path / 'note.seg').write_text('no traces here')
+    with pytest.raises(BagError, match='cannot be read'):
+        convert_segy(tmp_path / 'note.seg', tmp_path / 'bag')
+    with pytest.raises(BagError, match='cannot be read'):
+        convert_segy(tmp_path / 'absent.seg', tmp_path / 'bag')
+
+
+def test_without_segyio_the_command_says_how_to_get_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'segyio', None)
+    (tmp_path / 'line.seg').write_bytes(b'')
+    assert main(['convert', 'segy', str(tmp_path / 'line.seg'), str(tmp_path / 'bag')]) == 2
+    assert "pip install 'sonar_imm[segy]'" in capsys.readouterr().err

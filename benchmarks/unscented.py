@@ -12,28 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The unscented transform: the moments of a Gaussian after a nonlinear function.
+"""The unscented filter, of the baseline in `landmark`: a Gaussian through a nonlinear function.
 
-A Gaussian is replaced by sigma points on its principal axes. The points go through the function,
-and their weighted mean and covariance are those of the result. Exact for linear functions; for
-quadratic ones the mean is exact.
-
-Three choices make it robust:
-
-- **No negative weights.** ``kappa = max(0, 3 - n)``. Up to three dimensions the fourth moment of
-  the Gaussian is matched; above that the centre has no weight and the rule is the cubature rule.
-  Every covariance is a sum of squares with non-negative weights, so it cannot lose its
-  definiteness. The measurement update has the matching (Joseph) form.
-- **Angles are averaged as offsets.** Components marked as angles are compared with the image of
-  the centre point. The differences are wrapped once into [-pi, pi], averaged and added back.
-  Turning the scene turns the answer and changes nothing else, because the points lie on principal
-  axes, which turn with the scene. Singular covariances need no special care.
-- **What is not finite is refused** by `CovarianceError`, at the step where it appears.
-
+Sigma points go through the function, and their weighted mean and covariance are those of the
+result: exact for linear functions; for quadratic ones the mean is exact. Components marked as
+angles are compared with the image of the centre point, wrapped once, averaged and added back.
 Functions are vectorised: they take points (..., s, n) and give (..., s, m).
 
-Reference: Julier, Uhlmann, *Unscented Filtering and Nonlinear Estimation*, Proc. IEEE 92(3), 2004;
-Arasaratnam, Haykin, *Cubature Kalman Filters*, IEEE TAC 54(6), 2009.
+Reference: Julier, Uhlmann, *Unscented Filtering and Nonlinear Estimation*, Proc. IEEE 92(3), 2004.
 """
 
 from __future__ import annotations
@@ -43,10 +29,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .angles import wrap_angle
-from .arrays import BoolArray, FloatArray
-from .covariance import add_jitter, CovarianceError, solve, symmetrise, transpose
-from .kalman import apply, factorise, log_density, Predicted, Updated
+from sonar_imm.estimation.angles import wrap_angle
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.covariance import (
+    add_jitter,
+    CovarianceError,
+    solve,
+    symmetrise,
+    transpose,
+)
+from sonar_imm.estimation.kalman import apply, factorise, log_density, Updated
+from sonar_imm.estimation.smoothing import sigma_offsets
 
 Function = Callable[[FloatArray], FloatArray]
 
@@ -70,25 +63,6 @@ class _Cloud(NamedTuple):
     mean: FloatArray
 
 
-def sigma_offsets(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Offsets (..., 2n + 1, n) of the sigma points from their mean, the centre first, and their
-    weights (2n + 1,).
-
-    Raises CovarianceError when `P` (..., n, n) is not finite. Eigenvalues below zero count as
-    zero.
-    """
-    finite = np.isfinite(P).all(axis=(-1, -2))
-    if not finite.all():
-        raise CovarianceError('covariance is not finite', np.asarray(~finite))
-    n = P.shape[-1]
-    kappa = max(0.0, 3.0 - n)
-    values, vectors = np.linalg.eigh(P)
-    axes = transpose(vectors) * np.sqrt((n + kappa) * np.maximum(values, 0.0))[..., None]
-    weights = np.full(2 * n + 1, 0.5 / (n + kappa))
-    weights[0] = kappa / (n + kappa)
-    return np.concatenate([np.zeros_like(axes[..., :1, :]), axes, -axes], axis=-2), weights
-
-
 def unscented_transform(
     function: Function, x: FloatArray, P: FloatArray, *, angles: BoolArray | None = None
 ) -> Transformed:
@@ -108,14 +82,6 @@ def unscented_transform(
     )
 
 
-def predict(
-    x: FloatArray, P: FloatArray, f: Function, Q: FloatArray, *, angles: BoolArray | None = None
-) -> Predicted:
-    """Time update ``x <- f(x) + w``, ``w ~ N(0, Q)``; `angles` (n,) marks angles of the state."""
-    moved = unscented_transform(f, x, P, angles=angles)
-    return Predicted(moved.mean, *add_jitter(symmetrise(moved.covariance + Q)))
-
-
 def update(
     x: FloatArray,
     P: FloatArray,
@@ -124,12 +90,11 @@ def update(
     R: FloatArray,
     *,
     angles: BoolArray | None = None,
-    state_angles: BoolArray | None = None,
 ) -> Updated:
     """Measurement update with ``z = h(x) + v``, ``v ~ N(0, R)``.
 
     z: (..., m); h: (..., s, n) to (..., s, m); R: (..., m, m); angles: (m,), angles of the
-    measurement; state_angles: (n,), angles of the state, which are wrapped into [-pi, pi].
+    measurement.
 
     The covariance is ``sum w (dx - K dz)(.)' + K R K'``: squares only, equal to ``P - K S K'`` in
     exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or a component of the
@@ -147,7 +112,7 @@ def update(
     covariance, repaired = add_jitter(symmetrise(covariance))
     nis, log_likelihood = log_density(innovation, factor)
     return Updated(
-        _wrap(x + apply(gain, innovation), state_angles),
+        x + apply(gain, innovation),
         covariance,
         S,
         nis,
