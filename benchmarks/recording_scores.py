@@ -15,8 +15,8 @@
 """Every real recording of divers and boats in one table each: the default, its single families,
 conventional filters, and a peer.
 
-    SONAR_IMM_DATA=../shared/data python -m benchmarks.recording_scores \\
-        --out docs/results/recording_scores.json
+    export SONAR_IMM_DATA=../shared/data
+    python -m benchmarks.recording_scores --out docs/results/recording_scores.json
 
 `plain CV Kalman` is that of `real_boats`; the peer is FilterPy's Kalman filter with the noise of
 ours, which takes the fixes of a tag one by one and knows no clutter. Tags are

@@ -55,7 +55,12 @@ from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
     outlines,
 )
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
-from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth, TruthPath  # noqa: E402
+from sonar_imm_tools.evaluation.diver.series import (  # noqa: E402
+    Series,
+    series_of,
+    Truth,
+    TruthPath,
+)
 from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
     RECEIVERS,
     scenario,

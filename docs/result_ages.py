@@ -137,7 +137,6 @@ def git(*words: str) -> str:
 @cache
 def history() -> tuple[Commit, ...]:
     """All commits, newest first; none without git, or where the clone is shallow."""
-
     if git('rev-parse', '--is-shallow-repository').strip() != 'false':
         return ()
     log = git('log', '-M', '--topo-order', '--name-status', '--no-relative', '--format=%x00%H %P')
