@@ -34,6 +34,7 @@ from __future__ import annotations
 import array
 from collections.abc import Callable, Sequence
 from functools import partial
+import math
 import os
 import signal
 import subprocess
@@ -141,10 +142,12 @@ class Peer:
         return bool(there and all(out.get_subscription_count() for out in self.out.values()))
 
     def ask(self, key: str, message: Any) -> float:
-        """Milliseconds from sending to the answer."""
+        """Milliseconds from sending to the answer; NaN while the other end has not found this one."""
         self.answered, begin = 0.0, time.perf_counter()
         self.out[key].publish(message)
-        if not self.link.wait_for(lambda: self.answered, LIMIT):
+        if not self.link.wait_for(lambda: self.answered, LIMIT if self.last else 1.0):
+            if not self.last:
+                return math.nan
             raise LinkError(f'/{self.name} did not answer')
         return 1e3 * (self.answered - begin)
 
@@ -193,7 +196,7 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
         for which in (0, 1) if len(spent) % 2 else (1, 0):
             message.header.frame_id = str(size) if which else frame_id
             pair[which] = (other if which else node).ask(key, message)
-        size = len(deserialize_message(node.last, PointCloud2).data)
+        size = len(deserialize_message(node.last, PointCloud2).data) if node.last else 0
         spent.append((pair[0], pair[1]))
     return np.array(spent[SETTLED:])
 

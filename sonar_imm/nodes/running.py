@@ -32,14 +32,12 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.event_handler import EventHandler
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import (
     ExternalShutdownException,
     ShutdownException,
     SingleThreadedExecutor,
     TimeoutException,
 )
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -150,58 +148,21 @@ def _full(name: str) -> str:
 
 
 class MessagesFirst(SingleThreadedExecutor):
-    """One thread, in which messages, timers and services do not wait for events.
-
-    Messages are waited for, taken and handed on here, with what there is to wait for listed once;
-    whatever else is ready, and callbacks that take time, are left to rclpy.
-    """
+    """One thread, in which messages, timers and services do not wait for events."""
 
     def __init__(self, *, context: Context | None = None):
         super().__init__(context=context)
         self._events, self._next_look = False, 0.0
-        self._waits: _Waits | None = None
-        self._stale = True
-        # What is not public in rclpy may be another way in another version.
-        self._by_itself = all(hasattr(self, f'_{n}') for n in ('tasks', 'cb_iter', 'sigint_gc'))
 
     def can_execute(self, entity: Any) -> bool:
         return isinstance(entity, EventHandler) == self._events and super().can_execute(entity)
-
-    def wake(self) -> None:
-        """As rclpy does when something was made or destroyed."""
-        self._stale = True
-        super().wake()
-
-    def add_node(self, node: Node) -> bool:
-        added = super().add_node(node)
-        self._stale = True
-        return added
-
-    def remove_node(self, node: Node) -> None:
-        super().remove_node(node)
-        self._stale = True
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         now = time.monotonic()
         if now >= self._next_look:
             self._next_look = now + EVENT_PERIOD
             self._look_at_events()
-        if not self._by_itself or self._is_shutdown:
-            super().spin_once(timeout_sec)
-        elif self._tasks or self._cb_iter is not None:
-            self._leave_to_rclpy(timeout_sec if self._cb_iter is None else 0.0)
-        else:
-            if self._stale or self._waits is None:
-                self._stale = False  # before it is looked, since others may add something
-                self._waits = _Waits(self.get_nodes(), [self._guard, self._sigint_gc])
-            if not self._waits.complete or self._waits.message(timeout_sec, self._context):
-                self._leave_to_rclpy(0.0 if self._waits.complete else timeout_sec)
-
-    def _leave_to_rclpy(self, timeout_sec: float | None) -> None:
-        """Let rclpy do one thing, and go on with what it has begun until nothing is left."""
         super().spin_once(timeout_sec)
-        if self._cb_iter is not None and self._cb_iter.gi_frame is None:
-            self._cb_iter = None
 
     def _look_at_events(self) -> None:
         self._events = True
@@ -214,70 +175,4 @@ class MessagesFirst(SingleThreadedExecutor):
         except (ShutdownException, TimeoutException):
             pass  # none is left, or `spin_once` will say so
         finally:
-            self._events, self._cb_iter = False, None
-
-
-class _Waits:
-    """What nodes wait for besides events. complete: whether that is all; a node with other
-    waitables, as actions are, is left to rclpy."""
-
-    def __init__(self, nodes: Iterable[Node], guards: Iterable[Any]):
-        nodes = list(nodes)
-        self._subscriptions = [each for node in nodes for each in node.subscriptions]
-        self._guards = [*(each for node in nodes for each in node.guards), *guards]
-        self._others = {
-            'timer': [each.handle for node in nodes for each in node.timers],
-            'client': [each.handle for node in nodes for each in node.clients],
-            'service': [each.handle for node in nodes for each in node.services],
-        }
-        waitables = (each for node in nodes for each in node.waitables)
-        self.complete = all(isinstance(each, EventHandler) for each in waitables)
-        self._set: Any = None
-
-    def message(self, timeout_sec: float | None, context: Context) -> bool:
-        """Wait, and hand on a message of each topic; True when something else is ready."""
-        handles = [each.handle for each in (*self._subscriptions, *self._guards)]
-        with contextlib.ExitStack() as stack:
-            try:
-                for handle in (context.handle, *handles, *sum(self._others.values(), [])):
-                    stack.enter_context(handle)
-            except InvalidHandle:
-                return True
-            waiting = self._filled(context)
-            waiting.wait(-1 if timeout_sec is None else int(timeout_sec * 1e9))
-            ready = waiting.get_ready_entities('subscription')
-            triggered = waiting.get_ready_entities('guard_condition')
-            for guard in self._guards:
-                if guard.handle.pointer in triggered:
-                    guard._executor_triggered = True
-            if triggered or any(waiting.get_ready_entities(kind) for kind in self._others):
-                return True
-            due = [each for each in self._subscriptions if each.handle.pointer in ready]
-        for each in due:  # one of each, so that none has to wait for all of another
-            try:
-                with each.handle:
-                    taken = each.handle.take_message(each.msg_type, each.raw)
-            except InvalidHandle:
-                continue  # what the one before did away with
-            if taken is not None:
-                plain = each._callback_type is each.CallbackType.MessageOnly
-                each.callback(*(taken[:1] if plain else taken))
-        return not due and not context.ok()
-
-    def _filled(self, context: Context) -> Any:
-        """The wait set, which a wait empties of what is not ready."""
-        if self._set is None:
-            counts = (len(self._others[kind]) for kind in ('timer', 'client', 'service'))
-            sizes = (len(self._subscriptions), len(self._guards), *counts, 0)
-            self._set = _rclpy.WaitSet(*sizes, context.handle)
-        waiting = self._set
-        waiting.clear_entities()
-        for each in self._subscriptions:
-            waiting.add_subscription(each.handle)
-        for each in self._guards:
-            waiting.add_guard_condition(each.handle)
-        for kind, handles in self._others.items():
-            add = getattr(waiting, f'add_{kind}')
-            for handle in handles:
-                add(handle)
-        return waiting
+            self._events = False
