@@ -142,7 +142,7 @@ class Peer:
         return bool(there and all(out.get_subscription_count() for out in self.out.values()))
 
     def ask(self, key: str, message: Any) -> float:
-        """Milliseconds from sending to the answer; NaN while the ends have not found each other."""
+        """Milliseconds from sending to the answer; NaN while the ends have not met."""
         self.answered, begin = 0.0, time.perf_counter()
         self.out[key].publish(message)
         if not self.link.wait_for(lambda: self.answered, LIMIT if self.last else 1.0):
