@@ -153,7 +153,7 @@ class Watch:
 
     def _look(self) -> None:
         while not self._ended.wait(0.2):
-            for child in _children():
+            for child in _descendants():
                 used = _memory_mb(child, 'RssAnon')
                 self.peak = max(self.peak, _memory_mb(child, 'VmHWM'))
                 self.most = max(self.most, used)
@@ -162,18 +162,21 @@ class Watch:
             self.own = max(self.own, _memory_mb(os.getpid(), 'RssAnon'))
 
 
-def _children() -> Iterator[int]:
-    for task in Path('/proc/self/task').iterdir():
-        try:
-            yield from map(int, (task / 'children').read_text().split())
-        except OSError:
-            continue
+def _descendants(process: int | str = 'self') -> Iterator[int]:
+    """Workers are children of a process that has loaded the libraries for them."""
+    try:
+        for task in Path(f'/proc/{process}/task').iterdir():
+            for child in map(int, (task / 'children').read_text().split()):
+                yield child
+                yield from _descendants(child)
+    except OSError:  # it has ended
+        return
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of its children that live."""
+    """Of this process and of all below it that live."""
     total = 0.0
-    for process in (os.getpid(), *_children()):
+    for process in (os.getpid(), *_descendants()):
         try:
             fields = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
         except OSError:
