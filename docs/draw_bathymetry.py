@@ -260,7 +260,7 @@ def draw_labels() -> None:
             for kind, style in (('white', '-'), ('.3 m', '--'), ('1 m', ':')):
                 rows = [result['cells'][f'{place}, {std:g} m, {kind}'] for std in stds]
                 axis.plot(stds, [row[name] for row in rows], style, color=colour, linewidth=1.2)
-        axis.set(title=place, ylim=(-0.03, 1.03), xlabel='roughness, standard deviation [m]')
+        axis.set(title=place, ylim=(-0.03, 1.03), xlabel='std of roughness [m]')
     axes[0].set_ylabel('overlap')
     for kind, style in (('white', '-'), ('correlated over .3 m', '--'), ('over 1 m', ':')):
         axes[0].plot([], [], style, color=INK, label=kind)
