@@ -243,6 +243,8 @@ def root(tmp_path):
     package = tmp_path / 'root' / 'sonar_imm'
     for room in ('estimation', 'acoustics'):
         (package / room).mkdir(parents=True)
+        (package / room / '__init__.py').touch()
+    (package / '__init__.py').touch()  # else one that is installed is found first
     for name, text in SMALL.items():
         (package / name).write_text(text)
     shutil.copy(jit.__file__, package / 'estimation')
