@@ -26,7 +26,7 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import example, load_config, params_option, say
+from .common import example, load_config, params_option, say, timeout_option
 
 if TYPE_CHECKING:
     from ..survey.live import LiveChart
@@ -60,14 +60,7 @@ MAKING = 0.5
     help='Time between two messages of the chart.',
 )
 @params_option('Parameter file of the bathymetry node, for its error budget and sound speed.')
-@click.option(
-    '--timeout',
-    type=click.FloatRange(min=0.0, min_open=True),
-    default=60.0,
-    show_default=True,
-    metavar='SECONDS',
-    help='End with 1 when nothing is heard for so long from the start.',
-)
+@timeout_option(60.0)
 def command(
     topics: tuple[str, ...], cell: float, period: float, params: Path | None, timeout: float
 ) -> None:

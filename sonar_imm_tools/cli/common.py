@@ -108,6 +108,19 @@ def params_option(help: str) -> Callable[..., Any]:
     return click.option('--params', type=click.Path(path_type=Path, dir_okay=False), help=help)
 
 
+def timeout_option(default: float, *, when: str = '') -> Callable[..., Any]:
+    """``--timeout SECONDS``, of a command that listens to nodes."""
+    ends = 'with 1 when nothing is heard for so long from the start.'
+    return click.option(
+        '--timeout',
+        type=click.FloatRange(min=0.0, min_open=True),
+        default=default,
+        show_default=True,
+        metavar='SECONDS',
+        help=f'{when}: end {ends}' if when else f'End {ends}',
+    )
+
+
 def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
     """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
 

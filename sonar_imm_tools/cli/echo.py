@@ -26,7 +26,7 @@ from typing import Any, TYPE_CHECKING
 
 import click
 
-from .common import example, say
+from .common import example, say, timeout_option
 
 if TYPE_CHECKING:
     from ..replay.listening import ReceivedTable
@@ -54,14 +54,7 @@ Show = Callable[['ReceivedTable'], None]
     show_default=True,
     help='Most rows of a table to show; --json has all.',
 )
-@click.option(
-    '--timeout',
-    type=click.FloatRange(min=0.0, min_open=True),
-    default=10.0,
-    show_default=True,
-    metavar='SECONDS',
-    help='End with 1 when nothing is heard for so long from the start.',
-)
+@timeout_option(10.0)
 @click.option('--json', 'as_json', is_flag=True, help='One line of JSON for each table.')
 def command(
     topics: tuple[str, ...],

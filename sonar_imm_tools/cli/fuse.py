@@ -23,7 +23,7 @@ from typing import Any
 
 import click
 
-from .common import example, json_option, print_json, say
+from .common import example, json_option, print_json, say, timeout_option
 
 NAME = 'sonar_imm_fuse'
 
@@ -60,14 +60,7 @@ NAME = 'sonar_imm_fuse'
     show_default=True,
     help='With --live: seconds that an estimate waits for the other node to come as far.',
 )
-@click.option(
-    '--timeout',
-    type=click.FloatRange(min=0.0, min_open=True),
-    default=60.0,
-    show_default=True,
-    metavar='SECONDS',
-    help='With --live: end with 1 when nothing is heard for so long from the start.',
-)
+@timeout_option(60.0, when='With --live')
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
@@ -140,7 +133,7 @@ def _fuse_live(
     with Link(NAME) as link, contextlib.suppress(KeyboardInterrupt):
         cloud = message_class('sensor_msgs/msg/PointCloud2')
         output: Any = link.node.create_publisher(cloud, f'/{NAME}/estimate', output_qos())
-        told = 0
+        reported = 0
         for table in TableListener(link, topics).tables(timeout):
             if table is not None:
                 fusion.take(sides[table.topic], _estimate(table), time.monotonic())
@@ -149,9 +142,9 @@ def _fuse_live(
             for pair in sorted(fusion.pairs - known):
                 say(f'track {pair[0]} of {topics[0]} and {pair[1]} of {topics[1]} are one diver')
             known |= fusion.pairs
-            if fusion.late > 2 * told:
-                told = fusion.late
-                say(f'{told} estimates came too late and are left out: try a longer --wait')
+            if fusion.late > 2 * reported:
+                reported = fusion.late
+                say(f'{reported} estimates came too late and are left out: try a longer --wait')
 
 
 def _estimate(table: Any) -> Any:
