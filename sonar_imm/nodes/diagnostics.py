@@ -312,12 +312,12 @@ class Reporter:
         )
         self._before = now, meter.received.copy(), meter.refused.copy(), dropped, all_lost
         unused = self._unused.sentence(now, meter.received.total(), counts)
-        said = [*warnings, *filter(None, [unused])]
+        sentences = [*warnings, *filter(None, [unused])]
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
             self._input_status(period, stale_after, lost, incompatible, publishers),
-            self._tracker_status(period, starting, counts, health, said),
+            self._tracker_status(period, starting, counts, health, sentences),
         ]
         return message
 

@@ -43,6 +43,8 @@ these are reconstructions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from attrs import evolve
 import numpy as np
 
@@ -197,8 +199,20 @@ def _heading_speed_lateral(config: DiverConfig) -> ModelSet:
 # -- to compare with ------------------------------------------------------------------------------
 
 
-def _velocity_state(M: int) -> FloatArray:
-    return np.tile(np.eye(4), (M, 1, 1))
+def _with_velocity(
+    config: DiverConfig, names: tuple[str, ...], chain: Chain, motion: Callable[[float], Motion]
+) -> ModelSet:
+    """Models whose state is position and velocity, which begins at rest."""
+    M = len(names)
+    return ModelSet(
+        names,
+        np.tile(np.eye(4), (M, 1, 1)),
+        chain,
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        initial_probabilities(config, M),
+        motion,
+    )
 
 
 def _world_headings(config: DiverConfig) -> ModelSet:
@@ -221,15 +235,7 @@ def _world_headings(config: DiverConfig) -> ModelSet:
             config.fixed_speed * np.hstack([dt * u, u]),
         )
 
-    return ModelSet(
-        names,
-        _velocity_state(M),
-        rate_chain(config, P),
-        np.zeros(2),
-        np.full(2, config.velocity_std**2),
-        initial_probabilities(config, M),
-        motion,
-    )
+    return _with_velocity(config, names, rate_chain(config, P), motion)
 
 
 def _relative_headings(config: DiverConfig) -> ModelSet:
@@ -252,15 +258,7 @@ def _relative_headings(config: DiverConfig) -> ModelSet:
         F[:, :2, 2:], F[:, 2:, 2:] = dt * R, R
         return Motion(F, np.tile(Q, (M, 1, 1)), np.zeros((M, 4)))
 
-    return ModelSet(
-        names,
-        _velocity_state(M),
-        chain,
-        np.zeros(2),
-        np.full(2, config.velocity_std**2),
-        initial_probabilities(config, M),
-        motion,
-    )
+    return _with_velocity(config, names, chain, motion)
 
 
 def _single_direction(config: DiverConfig) -> ModelSet:
@@ -282,12 +280,4 @@ def _single_direction(config: DiverConfig) -> ModelSet:
             np.zeros((M, 4)),
         )
 
-    return ModelSet(
-        names,
-        _velocity_state(M),
-        rate_chain(config, P),
-        np.zeros(2),
-        np.full(2, config.velocity_std**2),
-        initial_probabilities(config, M),
-        motion,
-    )
+    return _with_velocity(config, names, rate_chain(config, P), motion)
