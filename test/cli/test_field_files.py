@@ -57,7 +57,7 @@ MADE = {each.name: each for each in FORMATS}
 
 def test_from_sound_to_reflectors(tmp_path, capsys):
     """The sound of a shipped array comes back from a WAV sample by sample, and is tracked."""
-    blocks = shipped_sound(12)
+    blocks = shipped_sound(3)
     pressure = np.concatenate([block.pressure for block in blocks])
     rate, scale = blocks[0].sample_rate, blocks[0].scale
     steps = np.round(pressure / scale).astype(np.int16)

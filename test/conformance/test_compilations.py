@@ -24,14 +24,18 @@ import pytest
 
 from sonar_imm.trackers import SYSTEMS
 
-RUN = """
-import json, sys
+PROGRAM = """
+import importlib, json, os, sys
 
 sys.path.append('test')
 
-from helpers.tracked import Tracked
+import numba
+from helpers.tracked import RUNS, Tracked
 from numba import types
 from numba.core.registry import CPUDispatcher
+
+from sonar_imm.estimation import jit
+from sonar_imm.trackers import SYSTEMS
 
 
 def signatures():
@@ -52,66 +56,65 @@ class Warmed(Tracked):
         return tracker
 
 
-run = Warmed(sys.argv[1])
-print(json.dumps([run.warmed, signatures()]))
-"""
-WARM = """
-import json, sys
+def recording(name):
+    return Warmed(name).warmed, signatures()
 
-from sonar_imm.estimation import jit
-from sonar_imm.trackers import SYSTEMS
 
-system = SYSTEMS[sys.argv[1]]
-steps = system.build(system.config_type()()).warm_steps()
-figures = {}
-for name, compile_step in steps:
-    jit.present.clear()
-    compile_step()
-    figures[name] = len(jit.present), sum(jit.present.values())
-print(json.dumps(figures))
+def steps(name):
+    system = SYSTEMS[name]
+    figures = {}
+    for step, compile_step in system.build(system.config_type()()).warm_steps():
+        jit.present.clear()
+        compile_step()
+        figures[step] = len(jit.present), sum(jit.present.values())
+    return figures
+
+
+# What all processes need is loaded once: each is a copy of this one, in which no kernel is.
+for system in SYSTEMS.values():
+    importlib.import_module(f'sonar_imm.trackers.{system.name}.tracker')
+numba.njit(lambda: 0)()
+for task, names in ((recording, RUNS), (steps, SYSTEMS)):
+    for name in names:
+        child = os.fork()
+        if not child:
+            print(json.dumps([name, task(name)]), flush=True)
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
 """
 COLD = {'_repair', '_update_again'}
 """Compiled when the first covariance needs it, and what they call."""
 
 
-@pytest.fixture(scope='module', params=RUNS)
-def compilations(request):
-    """Of each kernel the types of its arguments, after `warm` and after a recording."""
-    found = subprocess.run(
-        [sys.executable, '-c', RUN, request.param],
+@pytest.fixture(scope='module')
+def found():
+    """Of each recording the types of the arguments of each kernel, after `warm` and at the end; of
+    each system how many kernels its steps need."""
+    done = subprocess.run(
+        [sys.executable, '-c', PROGRAM],
         cwd=Path(__file__).resolve().parents[2],
         capture_output=True,
         text=True,
-        check=True,
     )
-    return json.loads(found.stdout.splitlines()[-1])
+    assert done.returncode == 0, done.stderr
+    return dict(map(json.loads, done.stdout.splitlines()))
 
 
-def test_nothing_is_left_to_compile_after_warm(compilations):
-    before, after = compilations
+@pytest.mark.parametrize('name', RUNS)
+def test_nothing_is_left_to_compile_after_warm_and_a_kernel_has_one_kind_of_arguments(found, name):
+    before, after = found[name]
     assert any(before.values())
     late = {name for name in after if after[name] != before.get(name, [])}
     late = {name for name in late if '.two_surfaces.' not in name}  # flat floors do without
     assert {name for name in late if name.rpartition('.')[2] not in COLD} == set()
-
-
-def test_a_kernel_has_one_kind_of_arguments(compilations):
-    several = {name: kinds for name, kinds in compilations[1].items() if len(kinds) > 1}
-    assert several == {}
+    assert {name: kinds for name, kinds in after.items() if len(kinds) > 1} == {}
 
 
 @pytest.mark.parametrize('name', SYSTEMS)
-def test_a_system_knows_about_how_many_kernels_its_steps_need(name):
+def test_a_system_knows_about_how_many_kernels_its_steps_need(found, name):
     """Those of the default configuration, as `jit.Progress` counts them; a shared kernel that an
     earlier step has loaded is not loaded again, so that a later step may have fewer."""
-    found = subprocess.run(
-        [sys.executable, '-c', WARM, name],
-        cwd=Path(__file__).resolve().parents[2],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    figures = json.loads(found.stdout.splitlines()[-1])
+    figures = found[name]
     system = SYSTEMS[name]
     assert set(figures) == set(system.kernels)
     first = next(iter(figures))

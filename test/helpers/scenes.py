@@ -36,8 +36,11 @@ def smaller_scene(system, name, seed):
     """(parameters, scene) of any scenario of a system."""
     scenes = importlib.import_module(system.scenes)
     overrides = dict(SMALLER[system.name])
-    if scenes.SCENARIOS[name][1].get('level') == 'pressure':
+    given = scenes.SCENARIOS[name][1]
+    if given.get('level') == 'pressure':
         overrides |= {'records': 1, 'record_seconds': 1.0, 'sample_rate': 4000.0}
+    if given.get('images'):
+        overrides |= {'image_beams': 64, 'image_bins': 200, 'last_range': 59.0}
     config = scenes.scenario(name, overrides)
     return config, scenes.simulate(config, seed)
 
