@@ -27,7 +27,9 @@ TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
     ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
 # Real nodes wait more than they work, but some of the tests bound their answers in time.
-SYSTEM_JOBS ?= 2
+SYSTEM_JOBS ?= 3
+# Neighbours in a file stay together, for they share what was simulated and tracked; who is done takes from others.
+SHARED := --dist worksteal
 
 # A kernel type of OpenBLAS to test under, e.g. Prescott, Haswell or SkylakeX; empty: the one that
 # OpenBLAS chooses. `python test/helpers/kernel_types.py` lists those that this processor can run.
@@ -92,21 +94,22 @@ demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say wh
 test: test-core test-system ## run the tests; of the Monte Carlo ones a fourth, in turn
 
 test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(TESTS)
+	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(SHARED) $(TESTS)
 
 test-statistics: venv ## run every Monte Carlo test; `make test` takes a fourth of them in turn
-	$(TEST_ENV) $(BIN)/python -m pytest -m statistics -n $(JOBS) $(TESTS)
+	$(TEST_ENV) $(BIN)/python -m pytest -m statistics -n $(JOBS) $(SHARED) $(TESTS)
 
 test-bounds: venv ## run the tests of the compiled kernels with every index checked
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
-	    $(BIN)/python -m pytest -m 'not system' --statistics none -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
+	    $(BIN)/python -m pytest -m 'not system' --statistics none -n $(JOBS) $(SHARED) $(or $(TESTS),$(KERNEL_TESTS))
 
 fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON=...)
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
-test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) test/system
+# The pages of tutorials take longest: they come first, so that nothing waits for them at the end.
+test-system: venv ## run the tests that start real nodes, three at a time (SYSTEM_JOBS=...)
+	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) $(SHARED) test/system/test_tutorials.py test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
 	CASES=$(CASES) SONAR_IMM_SHARE=$(SHARE) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)

@@ -28,6 +28,7 @@ LIMITS = {
 """Hours, and MB by which the second half may grow."""
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('system', LIMITS)
 def test_a_tracker_grows_and_slows_no_more_once_it_is_warm(system):
     hours, limit = LIMITS[system]

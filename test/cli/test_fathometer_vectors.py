@@ -54,6 +54,7 @@ def call(capsys):
     return call
 
 
+@pytest.mark.statistics
 def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
     call('convert', 'traces', VECTORS, tmp_path / 'bag', '--rate', '0.0111')
     run = call('track', tmp_path / 'bag', tmp_path / 'out')

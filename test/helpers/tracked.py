@@ -28,13 +28,18 @@ from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
-MOST = {'bathymetry': 120, 'diver': 80, 'fathometer': 80, 'obstacle': 80}
+MOST = {'bathymetry': 120, 'diver': 80, 'fathometer': 68, 'obstacle': 80}
 """Measurements of a recording; of a ship most are navigation."""
 RUNS = {
     'diver_table1': {},
     'diver_multistatic': {},
     'obstacle_tethers': {},
-    'bathymetry_ship': {'engine': 'grid', 'smoothing': 'states', 'ping_coupling': '1.0'},
+    'bathymetry_ship': {
+        'engine': 'grid',
+        'smoothing': 'states',
+        'ping_coupling': '1.0',
+        'grid_extent': '3.0',
+    },
     'fathometer_drift': {'smoothing_lag': '2', 'particles': '300'},
     'fathometer_pressure': {
         'preview_seconds': '5.0',

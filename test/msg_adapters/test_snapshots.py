@@ -173,7 +173,7 @@ ALL = ('range', 'time', 'iq', *CONSTANTS, *VARIANCES)
     cut=st.sampled_from((0, 0, 3)),
     values=st.binary(min_size=24, max_size=24),
 )
-@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_snapshots_are_refused_or_usable(bins, staves, nasty, gone, cut, values):
     table = columns(bins=bins, staves=max(staves, 1))
     drawn = NASTY[np.frombuffer(values, np.uint8) % len(NASTY)].astype(np.float32)
