@@ -77,11 +77,12 @@ $(STAMP): setup.py pyproject.toml
 	@$(INSTALL) --editable .
 	@# Kernels compile while pip fetches the rest; whoever needs one earlier compiles it too.
 	@nohup nice $(BIN)/sonar-imm warm --jobs 1 >$(VENV)/warm.log 2>&1 &
-	@$(INSTALL) --editable '.$(ROS)'
+	@# By its name: it is there, and need not be built again for what else it needs.
+	@$(INSTALL) 'sonar_imm$(ROS)'
 	@touch $@
 
 $(TEST_STAMP): $(STAMP)
-	@$(INSTALL) --editable '.[test,lint,sweep]'
+	@$(INSTALL) 'sonar_imm[test,lint,sweep]'
 	@# Without what it brings along, 1.7 GB of Qt and notebooks. Where there is no wheel, its tests say so.
 	@$(INSTALL) --no-deps --only-binary :all: tqdm \
 	    'themachinethatgoesping>=0.33; python_version >= "3.11"' \
@@ -143,7 +144,7 @@ placeholders: ## say what only the owner of a release can fill in (address, repo
 	@$(PYTHON) .ci/placeholders.py
 
 $(DOCS_STAMP): $(STAMP)
-	@$(INSTALL) --editable '.[docs]'
+	@$(INSTALL) 'sonar_imm[docs]'
 	@touch $@
 
 bench: venv ## measure the speed against other libraries

@@ -12,8 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Several runs of one command: instruments of one recording, several recordings, and going on."""
+"""Several runs of one command: instruments of one recording, several recordings, several processes
+with the bytes of one by one, and going on."""
 
+from concurrent.futures.process import BrokenProcessPool
 import json
 from pathlib import Path
 
@@ -23,11 +25,14 @@ from helpers.source import ROOT
 import pytest
 
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline.tracking import OfflineRun
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.topics import fitting_systems, fitting_topics, instruments
 from sonar_imm_tools.recordings.writer import BagWriter
 
 FEW = ('--set', 'particles_per_model=10')
+COUPLED = ('--set', 'engine=grid', '--set', 'grid_extent=3', '--set', 'smoothing=states')
+COUPLED += ('--set', 'ping_coupling=0.35')
 
 
 @pytest.fixture(scope='module')
@@ -294,3 +299,54 @@ def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
     assert main(['convert', 'fixes', str(tmp_path / 'none'), str(tmp_path / 'q')]) == 2
     assert 'nothing to convert' in capsys.readouterr().err
     assert not (tmp_path / 'p').exists() and not (tmp_path / 'q').exists()
+
+
+@pytest.mark.parametrize('options', [FEW, COUPLED], ids=['independent', 'coupled'])
+def test_pings_are_shared_out(swaths, tmp_path, capsys, options):
+    counts = []
+    for jobs in ('1', '2'):
+        capsys.readouterr()
+        out = str(tmp_path / jobs)
+        assert main(['track', str(swaths), out, *options, '--jobs', jobs, '--json']) == 0
+        run = json.loads(capsys.readouterr().out)
+        counts.append((run['counts'], run['estimates'], run['messages']))
+    assert counts[0] == counts[1] and counts[0][1] == 6
+    assert contents(tmp_path / '1') == contents(tmp_path / '2')
+
+
+def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path, capsys):
+    dive, broken = write_dive(tmp_path / 'dive.bag'), tmp_path / 'broken.bag'
+    broken.mkdir()
+    bags = [str(swaths), str(broken), str(dive)]
+    found = []
+    for jobs in ('1', '2'):
+        capsys.readouterr()
+        assert main(['track', *bags, str(tmp_path / jobs), '--jobs', jobs]) == 1
+        output = capsys.readouterr()
+        assert output.err.startswith(f'{broken}: ')
+        assert 'Traceback' not in output.err and output.err.count('broken') == 2
+        found.append((contents(tmp_path / jobs), output.out.replace(str(tmp_path / jobs), '')))
+    assert found[0] == found[1]
+    assert {name.split('/')[0] for name in found[0][0]} == {'swaths', 'dive'}
+    capsys.readouterr()
+    assert main(['track', str(swaths), str(dive), str(tmp_path / 'j'), '--json']) == 0
+    runs = json.loads(capsys.readouterr().out)['runs']
+    assert {run['bag']: run['system'] for run in runs} == {
+        str(swaths): 'bathymetry',
+        str(dive): 'diver',
+    }
+
+
+def test_two_bags_of_one_name_are_refused(swaths, tmp_path, capsys):
+    assert main(['track', str(swaths), str(swaths), str(tmp_path / 'out')]) == 2
+    assert 'two bags would be tracked into' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_worker_that_dies_is_one_sentence(swaths, tmp_path, capsys, monkeypatch):
+    def dies(self, done):
+        raise BrokenProcessPool('gone')
+
+    monkeypatch.setattr(OfflineRun, '_taken', dies)
+    assert main(['track', str(swaths), str(tmp_path / 'out'), *FEW, '--jobs', '2']) == 2
+    assert 'Traceback' not in (errors := capsys.readouterr().err) and 'lack of memory' in errors

@@ -30,46 +30,14 @@ def test_a_seed_scores_as_simulate_track_and_evaluate_say(tmp_path, capsys):
     params = tmp_path / 'mine.yaml'
     params.write_text('model_set: cv_cv\n')
     out = tmp_path / 'out'
-    assert (
-        main(
-            [
-                'sweep',
-                'diver',
-                '--runs',
-                '2',
-                '--seed',
-                '6',
-                '--scenario',
-                'circle',
-                *TINY,
-                '--params',
-                str(params),
-                '--out',
-                str(out),
-            ]
-        )
-        == 0
-    )
+    circle = ['--scenario', 'circle']
+    asked = ['--runs', '2', '--seed', '6', '--params', str(params), '--out', str(out)]
+    assert main(['sweep', 'diver', *circle, *TINY, *asked]) == 0
     with (out / 'sweep.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     assert [row['seed'] for row in rows] == ['6', '7']
     bag, run = str(tmp_path / 'bag'), str(tmp_path / 'run')
-    assert (
-        main(
-            [
-                'simulate',
-                'diver',
-                bag,
-                '--seed',
-                '7',
-                '--scenario',
-                'circle',
-                '--set',
-                'duration=15',
-            ]
-        )
-        == 0
-    )
+    assert main(['simulate', 'diver', bag, '--seed', '7', *circle, *TINY[:2]]) == 0
     assert main(['track', bag, run, '--params', str(params)]) == 0
     capsys.readouterr()
     assert main(['evaluate', run, '--no-report', '--json']) == 0
