@@ -18,7 +18,7 @@ from pathlib import Path
 import re
 
 from helpers.faults.cases import CASES
-from helpers.faults.figures import long_form
+from helpers.faults.figures import FOLDER, long_form
 from helpers.faults.rig import LEVELS, Rig
 from helpers.faults.table import FAULTS
 import pytest
@@ -27,7 +27,13 @@ pytestmark = pytest.mark.system
 
 
 def pairs():
-    """Faults and systems to try."""
+    """Faults and systems to try. Those of one node together, for of several processes that share
+    the tests one starts it then; on a page of figures in the order of the table."""
+    found = [*tried()]
+    return found if FOLDER else sorted(found, key=lambda pair: (pair[1], pair[0].arguments))
+
+
+def tried():
     for turn, fault in enumerate(FAULTS):
         if long_form():
             yield from ((fault, system) for system in fault.systems)
@@ -50,9 +56,7 @@ def rigs():
         assert code == 0 and 'Traceback' not in log and not children
 
 
-@pytest.mark.parametrize(
-    'fault, system', list(pairs()), ids=lambda item: getattr(item, 'name', item)
-)
+@pytest.mark.parametrize('fault, system', pairs(), ids=lambda item: getattr(item, 'name', item))
 def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     figures.skip_if_measured(fault=fault.name, system=system)
     key = system, *fault.arguments
