@@ -60,6 +60,7 @@ def found(amplitude, **rules):
     return find_echoes(amplitude, RANGE, BEARING, evolve(RULES, **rules))
 
 
+@pytest.mark.statistics
 def test_a_point_lies_where_it_is_and_its_variance_is_believed():
     nees, places = [], []
     for seed in range(120):

@@ -460,8 +460,7 @@ def test_the_sum_of_walks_is_their_convolution():
     assert np.sqrt(long @ np.square(place)) == pytest.approx(2.0 * np.sqrt(50.0), rel=0.01)
 
 
-@pytest.mark.parametrize('least', [0, 1, 3])
-@pytest.mark.parametrize('records', [1, 2, 7])
+@pytest.mark.parametrize(('least', 'records'), [(0, 1), (1, 2), (3, 1), (0, 7), (3, 7)])
 def test_who_left_and_was_replaced(least, records):
     """Against members that are drawn one by one."""
     P = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.3, 0.1, 0.6]])

@@ -23,6 +23,7 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 
+@pytest.mark.statistics
 def test_arrivals_are_better_than_fixes_made_of_them():
     squared = {'arrivals': [], 'multistatic_fixes': []}
     for sensor, found in squared.items():
