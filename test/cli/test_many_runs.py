@@ -151,7 +151,7 @@ def test_a_named_topic_is_tracked_alone(two_ships, tmp_path):
 
 
 def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
-    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abc')]
+    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
     out = tmp_path / 'out'
     assert track(*bags, out) == 0
     first, times = contents(out), {path: path.stat().st_mtime_ns for path in out.rglob('*.csv')}
@@ -184,7 +184,7 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
 
 
 def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
-    a, b, c = (write_dive(tmp_path / name) for name in 'abc')
+    a, b, c = (write_dive(tmp_path / name, count=30) for name in 'abc')
     assert track(a, b, tmp_path / 'out') == 0 == track(b, c, tmp_path / 'out')
     runs = json.loads((tmp_path / 'out' / 'summary.json').read_text())['runs']
     assert [(run['folder'], run['state']) for run in runs] == [
@@ -203,7 +203,7 @@ def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
 
 
 def test_bags_on_a_cluster(tmp_path, capsys):
-    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('ab')]
+    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('ab')]
     assert track(*bags, tmp_path / 'here') == 0
     with small_cluster(silence_logs='CRITICAL') as there:
         address = ('--scheduler', there.scheduler_address)
@@ -231,7 +231,7 @@ def test_the_tracker_with_the_best_evidence_is_chosen():
 
 def test_shards_share_the_bags_out(tmp_path, capsys):
     """As a Slurm array does: each command has the same bags, in any order, and makes its share."""
-    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abc')]
+    bags = [write_dive(tmp_path / name, count=30, spoilt=range(k)) for k, name in enumerate('abc')]
     out = tmp_path / 'out'
     assert track(*bags[::-1], out, '--shard', '1/2') == 0
     assert sorted(path.name for path in out.iterdir()) == ['a', 'c', 'summary-1-of-2.json']
@@ -315,7 +315,7 @@ def test_pings_are_shared_out(swaths, tmp_path, capsys, options):
 
 
 def test_bags_are_shared_out_and_one_that_fails_stops_no_other(swaths, tmp_path, capsys):
-    dive, broken = write_dive(tmp_path / 'dive.bag'), tmp_path / 'broken.bag'
+    dive, broken = write_dive(tmp_path / 'dive.bag', count=30), tmp_path / 'broken.bag'
     broken.mkdir()
     bags = [str(swaths), str(broken), str(dive)]
     found = []
