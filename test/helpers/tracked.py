@@ -39,10 +39,12 @@ RUNS = {
         'smoothing': 'states',
         'ping_coupling': '1.0',
         'grid_extent': '3.0',
+        'grid_step': '0.1',
     },
     'fathometer_drift': {'smoothing_lag': '2', 'particles': '300'},
     'fathometer_pressure': {
         'preview_seconds': '5.0',
+        'frequency_max': '1500.0',
         'processor': 'mvdr',
         'pulse': 'processor',
         'particles': '300',
