@@ -124,6 +124,7 @@ def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
         synced(handle)
 
     monkeypatch.setattr(files, 'fcntl', None)
+    monkeypatch.setattr(shutil, '_use_fd_functions', False)  # that of Python 3.10 does not
     monkeypatch.setattr(os, 'open', open_files_only)
     monkeypatch.setattr(os, 'fsync', sync_written_only)
     with whole(tmp_path / 'run') as path:
