@@ -113,16 +113,19 @@ def caption(mark: str, up: str) -> str:
     if kind == 'none':
         return ''
     if kind.startswith('read '):
-        return f'*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`'
+        return (
+            f'<small>*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`</small>'
+        )
     sources = known_sources()
     named = dict.fromkeys(
         name for name in re.findall(r'[a-z_0-9]+\.json', mark) if name in sources
     )
-    return '<br>'.join(
+    lines = '<br>'.join(
         f'*Values of {sources[name]["date"]} ({aged(name)}), [{name}]({up}results/{name}):* '
         f'`{sources[name]["command"]}`'
         for name in named
     )
+    return f'<small>{lines}</small>' if lines else ''
 
 
 def captioned(markdown: str, up: str) -> str:

@@ -14,7 +14,6 @@
 
 """Files and folders are whole or not there."""
 
-import fcntl
 import os
 from pathlib import Path
 import shutil
@@ -24,7 +23,9 @@ import sys
 import pytest
 
 from sonar_imm import files
-from sonar_imm.files import beside, hold, UNFINISHED, whole
+from sonar_imm.files import beside, fcntl, hold, UNFINISHED, whole
+
+locks = pytest.mark.skipif(fcntl is None, reason='there are no locks')
 
 
 def test_a_file_is_there_at_the_end_only_and_replaces_an_older_one(tmp_path):
@@ -70,6 +71,7 @@ def test_errors_name_what_the_user_named(tmp_path):
         assert str(caught.value.filename) in (str(path), str(path.parent))
 
 
+@locks
 def test_what_a_killed_process_left_is_removed_and_that_of_a_living_one_is_not(tmp_path):
     text = (
         'import sys\nfrom pathlib import Path\nfrom sonar_imm.files import beside\n'
@@ -92,6 +94,7 @@ def test_what_a_killed_process_left_is_removed_and_that_of_a_living_one_is_not(t
         assert list(tmp_path.iterdir()) == [place]
 
 
+@locks
 def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
     def no_locks(*_):
         raise OSError(38, 'no locks')
@@ -105,6 +108,7 @@ def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['out', f'out{UNFINISHED}abc']
 
 
+@locks
 def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
     """As on Windows: no fcntl, folders cannot be opened, files not synced that are read only."""
     opened, synced = os.open, os.fsync
@@ -120,6 +124,7 @@ def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
         synced(handle)
 
     monkeypatch.setattr(files, 'fcntl', None)
+    monkeypatch.setattr(shutil, '_use_fd_functions', False)  # that of Python 3.10 does not
     monkeypatch.setattr(os, 'open', open_files_only)
     monkeypatch.setattr(os, 'fsync', sync_written_only)
     with whole(tmp_path / 'run') as path:

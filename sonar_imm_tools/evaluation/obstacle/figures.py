@@ -101,7 +101,7 @@ def sections(
             'are not independent.',
             header=('P(above)', 'pings', 'stated', 'was above'),
             rows=[
-                (name, group['n'], group['stated'], group['came_true'])
+                (name, group['n'], f'{group["stated"]:.3f}', f'{group["came_true"]:.3f}')
                 for name, group in metrics['above']['bins'].items()
             ],
         )
@@ -111,7 +111,7 @@ def sections(
             'Mean stated probability of each behaviour, by what the obstacle really does.',
             header=('does', 'rows', *(f'P({name})' for name in BEHAVIOURS)),
             rows=[
-                (true, values['n'], *(values[name] for name in BEHAVIOURS))
+                (true, values['n'], *(f'{values[name]:.3f}' for name in BEHAVIOURS))
                 for true, values in behaviours['confusion'].items()
             ],
         )

@@ -2,30 +2,30 @@
 const PLOTLYJS = 'plotly.packed.js';
 const CONFIG = {displaylogo: false, responsive: true,
   modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d']};
-function unpacked(text) {
-  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
-  return new Response(stream).text();
+async function unpacked(text) {
+  const {body} = await fetch(`data:;base64,${text}`);
+  return new Response(body.pipeThrough(new DecompressionStream('gzip')));
+}
+function scriptOf(src, why) {
+  return new Promise((good, bad) => {
+    const script = document.createElement('script');
+    script.onload = good;
+    script.onerror = () => bad(new Error(why));
+    script.src = src;
+    document.head.append(script);
+  });
 }
 let ready = null;
 function plotly() {
-  ready = ready || packedPlotly().then(unpacked).then((text) => {
-    const script = document.createElement('script');
-    script.textContent = text;
-    document.head.append(script);
-  });
+  ready = ready || packedPlotly().then(unpacked).then((response) => response.blob())
+    .then((blob) => scriptOf(URL.createObjectURL(blob), 'plotly.js does not start'));
   return ready;
 }
-function packedPlotly() {
+async function packedPlotly() {
   const inside = document.getElementById('plotlyjs');
-  if (inside !== null) return Promise.resolve(inside.textContent);
-  return new Promise((good, bad) => {
-    const script = document.createElement('script');
-    script.onload = () => good(packedPlotlyJs);
-    script.onerror = () => bad(new Error(`${PLOTLYJS} is not in the folder of this page`));
-    script.src = PLOTLYJS;
-    document.head.append(script);
-  });
+  if (inside !== null) return inside.textContent;
+  await scriptOf(PLOTLYJS, `${PLOTLYJS} is not in the folder of this page`);
+  return packedPlotlyJs;
 }
 async function draw(plot) {
   if (plot.dataset.figure === undefined) return;
@@ -35,8 +35,8 @@ async function draw(plot) {
     if (!('DecompressionStream' in window)) {
       throw new Error('it takes a browser of 2023 or newer');
     }
-    const [text] = await Promise.all([unpacked(packed), plotly()]);
-    const figure = JSON.parse(text);
+    const [response] = await Promise.all([unpacked(packed), plotly()]);
+    const figure = await response.json();
     const small = matchMedia('(max-width: 640px)').matches;  // there a finger scrolls the page
     if (small) {
       const {font, margin} = figure.layout;
