@@ -76,7 +76,12 @@ def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band()
     series = series_of(estimates)
     series.track_id[:10] = 6  # another track goes before
     matching = match(series, Truth.from_series(series_of(true_rows)), cutoff=10.0)
-    drawn = figures.error_figure(matching, 7).data
+    figure = figures.error_figure(matching, 7)
+    assert {name for name in figure.to_dict()['layout'] if name.startswith('yaxis')} == {
+        'yaxis',
+        'yaxis2',
+    }
+    drawn = figure.data
     lines = [line for line in drawn if line.name == 'error of the track']
     bands = [line for line in drawn if line.name == 'predicted 95 % band']
     assert len(lines) == len(bands) == 2
