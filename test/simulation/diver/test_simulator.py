@@ -24,6 +24,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
 from sonar_imm_tools.simulation.diver.afloat import ORIGIN
+from sonar_imm_tools.simulation.diver.crossing import CLOSEST, crossing_paths
 from sonar_imm_tools.simulation.diver.simulator import (
     draw_errors,
     RECEIVERS,
@@ -377,3 +378,10 @@ def test_a_depth_is_stated_where_it_is_measured_and_there_is_one_it_can_be_of(di
             index = np.searchsorted(scene.truth[0].stamp_ns, each.measurement.stamp_ns)
             true = -scene.truth[0].position[index, 2]
             assert each.measurement.depth == pytest.approx(true, abs=0.8)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_divers_who_cross_come_as_near_as_they_are_said_to(seed):
+    paths = crossing_paths(6, np.linspace(0.0, 100.0, 2001), np.random.default_rng(seed))
+    for first, other in zip(paths[::2], paths[1::2]):
+        assert np.linalg.norm(first[:, :2] - other[:, :2], axis=1).min() < CLOSEST + 0.05

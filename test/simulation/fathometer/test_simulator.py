@@ -14,6 +14,7 @@
 
 """Scenes of the fathometer: what they promise, and that they are the same each time."""
 
+from attrs import evolve
 from helpers.scenes import smaller_scene
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
+    _envelope,
     cross_spectra,
     scenario,
     SCENARIOS,
@@ -306,3 +308,13 @@ def test_the_truth_names_what_is_there():
     ]
     steps = np.diff([item.stamp_ns for item in scene.truth])
     np.testing.assert_allclose(steps, 89.6e9, atol=1.0)
+
+
+def test_a_profiler_hears_its_own_noise_alone_where_there_is_no_floor():
+    config = scenario('diffuse', {'records': 1})
+    drift = drift_of(config, np.random.default_rng(0))
+    bare = evolve(drift, amplitude=np.zeros_like(drift.amplitude))
+    heard, silent = (
+        _envelope(config, each, 0, np.random.default_rng(1))[0] for each in (drift, bare)
+    )
+    assert silent.max() < 0.2 * heard.max() and len(silent) == len(heard)
