@@ -61,6 +61,7 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
     truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
     series = series_of(estimates)
     fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    assert fixes.place_covariance.shape == (1, 3, 3)
     figure = figures.map_figure(series, truth, fixes)
     low, high = figure.layout.xaxis.range
     assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0

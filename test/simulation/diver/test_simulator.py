@@ -53,6 +53,12 @@ def test_fixes_are_as_accurate_as_they_say():
             error = item.measurement.position[:2] - place[:2]
             squared.append(error @ np.linalg.solve(item.measurement.covariance[:2, :2], error))
     assert np.mean(squared) == pytest.approx(2.0, abs=0.15)
+    plain = simulate(scenario('table1', {'sensor': 'positions', 'duration': 999.0}), 1)
+    errors = [
+        item.measurement.position[:2] - place[:2]
+        for item, place in zip(plain.measurements, plain.truth[0].position)
+    ]
+    assert np.std(errors) == pytest.approx(1.0, rel=0.07)  # metres, unless it is told otherwise
 
 
 def test_arrivals_are_transmitter_diver_receiver():
