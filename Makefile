@@ -47,6 +47,8 @@ RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
 FUZZ_JSON ?=
+# Damaged files of each format and damaged states of each system.
+FILES ?= 100
 # Tests that run the compiled kernels.
 KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm imm_particles \
     set_particles smoothing covariance kalman)) \
@@ -104,8 +106,8 @@ test-bounds: venv ## run the tests of the compiled kernels with every index chec
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
 	    $(BIN)/python -m pytest -m 'not system' --statistics none -n $(JOBS) $(SHARED) $(or $(TESTS),$(KERNEL_TESTS))
 
-fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON=...)
-	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
+fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and states (CASES=... FILES=... FUZZ_JSON=...)
+	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) --files $(FILES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 # The pages of tutorials take longest: they come first, so that nothing waits for them at the end.

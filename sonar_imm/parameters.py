@@ -40,6 +40,7 @@ import difflib
 from functools import lru_cache, partial
 from importlib.metadata import entry_points, EntryPoint
 import math
+from pathlib import Path
 import sys
 from typing import Any, TypeVar
 
@@ -287,6 +288,13 @@ class Config:
             else value
             for spec in self.specs()
         }
+
+
+def small_text(path: Path, encoding: str = 'utf-8', errors: str = 'strict') -> str:
+    """The text of a file of parameters, cut where it is too long for one: a device or a pipe may
+    have no end. Raises OSError and UnicodeDecodeError."""
+    with path.open(encoding=encoding, errors=errors) as stream:
+        return stream.read(MOST_YAML + 1)
 
 
 def yaml_tree(text: str) -> Any:

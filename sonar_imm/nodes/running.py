@@ -42,7 +42,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from ..parameters import ConfigError, sections_of
+from ..parameters import ConfigError, sections_of, small_text
 from .stopping import START_PATIENCE, stopper
 
 EVENT_PERIOD = 0.25
@@ -133,7 +133,7 @@ def warn_of_foreign_files(nodes: Sequence[Node], args: Sequence[str] | None) -> 
     for before, word in zip(words, words[1:]):
         if before != '--params-file':
             continue
-        names = sections_of(Path(word).read_text(encoding='utf-8'))
+        names = sections_of(small_text(Path(word)))
         full = [node.get_fully_qualified_name() for node in nodes]
         own = {*full, *(f'/{node.get_name()}' for node in nodes)}
         if names and not any('*' in name or _full(name) in own for name in names):

@@ -35,6 +35,7 @@ from sonar_imm.parameters import (
     parameters_from_yaml,
     ParameterSpec,
     sections_of,
+    small_text,
 )
 from sonar_imm.texts import visible
 from sonar_imm.trackers import System, SYSTEMS
@@ -254,7 +255,7 @@ def _detector_specs(system: System) -> dict[str, ParameterSpec]:
 def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[str, Any]:
     """What a file says for a node; needed: it is a mistake when it is for others only."""
     try:
-        text = path.read_text(encoding='utf-8')
+        text = small_text(path)
         values = parameters_from_yaml(text, node_name=node_name)
     except UnicodeDecodeError:
         raise ConfigError(f'{path} is not a text file') from None

@@ -141,7 +141,7 @@ def _fuse_live(
                 output.publish(write_estimate(estimate, make))
             for pair in sorted(fusion.pairs - known):
                 say(f'track {pair[0]} of {topics[0]} and {pair[1]} of {topics[1]} are one diver')
-            known |= fusion.pairs
+            known = set(fusion.pairs)
             if fusion.late > 2 * reported:
                 reported = fusion.late
                 say(f'{reported} estimates came too late and are left out: try a longer --wait')

@@ -128,7 +128,7 @@ def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options
     one waits until NODE (a node of this package, e.g. /diver) has processed the one before.
     """
     from sonar_imm.nodes.qos import profiles_of
-    from sonar_imm.parameters import ConfigError
+    from sonar_imm.parameters import ConfigError, small_text
 
     from ..recordings.reader import BagReader
     from ..replay.player import play, PlayOptions
@@ -136,7 +136,7 @@ def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options
     qos = {}
     if qos_file is not None:
         try:
-            qos = profiles_of(qos_file.read_text(encoding='utf-8'))
+            qos = profiles_of(small_text(qos_file))
         except (ConfigError, UnicodeDecodeError) as error:
             raise ConfigError(f'{qos_file}: {error}') from None
     settings = PlayOptions(remap=dict(_old_and_new(remap) for remap in remaps), qos=qos, **options)

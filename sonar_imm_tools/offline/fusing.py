@@ -34,8 +34,8 @@ the covariance as fast as divers turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 from attrs import evolve
 import numpy as np
@@ -50,12 +50,19 @@ from sonar_imm.measurements import NOBODY
 from ..recordings.reader import BagError
 from .run_folder import RUN, run_record, RunFolder
 
+K = TypeVar('K')
+V = TypeVar('V')
+
 GATE = 13.8
 """Mahalanobis distance squared of two positions beyond which two tracks are no pair: .1 % of the
 pairs whose errors are independent."""
 
 MEMORY = 0.8
 """Share that the last distance of a pair has of the one before it."""
+
+REMEMBERED = 10_000
+"""Tracks and pairs of tracks that are remembered, many times what is there at a time, since nodes
+may run for years. The oldest are forgotten for more."""
 
 STAYS = 4.0
 """By so much another partner must fit better, distance squared, than the one of now."""
@@ -106,6 +113,13 @@ def best_weight(ratio: FloatArray) -> float:
     return 0.5 * (low + high)
 
 
+def _remember(known: dict[K, V], key: K, value: V) -> None:
+    known.pop(key, None)
+    known[key] = value
+    if len(known) > REMEMBERED:
+        del known[next(iter(known))]
+
+
 class Fuser:
     """Puts the estimates of two runs together, stamp by stamp in order."""
 
@@ -116,8 +130,13 @@ class Fuser:
         self._partner: dict[int, int] = {}
         self._ids: tuple[dict[int, int], dict[int, int]] = ({}, {})
         self._next = 1
-        self.pairs: set[tuple[int, int]] = set()
+        self._pairs: dict[tuple[int, int], None] = {}
         self.rows, self.fused_rows = 0, 0
+
+    @property
+    def pairs(self) -> KeysView[tuple[int, int]]:
+        """The tracks of both that were one."""
+        return self._pairs.keys()
 
     def fuse(self, first: Estimate | None, second: Estimate | None, stamp_ns: int) -> Estimate:
         """The confirmed tracks of both at `stamp_ns`, each carried on to it."""
@@ -144,7 +163,7 @@ class Fuser:
             row['existence'] = np.fmax(row['existence'], b.extras['existence'][j])
             row['z'] = merged.weight * a.xyz[i, 2] + (1.0 - merged.weight) * b.xyz[j, 2]
             pair = int(a.extras['track_id'][i]), int(b.extras['track_id'][j])
-            self.pairs.add(pair)
+            _remember(self._pairs, pair, None)
             rows.append(row | {'ids': pair})
         for side, each in enumerate((a, b)):
             for k in only[side]:
@@ -206,7 +225,7 @@ class Fuser:
                 now = min(float(apart @ np.linalg.solve(S, apart)), 10.0 * GATE)
                 before = self._distance.get((first, second), now)
                 mean = MEMORY * before + (1.0 - MEMORY) * now
-                self._distance[first, second] = mean
+                _remember(self._distance, (first, second), mean)
                 names = int(a.extras['target_id'][i]), int(b.extras['target_id'][j])
                 cost[i, j] = min(mean - GATE, 0.0)
                 if cost[i, j] < 0.0 and self._partner.get(first) == second:
@@ -216,7 +235,8 @@ class Fuser:
         pairs = [
             (int(i), int(j)) for i, j in zip(*linear_sum_assignment(cost)) if cost[i, j] < 0.0
         ]
-        self._partner.update((ids[0][i], ids[1][j]) for i, j in pairs)
+        for i, j in pairs:
+            _remember(self._partner, ids[0][i], ids[1][j])
         return pairs
 
     def _identify(self, rows: list[dict[str, Any]]) -> None:
@@ -234,7 +254,7 @@ class Fuser:
             taken.add(number)
             for side, track in enumerate(row['ids']):
                 if track is not None:
-                    self._ids[side][track] = number
+                    _remember(self._ids[side], track, number)
             row['track_id'] = number
 
     @staticmethod
@@ -329,7 +349,7 @@ class LiveFusion:
         self._reached, self._passed, self._in_a_row = [-1, -1], -1, 0
 
     @property
-    def pairs(self) -> set[tuple[int, int]]:
+    def pairs(self) -> KeysView[tuple[int, int]]:
         """The tracks of both that were one."""
         return self._joined.fuser.pairs
 

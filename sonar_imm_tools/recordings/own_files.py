@@ -35,7 +35,7 @@ from typing import Any
 import yaml
 
 from sonar_imm.files import whole
-from sonar_imm.parameters import Config, ConfigError, yaml_tree
+from sonar_imm.parameters import Config, ConfigError, small_text, yaml_tree
 
 from .sources import BagError
 
@@ -118,7 +118,7 @@ def own_recipe(bag: Path) -> list[str]:
 
 def _stated(path: Path) -> dict[str, Any]:
     try:
-        stated = yaml_tree(path.read_text(encoding='utf-8'))
+        stated = yaml_tree(small_text(path))
     except (ConfigError, UnicodeDecodeError):
         raise BagError(f'{path} is not YAML') from None
     return stated if isinstance(stated, dict) else {}

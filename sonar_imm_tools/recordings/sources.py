@@ -32,7 +32,7 @@ from attrs import frozen
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
-from sonar_imm.parameters import ConfigError, yaml_tree
+from sonar_imm.parameters import ConfigError, small_text, yaml_tree
 from sonar_imm.texts import in_one_line
 
 from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack, wrong_sums, zstd
@@ -109,7 +109,7 @@ class RosbagsSource:
         for file in path.glob('*.zstd') if path.is_dir() else []:
             if oversized := oversized_file(file):
                 raise BagError(f'{file.name} cannot be unpacked: {oversized}')
-        if (path / 'metadata.yaml').is_file():
+        if (path / 'metadata.yaml').exists():
             _check_metadata(path / 'metadata.yaml')
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
@@ -383,7 +383,7 @@ def _split_order(file: Path) -> tuple[int, str]:
 def _check_metadata(path: Path) -> None:
     """Raise `BagError` for metadata that rosbags would unpack without an end."""
     try:
-        yaml_tree(path.read_text(encoding='utf-8', errors='replace'))
+        yaml_tree(small_text(path, errors='replace'))
     except ConfigError as error:
         raise BagError(f'{path.name} is {error}') from None
 

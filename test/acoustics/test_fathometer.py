@@ -15,6 +15,7 @@
 """The fathometer's processors against golden values, closed forms and the mistakes of print."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,9 @@ def test_noise_integrals(golden):
     for x in (0.0, 5e-4, 2e-3, -7.0):
         expected = np.mean(2.0 * u * np.exp(1j * x * u))
         assert noise_integral(x) == pytest.approx(expected, abs=1e-9)
+    for x in (1e-7, -3e-4, 9.9e-4):
+        series = sum(2.0 * (1j * x) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
+        assert noise_integral(x) == pytest.approx(series, abs=1e-13)
 
 
 def single_layer():
@@ -306,5 +310,7 @@ def test_the_power_of_few_snapshots_is_less_by_what_is_fitted():
     exact = coherence_and_power(R, w, 'mvdr')[1]
     expected = sampled_share(sampled.astype(np.complex128), 1e-2, 40.0)
     assert expected.max() < 0.9
+    louder = sampled_share(1e6 * sampled.astype(np.complex128), 1e-2, 40.0)
+    assert louder == pytest.approx(expected)
     # That of every beam together: a beam where it is quiet is fitted less.
     assert np.mean(drawn) / exact[0] == pytest.approx(expected.mean(), rel=0.08)

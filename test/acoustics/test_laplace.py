@@ -58,6 +58,16 @@ def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
     )
 
 
+@pytest.mark.parametrize('q', [0.1, 0.3])
+def test_where_the_bessel_function_overflows_the_law_is_its_integral_still(q):
+    log_u = np.linspace(-3.0, 8.0, 100_001)
+    height = 199.0 * log_u - np.exp(log_u) - q * np.exp(-log_u)
+    integral = np.exp(height - height.max()).sum() * (log_u[1] - log_u[0])
+    expected = math.log(0.5 * integral) + height.max() - 199.0 * math.log(q)
+    assert math.isinf(kve(199, 2.0 * math.sqrt(q)))
+    assert laplace.log_density(q, 200) == pytest.approx(expected, abs=1e-5)
+
+
 @pytest.mark.parametrize('staves', range(2, 17))
 def test_both_laws_integrate_to_one(staves):
     # Over C^P in whitened coordinates: shells of area pi^P / Gamma(P) q^(P-1) dq, q = v^2.

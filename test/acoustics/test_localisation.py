@@ -320,6 +320,10 @@ def test_limits():
     assert isinstance(localise(**far, limits=Limits(max_std=1000.0)), Localisation)
     beyond = active(5, np.array([900.0, 0.0]), limits=Limits(max_range=500.0))
     assert localise(**beyond).reason == 'out_of_range'
+    middle = 0.5 * (RX[:, :2].mean(axis=0) + TX[:2])  # of receivers, and of a transmitter for each
+    for distance, wanted in ((9999.6, Localisation), (10_000.4, Refusal)):
+        scene = active(8, middle + [distance, 0.0], limits=Limits(max_std=1e9, max_condition=1e30))
+        assert isinstance(localise(**scene), wanted)
 
 
 # -- reflections ---------------------------------------------------------------------------------

@@ -71,6 +71,10 @@ def test_a_burst_is_one_beside_the_twenty_bins_before_it_and_after_it():
     assert np.flatnonzero(loudness.bursts(power)).tolist() == [100]
     power[86:97] = 1e4  # most of those before it
     assert not loudness.bursts(power).any()
+    for first, alone in ((80, False), (81, True)):  # ten of those before it, nine
+        power = np.ones(200)
+        power[first:90], power[100] = 1e4, 1e3
+        assert loudness.bursts(power)[100] == alone
 
 
 def test_a_loud_stretch_that_is_not_coherent_is_a_diffuse_floor_and_a_spike_is_not():

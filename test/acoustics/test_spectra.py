@@ -97,6 +97,7 @@ def test_windows_have_unit_power_and_the_autocorrelation_they_claim():
             lag = round(share * 4096)
             seen = np.sum(window[lag:] * window[: 4096 - lag]) / 4096
             assert window_overlap(name, lag / 4096) == pytest.approx(seen, abs=1e-3)
+        assert window_overlap(name, 1.5) == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(ValueError):
         window_of('kaiser', 8)
 

@@ -17,6 +17,7 @@
 import os
 from pathlib import Path
 import resource
+import shutil
 import subprocess
 import sys
 
@@ -112,6 +113,26 @@ def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_
     assert printed.out == ''
     assert len(printed.err.splitlines()) == 1 and printed.err.startswith('sonar-imm: ')
     assert words in printed.err
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['track', 'BAG', 'out', '--params', '/dev/zero'],
+        ['tune', 'BAG', '--params', '/dev/zero'],
+        ['play', 'BAG', '--qos-profile-overrides-path', '/dev/zero'],
+        ['info', 'folder'],
+    ],
+)
+def test_parameters_and_metadata_without_an_end_are_not_read_to_it(arguments, tmp_path, capsys):
+    shutil.copytree(ROOT / 'bags' / 'diver_table1', tmp_path / 'folder')
+    (tmp_path / 'folder' / 'metadata.yaml').unlink()
+    (tmp_path / 'folder' / 'metadata.yaml').symlink_to('/dev/zero')
+    places = {'BAG': ROOT / 'bags' / 'diver_table1', 'folder': tmp_path / 'folder'}
+    places['out'] = tmp_path / 'out'
+    code = main([str(places.get(word, word)) for word in arguments])
+    printed = capsys.readouterr()
+    assert code == (0 if 'folder' in arguments else 2) and 'YAML' in printed.out + printed.err
 
 
 def test_convert_alone_lists_what_it_reads(capsys):

@@ -181,6 +181,20 @@ def test_what_is_gained_is_of_each_half_by_what_the_other_one_told(
     assert math.log(row.high / row.low) == pytest.approx(4.0 / math.sqrt(80.0), rel=0.05)
 
 
+@pytest.mark.parametrize('count, told', [(3, False), (6, True)])
+def test_of_too_few_numbers_nothing_is_told(
+    count: int, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The logarithm of a spread is known to .41, or to .29."""
+    monkeypatch.setattr(Halves, 'z', 3.0 * np.resize([1.0, -1.0], count))
+    monkeypatch.setattr(tuning, '_recording', lambda job: Halves())
+    job: Any = SimpleNamespace(system='diver')
+    tunables = (Tunable(name='speed_std', start=1.0, std=3.0),)
+    fitting = tuning.Fitting(jobs=(job,), tunables=tunables, split=(count // 2 - 1,))
+    (row,) = tuning.tune(fitting, 40).parameters
+    assert (row.verdict == 'told') == told
+
+
 def test_the_score_of_a_sea_without_obstacles_is_that_of_its_clutter() -> None:
     """Clutter is a Poisson process: m detections in an area A have m log(density) - density A."""
     config = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)

@@ -92,6 +92,8 @@ def test_every_scenario_has_a_description_and_can_be_configured(scenes):
     for name, (description, _) in scenes.SCENARIOS.items():
         assert len(description.split()) > 2
         assert scenes.scenario(name, {}) == scenes.scenario(name, None)
+    shares = [spec for spec in scenes.scenario(name, {}).specs() if 'probability' in spec.name]
+    assert all((spec.low, spec.high) == (0.0, 1.0) for spec in shares)
 
 
 def test_a_name_that_nobody_knows_is_answered_with_those_that_exist(scenes):

@@ -15,10 +15,13 @@
 """Every system has what the commands need of it, and judges its own runs."""
 
 from importlib import import_module
+import re
 
 from helpers.dive_bags import write_dive
+import numpy as np
 import pytest
 
+from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions, Limit
@@ -106,3 +109,13 @@ def test_a_truth_bag_without_truth_is_told(tmp_path):
     assert read_truth({'bag': str(blind)}) is None
     with pytest.raises(BagError, match='has no topic /truth/estimate'):
         read_truth({'bag': str(blind)}, blind)
+
+
+@pytest.mark.parametrize('system', ['diver', 'obstacle'])
+def test_truth_that_is_none_is_refused_by_the_name_of_its_recording(system, tmp_path, monkeypatch):
+    module = import_module(f'sonar_imm_tools.evaluation.{system}')
+    place = {name: np.zeros(1, np.float32) for name in 'xyz'}
+    nothing = Estimate.from_columns(place, stamp_ns=1, frame_id='map')
+    monkeypatch.setattr(module, 'read_truth', lambda *_: [nothing])
+    with pytest.raises(BagError, match=re.escape(f'{tmp_path / "dive"}: ')):
+        module.judge(folder_of(tmp_path), JudgeOptions())

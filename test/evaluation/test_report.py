@@ -23,6 +23,7 @@ from helpers.report_pages import unpacked
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from scipy.stats import chi2
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.acoustics.geodesy import Origin
@@ -309,3 +310,8 @@ def test_hits_with_different_degrees_of_freedom_are_divided_by_them():
     np.testing.assert_allclose(same.data[0].y, nis)
     np.testing.assert_allclose(mixed.data[0].y, [1.0, 3.0, 2.0, 1.0])
     assert len(same.layout.shapes) == 1 and len(mixed.layout.shapes) == 0
+
+
+def test_the_mean_of_hits_has_its_own_band_of_95_percent():
+    band, _ = nis_figure(np.arange(40.0), np.ones(40), np.full(40, 2)).layout.shapes
+    assert [band.y0, band.y1] == pytest.approx(chi2.ppf([0.025, 0.975], 2 * 5) / 5)

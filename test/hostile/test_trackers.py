@@ -14,13 +14,14 @@
 
 """Whatever a wire brings and a parameter file says, a tracker goes on and tells the truth.
 
-400 messages for each system here; ``make fuzz`` sends 100,000.
+400 messages for each system here, and a few damaged files; ``make fuzz`` sends 100,000.
 """
 
 import json
 import warnings
 
 from helpers.dive_bags import write_dive
+from helpers.hostile.files import file_results, FILES
 from helpers.hostile.mutations import MUTATIONS
 from helpers.hostile.runs import Bad, BATCH, batches, run, run_extreme, Tally
 from helpers.hostile.streams import stream, templates, VARIANTS
@@ -123,6 +124,11 @@ def test_no_more_divers_than_allowed_are_followed():
             )
             last = tracker.process(scan)[-1]
         assert (last.extras['track_state'] > 0).sum() == wanted
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_a_damaged_file_is_read_or_refused(name):
+    assert not file_results(name, 4)['failures']
 
 
 def test_track_uses_the_parameters_that_a_recording_brings(tmp_path):

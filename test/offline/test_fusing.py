@@ -29,6 +29,7 @@ import pytest
 
 from sonar_imm.estimates import Estimate
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline import fusing
 from sonar_imm_tools.offline.fusing import (
     best_weight,
     covariance_intersection,
@@ -159,6 +160,20 @@ def test_a_diver_keeps_his_identity_when_he_leaves_one_view() -> None:
     first += [node({2: (0.0, 0.0)}, k, seed=5) for k in range(20, 30)]
     made, _ = both(first, second)
     assert {number for each in made for number in ids(each)} == {1}
+
+
+def test_tracks_of_years_are_forgotten_but_not_those_that_are_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fusing, 'REMEMBERED', 20)
+    fuser = Fuser(0.6)
+    for k in range(60):
+        places = {1: (0.0, 0.0), 1000 + k: (500.0, 0.0), 2000 + k: (0.0, 900.0)}
+        one, other = node(places, k, seed=9), node(places, k, seed=10)
+        made = fuser.fuse(one, other, one.stamp_ns)
+        assert ids(made)[0] == 1 and max(ids(made)) >= 2 * k + 3
+    kept = [fuser._distance, fuser._partner, *fuser._ids, fuser.pairs]
+    assert [len(each) for each in kept] == [20] * 5 and (1, 1) in fuser.pairs
 
 
 def test_what_only_one_sees_stays_as_it_is() -> None:

@@ -49,7 +49,7 @@ from ...estimation.set_model import walk_reach
 from ...estimation.set_scatter import decaying_profile, Scatter
 from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
-from ...parameters import ConfigError
+from ...parameters import ConfigError, small_text
 from .config import FathometerConfig
 
 MAX_CELLS = 100_000
@@ -118,15 +118,17 @@ def pulse_of(config: FathometerConfig) -> Pulse:
     if config.pulse == 'gaussian':
         return gaussian_pulse(config.pulse_width)
     try:
-        rows = Path(config.pulse_file).read_text(encoding='utf-8-sig').split('\n')
+        rows = small_text(Path(config.pulse_file), 'utf-8-sig').split('\n')
         # The first line may name the columns.
         named = any(character.isalpha() for character in rows[0].replace('e', ''))
         table = [[float(cell) for cell in row.split(',')] for row in rows[named:] if row.strip()]
         return measured_pulse([row[0] for row in table], [row[1] for row in table])
     except OSError as error:
         raise ConfigError(f'pulse_file {config.pulse_file}: {error.strerror}') from None
-    except (ValueError, IndexError) as error:
-        raise ConfigError(f'pulse_file {config.pulse_file}: {error}') from None
+    except IndexError:
+        raise ConfigError(f'pulse_file {config.pulse_file}: two columns are needed') from None
+    except ValueError as error:
+        raise ConfigError(f'pulse_file {config.pulse_file}: {str(error)[:200]}') from None
 
 
 def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:

@@ -108,13 +108,8 @@ class TruePath:
 
     def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
         """True (m,) where it should be tracked: in the beam for a while and not passed yet."""
-        seen = np.cumsum(self.in_beam)[
-            np.clip(
-                np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1,
-                0,
-                len(self.stamp_ns) - 1,
-            )
-        ]
+        last = np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1
+        seen = np.cumsum(self.in_beam)[np.maximum(last, 0)]
         distance, bearing, offset = self.at(stamp_ns, gap).T
         level = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
         with np.errstate(invalid='ignore'):

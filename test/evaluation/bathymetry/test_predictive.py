@@ -14,11 +14,23 @@
 
 """What tuning runs the bathymetry tracker with."""
 
+import numpy as np
 import pytest
 
+from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig, MODEL_SETS
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
-from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning
+from sonar_imm_tools.evaluation.bathymetry.predictive import for_tuning, Scored
+
+
+def test_of_a_long_recording_sixteen_pings_from_begin_to_end_are_scored():
+    pings = [
+        Snapshot(stamp_ns=k, range=[20.0, 21.0], iq=np.ones((2, 2), complex))
+        for k in range(1, 101)
+    ]
+    used = Scored(BathymetryConfig(), pings).used
+    assert len(used) == 16 and {1, 100} <= used
+    assert Scored(BathymetryConfig(), pings[:16]).used == set(range(1, 17))
 
 
 @pytest.mark.parametrize('model_set', MODEL_SETS)

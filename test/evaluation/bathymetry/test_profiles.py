@@ -85,6 +85,11 @@ def test_truth_with_hardly_a_bin(ranges):
     assert np.isfinite(floor.height).sum() == len(ranges)
 
 
+def test_the_truth_of_a_ping_of_one_bin_is_the_nearest_there_is():
+    floor = profile_of(estimate(ranges=RANGES[:1]), truth(np.array([19.0, 30.0]))).truth
+    assert floor.height.tolist() == [0.0]
+
+
 def test_pings_meet_the_truth_of_their_own_stamp():
     swath = profiles_of([estimate(stamp_ns=7), estimate(stamp_ns=8)], [truth(RANGES, stamp_ns=8)])
     assert [profile.truth is None for profile in swath.profiles] == [True, False]

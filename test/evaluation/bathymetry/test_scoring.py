@@ -18,8 +18,10 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm_tools.evaluation.bathymetry import figures
 from sonar_imm_tools.evaluation.bathymetry.figures import (
     chart_figure,
+    finest_chart,
     profile_figure,
     verdict_figure,
 )
@@ -79,6 +81,14 @@ def test_the_chart_puts_the_middle_of_each_cell_in_its_place_north_up():
     np.testing.assert_array_equal(cells.z, -depth)
     assert list(ship.x) == [101.0, 106.0] and list(ship.y) == [46.0, 50.0]
     assert cells.customdata.shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize('extent, cell', [(10.0, 0.1), (17.0, 0.25), (900.0, 6.0)])
+def test_the_chart_has_cells_as_small_as_fit(extent, cell, monkeypatch):
+    made = []
+    monkeypatch.setattr(figures, 'chart_of', lambda points, size, *_: made.append(size))
+    finest_chart({'x': np.array([0.0, extent]), 'y': np.zeros(2)}, {'parameters': {}})
+    assert made == [cell]
 
 
 def test_errors_by_place_and_the_share_inside_the_band():
@@ -147,6 +157,8 @@ def test_shadow_is_scored_apart():
     assert metrics['height']['all']['n'] == N - 4
     assert metrics['height']['shadow']['n'] == 4
     assert metrics['gate'] == {'shadow_bins': 4, 'shadow_passed_over': 0.75, 'echo_heard': 1.0}
+    told = ' '.join(name for name, _ in lines(METRICS, metrics))
+    assert 'height error, all' in told and 'angle error, all' in told
     assert any('shadow passed over' in name for name, _ in lines(METRICS, metrics))
 
 

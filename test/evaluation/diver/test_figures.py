@@ -61,6 +61,7 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
     truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
     series = series_of(estimates)
     fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    assert fixes.place_covariance.shape == (1, 3, 3)
     figure = figures.map_figure(series, truth, fixes)
     low, high = figure.layout.xaxis.range
     assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
@@ -76,7 +77,12 @@ def test_the_error_of_a_track_is_drawn_over_the_seconds_of_the_run_in_its_band()
     series = series_of(estimates)
     series.track_id[:10] = 6  # another track goes before
     matching = match(series, Truth.from_series(series_of(true_rows)), cutoff=10.0)
-    drawn = figures.error_figure(matching, 7).data
+    figure = figures.error_figure(matching, 7)
+    assert {name for name in figure.to_dict()['layout'] if name.startswith('yaxis')} == {
+        'yaxis',
+        'yaxis2',
+    }
+    drawn = figure.data
     lines = [line for line in drawn if line.name == 'error of the track']
     bands = [line for line in drawn if line.name == 'predicted 95 % band']
     assert len(lines) == len(bands) == 2

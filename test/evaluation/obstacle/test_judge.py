@@ -45,7 +45,7 @@ def estimate(second, rows):
     return Estimate(
         stamp_ns=second * SECOND,
         frame_id='odom',
-        xyz=np.zeros((len(rows), 3), np.float32),
+        xyz=np.column_stack([rows[:, 2], rows[:, 3], rows[:, 4]]).astype(np.float32),
         state_names=('range', 'bearing', 'vertical_offset'),
         state=rows[:, 2:5],
         covariance=covariance,
@@ -115,6 +115,7 @@ def test_scores_are_those_done_by_hand():
             ],
         ),
     ]
+    assert series_of(estimates).place[1] == pytest.approx([20.0, 0.3])
     metrics, found = score(series_of(estimates), (straight(1, 3.0),), cutoff=5.0, gap=60.0)
     assert (metrics['pings'], metrics['span_s']) == (2, 1.0)
     assert metrics['vertical_offset']['rmse_m'] == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))

@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``python -m helpers.hostile``: hostile messages and extreme parameters, many, and what they did.
+"""``python -m helpers.hostile``: hostile messages, extreme parameters and damaged files, many, and
+what they did.
 
 Run by ``make fuzz``; prints one line per system and writes the numbers as JSON. Exit code 1 when
 something got through.
@@ -35,6 +36,7 @@ import numpy as np
 
 from sonar_imm.trackers import SYSTEMS
 
+from .files import file_results, FILES
 from .runs import BATCH, batches, run, run_extreme, Tally
 
 ROOT = Path(__file__).parents[3]
@@ -119,6 +121,7 @@ def main():
     parser = argparse.ArgumentParser(prog='python -m helpers.hostile', description=__doc__)
     parser.add_argument('--cases', type=int, default=100_000, help='messages for each system')
     parser.add_argument('--draws', type=int, default=300, help='configurations for each system')
+    parser.add_argument('--files', type=int, default=0, help='damaged files of each kind')
     parser.add_argument('--systems', nargs='*', default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument('--jobs', type=int, default=2)
     parser.add_argument('--json', type=Path, help='write the numbers here')
@@ -127,7 +130,9 @@ def main():
         coming = {
             system: pool.submit(_all, system, given.cases, given.draws) for system in given.systems
         }
+        files = [pool.submit(file_results, name, given.files) for name in FILES if given.files]
         results = {system: item.result() for system, item in coming.items()}
+        damaged = [item.result() for item in files]
     failed = False
     for system, result in results.items():
         hostile, extreme = result['messages'], result['parameters']
@@ -140,6 +145,10 @@ def main():
         )
         for failure in hostile['failures'] + extreme['failures']:
             print(failure)
+    for tried in damaged:
+        failed = failed or bool(tried['failures'])
+        print('{name}: {draws} damaged, {used} used, {cpu_seconds} s'.format(**tried))
+        print(*tried['failures'], sep='\n', end='\n' * bool(tried['failures']))
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + '\n')
     return int(failed)

@@ -24,6 +24,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.georeferencing import Georeferencer
 from sonar_imm_tools.simulation.diver.afloat import ORIGIN
+from sonar_imm_tools.simulation.diver.crossing import CLOSEST, crossing_paths
 from sonar_imm_tools.simulation.diver.simulator import (
     draw_errors,
     RECEIVERS,
@@ -52,6 +53,12 @@ def test_fixes_are_as_accurate_as_they_say():
             error = item.measurement.position[:2] - place[:2]
             squared.append(error @ np.linalg.solve(item.measurement.covariance[:2, :2], error))
     assert np.mean(squared) == pytest.approx(2.0, abs=0.15)
+    plain = simulate(scenario('table1', {'sensor': 'positions', 'duration': 999.0}), 1)
+    errors = [
+        item.measurement.position[:2] - place[:2]
+        for item, place in zip(plain.measurements, plain.truth[0].position)
+    ]
+    assert np.std(errors) == pytest.approx(1.0, rel=0.07)  # metres, unless it is told otherwise
 
 
 def test_arrivals_are_transmitter_diver_receiver():
@@ -377,3 +384,10 @@ def test_a_depth_is_stated_where_it_is_measured_and_there_is_one_it_can_be_of(di
             index = np.searchsorted(scene.truth[0].stamp_ns, each.measurement.stamp_ns)
             true = -scene.truth[0].position[index, 2]
             assert each.measurement.depth == pytest.approx(true, abs=0.8)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_divers_who_cross_come_as_near_as_they_are_said_to(seed):
+    paths = crossing_paths(6, np.linspace(0.0, 100.0, 2001), np.random.default_rng(seed))
+    for first, other in zip(paths[::2], paths[1::2]):
+        assert np.linalg.norm(first[:, :2] - other[:, :2], axis=1).min() < CLOSEST + 0.05

@@ -14,6 +14,7 @@
 
 """Scenes of the fathometer: what they promise, and that they are the same each time."""
 
+from attrs import evolve
 from helpers.scenes import smaller_scene
 import numpy as np
 import pytest
@@ -23,8 +24,10 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm_tools.simulation.fathometer.simulator import (
+    _envelope,
     cross_spectra,
     scenario,
     SCENARIOS,
@@ -47,6 +50,9 @@ def test_layers_fade_and_appear_as_told():
     assert drift.present.sum(axis=1)[[0, 20, 45, 99]].tolist() == [8, 9, 8, 9]
     assert drift.present[:, 0].all()
     assert (drift.amplitude[:, 0] > 0.2).all()
+    config = scenario('drift', {'appearing': (), 'fading': (30, 40, 50), 'records': 100})
+    left = drift_of(config, np.random.default_rng(0)).present[99]
+    assert np.flatnonzero(~left).tolist() == [3, 5, 7]  # no neighbours
 
 
 def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
@@ -306,3 +312,23 @@ def test_the_truth_names_what_is_there():
     ]
     steps = np.diff([item.stamp_ns for item in scene.truth])
     np.testing.assert_allclose(steps, 89.6e9, atol=1.0)
+
+
+def test_a_profiler_hears_its_own_noise_alone_where_there_is_no_floor():
+    config = scenario('diffuse', {'records': 1})
+    drift = drift_of(config, np.random.default_rng(0))
+    bare = evolve(drift, amplitude=np.zeros_like(drift.amplitude))
+    heard, silent = (
+        _envelope(config, each, 0, np.random.default_rng(1))[0] for each in (drift, bare)
+    )
+    assert silent.max() < 0.2 * heard.max() and len(silent) == len(heard)
+
+
+def test_the_noise_of_ships_falls_by_half_at_200_hertz():
+    config = scenario('drift', {'records': 1, 'ship_noise': 2.0, 'whitened': True})
+    drift, at = drift_of(config, np.random.default_rng(0)), np.array([1.0, 200.0, 600.0])
+    loud, quiet = (
+        expected_csdm(each, drift, 0, at) for each in (config, evolve(config, ship_noise=0.0))
+    )
+    power = np.einsum('fmm->f', loud - quiet).real
+    assert power / power[0] == pytest.approx([1.0, 0.5, 0.1], rel=1e-4)

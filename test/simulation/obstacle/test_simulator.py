@@ -26,7 +26,14 @@ from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.simulation.obstacle.simulator import DOES, scenario, SCENARIOS, simulate
+from sonar_imm_tools.simulation.obstacle.simulator import (
+    _sway,
+    _SWAY_STEP,
+    DOES,
+    scenario,
+    SCENARIOS,
+    simulate,
+)
 
 EXACT = {
     'ideal_navigation': True,
@@ -474,3 +481,12 @@ def test_truth_tables_say_the_velocity():
 def test_speeds_in_the_wrong_order_are_refused():
     with pytest.raises(ConfigError, match='obstacle_speed'):
         scenario('mover', {'obstacle_speed': [2.0, 1.0]})
+
+
+def test_what_sways_has_its_deviation_and_forgets_in_its_time():
+    config = scenario('swaying', {'obstacle_sway': 0.5, 'obstacle_sway_time': 2.0})
+    ways = np.stack([_sway(config, np.random.default_rng(seed)) for seed in range(200)])
+    assert ways.std(axis=(0, 2)) == pytest.approx(0.5, rel=0.25)
+    assert ways.std() == pytest.approx(0.5, rel=0.03)
+    lag = round(2.0 / _SWAY_STEP)
+    assert np.mean(ways[:, lag:] * ways[:, :-lag]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)

@@ -325,6 +325,9 @@ def test_a_pulse_from_a_file(tmp_path):
             FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(path)))
     with pytest.raises(ConfigError, match='No such file'):
         FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(tmp_path / 'no')))
+    with pytest.raises(ConfigError) as endless:
+        FathometerTracker(FathometerConfig(pulse='file', pulse_file='/dev/zero'))
+    assert len(str(endless.value)) < 300
 
 
 def fine_trace():

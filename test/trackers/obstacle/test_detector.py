@@ -20,7 +20,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import Rejection, SonarImage
+from sonar_imm.measurements import Rejection, SonarImage, SonarInfo
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig, ImageDetector
 
 VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_sea'
@@ -241,3 +241,7 @@ def test_memory_is_bounded_whatever_comes():
     for beam in beams(angles, rows=20):
         detector.process(beam)
     assert len(detector._sweep) <= 1000
+    for k in range(200):  # the first sonar goes on saying what it is
+        for name in (f'sonar_{k}', 'sonar'):
+            detector.describe(SonarInfo(stamp_ns=k, frame_id=name, gain=2.0))
+    assert len(detector.infos) <= 16 and {'sonar', 'sonar_199'} <= detector.infos.keys()

@@ -1,0 +1,192 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Damaged files: what `convert` takes in, and states of trackers.
+
+Random bytes of a good file are changed, cut off, repeated or taken from elsewhere in it, numbers
+of text are changed for odd ones. A state is also changed under a checksum that is right again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+from pathlib import Path
+import re
+import shutil
+import tempfile
+from time import process_time
+
+import numpy as np
+
+from helpers.field_files import FORMATS, line
+from helpers.tracked import tracked
+from sonar_imm.trackers import state_file
+from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
+from sonar_imm.trackers.state_values import StateError
+from sonar_imm_tools.cli import main
+
+SPOTS = 12
+"""Moments in a file."""
+LONGEST = 20.0
+"""CPU seconds that a damaged file may take; a good one takes half a second."""
+WORDS = [
+    b'', b'nan', b'-1', b'0', b'1e308', b'1e999', b'9' * 40, b'99999999999', b'-0.0', b'x', b'"',
+    b'<', b'\xff', b',,,', b'\r', b'\0', b'2024-13-45T99:99:99Z', b'90.0001', b'{', b']',
+]  # fmt: skip
+RECORDED = ('diver_table1', 'obstacle_tethers', 'bathymetry_ship', 'fathometer_drift')
+
+
+def damaged(content, rng):
+    """The bytes of a file, changed in one to four places."""
+    content = bytearray(content)
+    for _ in range(1 + rng.integers(4)):
+        size = len(content)
+        if not size:
+            break
+        at, length = int(rng.integers(size)), int(rng.integers(1, 9))
+        kind = rng.integers(6)
+        if kind == 0:
+            content[at] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            content[at : at + length] = bytes([int(rng.choice([0, 1, 127, 128, 255]))]) * length
+        elif kind == 2:
+            del content[at : at + (length if rng.random() < 0.7 else size)]
+        elif kind == 3:
+            start = int(rng.integers(size))
+            content[at:at] = content[start : start + int(rng.integers(1, 400))]
+        elif kind == 4:
+            start = int(rng.integers(size))
+            content[at : at + length] = content[start : start + length]
+        elif found := list(re.finditer(rb'-?[0-9][0-9.eE+-]*', bytes(content[at : at + 300]))):
+            start, end = found[int(rng.integers(len(found)))].span()
+            content[at + start : at + end] = WORDS[int(rng.integers(len(WORDS)))]
+    return bytes(content)
+
+
+def convert_damaged(each, draws):
+    """Convert a file of a `Format`, damaged in `draws` ways: how many gave a bag, and what was
+    wrong."""
+    made, failures = 0, []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source, bag = folder / each.name, folder / 'bag'
+        each.make(source, line(SPOTS, each.step))
+        kept = sorted(path for path in [source, *source.rglob('*')] if path.is_file())
+        good = [path.read_bytes() for path in kept]
+        words = [each.kind] if each.kind else []
+        options = [option.format(folder) for option in each.options]
+        for k in range(draws):
+            rng = np.random.default_rng([k, len(each.name)])
+            which = int(rng.integers(len(kept)))
+            kept[which].write_bytes(damaged(good[which], rng))
+            problem, code = _called(['convert', *words, str(source), str(bag), *options])
+            if not problem and (code == 0) != bag.exists():
+                problem = f'exit code {code}, and a bag: {bag.exists()}'
+            if problem:
+                failures.append(f'{each.name}, draw {k}: {problem}')
+            made += code == 0
+            kept[which].write_bytes(good[which])
+            shutil.rmtree(bag, ignore_errors=True)
+    return made, failures
+
+
+def _called(words):
+    """What is wrong with how the command ended, and its exit code."""
+    out, start = io.StringIO(), process_time()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+            code = main(words)
+    except BaseException as error:
+        return f'{type(error).__name__}: {error}', None
+    if 'Traceback' in out.getvalue() or code not in (0, 1, 2):
+        return f'exit code {code}: {out.getvalue()[-500:]}', code
+    seconds = process_time() - start
+    return f'{seconds:.0f} s' if seconds > LONGEST else '', code
+
+
+def states_damaged(recording, draws):
+    """Read states of a run, damaged in `draws` ways: how many were read, and what was wrong."""
+    run = tracked(recording)
+    system = run.system.name
+    taken, failures = 0, []
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / 'state'
+        write_state(path, run.saved(run.until(30)))
+        good = path.read_bytes()
+        for k in range(draws):
+            rng = np.random.default_rng(k)
+            path.write_bytes(_forged(good, rng) if k % 2 else damaged(good, rng))
+            start = process_time()
+            try:
+                tracker_from(read_state(path), run.system, run.config)
+                taken += 1
+                if not k % 2 and path.read_bytes() != good:
+                    failures.append(f'state of {system}, draw {k}: damaged, and taken for good')
+            except StateError:
+                pass
+            except Exception as error:
+                failures.append(f'state of {system}, draw {k}: {type(error).__name__}: {error}')
+            if process_time() - start > LONGEST:
+                failures.append(f'state of {system}, draw {k}: {process_time() - start:.0f} s')
+    return taken, failures
+
+
+def _forged(content, rng):
+    """A state that says something else, under a checksum that is right."""
+    with np.load(io.BytesIO(content.partition(b'\n')[2])) as parts:
+        text, block = parts['header'].tobytes(), parts['block']
+    header, place = json.loads(text), None
+    for _ in range(40):  # down into a random place
+        branch = header if place is None else place[0][place[1]]
+        keys = (
+            list(branch)
+            if isinstance(branch, dict)
+            else range(len(branch))
+            if isinstance(branch, list)
+            else ()
+        )
+        if not len(keys) or (place and rng.random() < 0.1):
+            break
+        place = branch, keys[int(rng.integers(len(keys)))]
+    owner, key = place
+    odd = [None, -1, 0, 2**70, 1.5, '', 'os', [], {}, True, [owner[key]], header['values'][:3]]
+    owner[key] = odd[int(rng.integers(len(odd)))]
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.frombuffer(json.dumps(header).encode(), np.uint8), block=block)
+    body = buffer.getvalue()
+    head = f'sonar_imm state {state_file.FORMAT} {hashlib.sha256(body).hexdigest()}\n'
+    return head.encode() + body
+
+
+FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'} | {
+    f'state of {name.split("_")[0]}': (states_damaged, name) for name in RECORDED
+}
+"""What is damaged: each format that is taken in, and the state of each system."""
+
+
+def file_results(name, draws):
+    """What happened to `draws` damaged files, as plain values."""
+    attempt, what = FILES[name]
+    start = process_time()
+    used, failures = attempt(what, draws)
+    return {
+        'name': name,
+        'draws': draws,
+        'used': used,
+        'failures': failures[:5],
+        'cpu_seconds': round(process_time() - start, 1),
+    }
