@@ -87,7 +87,6 @@ def records_of(
 def drift(seed: int, records: int) -> tuple[FathometerScenario, Drift, np.random.Generator]:
     scale = records / 300
     config = FathometerScenario(
-        level='csdm',
         records=records,
         snapshot_seconds=0.35,
         snapshots=256,

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace
 
 from ..array_records import (
     read_array_depth,
@@ -28,6 +28,7 @@ from ..array_records import (
     write_pressure,
     write_trace,
 )
+from ..fixes import read_geodetic, write_geodetic
 from .topic import InputTopic
 
 TOPICS = (
@@ -65,5 +66,14 @@ TOPICS = (
         },
         write=write_array_depth,
         companion=True,
+    ),
+    InputTopic(
+        'position',
+        'where the array is, for what changes by distance (record_distance)',
+        measurement=GeodeticFix,
+        readers={'sensor_msgs/msg/NavSatFix': read_geodetic},
+        write=write_geodetic,
+        companion=True,
+        wanted=lambda settings: settings['record_distance'] > 0.0,
     ),
 )

@@ -55,8 +55,8 @@ class FathometerConfig(StampParameters):
         'depth of the deepest hydrophone, where neither the record nor a companion instrument '
         'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))
     array_depth_age: float = live(30.0, 's',
-        'largest time between a record and the depth of a companion instrument that is used for '
-        'it', range=(0.0, 86400.0))
+        'largest time between a record and the depth or position of a companion instrument that '
+        'is used for it', range=(0.0, 86400.0))
     array_depth_std: float = live(0.03, 'm',
         'standard deviation of the stated depth of the array, a part of the error of every '
         'reflector; 0: depths are judged as seen from the array', range=(0.0, 1000.0))
@@ -179,6 +179,9 @@ class FathometerConfig(StampParameters):
         'time from record to record that depth_std, order_switch_probability and what else is per '
         'record are meant for: after a gap they count as often as records would have come; 0: the '
         'median of the first intervals', range=(0.0, 86400.0))
+    record_distance: float = parameter(0.0, 'm',
+        'distance from record to record that they are meant for instead, where positions tell how '
+        'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('positive', '',

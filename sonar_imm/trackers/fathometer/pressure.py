@@ -21,7 +21,8 @@ gap longer than a record, it does not.
 Where the length of a snapshot is not given, it follows from the deepest depth that is tracked and
 from how many snapshots the array needs (`automatic_snapshot`).
 
-The depth of the array comes with the blocks, or from a companion instrument (`CompanionDepths`).
+The depth of the array comes with the blocks, or from a companion instrument (`CompanionDepths`);
+where it was, from another one (`CompanionPlaces`). `Pace` counts what passes between records.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from collections import Counter
 import math
 from typing import NamedTuple
 
+from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acoustics.geodesy import Origin
 from ...acoustics.spectra import (
     Average,
     BlockAverage,
@@ -41,7 +44,7 @@ from ...acoustics.spectra import (
     SlidingAverage,
     SnapshotStream,
 )
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection
+from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection
 from ...measurements.fathometer import MAX_FREQUENCIES
 from .config import FathometerConfig
 
@@ -54,7 +57,7 @@ _MOST_WAYS, _LEAST_WAYS, _SNAPSHOTS_PER_PHONE = 7.0, 5.0, 2.5
 MOST_HEAVE = 0.05
 """Standard deviation of the depth within a record, m, above which it is said: a sinusoid of so
 much leaves 0.62 of an echo in 50 Hz to 4 kHz (the mean of J0(2 k A), A its amplitude)."""
-_DEPTHS_KEPT = 10_000
+_KEPT, _INTERVALS = 10_000, 15
 
 
 class Collected(NamedTuple):
@@ -236,7 +239,7 @@ class CompanionDepths:
 
     def add(self, depth: ArrayDepth) -> None:
         insort(self._depths, (depth.stamp_ns, depth.depth))
-        del self._depths[:-_DEPTHS_KEPT]
+        del self._depths[:-_KEPT]
 
     def over(self, stamp_ns: int, span_ns: int, config: FathometerConfig) -> float | None:
         """The mean depth, m, over `span_ns` before the stamp; else `nearest`."""
@@ -262,3 +265,61 @@ class CompanionDepths:
         low = bisect_left(self._depths, (stamp_ns - span_ns, -np.inf))
         high = bisect_right(self._depths, (stamp_ns, np.inf))
         return [depth for _, depth in self._depths[low:high]]
+
+
+class CompanionPlaces:
+    """Latitudes and longitudes of the array, degrees, by stamp, as a companion has them."""
+
+    def __init__(self) -> None:
+        self._fixes: list[tuple[int, float, float]] = []
+
+    def add(self, fix: GeodeticFix) -> None:
+        insort(self._fixes, (fix.stamp_ns, fix.latitude, fix.longitude))
+        del self._fixes[:-_KEPT]
+
+    def at(self, stamp_ns: int, config: FathometerConfig) -> Origin | None:
+        """The place at a stamp, between the fixes before and behind it or at the only one; None
+        where there is none that is recent enough."""
+        row = bisect_right(self._fixes, (stamp_ns, np.inf, np.inf))
+        near = [
+            fix
+            for fix in self._fixes[max(0, row - 1) : row + 1]
+            if abs(fix[0] - stamp_ns) <= config.array_depth_age * 1e9
+        ]
+        if not near:
+            return None
+        (before, south, west), (after, north, east) = near[0], near[-1]
+        share = (stamp_ns - before) / (after - before) if after > before else 0.0
+        # Across the date line the longitude goes on.
+        turn = (east - west + 180.0) % 360.0 - 180.0
+        return Origin(south + share * (north - south), west + share * turn)
+
+
+@frozen
+class Pace:
+    """How many records' time, or way, passes from record to record: whole numbers, so that stamps
+    may be off by half an interval and change nothing. A value: `after` makes a new one.
+
+    newest_ns: stamp of the newest record; place: where it was made, if known; intervals: the first
+    ones, ns, whose median is that of the tracker where none is configured. While there are two,
+    the longer one counts: no gap is seen where there is none."""
+
+    newest_ns: int | None = None
+    intervals: tuple[int, ...] = ()
+    place: Origin | None = None
+
+    def after(self, stamp_ns: int, place: Origin | None = None) -> Pace:
+        if self.newest_ns is None or len(self.intervals) == _INTERVALS:
+            return Pace(stamp_ns, self.intervals, place)
+        return Pace(stamp_ns, (*self.intervals, stamp_ns - self.newest_ns), place)
+
+    def records(self, stamp_ns: int, config: FathometerConfig, place: Origin | None = None) -> int:
+        """How many from the newest one to that of `stamp_ns`, 1 at least."""
+        if self.newest_ns is None:
+            return 1
+        if config.record_distance and place is not None and self.place is not None:
+            way = math.hypot(*self.place.local(place.latitude, place.longitude)[:2])
+            return max(1, round(way / config.record_distance))
+        intervals = sorted(self.after(stamp_ns).intervals)
+        interval = config.record_interval * 1e9 or intervals[len(intervals) // 2]
+        return max(1, round((stamp_ns - self.newest_ns) / max(interval, 1)))

@@ -31,7 +31,8 @@ The cycle of the particle filter, for each record (`FathometerTracker._cycle`):
 
 Records are minutes of averaging apart, so that each is taken in once and for good: one that is
 late or repeated is counted and dropped. The random numbers of a record come from its own stamp.
-After a gap, what is per record happens as often as records would have come (`Pace`).
+After a gap, or a longer way, what is per record happens as often as records would have come
+(`Pace`).
 
 With a `smoothing_lag`, `process` gives the revised estimate of an earlier record before that of
 the newest. A preview is the newest, too, but leaves the filter as it was: windows that overlap are
@@ -64,10 +65,17 @@ from ...estimation.set_model import (
 )
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from ..protocol import WarmStep
 from .config import FathometerConfig
-from .pressure import Collected, CompanionDepths, MOST_HEAVE, PressureStream
+from .pressure import (
+    Collected,
+    CompanionDepths,
+    CompanionPlaces,
+    MOST_HEAVE,
+    Pace,
+    PressureStream,
+)
 from .reflectors import (
     IdArray,
     Identified,
@@ -100,7 +108,7 @@ from .slopes import slopes_followed
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
 _RECORDS, _LEAST = 100, 10
-_INTERVALS, LONGEST_GAP = 15, 5000
+LONGEST_GAP = 5000
 _FULL, _UNEXPLAINED, _NEGATIVE = 0.5, 0.05, 1e-9
 _LEFT, _DEEP, _OF_STRONGEST = 0.5, 6.0, 0.25
 """Share of records with a negative echo; how deep it is, in sigma and of the strongest one."""
@@ -114,35 +122,9 @@ class _Taken:
     named: tuple[Identified, ...]
 
 
-@frozen
-class Pace:
-    """How many records' time passes from record to record: whole numbers, so that stamps may be
-    off by half an interval and change nothing. A value: `after` makes a new one.
-
-    newest_ns: stamp of the newest record; intervals: the first ones, ns, whose median is that of
-    the tracker where none is configured. While there are two, the longer one counts: no gap is
-    seen where there is none."""
-
-    newest_ns: int | None = None
-    intervals: tuple[int, ...] = ()
-
-    def after(self, stamp_ns: int) -> Pace:
-        if self.newest_ns is None or len(self.intervals) == _INTERVALS:
-            return Pace(stamp_ns, self.intervals)
-        return Pace(stamp_ns, (*self.intervals, stamp_ns - self.newest_ns))
-
-    def records(self, stamp_ns: int, config: FathometerConfig) -> int:
-        """How many from the newest one to that of `stamp_ns`, 1 at least."""
-        if self.newest_ns is None:
-            return 1
-        intervals = sorted(self.after(stamp_ns).intervals)
-        interval = config.record_interval * 1e9 or intervals[len(intervals) // 2]
-        return max(1, round((stamp_ns - self.newest_ns) / max(interval, 1)))
-
-
 class FathometerTracker:
     """The tracker of `trackers.Tracker` for reflectors: `process` takes `Pressure`,
-    `CrossSpectra`, `Trace` and `ArrayDepth`.
+    `CrossSpectra`, `Trace`, `ArrayDepth` and `GeodeticFix`.
 
     response: the depth response of the newest record or preview, for display; None before.
     refusals: the sentence of the first record that could not be used, by reason.
@@ -155,6 +137,7 @@ class FathometerTracker:
         '_pace',
         '_ids',
         '_depths',
+        '_places',
         '_hydrophones',
         '_pressure',
         '_multiples',
@@ -179,6 +162,7 @@ class FathometerTracker:
         self.refusals: dict[str, str] = {}
         self._ids = Identities()
         self._depths = CompanionDepths()
+        self._places = CompanionPlaces()
         self._forget()
 
     def _forget(self) -> None:
@@ -219,7 +203,7 @@ class FathometerTracker:
             compile_step()
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        if inputs is not None and {ArrayDepth}.issuperset(inputs):
+        if inputs is not None and {ArrayDepth, GeodeticFix}.issuperset(inputs):
             return []
         return [('records', self._warm_records)]
 
@@ -263,6 +247,10 @@ class FathometerTracker:
         if isinstance(measurement, ArrayDepth):
             self._depths.add(measurement)
             self.counts['array_depths'] += 1
+            return []
+        if isinstance(measurement, GeodeticFix):
+            self._places.add(measurement)
+            self.counts['positions'] += 1
             return []
         admitted = self._stream.admit(measurement)
         if admitted.restarted:
@@ -362,7 +350,8 @@ class FathometerTracker:
     def _filtered(self, response: Response) -> tuple[Response, SetStep, int]:
         """What this record would change, and how many records' time passed. Where its noise is not
         known, it is measured in what the reflectors of a first round leave."""
-        records = self._pace.records(response.stamp_ns, self.config)
+        place = self._places.at(response.stamp_ns, self.config)
+        records = self._pace.records(response.stamp_ns, self.config, place)
         step = self._cycle(response, records)
         if response.noise_unknown:
             found, _ = self._summarise(step, response)
@@ -416,7 +405,8 @@ class FathometerTracker:
     def _record(self, response: Response) -> list[Estimate]:
         response, step, records = self._filtered(response)
         self._before = step.after if step.ok else None
-        self._pace = self._pace.after(response.stamp_ns)
+        place = self._places.at(response.stamp_ns, self.config)
+        self._pace = self._pace.after(response.stamp_ns, place)
         self.counts['used'] += 1
         if records > 1:
             self.counts['gaps'] += 1

@@ -31,6 +31,7 @@ from sonar_imm.measurements import (
     Detections,
     Fix,
     Fixes,
+    GeodeticFix,
     Ground,
     Navigation,
     Pressure,
@@ -75,7 +76,14 @@ VARIANTS = {
     ),
     'fathometer': (
         {'particles': 40, 'order_max': 3, 'phones': 0, 'record_seconds': 0.2},
-        {'particles': 40, 'order_max': 2, 'phones': 0, 'smoothing_lag': 1, 'heave': 'memory'},
+        {
+            'particles': 40,
+            'order_max': 2,
+            'phones': 0,
+            'smoothing_lag': 1,
+            'heave': 'memory',
+            'record_distance': 5.0,
+        },
         {
             'particles': 40,
             'order_max': 2,
@@ -104,6 +112,7 @@ FRAMES = {
     ('obstacle', 'altitude'): 'altimeter',
     ('bathymetry', 'altitude'): 'altimeter',
     ('fathometer', 'array_depth'): '',
+    ('fathometer', 'position'): '',
 }
 """The frame of messages; 'map' where it is not said."""
 
@@ -194,6 +203,7 @@ def _fathometer(k, variant):
     stamp = T0 + k * (SECOND // 10 if variant == 0 else SECOND)
     if k % 5 == 0:
         yield 'array_depth', ArrayDepth(stamp_ns=stamp, depth=30.0)
+        yield 'position', GeodeticFix(stamp_ns=stamp, latitude=3.0, longitude=3.0 + 1e-4 * k)
     if variant == 0:
         yield 'pressure', _pressure(k, stamp)
     elif variant == 1:

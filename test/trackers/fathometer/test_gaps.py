@@ -14,13 +14,16 @@
 
 """What passes between two records: records that are missing, and stamps that are not even."""
 
+from attrs import evolve
 from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_gaps import BEFORE, kalman, LAYERS, scene, summary, tracked
+from benchmarks.fathometer_gaps import BEFORE, kalman, LAYERS, scene, SECONDS, summary, tracked
+from sonar_imm.measurements import GeodeticFix
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.tracker import LONGEST_GAP, Pace
+from sonar_imm.trackers.fathometer.pressure import CompanionPlaces, Pace
+from sonar_imm.trackers.fathometer.tracker import FathometerTracker, LONGEST_GAP
 
 OPTIONS = {'particles': 5000}
 
@@ -89,13 +92,18 @@ def test_after_too_long_a_gap_all_is_new():
     assert len(before) == len(LAYERS) and tracker.counts['gaps'] == 1
 
 
-def passed(stamps, **parameters):
-    """How many records' time passes before each stamp, s."""
-    pace, config, found = Pace(), FathometerConfig(**parameters), []
+def passed(stamps, fixes=(), **parameters):
+    """How many records' time, or way, passes before each stamp, s; fixes: stamp, latitude and
+    longitude."""
+    pace, config, places, found = Pace(), FathometerConfig(**parameters), CompanionPlaces(), []
+    for second, latitude, longitude in fixes:
+        stamp_ns = round(second * 1e9)
+        places.add(GeodeticFix(stamp_ns=stamp_ns, latitude=latitude, longitude=longitude))
     for stamp in stamps:
         stamp_ns = round(stamp * 1e9)
-        found.append(pace.records(stamp_ns, config))
-        pace = pace.after(stamp_ns)
+        place = places.at(stamp_ns, config)
+        found.append(pace.records(stamp_ns, config, place))
+        pace = pace.after(stamp_ns, place)
     return found
 
 
@@ -114,6 +122,49 @@ def test_the_interval_is_learned_from_the_first_records():
     # From then on it stays: half as many records are each two records' time.
     assert passed([*range(20), *range(21, 41, 2)])[-9:] == [2] * 9
     assert passed([*range(20), *range(21, 41, 2)], record_interval=2.0) == [1] * 30
+
+
+METRE = 360.0 / (2.0 * np.pi * 6_378_137.0)
+"""In degrees of longitude at the equator."""
+
+
+def test_by_distance_the_way_counts_and_not_the_time():
+    # 2 m/s, then 6 m/s, then at rest, across the date line; fixes between the records.
+    at = np.concatenate([2.0 * np.arange(60), 120.0 + 6.0 * np.arange(60), np.full(60, 480.0)])
+    fixes = [
+        (k + 0.5, 0.0, (179.999 + METRE * x + 180.0) % 360.0 - 180.0) for k, x in enumerate(at)
+    ]
+    stamps = np.arange(1.0, 171.0, 10.0)
+    steps = passed(stamps, fixes, record_distance=20.0)
+    assert steps == [1] * 7 + [3] * 6 + [1] * 4
+    assert passed(stamps, fixes) == [1] * 17
+    # Without a fix that is near enough time counts: 100 m, but one interval.
+    lost = [fix for fix in fixes if not 55.0 < fix[0] < 115.0]
+    near = passed(stamps, lost, record_distance=20.0, array_depth_age=2.0)
+    assert near == [1] * 17
+    assert passed(stamps[::12], lost, record_distance=20.0, array_depth_age=2.0) == [1, 24]
+
+
+def test_what_a_long_way_changes_is_expected_by_distance_only():
+    """Records at even times, 30 records' way between two of them."""
+    traces, _ = scene(30, 0.1, 0)
+    right = {}
+    for record_distance in (0.0, 5.0):
+        options = {'record_distance': record_distance, 'slope_std': 0.0, 'seed': 0, **OPTIONS}
+        tracker = FathometerTracker(FathometerConfig(sound_speed_std=0.0, **options))
+        found = []
+        for k, trace in enumerate(traces):
+            stamp_ns = round((k + 1) * SECONDS * 1e9)
+            way = METRE * 5.0 * (k + 30 * (k >= BEFORE))
+            fix = GeodeticFix(stamp_ns=stamp_ns, latitude=0.0, longitude=way)
+            assert tracker.process(fix) == []
+            (estimate,) = tracker.process(evolve(trace, stamp_ns=stamp_ns))
+            found.append(np.argmax(estimate.probabilities[0]) + 1 == len(LAYERS))
+        right[record_distance] = np.array(found)
+        assert tracker.counts['positions'] == len(traces)
+        assert tracker.counts['gaps'] == (record_distance > 0.0)
+    assert right[0.0][:BEFORE].mean() >= 0.9 and not right[0.0][BEFORE : BEFORE + 2].any()
+    assert right[5.0].mean() >= 0.9 and right[5.0][BEFORE + 1 :].all()
 
 
 @pytest.mark.parametrize(
