@@ -57,7 +57,14 @@ from .family_kernels import HEADING, HOVER, Mixing, VELOCITY
 from .fix_kernels import expected
 from .scan import Positions
 from .state import cross, DiverState
-from .state_space import headings, initial_probabilities, Layout, ModelSet, rate_chain
+from .state_space import (
+    as_stated,
+    headings,
+    initial_probabilities,
+    Layout,
+    ModelSet,
+    rate_chain,
+)
 
 FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
 
@@ -144,6 +151,8 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         initial = 0.25 / np.bincount(family)[family]
     # Copies of the models begin at heights where depth is a state; one thing at a time.
     scales = (1.0,) if config.dimensions == 3 else config.covariance_scales
+    least = min(config.least_covariance_scale, max(scales))
+    stated = tuple(each >= least for each in scales)
     names = [f'{name}_{each}' for name in FAMILIES[:2] for each in steady.names]
     return ModelSet(
         (*names, 'lively_calm', 'lively_sharp', 'quiet'),
@@ -155,6 +164,7 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         motion,
         mixing=Mixing(family, kind, direction, units, *speed, sector),
         scales=scales,
+        stated=stated,
     )
 
 
@@ -213,7 +223,26 @@ def _each_copy(mu: FloatArray, copies: int) -> tuple[FloatArray, FloatArray]:
 def scale(mu: FloatArray, models: ModelSet) -> FloatArray:
     """How many times what they state the covariances of measurements are, (T,), as the copies
     tell."""
-    return np.asarray(_each_copy(mu, len(models.scales))[1] @ models.scales)
+    mu = as_stated(mu, np.array(models.stated))
+    return np.asarray(mu.reshape(len(mu), models.copies, -1).sum(axis=2) @ models.scales)
+
+
+def positions(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, q) and covariance (T, q, q) of what is published: where all copies say, and how far
+    off that may be for those that are `stated`.
+
+    Fixes that are better than stated look like fixes whose errors last. If they are as stated, the
+    copy that says so is the optimal filter: its error is uncorrelated with all that is computed of
+    the data, so that of the mean of all copies has its covariance and the square of how far the
+    two are apart. If they are better, this is cautious.
+    """
+    mean, covariance = now.positions(models.E)
+    stated = np.array(models.stated)
+    if not stated.all():
+        own, covariance = now._replace(mu=as_stated(now.mu, stated)).positions(models.E)
+        off = mean - own
+        covariance = covariance + off[:, :, None] * off[:, None, :]
+    return mean, covariance
 
 
 class Densities(NamedTuple):
