@@ -71,6 +71,10 @@ FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
 LIVELY, QUIET = (0.05, 0.6), (0.03,)
 """Acceleration noise of the constant velocities, m/s^2 over a reference step."""
 
+PACE_TIME = 60.0
+"""Time within which a diver who stands forgets his pace, s, as `brisk` does: else who stands for
+minutes is taken for one who swims at a crawl, and keeps to that when he goes on."""
+
 SHARE = 5e-4
 """Share of the weight of the copies that is spread evenly over them with each scan, so that a
 sensor which becomes worse is noticed."""
@@ -121,17 +125,21 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
     E = np.zeros((M, 4, 4))
     E[: 2 * count, :, :3] = np.concatenate([steady.E, brisk.E])
     E[2 * count :] = np.eye(4)
+    hovers = np.flatnonzero(kind == HOVER)
 
     def motion(dt: float) -> Motion:
-        F, Q = np.zeros((M, 4, 4)), np.zeros((M, 4, 4))
+        F, Q, B = np.zeros((M, 4, 4)), np.zeros((M, 4, 4)), np.zeros((M, 4))
         F[:] = np.eye(4)
         for first, models in ((0, steady), (count, brisk)):
             rows = slice(first, first + count)
             F[rows, :3, :3], Q[rows, :3, :3], _ = models.motion(dt)
+        kept = math.exp(-dt / PACE_TIME)
+        F[hovers, 2, 2], B[hovers, 2] = kept, (1.0 - kept) * speed[0]
+        Q[hovers, 2, 2] = np.maximum(Q[hovers, 2, 2], (1.0 - kept**2) * speed[1])
         F[2 * count :, :2, 2:] = dt * np.eye(2)
         for row, noise in enumerate(noises, start=2 * count):
             Q[row] = white_acceleration(noise**2 * T, 0.0, dt)
-        return Motion(F, Q, np.zeros((M, 4)))
+        return Motion(F, Q, B)
 
     start_mean, start_variance = np.zeros((M, 2)), np.full((M, 2), config.velocity_std**2)
     start_mean[: 2 * count, 0] = speed[0]

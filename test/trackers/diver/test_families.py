@@ -14,6 +14,7 @@
 
 """Families: the vectors of an independent prototype, and what the set promises its users."""
 
+import math
 from pathlib import Path
 
 from attrs import evolve
@@ -24,7 +25,7 @@ import pytest
 
 from sonar_imm.measurements import Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver import family_kernels
+from sonar_imm.trackers.diver import families, family_kernels
 from sonar_imm.trackers.diver.config import TARGETS
 from sonar_imm.trackers.diver.families import FAMILIES
 from sonar_imm.trackers.diver.models import build_models
@@ -109,8 +110,10 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
         np.testing.assert_allclose(c[~headings], transition[0, source, ~headings], atol=1e-15)
 
 
-def test_a_run_is_that_of_the_prototype():
-    """Its transitions are taken at a step rounded to a microsecond, and are not learnt."""
+def test_a_run_is_that_of_the_prototype(monkeypatch):
+    """Its transitions are taken at a step rounded to a microsecond, and are not learnt; who stands
+    keeps his pace."""
+    monkeypatch.setattr(families, 'PACE_TIME', math.inf)
     tracker = DiverTracker(config(association='gnn', adaptation='fixed', confirm_hits=1))
     exact = tracker.models.chain.transition
     tracker._chain.transition = lambda learnt, dt: np.array(exact(round(dt, 6))[None])
@@ -136,6 +139,27 @@ def test_a_run_is_that_of_the_prototype():
 
 
 TOLERANCE = 1e-9
+
+
+def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
+    """Fixes half a minute apart, worse where he goes on, as of a towed tag (docs/results/
+    real_recordings.md): who keeps the crawl that was learnt while he stood stays behind."""
+
+    def errors():
+        rng, tracker, out = np.random.default_rng(4), DiverTracker(config(association='gnn')), []
+        for k in range(27):
+            swum = 20.0 * (min(k, 8) + max(k - 24, 0))
+            std = 9.0 if k > 24 else 4.0 if k > 8 else 1.5
+            offset = 3.0 * rng.normal(size=2) / math.sqrt(2.0)
+            estimate = tracker.process(
+                fix(100 + 30 * k, swum + offset[0], offset[1], std**2 * np.eye(2))
+            )[-1]
+            out.append(np.hypot(estimate.state[0, 0] - swum, estimate.state[0, 1]))
+        return out
+
+    found = errors()
+    monkeypatch.setattr(families, 'PACE_TIME', math.inf)
+    assert max(found[25:]) < 0.75 * max(errors()[25:])
 
 
 def path(count, speed=0.7, std=0.5, seed=1, every=1.0, scale=1.0, **more):
