@@ -212,12 +212,20 @@ class FamilyChain(AdaptiveChain):
 # -- copies --------------------------------------------------------------------------------------
 
 
-def shared(mu: FloatArray, copies: int) -> FloatArray:
-    """mu (T, K M) after a little of the weight of the copies is spread over them."""
-    if copies == 1 or not len(mu):
+def shared(mu: FloatArray, models: ModelSet) -> FloatArray:
+    """mu (T, K M) after a little of the weight of the copies is spread over them: over those that
+    are `stated`, over the others, and over these two, so that what the stated ones weigh among
+    themselves does not depend on the others."""
+    stated = np.array(models.stated)
+    if len(stated) == 1 or not len(mu):
         return mu
-    each, weight = _each_copy(mu, copies)
-    weight = (1.0 - SHARE) * weight + SHARE / copies
+    each, weight = _each_copy(mu, len(stated))
+    groups = [group for group in (stated, ~stated) if group.any()]
+    for group in groups:
+        total = weight[:, group].sum(axis=1, keepdims=True)
+        after = (1.0 - SHARE) * total + SHARE / len(groups)
+        own = (1.0 - SHARE) * weight[:, group] / total + SHARE / group.sum()
+        weight[:, group] = after * own
     return np.asarray((each * weight[..., None]).reshape(mu.shape))
 
 
@@ -232,7 +240,8 @@ def scale(mu: FloatArray, models: ModelSet) -> FloatArray:
     """How many times what they state the covariances of measurements are, (T,), as the copies
     tell."""
     mu = as_stated(mu, np.array(models.stated))
-    return np.asarray(mu.reshape(len(mu), models.copies, -1).sum(axis=2) @ models.scales)
+    size = len(mu), len(models.scales), mu.shape[1] // len(models.scales)
+    return np.asarray(mu.reshape(size).sum(axis=2) @ models.scales)
 
 
 def positions(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray]:

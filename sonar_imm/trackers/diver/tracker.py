@@ -277,7 +277,7 @@ class DiverTracker:
             stamp_ns=stamp_ns,
             x=x,
             P=P,
-            mu=families.shared(last.mu, len(self.models.scales)),
+            mu=families.shared(last.mu, self.models),
             nis=np.zeros(count),
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
