@@ -388,7 +388,7 @@ def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> 
             yield {name: {'nothing lasts': assumed({'fix_bias_std': 0.0}, runs)}}
             continue
         if name == POWER:
-            yield {name: {'found': power(10 * runs)}}
+            yield {name: {'found': power(5 * runs)}}
             continue
         if name == UNTOLD:
             for scene_name, config in STATED.items():

@@ -126,6 +126,9 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
     E[: 2 * count, :, :3] = np.concatenate([steady.E, brisk.E])
     E[2 * count :] = np.eye(4)
     hovers = np.flatnonzero(kind == HOVER)
+    # A pace that is forgotten has the spread of `speed_std` in the end, or that of its own noise.
+    noise = np.square([config.speed_noise, config.brisk_speed_noise])[: len(hovers)] / T
+    forgotten = np.maximum(0.5 * PACE_TIME * noise, speed[1])
 
     def motion(dt: float) -> Motion:
         F, Q, B = np.zeros((M, 4, 4)), np.zeros((M, 4, 4)), np.zeros((M, 4))
@@ -135,7 +138,7 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
             F[rows, :3, :3], Q[rows, :3, :3], _ = models.motion(dt)
         kept = math.exp(-dt / PACE_TIME)
         F[hovers, 2, 2], B[hovers, 2] = kept, (1.0 - kept) * speed[0]
-        Q[hovers, 2, 2] = np.maximum(Q[hovers, 2, 2], (1.0 - kept**2) * speed[1])
+        Q[hovers, 2, 2] = -math.expm1(-2.0 * dt / PACE_TIME) * forgotten
         F[2 * count :, :2, 2:] = dt * np.eye(2)
         for row, noise in enumerate(noises, start=2 * count):
             Q[row] = white_acceleration(noise**2 * T, 0.0, dt)

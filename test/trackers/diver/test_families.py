@@ -113,7 +113,7 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
 def test_a_run_is_that_of_the_prototype(monkeypatch):
     """Its transitions are taken at a step rounded to a microsecond, and are not learnt; who stands
     keeps his pace."""
-    monkeypatch.setattr(families, 'PACE_TIME', math.inf)
+    monkeypatch.setattr(families, 'PACE_TIME', 1e12)
     tracker = DiverTracker(
         config(
             association='gnn',
@@ -165,7 +165,7 @@ def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
         return out
 
     found = errors()
-    monkeypatch.setattr(families, 'PACE_TIME', math.inf)
+    monkeypatch.setattr(families, 'PACE_TIME', 1e12)
     assert max(found[25:]) < 0.75 * max(errors()[25:])
 
 
