@@ -32,6 +32,8 @@ import numpy as np
 
 from benchmarks.real_recordings import DATA
 from benchmarks.study import Parts, study
+from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.cli.track import Plan
 from sonar_imm_tools.evaluation.tuning import prepared, tune, Tuned
@@ -51,6 +53,14 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         'random_heading',
         {'duration': '300'},
         {'model_set': 'heading_speed'},
+        'covariance_scale',
+        1.0,
+    ),
+    'diver who moves as the model says, covariances 4 times too small': (
+        'diver',
+        'as modelled',
+        {'fixes': '300'},
+        {'covariance_scale': '0.25', 'model_set': 'heading_speed'},
         'covariance_scale',
         1.0,
     ),
@@ -107,17 +117,35 @@ ONCE = 'tow tag, a fix in 29 s', 'bathymetry, rough patch'
 
 
 def wandering(out: Path, seed: int, fixes: str, noise: str) -> None:
-    """A target with a velocity that wanders by `noise` m/s in the root of a second: `fixes` of it,
-    one a second, good to 1 m."""
-    rng, csv = np.random.default_rng(seed), out.with_suffix('.csv')
+    """A target with a velocity that wanders by `noise` m/s in the root of a second."""
+    rng = np.random.default_rng(seed)
     q = float(noise) ** 2 * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
     F, L = np.array([[1.0, 1.0], [0.0, 1.0]]), np.linalg.cholesky(q)
-    x = np.array([[0.0, 0.0], [0.5, 0.3]])
-    lines = ['stamp_s,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2']
-    for second in range(int(fixes)):
+    x, places = np.array([[0.0, 0.0], [0.5, 0.3]]), []
+    for _ in range(int(fixes)):
         x = F @ x + L @ rng.normal(size=(2, 2))
-        place = x[0] + rng.normal(size=2)
-        lines.append(f'{1_700_000_000 + second},{place[0]:.4f},{place[1]:.4f},1.0,0.0,1.0')
+        places.append(x[0] + rng.normal(size=2))
+    _written(out, places)
+
+
+def as_modelled(out: Path, seed: int, fixes: str) -> None:
+    """A diver drawn from the models of `heading_speed`."""
+    rng, models = np.random.default_rng(seed), build_models(DiverConfig(model_set='heading_speed'))
+    P, (F, Q, _) = models.chain.transition(1.0), models.motion(1.0)
+    x, model, places = np.array([0.0, 0.0, 0.75]), 0, []
+    for _ in range(int(fixes)):
+        model = rng.choice(len(P), p=P[model])
+        x = rng.multivariate_normal(F[model] @ x, Q[model])
+        places.append(x[:2] + rng.normal(size=2))
+    _written(out, places)
+
+
+def _written(out: Path, places: list[np.ndarray]) -> None:
+    """A recording of fixes, one a second, good to 1 m."""
+    csv = out.with_suffix('.csv')
+    lines = ['stamp_s,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2']
+    for second, (east, north) in enumerate(places):
+        lines.append(f'{1_700_000_000 + second},{east:.4f},{north:.4f},1.0,0.0,1.0')
     csv.write_text('\n'.join(lines) + '\n', encoding='utf-8')
     convert_fixes(csv, out)
 
@@ -129,7 +157,11 @@ def tow_tag(out: Path, seed: int) -> None:
     convert_fixes(DATA / 'yaps_ssu1' / 'fixes.csv', out)
 
 
-MADE: dict[str, Callable[..., None]] = {'wandering': wandering, 'tow tag': tow_tag}
+MADE: dict[str, Callable[..., None]] = {
+    'wandering': wandering,
+    'as modelled': as_modelled,
+    'tow tag': tow_tag,
+}
 
 
 def fitted(name: str, seed: int) -> tuple[Tuned, float]:

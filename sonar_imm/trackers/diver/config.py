@@ -145,11 +145,14 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
     family_switch_rate: float = parameter(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
-    covariance_scales: tuple[float, ...] = parameter((1.0, 3.0, 10.0), '',
+    covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
         'families: the filter runs in copies, each of which multiplies the covariances of all '
-        'measurements by one of these; below 1 (0.1, 0.3) only where errors of fixes are known '
-        'not to last: those look the same; with dimensions 3: one copy, times 1',
+        'measurements by one of these; with dimensions 3: one copy, times 1',
         range=(0.01, 1e4), kind='float[]')
+    least_covariance_scale: float = parameter(1.0, '',
+        'families: copies with a lower scale say where the diver is, but not how well that is '
+        'known: fixes better than stated look like fixes whose errors last; lower it only where '
+        'errors are known not to last', range=(0.01, 1.0))
     adaptation: str = parameter('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
         'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',

@@ -57,12 +57,23 @@ from .family_kernels import HEADING, HOVER, Mixing, VELOCITY
 from .fix_kernels import expected
 from .scan import Positions
 from .state import cross, DiverState
-from .state_space import headings, initial_probabilities, Layout, ModelSet, rate_chain
+from .state_space import (
+    as_stated,
+    headings,
+    initial_probabilities,
+    Layout,
+    ModelSet,
+    rate_chain,
+)
 
 FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
 
 LIVELY, QUIET = (0.05, 0.6), (0.03,)
 """Acceleration noise of the constant velocities, m/s^2 over a reference step."""
+
+PACE_TIME = 60.0
+"""Time within which a diver who stands forgets his pace, s, as `brisk` does: else who stands for
+minutes is taken for one who swims at a crawl, and keeps to that when he goes on."""
 
 SHARE = 5e-4
 """Share of the weight of the copies that is spread evenly over them with each scan, so that a
@@ -114,17 +125,24 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
     E = np.zeros((M, 4, 4))
     E[: 2 * count, :, :3] = np.concatenate([steady.E, brisk.E])
     E[2 * count :] = np.eye(4)
+    hovers = np.flatnonzero(kind == HOVER)
+    # A pace that is forgotten has the spread of `speed_std` in the end, or that of its own noise.
+    noise = np.square([config.speed_noise, config.brisk_speed_noise])[: len(hovers)] / T
+    forgotten = np.maximum(0.5 * PACE_TIME * noise, speed[1])
 
     def motion(dt: float) -> Motion:
-        F, Q = np.zeros((M, 4, 4)), np.zeros((M, 4, 4))
+        F, Q, B = np.zeros((M, 4, 4)), np.zeros((M, 4, 4)), np.zeros((M, 4))
         F[:] = np.eye(4)
         for first, models in ((0, steady), (count, brisk)):
             rows = slice(first, first + count)
             F[rows, :3, :3], Q[rows, :3, :3], _ = models.motion(dt)
+        kept = math.exp(-dt / PACE_TIME)
+        F[hovers, 2, 2], B[hovers, 2] = kept, (1.0 - kept) * speed[0]
+        Q[hovers, 2, 2] = -math.expm1(-2.0 * dt / PACE_TIME) * forgotten
         F[2 * count :, :2, 2:] = dt * np.eye(2)
         for row, noise in enumerate(noises, start=2 * count):
             Q[row] = white_acceleration(noise**2 * T, 0.0, dt)
-        return Motion(F, Q, np.zeros((M, 4)))
+        return Motion(F, Q, B)
 
     start_mean, start_variance = np.zeros((M, 2)), np.full((M, 2), config.velocity_std**2)
     start_mean[: 2 * count, 0] = speed[0]
@@ -144,6 +162,8 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         initial = 0.25 / np.bincount(family)[family]
     # Copies of the models begin at heights where depth is a state; one thing at a time.
     scales = (1.0,) if config.dimensions == 3 else config.covariance_scales
+    least = min(config.least_covariance_scale, max(scales))
+    stated = tuple(each >= least for each in scales)
     names = [f'{name}_{each}' for name in FAMILIES[:2] for each in steady.names]
     return ModelSet(
         (*names, 'lively_calm', 'lively_sharp', 'quiet'),
@@ -155,6 +175,7 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         motion,
         mixing=Mixing(family, kind, direction, units, *speed, sector),
         scales=scales,
+        stated=stated,
     )
 
 
@@ -194,12 +215,20 @@ class FamilyChain(AdaptiveChain):
 # -- copies --------------------------------------------------------------------------------------
 
 
-def shared(mu: FloatArray, copies: int) -> FloatArray:
-    """mu (T, K M) after a little of the weight of the copies is spread over them."""
-    if copies == 1 or not len(mu):
+def shared(mu: FloatArray, models: ModelSet) -> FloatArray:
+    """mu (T, K M) after a little of the weight of the copies is spread over them: over those that
+    are `stated`, over the others, and over these two, so that what the stated ones weigh among
+    themselves does not depend on the others."""
+    stated = np.array(models.stated)
+    if len(stated) == 1 or not len(mu):
         return mu
-    each, weight = _each_copy(mu, copies)
-    weight = (1.0 - SHARE) * weight + SHARE / copies
+    each, weight = _each_copy(mu, len(stated))
+    groups = [group for group in (stated, ~stated) if group.any()]
+    for group in groups:
+        total = weight[:, group].sum(axis=1, keepdims=True)
+        after = (1.0 - SHARE) * total + SHARE / len(groups)
+        own = (1.0 - SHARE) * weight[:, group] / total + SHARE / group.sum()
+        weight[:, group] = after * own
     return np.asarray((each * weight[..., None]).reshape(mu.shape))
 
 
@@ -213,7 +242,27 @@ def _each_copy(mu: FloatArray, copies: int) -> tuple[FloatArray, FloatArray]:
 def scale(mu: FloatArray, models: ModelSet) -> FloatArray:
     """How many times what they state the covariances of measurements are, (T,), as the copies
     tell."""
-    return np.asarray(_each_copy(mu, len(models.scales))[1] @ models.scales)
+    mu = as_stated(mu, np.array(models.stated))
+    size = len(mu), len(models.scales), mu.shape[1] // len(models.scales)
+    return np.asarray(mu.reshape(size).sum(axis=2) @ models.scales)
+
+
+def positions(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, q) and covariance (T, q, q) of what is published: where all copies say, and how far
+    off that may be for those that are `stated`.
+
+    Fixes that are better than stated look like fixes whose errors last. If they are as stated, the
+    copy that says so is the optimal filter: its error is uncorrelated with all that is computed of
+    the data, so that of the mean of all copies has its covariance and the square of how far the
+    two are apart. If they are better, this is cautious.
+    """
+    mean, covariance = now.positions(models.E)
+    stated = np.array(models.stated)
+    if not stated.all():
+        own, covariance = now._replace(mu=as_stated(now.mu, stated)).positions(models.E)
+        off = mean - own
+        covariance = covariance + off[:, :, None] * off[:, None, :]
+    return mean, covariance
 
 
 class Densities(NamedTuple):

@@ -57,7 +57,7 @@ from .ping_kernels import (
 )
 from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
 from .state import ARRIVALS, DiverState, learnt_scale
-from .state_space import heights_of, Layout, ModelSet
+from .state_space import as_stated, heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
@@ -328,7 +328,7 @@ def _explain_tag(
         best = _best_for_tag(now, np.flatnonzero(turn), ping, config, layout)
         if best is not None:
             track, after = best
-            taking = taking_of(_mixture(now, track), after, ping, config, factor)
+            taking = taking_of(_mixture(now, track), after, ping, config, layout, factor)
             takings[track] = taking
             score[track] += float(taking.good.sum())
             if 2 * taking.good.sum() >= len(taking.good):
@@ -373,21 +373,29 @@ def _taking(
     """What a track takes of the measurements it may have; None where no model can explain them."""
     before = _mixture(now, track)
     after = update_by_ping(*before, ping, config, layout) if ping.echo.any() else None
-    return None if after is None else taking_of(before, after, ping, config, factor)
+    return None if after is None else taking_of(before, after, ping, config, layout, factor)
 
 
 def taking_of(
-    before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig, factor: float
+    before: Mixture,
+    after: PingUpdate,
+    ping: Ping,
+    config: DiverConfig,
+    layout: Layout,
+    factor: float,
 ) -> Taking:
     """What a track takes, `before` it and after."""
     good = np.asarray(after.good > TAKEN)
     nis, dof, scale = 0.0, 0, None
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.compared(good)
-        residual, covariance, dof = residuals(*before, own, config.target_z)
+        x, P, mu = before
+        mu = as_stated(mu, layout.stated)
+        residual, covariance, dof = residuals(x, P, mu, own, config.target_z)
         nis = _joint_nis(residual, covariance, own.measured.variance)
     if config.estimate_covariance_scale and (good & ping.echo).any():
-        scale = _for_scale(after, ping.compared(good & ping.echo), config, factor)
+        own = ping.compared(good & ping.echo)
+        scale = _for_scale(after, as_stated(after.mu, layout.stated), own, config, factor)
     return Taking(after, good, nis, dof, scale)
 
 
@@ -407,10 +415,10 @@ def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArra
 
 
 def _for_scale(
-    after: PingUpdate, ping: Ping, config: DiverConfig, factor: float
+    after: PingUpdate, mu: FloatArray, ping: Ping, config: DiverConfig, factor: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Residuals of the arrivals that a track took, their covariance and what is stated of it."""
-    residual, covariance, dof = residuals(after.x, after.P, after.mu, ping, config.target_z)
+    residual, covariance, dof = residuals(after.x, after.P, mu, ping, config.target_z)
     stated = np.diag(ping.measured.variance / factor)
     if ping.passive and dof:
         # The emission is unknown: differences, whitened by what is stated.

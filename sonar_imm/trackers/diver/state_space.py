@@ -81,7 +81,8 @@ class ModelSet:
     outputs, names of the q outputs; height and bias, places of z and of the bias of fixes in the
     state, -1 for none; heights (K,): where K copies of the models begin in z, which do not switch
     between each other. What `families` adds: mixing, the kinds of unequal states; scales (K,): by
-    what K copies multiply the covariances of measurements.
+    what K copies multiply the covariances of measurements; stated (K,): which of them say how far
+    off an estimate may be.
     """
 
     names: tuple[str, ...]
@@ -97,6 +98,7 @@ class ModelSet:
     heights: tuple[float, ...] = (0.0,)
     mixing: Mixing | None = None
     scales: tuple[float, ...] = (1.0,)
+    stated: tuple[bool, ...] = (True,)
     _cache: OrderedDict[float, Motion] = field(factory=OrderedDict, init=False)
 
     @property
@@ -343,9 +345,17 @@ class Instruments:
         H = np.zeros((1, len(models.E), 2, n + len(variances)))
         H[0, :, :, :n] = models.fix
         mask = np.array([True] * n + estimated)
-        scales = np.array(models.scales)
+        scales, stated = np.array(models.scales), np.array(models.stated)
         places = speed, offsets, clocks, bearings
-        return Layout(n, np.array(variances), mask, H, scales, *places)
+        return Layout(n, np.array(variances), mask, H, scales, stated, *places)
+
+
+def as_stated(mu: FloatArray, stated: BoolArray) -> FloatArray:
+    """mu (..., K M) without the copies that are not `stated` (K,)."""
+    if stated.all():
+        return mu
+    kept = np.where(np.repeat(stated, mu.shape[-1] // len(stated)), mu, 0.0)
+    return np.asarray(kept / kept.sum(axis=-1, keepdims=True))
 
 
 @frozen(eq=False)
@@ -353,8 +363,9 @@ class Layout:
     """n states of motion, then q constants with prior `variances` (q,).
 
     mask (n + q,): True for what an update may move, False for what is only considered; H
-    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`;
-    sound_speed, offsets, clocks, bearings: places in the whole state, -1 or absent for none.
+    (1, M, 2, n + q): what a fix measures of the whole state; scales, stated (K,): as in
+    `ModelSet`; sound_speed, offsets, clocks, bearings: places in the whole state, -1 or absent
+    for none.
     """
 
     n: int
@@ -362,6 +373,7 @@ class Layout:
     mask: BoolArray
     H: FloatArray
     scales: FloatArray
+    stated: BoolArray
     sound_speed: int
     offsets: dict[int | str, int]
     clocks: dict[int | str, int]

@@ -59,7 +59,7 @@ from .models import build_models
 from .offsets import RecentPairs
 from .scan import Heights, Positions, Scan
 from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
-from .state_space import Instruments
+from .state_space import as_stated, Instruments
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
@@ -277,7 +277,7 @@ class DiverTracker:
             stamp_ns=stamp_ns,
             x=x,
             P=P,
-            mu=families.shared(last.mu, len(self.models.scales)),
+            mu=families.shared(last.mu, self.models),
             nis=np.zeros(count),
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
@@ -376,7 +376,8 @@ class DiverTracker:
         layout = self._layout(now.instruments)
         white, consistency = now.white, now.fixes
         if len(tracks):
-            mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
+            stated = as_stated(now.mu, layout.stated)
+            mean, covariance = imm_kernels.combine(now.x, now.P, stated, layout.H[0])
             z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
             if association.counted is not None:
@@ -428,7 +429,8 @@ class DiverTracker:
         if not self.config.estimate_covariance_scale or not len(tracks):
             return now
         E = self._layout(now.instruments).H[0]
-        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], now.mu[tracks], E)
+        mu = as_stated(now.mu[tracks], self._layout(now.instruments).stated)
+        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], mu, E)
         residual, stated = fixes.z[detection] - mean, fixes.R[detection] / fixes.factor
         scale = learnt_scale(now.scale, FIXES, residual, covariance, stated)
         return now._replace(scale=scale)
@@ -565,7 +567,7 @@ class DiverTracker:
             state = kbest.shown(state)
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
-        mean, covariance = state.positions(self.models.E)
+        mean, covariance = families.positions(state, self.models)
         covariance = state.offsets.widened(mean, covariance, self.config)
         depth = np.full(len(mean), self.config.target_z)
         if self.models.height >= 0:
