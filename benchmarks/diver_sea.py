@@ -367,8 +367,8 @@ def power(runs: int) -> dict[str, float]:
         ratios.append(np.array(found))
     lasting, nothing = ratios
     levels = np.quantile(nothing, 1.0 - np.array(FALSE_WARNINGS))
-    found = {f'{r:g}': float(np.mean(lasting > x)) for r, x in zip(FALSE_WARNINGS, levels)}
-    return {'runs': runs, **found}
+    shares = {f'{r:g}': float(np.mean(lasting > x)) for r, x in zip(FALSE_WARNINGS, levels)}
+    return {'runs': runs, **shares}
 
 
 TABLES = {
