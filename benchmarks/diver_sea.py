@@ -33,7 +33,6 @@ from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
-from sonar_imm_tools.evaluation.diver.predictive import for_tuning, Scored
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SETTLED = 10.0
@@ -341,36 +340,6 @@ def assumed(scene: Values, runs: int) -> dict[str, dict[str, float]]:
     }
 
 
-POWER = 'power'
-FALSE_WARNINGS = (0.01, 0.05, 0.1)
-
-
-def power(runs: int) -> dict[str, float]:
-    """What the best test for lasting errors finds in a minute of fixes: the ratio of the
-    likelihoods of what is true of them and of nothing, under the motions that the tracker knows.
-    No test of these data finds more at the same rate of false warnings (Neyman and Pearson).
-    Shares of the scenes with lasting errors, by that rate."""
-    ratios = []
-    for scene in ({}, {'fix_bias_std': 0.0}):
-        found = []
-        for seed in range(runs):
-            made = simulate(scenario('lasting_errors', {'duration': FIRST, **scene}), seed)
-            items = [item.measurement for item in made.measurements]
-            log_likelihood = []
-            for values in (STATED['lasting_errors'], {}):
-                config = DiverConfig(max_tracks=1, **values)
-                tracker = Scored(for_tuning(config), items)
-                for item in items:
-                    tracker.process(item)
-                log_likelihood.append(sum(score for score, _ in tracker.scores.values()))
-            found.append(log_likelihood[0] - log_likelihood[1])
-        ratios.append(np.array(found))
-    lasting, nothing = ratios
-    levels = np.quantile(nothing, 1.0 - np.array(FALSE_WARNINGS))
-    found = {f'{r:g}': float(np.mean(lasting > x)) for r, x in zip(FALSE_WARNINGS, levels)}
-    return {'runs': runs, **found}
-
-
 TABLES = {
     'depth': depth_cells,
     'fixes': fix_cells,
@@ -386,9 +355,6 @@ def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> 
         if name == ASSUMED:
             yield {name: {'errors that last': assumed({}, runs)}}
             yield {name: {'nothing lasts': assumed({'fix_bias_std': 0.0}, runs)}}
-            continue
-        if name == POWER:
-            yield {name: {'found': power(5 * runs)}}
             continue
         if name == UNTOLD:
             for scene_name, config in STATED.items():
@@ -407,13 +373,13 @@ if __name__ == '__main__':
         main,
         shown=lambda row: (
             {key: value for key, value in row.items() if key != 'NEES'}
-            if 'runs' in row
+            if 'warn' in row
             else {
                 c: f'{v["NEES"]:.2f} ({v["NEES good"]}, x {v["axes"]:.1f})' for c, v in row.items()
             }
             if 'axes' in next(iter(row.values()))
             else {column: text_of(found) for column, found in row.items()}
         ),
-        table={'action': 'append', 'choices': [*TABLES, UNTOLD, ASSUMED, POWER]},
+        table={'action': 'append', 'choices': [*TABLES, UNTOLD, ASSUMED]},
         only={'help': 'columns or rows whose name holds this'},
     )
