@@ -58,6 +58,7 @@ MOST_HEAVE = 0.05
 """Standard deviation of the depth within a record, m, above which it is said: a sinusoid of so
 much leaves 0.62 of an echo in 50 Hz to 4 kHz (the mean of J0(2 k A), A its amplitude)."""
 _KEPT, _INTERVALS = 10_000, 15
+"""Depths and places of companions that are kept, and intervals that the usual one is told by."""
 
 
 class Collected(NamedTuple):

@@ -263,7 +263,7 @@ def test_the_nearest_depth_counts_before_or_after(monkeypatch):
     assert depths.over(25 * second, 15 * second, config) == 71.5
     assert depths.spread(25 * second, 15 * second) == 0.5
     assert depths.over(29 * second, second, config) == 73.0  # nothing within: the nearest
-    monkeypatch.setattr(pressure, '_DEPTHS_KEPT', 2)
+    monkeypatch.setattr(pressure, '_KEPT', 2)
     depths.add(ArrayDepth(stamp_ns=40 * second, depth=74.0))
     assert depths.nearest(20 * second, config) is None
     assert depths.nearest(30 * second, config) == 73.0
