@@ -25,6 +25,7 @@ import pytest
 
 from msg_adapters.array_records import write_csdm
 from msg_adapters.table import encode_table
+from sonar_imm.measurements import Trace
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.measurements import measurements_of
@@ -133,7 +134,8 @@ def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
         for estimate in RunFolder(tmp_path / 'out').read_estimates()
     }
     with BagReader(tmp_path / 'bag') as bag:
-        traces = [received.measurement for received in measurements_of(bag, 'fathometer')]
+        read = [received.measurement for received in measurements_of(bag, 'fathometer')]
+    traces = [item for item in read if isinstance(item, Trace)]
     hits, ids = [], set()
     for trace in traces:
         # Three samples in a row above an eighth of full scale; the greatest of the next four.

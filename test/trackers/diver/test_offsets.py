@@ -21,7 +21,7 @@ import pytest
 
 from sonar_imm.measurements import Arrivals
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver import offsets
+from sonar_imm.trackers.diver import families, offsets
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.offsets import most, Offsets
@@ -216,13 +216,13 @@ def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
     made = simulate(scenario('multistatic', {'duration': 20.0}), 1)
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     assumed = run(tracker, (item.measurement for item in made.measurements))[-1]
-    mean, inside = tracker._stream.state.positions(tracker.models.E)
+    mean, inside = families.positions(tracker._stream.state, tracker.models)
     np.testing.assert_array_equal(assumed.state, mean)
     ratio = np.diag(assumed.covariance[0])[:2] / np.diag(inside[0])[:2]
     assert (ratio > 1.5).all() and (ratio < 30.0).all()
     last = made.measurements[-1].measurement.stamp_ns * 1e-9
     after = tracker.process(fix(last + 1.0, *mean[0, :2]))[-1]
-    inside = tracker._stream.state.positions(tracker.models.E)[1]
+    inside = families.positions(tracker._stream.state, tracker.models)[1]
     np.testing.assert_array_equal(after.covariance, inside)
 
 

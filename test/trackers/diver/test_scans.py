@@ -115,7 +115,8 @@ def test_a_false_fix_in_clutter_is_not_published():
 @pytest.mark.parametrize('most', [1, 2])
 def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
     """The share of one track in one fix, by Bayes: of a second diver only where there may be."""
-    config = DiverConfig(max_tracks=most, clutter_density=1e-5, birth_density=1e-4)
+    densities = {'clutter_density': 1e-5, 'birth_density': 1e-4}
+    config = DiverConfig(max_tracks=most, covariance_scales=(1.0, 3.0, 10.0), **densities)
     tracker = DiverTracker(config)
     run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
     now, _ = tracker._predict(tracker._stream.state, 11 * SECOND)

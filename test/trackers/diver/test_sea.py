@@ -244,7 +244,7 @@ def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
 def test_without_anything_stated_no_state_is_added():
     tracker = DiverTracker(DiverConfig())
     tracker.process(simulate(scenario('multistatic'), 1).measurements[0].measurement)
-    assert tracker.models.n == 4 and tracker._stream.state.x.shape[1:] == (3 * 37, 4)
+    assert tracker.models.n == 4 and tracker._stream.state.x.shape[1:] == (4 * 37, 4)
     assert tracker._stream.state.instruments == Instruments()
 
 
