@@ -27,7 +27,7 @@ TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
     ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
 # Real nodes wait more than they work, but some of the tests bound their answers in time.
-SYSTEM_JOBS ?= 3
+SYSTEM_JOBS ?= 2
 # Neighbours in a file stay together, for they share what was simulated and tracked; who is done takes from others.
 SHARED := --dist worksteal
 
@@ -111,7 +111,7 @@ fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and st
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 # The pages of tutorials take longest: they come first, so that nothing waits for them at the end.
-test-system: venv ## run the tests that start real nodes, three at a time (SYSTEM_JOBS=...)
+test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
 	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) $(SHARED) test/system/test_tutorials.py test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)

@@ -62,6 +62,7 @@ from .state_space import (
     headings,
     initial_probabilities,
     Layout,
+    LEAST_WEIGHT,
     ModelSet,
     rate_chain,
 )
@@ -78,9 +79,6 @@ minutes is taken for one who swims at a crawl, and keeps to that when he goes on
 SHARE = 5e-4
 """Share of the weight of the copies that is spread evenly over them with each scan, so that a
 sensor which becomes worse is noticed."""
-
-LEAST_WEIGHT = 1e-150
-"""Weight that a copy keeps."""
 
 LOST = 0.02
 """A track whose misses in a row were less probable than this may be lost."""

@@ -350,6 +350,10 @@ class Instruments:
         return Layout(n, np.array(variances), mask, H, scales, stated, *places)
 
 
+LEAST_WEIGHT = 1e-150
+"""Weight that a copy keeps."""
+
+
 def as_stated(mu: FloatArray, stated: BoolArray) -> FloatArray:
     """mu (..., K M) without the copies that are not `stated` (K,)."""
     if stated.all():
