@@ -57,7 +57,7 @@ from .ping_kernels import (
 )
 from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
 from .state import ARRIVALS, DiverState, learnt_scale
-from .state_space import as_stated, heights_of, Layout, LEAST_WEIGHT, ModelSet
+from .state_space import as_stated, each_kept, heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
@@ -479,7 +479,7 @@ def update_by_ping(
     if not np.isfinite(best):
         return None
     share = np.exp(weight - best)
-    updated = _each_kept(weight - best, share / share.sum(), len(layout.scales))
+    updated = each_kept(weight - best, share / share.sum(), len(layout.scales))
     P = np.ascontiguousarray(P[:, :n, :n])
     repairs = add_jitter_all(P)
     return PingUpdate(
@@ -490,20 +490,6 @@ def update_by_ping(
         float(best + np.log(share.sum())),
         repairs,
     )
-
-
-def _each_kept(log_weight: FloatArray, mu: FloatArray, copies: int) -> FloatArray:
-    """mu (K M) in which each of the copies keeps `LEAST_WEIGHT`: a ping of many arrivals can be
-    e^700 times as probable in one as in another; log_weight (K M) is of what mu is."""
-    lost = np.flatnonzero(mu.reshape(copies, -1).sum(axis=1) < LEAST_WEIGHT)
-    if copies == 1 or not len(lost):
-        return mu
-    kept = mu.reshape(copies, -1).copy()
-    for copy in lost:
-        own = log_weight.reshape(copies, -1)[copy]
-        inside = np.exp(own - own.max()) if np.isfinite(own.max()) else np.ones_like(own)
-        kept[copy] = LEAST_WEIGHT * inside / inside.sum()
-    return np.asarray(kept.ravel() / kept.sum())
 
 
 def _copies(

@@ -354,6 +354,20 @@ LEAST_WEIGHT = 1e-150
 """Weight that a copy keeps."""
 
 
+def each_kept(log_weight: FloatArray, mu: FloatArray, copies: int) -> FloatArray:
+    """mu (K M) in which each of the copies keeps `LEAST_WEIGHT`: a ping of many arrivals can be
+    e^700 times as probable in one as in another; log_weight (K M) is of what mu is."""
+    lost = np.flatnonzero(mu.reshape(copies, -1).sum(axis=1) < LEAST_WEIGHT)
+    if copies == 1 or not len(lost):
+        return mu
+    kept = mu.reshape(copies, -1).copy()
+    for copy in lost:
+        own = log_weight.reshape(copies, -1)[copy]
+        inside = np.exp(own - own.max()) if np.isfinite(own.max()) else np.ones_like(own)
+        kept[copy] = LEAST_WEIGHT * inside / inside.sum()
+    return np.asarray(kept.ravel() / kept.sum())
+
+
 def as_stated(mu: FloatArray, stated: BoolArray) -> FloatArray:
     """mu (..., K M) without the copies that are not `stated` (K,)."""
     if stated.all():

@@ -23,12 +23,11 @@ import pytest
 
 from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.measurements import Arrivals
-from sonar_imm.trackers.diver import pings
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
 from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
-from sonar_imm.trackers.diver.state_space import Instruments, MOST_RECEIVERS
+from sonar_imm.trackers.diver.state_space import each_kept, Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -214,13 +213,13 @@ def test_each_copy_keeps_a_weight_whatever_the_arrivals_say():
     """One copy e^900 times as probable as another, and one that nothing explains."""
     log_weight = np.array([-1.0, -2.0, -901.0, -900.0, -np.inf, -np.inf])
     share = np.exp(log_weight - log_weight.max())
-    kept = pings._each_kept(log_weight, share / share.sum(), 3).reshape(3, 2)
+    kept = each_kept(log_weight, share / share.sum(), 3).reshape(3, 2)
     np.testing.assert_allclose(kept.sum(), 1.0)
     np.testing.assert_allclose(kept[0, 0] / kept[0, 1], np.exp(1.0))
     np.testing.assert_allclose(kept[1, 0] / kept[1, 1], np.exp(-1.0))
     assert (kept.sum(axis=1) >= 0.99e-150).all()
     few = np.array([0.2, 0.3, 0.4, 0.1])
-    assert pings._each_kept(np.log(few), few, 2) is few
+    assert each_kept(np.log(few), few, 2) is few
 
 
 def test_wild_echoes_only_leave_the_prediction():
