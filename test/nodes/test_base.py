@@ -292,8 +292,11 @@ def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, c
     assert given in capfd.readouterr().err
 
 
-def test_accepted_changes_are_said_on_rosout(rig):
-    # A late subscriber gets what was logged before: it may be known here and not yet matched.
+def test_accepted_changes_are_said_on_rosout(make_bench):
+    # A name of its own: a node of an earlier test that is only now collected takes the publisher
+    # of its name along. A late subscriber gets what was logged before: it may be known here and
+    # not yet matched.
+    rig = Rig(make_bench('-r', '__ns:=/talker'), prefix='/talker')
     lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     received = rig.bench.listen(Log, '/rosout', lasting)
     times = itertools.cycle((3.5, 4.5))
