@@ -18,7 +18,7 @@
 
 Ships, boats, AUVs, ROVs, fish and divers, none drawn from a law of the tracker, with covariances
 that are true, too small, too large, with heavy tails, with errors that last, with outliers. The
-Kalman filter has two constant velocities, no gate, and acceleration noise of .1, .25 or .6 m/s^2
+Kalman filter has a constant velocity, no gate, and acceleration noise of .1, .25 or .6 m/s^2
 in a second (`cv_1`, `cv_25`, `cv_6`); it is told what the tracker is told. `ratio` is the RMSE of
 the tracker over that of the best of the three, which only hindsight knows. NEES: 2 is due.
 """
@@ -31,6 +31,7 @@ from attrs import evolve, frozen
 import numpy as np
 
 from benchmarks.diver_families import FIRST, followed, integrated, legs, Path, smooth_turns
+from benchmarks.real_boats import predicted, updated
 from benchmarks.study import mean_of, Parts, rms, study
 from sonar_imm.trackers.diver.tracker import DiverConfig
 
@@ -168,30 +169,25 @@ def plain(path: Path, noise: float) -> np.ndarray:
     error = np.empty_like(path.z)
     for k, dt in enumerate(np.diff(path.t, prepend=path.t[0])):
         if k:
-            F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
-            Q = np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.eye(2))
-            x, P = F @ x, F @ P @ F.T + noise**2 * Q
-            gain = P[:, :2] @ np.linalg.inv(P[:2, :2] + path.R[k] / path.too_small)
-            x, P = x + gain @ (path.z[k] - x[:2]), P - gain @ P[:2]
+            x, P = updated(*predicted(x, P, dt, noise), path.z[k], path.R[k] / path.too_small)
         error[k] = x[:2] - path.truth[k]
     return error
 
 
 def scores(path: Path) -> dict[str, float]:
-    found = {'raw': rms(np.hypot(*(path.z - path.truth)[FIRST:].T))}
-    for name, noise in NOISES.items():
-        found[name] = rms(np.hypot(*plain(path, noise)[FIRST:].T))
+    off = {name: plain(path, noise) for name, noise in NOISES.items()}
+    others = {'raw': path.z - path.truth, **off}
+    found = {name: rms(np.hypot(*each[FIRST:].T)) for name, each in others.items()}
     error, squared, _ = followed(path, DiverConfig(), 1.0 / path.too_small)
     good = np.isfinite(squared)
     good[:FIRST] = False
     found['default'] = rms(np.hypot(*error[good].T))
-    best = min(rms(np.hypot(*plain(path, noise)[good].T)) for noise in NOISES.values())
-    share = float(good[FIRST:].mean())
+    best = min(rms(np.hypot(*each[good].T)) for each in off.values())
     return {
         **found,
         'ratio': found['default'] / best,
         'nees': float(squared[good].mean()),
-        'seen': share,
+        'seen': float(good[FIRST:].mean()),
     }
 
 

@@ -47,6 +47,23 @@ to be about one scan late."""
 HALVES = ('GOSPA first half', 'GOSPA second half')
 
 
+def predicted(
+    x: np.ndarray, P: np.ndarray, dt: float, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """State (4,) and covariance of a constant velocity after dt seconds."""
+    F = np.eye(4) + dt * np.eye(4, k=2)
+    Q = noise**2 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+    return F @ x, F @ P @ F.T + Q
+
+
+def updated(
+    x: np.ndarray, P: np.ndarray, z: np.ndarray, R: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same after a position z (2,) with the covariance R (2, 2)."""
+    K = P[:, :2] @ np.linalg.inv(P[:2, :2] + R)
+    return x + K @ (z - x[:2]), P - K @ P[:2]
+
+
 class PlainKalman:
     """A constant-velocity Kalman filter a track, global nearest neighbours, M of N hits."""
 
@@ -58,11 +75,10 @@ class PlainKalman:
     def process(self, scan: Fixes) -> list[Estimate]:
         dt = (scan.stamp_ns - self.stamp_ns) * 1e-9 if self.stamp_ns else 0.0
         self.stamp_ns = scan.stamp_ns
-        F, z = np.eye(4) + dt * np.eye(4, k=2), scan.position[:, :2]
-        Q = self.noise**2 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+        z = scan.position[:, :2]
         cost = np.full((len(self.tracks), len(z)), 1e3)
         for t, track in enumerate(self.tracks):
-            track['x'], track['P'] = F @ track['x'], F @ track['P'] @ F.T + Q
+            track['x'], track['P'] = predicted(track['x'], track['P'], dt, self.noise)
             v = z - track['x'][:2]
             S = track['P'][:2, :2] + self.R
             nis = np.einsum('da,ab,db->d', v, np.linalg.inv(S), v)
@@ -71,9 +87,7 @@ class PlainKalman:
         for t, track in enumerate(self.tracks):
             track['seen'] = [*track['seen'][1 - self.window :], t in pairs]
             if t in pairs:
-                K = track['P'][:, :2] @ np.linalg.inv(track['P'][:2, :2] + self.R)
-                track['x'] = track['x'] + K @ (z[pairs[t]] - track['x'][:2])
-                track['P'] = track['P'] - K @ track['P'][:2]
+                track['x'], track['P'] = updated(track['x'], track['P'], z[pairs[t]], self.R)
             track['firm'] = track['firm'] or sum(track['seen']) >= self.hits
         for d in set(range(len(z))) - set(pairs.values()):
             self.number += 1

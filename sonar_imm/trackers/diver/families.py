@@ -230,9 +230,14 @@ def shared(mu: FloatArray, models: ModelSet) -> FloatArray:
     return np.asarray((each * weight[..., None]).reshape(mu.shape))
 
 
+def _by_copy(mu: FloatArray, copies: int) -> FloatArray:
+    """mu (T, K M) as (T, K, M)."""
+    return mu.reshape(len(mu), copies, mu.shape[1] // copies)
+
+
 def _each_copy(mu: FloatArray, copies: int) -> tuple[FloatArray, FloatArray]:
     """The probabilities (T, K, M) of the models in each copy, and the weights (T, K) of those."""
-    mu = mu.reshape(len(mu), copies, mu.shape[1] // copies)
+    mu = _by_copy(mu, copies)
     weight = mu.sum(axis=2)
     return mu / weight[..., None], weight
 
@@ -241,8 +246,7 @@ def scale(mu: FloatArray, models: ModelSet) -> FloatArray:
     """How many times what they state the covariances of measurements are, (T,), as the copies
     tell."""
     mu = as_stated(mu, np.array(models.stated))
-    size = len(mu), len(models.scales), mu.shape[1] // len(models.scales)
-    return np.asarray(mu.reshape(size).sum(axis=2) @ models.scales)
+    return np.asarray(_by_copy(mu, len(models.scales)).sum(axis=2) @ models.scales)
 
 
 def positions(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray]:

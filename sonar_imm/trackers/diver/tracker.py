@@ -428,9 +428,9 @@ class DiverTracker:
             tracks, detection = tracks[counts], detection[counts]
         if not self.config.estimate_covariance_scale or not len(tracks):
             return now
-        E = self._layout(now.instruments).H[0]
-        mu = as_stated(now.mu[tracks], self._layout(now.instruments).stated)
-        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], mu, E)
+        layout = self._layout(now.instruments)
+        mu = as_stated(now.mu[tracks], layout.stated)
+        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], mu, layout.H[0])
         residual, stated = fixes.z[detection] - mean, fixes.R[detection] / fixes.factor
         scale = learnt_scale(now.scale, FIXES, residual, covariance, stated)
         return now._replace(scale=scale)
