@@ -172,4 +172,7 @@ def test_the_numbers_below_the_picture_of_the_front_are_those_of_the_run() -> No
     for name in ('raw fixes, RMSE m', 'track, RMSE m'):
         assert f'{run[name]:.2f} m'.lstrip('0') in caption
     assert f'{100 * run["truth inside 95 % ellipse"]:.0f} % of the time' in caption
-    assert run['NEES low'] < run['NEES'] < run['NEES high']
+    nees, low, high = (f'{run[name]:.2f}' for name in ('NEES', 'NEES low', 'NEES high'))
+    assert f'NEES {nees}, where {low} to {high} is consistent' in caption
+    assert ('wider than they need be' in caption) == (run['NEES'] < run['NEES low'])
+    assert run['NEES'] < run['NEES high'], 'too narrow: no picture for the front'
