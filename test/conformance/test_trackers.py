@@ -23,8 +23,7 @@ import pytest
 
 from sonar_imm.measurements import Navigation, Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
-from sonar_imm.trackers.state_values import freeze
+from sonar_imm.trackers.state_file import freeze, read_state, tracker_from, write_state
 from sonar_imm_tools.offline.tracking import final_estimates
 
 SECOND = 10**9

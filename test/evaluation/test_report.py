@@ -26,10 +26,9 @@ import pytest
 from scipy.stats import chi2
 
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm_tools.evaluation.diver import figures
+from sonar_imm_tools.evaluation.diver import figures, METRICS, seen, summary_sentence
 from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of, Truth
-from sonar_imm_tools.evaluation.diver.summary import METRICS, seen, summary_sentence
 from sonar_imm_tools.evaluation.judging import Judgement
 from sonar_imm_tools.evaluation.numbers import Card, Check
 from sonar_imm_tools.evaluation.plotting import in_degrees, nis_figure, scale_length, thin

@@ -294,6 +294,7 @@ def test_parameters_that_may_change_do_and_others_do_not():
         tracker.reconfigure(DiverConfig(directions=8))
 
 
+@pytest.mark.statistics
 def test_smoothing_lowers_the_error_and_keeps_the_tracks():
     filtered, smooth = [], []
     for seed in range(3):
