@@ -59,7 +59,8 @@ def pytest_make_collect_report(collector):
     """Every other worker begins at the other end: each loads what the other has compiled."""
     report = yield
     odd = os.environ.get('PYTEST_XDIST_WORKER', '').endswith(tuple('13579'))
-    if odd and isinstance(collector, pytest.Directory) and len(collector.config.args) == 1:
+    folder = isinstance(collector, getattr(pytest, 'Directory', ()))  # since pytest 8
+    if odd and folder and len(collector.config.args) == 1:
         report.result.reverse()
     return report
 

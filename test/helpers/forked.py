@@ -23,6 +23,7 @@ import importlib
 import json
 import os
 from pathlib import Path
+import signal
 import socket
 import subprocess
 import sys
@@ -55,12 +56,13 @@ def commands(folder: Path):
         [python, '-m', 'helpers.forked', address],
         env={**os.environ, 'PYTHONPATH': search},
         stdout=subprocess.PIPE,
+        start_new_session=True,
     ) as server:
         try:
             assert server.stdout.readline() == b'ready\n'
             yield folder
         finally:
-            server.kill()
+            os.killpg(server.pid, signal.SIGKILL)  # with what a page has left running
 
 
 def serve(address: str) -> None:
