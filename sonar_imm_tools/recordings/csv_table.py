@@ -90,7 +90,7 @@ USUAL_NAMES = {
     'heading': 'hdg vessel_heading ship_heading boat_heading gyro',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
-    'id': 'track_id target target_id tag diver name taucher',
+    'id': 'track_id target target_id tag beacon beacon_id transponder diver name taucher',
     'valid': 'position_valid is_valid fix_valid validity',
     'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
     'ping': 'ping_id ping_number',
@@ -277,7 +277,7 @@ class Row:
         if not self.table.has('date'):
             raise BadRow(
                 f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
-                'the date'
+                'the date: add one, named date'
             )
         return dated(self.text('date'), text, self.table.header('date'))
 
