@@ -215,7 +215,8 @@ class Row:
         try:
             value = float(text if self.table.delimiter == ',' else text.replace(',', '.'))
         except ValueError:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
+            wanted = 'decimal degrees' if name in ('latitude', 'longitude') else 'a number'
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not {wanted}") from None
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
         return value
