@@ -328,7 +328,7 @@ class Table:
         if missing := [name for name in names if name not in self.index]:
             raise BagError(
                 f'{self.path} has no column for {" and ".join(missing)}; it has '
-                f'{", ".join(self.headers)}; say which column holds '
+                f'{", ".join(self.headers[:12])}; say which column holds '
                 f'{"it" if len(missing) == 1 else "them"}, as in --column {missing[0]}=HEADER'
             )
 
