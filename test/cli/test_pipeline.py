@@ -17,7 +17,6 @@
 import csv
 import json
 from pathlib import Path
-import resource
 import signal
 import subprocess
 import sys
@@ -229,6 +228,8 @@ def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_p
 
 @pytest.mark.parametrize('command', ['simulate', 'track'])
 def test_a_full_disk_is_named(command, tmp_path):
+    resource = pytest.importorskip('resource')
+
     def limit_files():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
