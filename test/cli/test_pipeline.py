@@ -17,7 +17,6 @@
 import csv
 import json
 from pathlib import Path
-import resource
 
 from helpers.dive_bags import write_dive
 import pytest
@@ -188,6 +187,7 @@ def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_p
 
 @pytest.mark.parametrize('command', ['simulate', 'track'])
 def test_a_full_disk_is_named(command, dive, tmp_path, capsys):
+    resource = pytest.importorskip('resource')
     out = tmp_path / 'out'
     _, most = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
