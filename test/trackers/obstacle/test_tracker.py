@@ -14,7 +14,6 @@
 
 """The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
 
-from helpers.estimates import same
 from helpers.obstacle_runs import (
     approach,
     FIXED,
@@ -43,10 +42,6 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 NAME = 'approach_dst+3_noisy'
-
-
-def same_runs(first, other):
-    return list(first) == list(other) and all(same(first[stamp], other[stamp]) for stamp in first)
 
 
 # -- the contract ------------------------------------------------------------------------------
