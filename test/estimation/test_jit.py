@@ -17,6 +17,7 @@
 import gc
 import hashlib
 import importlib
+import math
 import os
 from pathlib import Path
 import resource
@@ -24,7 +25,8 @@ import shutil
 
 from helpers.kernel_process import ROOT, run
 import numba
-from numba.core import caching
+from numba.core import caching, types
+import numpy as np
 import pytest
 
 from sonar_imm.estimation import jit
@@ -109,6 +111,34 @@ def test_a_loaded_kernel_counts_with_its_callees(monkeypatch):
     assert set(jit.present) == {f'{__name__}.caller', f'{__name__}.callee'}
 
 
+def test_what_is_left_out_of_compiling_changes_no_bit(monkeypatch):
+    def spread(P, count):
+        out, total = np.zeros((count, P.shape[1])), 0.0
+        for k in range(count):
+            row = P[k % len(P)]
+            for a in range(len(row)):
+                out[k, a] = math.exp(-row[a]) / (1.0 + abs(total)) + 0.1 * k
+                total += out[k, a] if row[a] > 0.0 else -(row[a] ** 2)
+        if not total > -1e6:
+            raise ValueError('too far')
+        return out[1:], total, np.sum(P[:, 0]), max(k, 2)
+
+    resolved, resolve = [], types.Function.get_call_type
+    monkeypatch.setattr(types.Function, 'get_call_type', resolve)  # and back, at the end
+    monkeypatch.setattr(jit, '_resolve', lambda *args: resolved.append(args) or resolve(*args))
+    monkeypatch.setattr(jit, '_resolved', {})
+    P = np.random.default_rng(3).normal(size=(5, 4))
+    options = {name: jit._OPTIONS[name] for name in ('nogil', 'error_model')}
+    own, numbas = jit.kernel(spread), numba.njit(**options)(spread)
+    (out, *rest), (expected, *others) = own(P, 7), numbas(P, 7)
+    assert out.tobytes() == expected.tobytes() and rest == others
+    with pytest.raises(ValueError, match='too far'):
+        own(np.full((5, 4), -1e6), 7)
+    asked = [(id(function), args) for function, _, args, _ in resolved]
+    scalars = [each for each in asked if set(each[1]) == {types.float64}]
+    assert scalars and len(scalars) == len(set(scalars))
+
+
 @pytest.mark.parametrize('before', [(700, 10, 10), (0, 10, 10)])
 def test_garbage_is_looked_for_rarely_while_numba_compiles_and_then_as_before(before, monkeypatch):
     seen = []
@@ -124,7 +154,7 @@ def test_garbage_is_looked_for_rarely_while_numba_compiles_and_then_as_before(be
     finally:
         gc.set_threshold(*other)
     # The callee is compiled inside of the caller, which is kept when it is compiled.
-    assert seen == [(100_000, 50, 100) if before[0] else before, before] and after == before
+    assert seen == [(1_000_000, 50, 100) if before[0] else before, before] and after == before
 
 
 DAMAGE = {
