@@ -254,7 +254,7 @@ def main(
             rclpy.spin(Echo())
         except (KeyboardInterrupt, ExternalShutdownException):
             return
-    for name in [system] if system else ['diver', 'obstacle']:
+    for name in [system] if system else SYSTEMS:
         for rate in rates:
             spent = latencies(case_of(name, messages), rate)
             node, other = np.percentile(spent, (50, 99), axis=0).T

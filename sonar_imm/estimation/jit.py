@@ -171,6 +171,9 @@ def kernel(function: F) -> F:
     compiled: Any = numba.njit(**_OPTIONS)(function)
     if compiled is function:  # with NUMBA_DISABLE_JIT
         return function
+    for_types = compiled.get_call_template
+    # Else a caller that says 0 or 1 has one compiled for each of these numbers.
+    compiled.get_call_template = lambda args, kws: for_types([*map(types.unliteral, args)], kws)
     try:
         _attach_cache(compiled, function)
     except (ImportError, AttributeError, TypeError):

@@ -14,6 +14,7 @@
 
 """Compiling: the cache is used when it can be, and is no condition."""
 
+import ast
 import gc
 import hashlib
 import importlib
@@ -137,6 +138,32 @@ def test_what_is_left_out_of_compiling_changes_no_bit(monkeypatch):
     asked = [(id(function), args) for function, _, args, _ in resolved]
     scalars = [each for each in asked if set(each[1]) == {types.float64}]
     assert scalars and len(scalars) == len(set(scalars))
+
+
+def test_a_number_that_a_caller_writes_out_is_no_type_of_its_own():
+    inner = jit.kernel(lambda values, k: values[k])
+    outer = jit.kernel(lambda values, k: inner(values, 0) + inner(values, 1) + inner(values, k))
+    assert outer(np.arange(5.0), 2) == 3.0 and len(inner.signatures) == 1
+
+
+def test_no_kernel_gives_an_array_to_a_slice():
+    """numba then compiles thirty functions more, which say what does not fit."""
+    found = []
+    for file in (ROOT / 'sonar_imm').rglob('*.py'):
+        for function in ast.walk(ast.parse(file.read_text())):
+            decorators = getattr(function, 'decorator_list', [])
+            if 'kernel' not in [getattr(each, 'id', '') for each in decorators]:
+                continue
+            for node in ast.walk(function):
+                slices = [
+                    part
+                    for target in getattr(node, 'targets', [getattr(node, 'target', node)])
+                    for part in ast.walk(target)
+                    if isinstance(node, ast.Assign | ast.AugAssign) and isinstance(part, ast.Slice)
+                ]
+                if slices and not isinstance(node.value, ast.Constant):
+                    found.append(f'{file.name}:{node.lineno}')
+    assert not found
 
 
 @pytest.mark.parametrize('before', [(700, 10, 10), (0, 10, 10)])
