@@ -94,12 +94,12 @@ $(TEST_STAMP): $(STAMP)
 demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
 	$(BIN)/sonar-imm demo --out demo
 
-test: test-core test-system ## run the tests; of the Monte Carlo ones a fourth, in turn
+test: test-core test-system ## run the tests; of the Monte Carlo ones an eighth, in turn
 
 test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
 	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(SHARED) $(TESTS)
 
-test-statistics: venv ## run every Monte Carlo test; `make test` takes a fourth of them in turn
+test-statistics: venv ## run every Monte Carlo test; `make test` takes an eighth of them in turn
 	$(TEST_ENV) $(BIN)/python -m pytest -m statistics -n $(JOBS) $(SHARED) $(TESTS)
 
 test-bounds: venv ## run the tests of the compiled kernels with every index checked

@@ -16,11 +16,11 @@
 
     python -m benchmarks.fathometer_accuracy --runs 3 --out docs/results/fathometer_accuracy.json
 
-Each run is one drift as cross-spectra (seven to nine reflectors over 300 records), processed twice
-(MVDR and conventional) and tracked by every configuration. OSPA has a cutoff of 2 m and order 2;
-a reflector within 0.4 m of a true one is neither false nor missed. Birth delay: records from the
-presence of a new reflector to the first of three records in a row that have it. Making the traces
-takes about 15 minutes per run.
+Each run is one drift as cross-spectra (seven to nine reflectors over 300 records, as in
+`fathometer_pulse`), processed twice (MVDR and conventional) and tracked by every configuration.
+OSPA has a cutoff of 2 m and order 2; a reflector within 0.4 m of a true one is neither false nor
+missed. Birth delay: records from the presence of a new reflector to the first of three records in
+a row that have it. The numbers so far are written after each run.
 """
 
 from __future__ import annotations
@@ -29,14 +29,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import fathometer_paper
+from benchmarks import fathometer_paper, fathometer_pulse
 from benchmarks.fathometer_paper import ORDERS, reflectors
 from benchmarks.study import final_estimates, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm_tools.simulation.fathometer.scenario import drift_of
-from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, FathometerScenario
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra
 
 DEPTHS = (122.0, 1 / 32, 1600)
 NEAR = 0.4
@@ -108,17 +107,10 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
 
 def drift(seed: int, records: int) -> Drift:
     """Traces of one run by processor, and the true depths and ids of each record."""
-    scale = records / 300
-    config = FathometerScenario(
-        records=records,
-        appearing=(int(140 * scale), int(262 * scale)),
-        fading=(int(85 * scale),),
-    )
+    config, floor, rng = fathometer_pulse.drift(seed, records)
     traces: dict[str, list[Trace]] = {}
     truth = []
     # Cross-spectra of a whole drift would not fit into memory, nor does `check` let them.
-    rng = np.random.default_rng(seed)
-    floor = drift_of(config, rng)
     for record in range(records):
         spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
         for name, trace in responses(spectra).items():
@@ -170,15 +162,15 @@ def main(runs: int = 3, records: int = 300, particles: int = 20_000) -> Parts:
             exact = {'particles': particles, 'sound_speed_std': 0.0}
             config = FathometerConfig(**{**exact, **values}, seed=seed)
             scores.setdefault(label, []).append(score(config, traces[processor], truth))
-    table = {
-        label: mean_of(each)
-        | {
-            f'{name}, s.e.': standard_error([row[name] for row in each])
-            for name in ('P(order right)', 'OSPA')
+        table = {
+            label: mean_of(each)
+            | {
+                f'{name}, s.e.': standard_error([row[name] for row in each])
+                for name in ('P(order right)', 'OSPA')
+            }
+            for label, each in scores.items()
         }
-        for label, each in scores.items()
-    }
-    yield {'runs': runs, 'records': records, 'table': table}
+        yield {'runs': seed + 1, 'records': records, 'table': table}
 
 
 if __name__ == '__main__':

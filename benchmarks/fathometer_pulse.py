@@ -323,7 +323,7 @@ def _score(found: Estimate, depth: np.ndarray, amplitude: np.ndarray) -> list[fl
 
 
 def main(
-    runs: int = 2,
+    runs: int = 5,
     records: int = 300,
     particles: int = 5000,
     scenes: Sequence[str] = tuple(SCENES),
@@ -340,8 +340,7 @@ def main(
     for name in scenes:
         length = records if name == 'drift' else max(10, records // 10)
         scores: dict[str, list[dict[str, float]]] = {}
-        # What costs little is repeated more often.
-        for seed in range(runs if name == 'drift' else 5 * runs):
+        for seed in range(runs):
             made = run(name, seed, length, particles, pulses, polarities)
             for label, row in made.items():
                 each = scores.setdefault(label, [])

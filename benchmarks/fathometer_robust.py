@@ -20,10 +20,7 @@ Traces of six or eight layers of 7 to 34 sigma (`fathometer_gaps`, `fathometer_d
 defaults: 30 or 120 missing records, layers that dip, a speed of sound that is off by so many m/s
 or drawn with the standard deviation of 10 m/s that is the default. Six layers, two of them
 negative (``signed``) or none (``strong``), with `polarity: both` and `pulse: processor`, at 16 or
-32 hydrophones (`fathometer_pulse`, 30 records, scored after 5). Three layers (`fathometer_sea`):
-the conventional processor and the pulse of the band over 20 records of 20 s, which see the same
-noise, as pressure and as cross-spectra drawn from the same model, and snapshots of 1.4 s in 12
-records of 8 s of pressure.
+32 hydrophones (`fathometer_pulse`, 30 records, scored after 5).
 
 P: share of the records whose number of reflectors is right ('1st', '2nd' after a gap, 'later' from
 the third on); inside: depths within two stated standard deviations. Rows are written as runs end,
@@ -35,11 +32,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks import fathometer_dips, fathometer_gaps, fathometer_pulse, fathometer_sea
+from benchmarks import fathometer_dips, fathometer_gaps, fathometer_pulse
 from benchmarks.study import known, mean_of, Parts, standard_error, study
 from sonar_imm.estimation.arrays import FloatArray
 
@@ -103,49 +99,6 @@ def six_layers(seed: int, particles: int, scene: str) -> Rows:
     return {f'{scene}, both': found[f'{scene}, processor, both']}
 
 
-def three_layers(
-    seed: int,
-    particles: int,
-    level: str,
-    scene: dict[str, Any],
-    ways: dict[str, dict[str, Any]],
-) -> Rows:
-    options = [{'particles': particles, **way} for way in ways.values()]
-    made = {}
-    for name, found in zip(ways, fathometer_sea.run(level, scene, options, seed)):
-        right, apart = np.array(found['right']), np.array(found['ospa'])
-        late = fathometer_sea.SETTLED
-        made[name] = {
-            'P': float(right.mean()),
-            'OSPA': float(apart.mean()),
-            'P, later': float(right[late:].mean()),
-            'OSPA, later': float(apart[late:].mean()),
-        }
-    return made
-
-
-def short_records(seed: int, particles: int) -> Rows:
-    ways = {
-        '8 s, snapshots of 1.4 s': {'snapshot_seconds': 1.4, **fathometer_sea.MIRROR},
-        '8 s, defaults': {},
-    }
-    return three_layers(seed, particles, 'pressure', {}, ways)
-
-
-def long_records(seed: int, particles: int, level: str) -> Rows:
-    ways: dict[str, dict[str, Any]] = {
-        'conventional': {'processor': 'conventional'},
-        'pulse of the band': {'pulse': 'band'},
-        'pulse of the processor': {'pulse': 'processor'},
-    }
-    if level == 'csdm':
-        ways = {name: {**way, **fathometer_sea.MIRROR} for name, way in ways.items()}
-    scene = {'record_seconds': 20.0, 'records': 20}
-    found = three_layers(seed, particles, level, scene, ways)
-    words = {'pressure': 'pressure', 'csdm': 'cross-spectra'}[level]
-    return {f'20 s, {words}, {name}': row for name, row in found.items()}
-
-
 CASES: dict[str, Callable[..., Rows]] = {
     'gap': after_gap,
     'dip': partial(dipping, cases=((0.4, 0), (0.4, GAP))),
@@ -155,9 +108,6 @@ CASES: dict[str, Callable[..., Rows]] = {
         scene: partial(six_layers, scene=scene)
         for scene in ('signed', 'strong', 'signed 32', 'strong 32')
     },
-    '8 s': short_records,
-    '20 s': partial(long_records, level='pressure'),
-    '20 s, spectra': partial(long_records, level='csdm'),
 }
 
 

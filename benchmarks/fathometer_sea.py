@@ -14,31 +14,31 @@
 
 """The fathometer at sea: pressure against cross-spectra of the same model, run by run.
 
-    python -m benchmarks.fathometer_sea --runs 8 --out docs/results/fathometer_sea.json
+    python -m benchmarks.fathometer_sea --out docs/results/fathometer_sea.json
 
 The scene: 16 hydrophones 0.25 m apart, 100 Hz to 2800 Hz, at 30 m and half a metre about it, told
 to 0.03 m; layers of amplitude 0.35, 0.25 and 0.2 at 52 m, 58.5 m and 66 m that walk by 0.05 m from
 record to record; ships and noise of the hydrophones. Pressure is drawn from the cross-spectral
 model over each whole record, in whole numbers of 2.5 steps to a standard deviation where it says
 so; cross-spectra are drawn from the same model frequency by frequency, of as many snapshots as fit
-into the record side by side, which gives a response of the same noise; "as at one frequency" means
-as many as the overlapping ones of the pressure are worth at one frequency (but not over all, since
-the window makes neighbouring frequencies alike). Every row has the same floors. P is the share of
-records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
+into the record side by side, which gives a response of the same noise. Every row has the same
+floors. Rows are written as runs end, and a file that is there already is added to. P is the share
+of records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
 median amplitude of each layer in units of the noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
 from benchmarks.fathometer_paper import reflectors, score
-from benchmarks.study import Parts, standard_error, study
-from sonar_imm.acoustics.spectra import effective_snapshots
+from benchmarks.study import known, Parts, standard_error, study
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
@@ -52,29 +52,23 @@ LAYERS, AMPLITUDES = np.array([52.0, 58.5, 66.0]), np.array([0.35, 0.25, 0.2])
 SETTLED = 4
 """Records after which a run is scored once more."""
 MIRROR: dict[str, Any] = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+LONG: dict[str, Any] = {'record_seconds': 20.0, 'records': 20}
+FEW: dict[str, Any] = {'snapshot_seconds': 1.4, **MIRROR}
 ROWS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     '8 s, pressure': ('pressure', {}, {}),
-    '8 s, cross-spectra': ('csdm', {}, MIRROR),
-    '8 s, cross-spectra, as at one frequency': ('csdm at one frequency', {}, MIRROR),
-    '8 s, pressure, int8': ('pressure', {'steps_per_sigma': 2.5}, {}),
-    '8 s, pressure, pulse of the processor': ('pressure', {}, {'pulse': 'processor'}),
-    '8 s, pressure, snapshots of 1.4 s': (
+    '8 s, pressure, pulse of the band': ('pressure', {}, {'pulse': 'band'}),
+    '8 s, pressure, snapshots of 1.4 s': ('pressure', {}, FEW),
+    '8 s, pressure, snapshots of 1.4 s, pulse of the band': (
         'pressure',
         {},
-        {'snapshot_seconds': 1.4, **MIRROR},
+        {'pulse': 'band', **FEW},
     ),
-    '20 s, pressure': ('pressure', {'record_seconds': 20.0, 'records': 20}, {}),
-    '20 s, pressure, pulse of the processor': (
-        'pressure',
-        {'record_seconds': 20.0, 'records': 20},
-        {'pulse': 'processor'},
-    ),
-    '20 s, cross-spectra': ('csdm', {'record_seconds': 20.0, 'records': 20}, MIRROR),
-    '20 s, pressure, conventional': (
-        'pressure',
-        {'record_seconds': 20.0, 'records': 20},
-        {'processor': 'conventional'},
-    ),
+    '8 s, pressure, int8': ('pressure', {'steps_per_sigma': 2.5}, {}),
+    '8 s, cross-spectra': ('csdm', {}, MIRROR),
+    '20 s, pressure': ('pressure', LONG, {}),
+    '20 s, pressure, pulse of the band': ('pressure', LONG, {'pulse': 'band'}),
+    '20 s, pressure, conventional': ('pressure', LONG, {'processor': 'conventional'}),
+    '20 s, cross-spectra': ('csdm', LONG, MIRROR),
 }
 """Name: level, what differs of the scene, what differs of the tracker."""
 
@@ -93,28 +87,24 @@ def run(
     level: str, scene: dict[str, Any], options: Sequence[dict[str, Any]], seed: int
 ) -> list[dict[str, Any]]:
     """One run with each of `options`, which see the same noise; numbers of each record."""
-    kind = level.split()[0]
-    config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
+    config = scenario('pressure', {'level': level, 'steps_per_sigma': 0.0, **scene})
     floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
     stated = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
     stated |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     stated.pop('snapshot_seconds', None)
     settings = [FathometerConfig(**{**stated, **each}, seed=seed) for each in options]
-    if kind == 'csdm':
-        first = settings[0]
-        seconds = automatic_snapshot(first, config.phones, config.depth_max - config.array_depth)
-        count = int(config.record_seconds / seconds / (1.0 - first.overlap)) - 1
-        worth = round(effective_snapshots(first.window, first.overlap, count))
-        if level == 'csdm':
-            worth = round(config.record_seconds / seconds)
-        config = evolve(config, snapshot_seconds=seconds, snapshots=worth)
+    if level == 'csdm':
+        reach = config.depth_max - config.array_depth
+        seconds = automatic_snapshot(settings[0], config.phones, reach)
+        count = round(config.record_seconds / seconds)
+        config = evolve(config, snapshot_seconds=seconds, snapshots=count)
         # Drawn frequency by frequency, their noise does not fade.
         settings = [evolve(each, window='rectangular', overlap=0.0) for each in settings]
     trackers = [FathometerTracker(each) for each in settings]
     found: list[dict[str, Any]] = [{'right': [], 'ospa': [], 'snr': []} for _ in options]
     for record in range(config.records):
         depth = float(floor.array_depth_stated[record])
-        if kind == 'csdm':
+        if level == 'csdm':
             measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
         else:
             measured = pressure_blocks(config, floor, record, depth, rng)
@@ -149,29 +139,22 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
     return row | {f'SNR {k + 1}': float(value) for k, value in enumerate(snr)}
 
 
-def main(runs: int = 8, particles: int = 4000, rows: Sequence[str] = ()) -> Parts:
+def main(
+    runs: int = 20, particles: int = 5000, rows: Sequence[str] = (), out: Path | None = None
+) -> Parts:
+    yield known(out)
     yield {'particles': particles}
     wanted = [name for name in ROWS if not rows or any(word in name for word in rows)]
     # Rows of one level and scene see the same noise, which is drawn once.
-    alike: list[list[str]] = []
-    for name in wanted:
-        group = next((g for g in alike if ROWS[g[0]][:2] == ROWS[name][:2]), None)
-        if group:
-            group.append(name)
-        else:
-            alike.append([name])
-    for group in alike:
-        level, scene, _ = ROWS[group[0]]
-        count = runs if group[0].startswith('8 s') else max(1, runs // 2)
-        options = [{'particles': particles, **ROWS[name][2]} for name in group]
-        found = [run(level, scene, options, seed) for seed in range(count)]
-        for name, each in zip(group, zip(*found)):
-            yield {'table': {name: {'runs': count, **row_of(list(each))}}}
+    for (level, scene), group in groupby(wanted, key=lambda name: ROWS[name][:2]):
+        names = list(group)
+        options = [{'particles': particles, **ROWS[name][2]} for name in names]
+        found: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+        for seed in range(runs):
+            for name, each in zip(names, run(level, scene, options, seed)):
+                found[name].append(each)
+                yield {'table': {name: {'runs': seed + 1, **row_of(found[name])}}}
 
 
 if __name__ == '__main__':
-    study(
-        main,
-        runs={'help': 'of 8 s; of 20 s half as many'},
-        rows={'help': 'only rows with one of these words in the name'},
-    )
+    study(main, rows={'help': 'only rows with one of these words in the name'})

@@ -31,8 +31,7 @@ import numpy as np
 from benchmarks.study import Parts, study
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import json_parameters, Saved, write_state
-from sonar_imm.trackers.state_values import frozen_state
+from sonar_imm.trackers.state_file import frozen_state, json_parameters, Saved, write_state
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.own_files import own_parameters

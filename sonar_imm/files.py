@@ -95,9 +95,14 @@ def _folder(path: Path) -> Iterator[int]:
         os.close(handle)
 
 
-def _where_it_can() -> contextlib.AbstractContextManager[None]:
+@contextlib.contextmanager
+def _where_it_can() -> Iterator[None]:
     """Windows syncs only what is open for writing."""
-    return contextlib.nullcontext() if fcntl is not None else contextlib.suppress(OSError)
+    try:
+        yield
+    except OSError as error:
+        if fcntl is not None or error.errno != errno.EBADF:
+            raise
 
 
 def lock(handle: int) -> None:

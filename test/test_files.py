@@ -140,21 +140,23 @@ def test_where_there_are_neither_locks_nor_open_folders(tmp_path, monkeypatch):
     assert not (tmp_path / 'state.lock').exists()
 
 
-def test_the_command_runs_without_the_modules_of_unix(tmp_path):
+def test_the_command_runs_without_the_modules_of_unix_and_with_backslashes(tmp_path):
+    run, report = tmp_path / 'a\\new\\run', tmp_path / 'a\\report.html'
     blocked = ('fcntl', 'grp', 'pwd', 'resource', 'termios')
     program = (
         'import os, signal, sys\n'
         f'sys.modules.update(dict.fromkeys({blocked!r}))\n'
         'del signal.SIGHUP, signal.SIGKILL, os.sched_getaffinity, os.fork, os.nice\n'
         'from sonar_imm_tools.cli import main\n'
-        f"sys.exit(main(['track', 'bags/diver_table1', {str(tmp_path / 'run')!r}]))"
+        f"main(['track', 'bags/diver_table1', {str(run)!r}])\n"
+        f"sys.exit(main(['evaluate', {str(run)!r}, '--report', {str(report)!r}]))"
     )
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
         [sys.executable, '-c', program], cwd=root, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / 'run' / 'estimate.csv').stat().st_size > 0
+    assert (run / 'estimate.csv').stat().st_size > 0 and report.stat().st_size > 0
 
 
 def test_what_is_renamed_is_on_the_disk_before_and_the_rename_after(tmp_path, monkeypatch):

@@ -36,13 +36,17 @@ from ..estimation.arrays import ComplexArray, FloatArray
 
 def noise_integral(x: ArrayLike) -> ComplexArray:
     """I(x), of the shape of x."""
-    x = np.asarray(x, np.float64)
-    small = np.abs(x) < 1e-3
-    z = 1j * np.where(small, 1.0, x)
-    turn = np.exp(z)
-    exact = 2.0 * (turn / z - (turn - 1.0) / np.square(z))
-    series = 1.0 + 2j * x / 3.0 - np.square(x) / 4.0 - 1j * x**3 / 15.0
-    return np.where(small, series, exact)
+    values = np.asarray(x, np.float64)
+    small = np.abs(values) < 1e-3
+    over = 1.0 / np.where(small, 1.0, values)
+    sine, cosine = np.sin(values), np.cos(values)
+    # In real numbers, which takes a third of the time.
+    found = np.empty(values.shape, np.complex128)
+    found.real = 2.0 * over * (sine + over * (cosine - 1.0))
+    found.imag = 2.0 * over * (over * sine - cosine)
+    near = values[small]
+    found[small] = 1.0 + 2j * near / 3.0 - np.square(near) / 4.0 - 1j * near**3 / 15.0
+    return found
 
 
 def surface_noise_csdm(

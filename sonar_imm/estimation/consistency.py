@@ -71,10 +71,10 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     >>> round(low, 3), round(high, 3)
     (1.627, 2.411)
     """
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
     tail = 0.5 * (1.0 - probability)
-    low, high = chi2.ppf(tail, count * dimension), chi2.ppf(1.0 - tail, count * dimension)
+    low, high = 2.0 * gammaincinv(0.5 * count * dimension, [tail, 1.0 - tail])
     return float(low) / count, float(high) / count
 
 

@@ -37,8 +37,16 @@ from ..intake import Intake
 from ..node_config import NodeConfig
 from ..parameters import Config, ConfigError
 from ..trackers import SYSTEMS
-from ..trackers.state_file import json_parameters, read_state, Saved, tracker_from, write_state
-from ..trackers.state_values import frozen_state, restore, StateError
+from ..trackers.state_file import (
+    frozen_state,
+    json_parameters,
+    read_state,
+    restore,
+    Saved,
+    StateError,
+    tracker_from,
+    write_state,
+)
 
 _ENOUGH = 3
 """First measurements that have to be far from a state before it is given up; one may be wrong."""

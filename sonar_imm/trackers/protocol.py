@@ -32,7 +32,7 @@ class Tracker(Protocol):
     clock, no global state.
 
     counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``,
-    ``too_late``, ...). STATE: the attributes that hold all it knows, see `state_values`; a tracker
+    ``too_late``, ...). STATE: the attributes that hold all it knows, see `state_file`; a tracker
     that keeps more, which follows from them, has a method ``restored`` that makes it again.
     """
 

@@ -208,8 +208,7 @@ def _export_tracks(asked: _Asked) -> Told:
 
 def _export_horizons(asked: _Asked, original: Path | None) -> Told:
     """Picks of a run of the fathometer."""
-    from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
-    from ..recordings.export.picks import write_picks
+    from ..recordings.export.horizons import picks_of, write_geojson, write_horizons, write_picks
     from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader
     from ..recordings.sources import BagError

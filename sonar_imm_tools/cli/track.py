@@ -227,9 +227,10 @@ class Plan:
 
 
 def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
-    """Say where the parameters of `bag` come from, when that was not asked for."""
-    if plan.params is None and (own := plan.parameters_of(bag)):
-        say(f'using the parameters of the recording, {own}', quiet=quiet)
+    """Say whether the parameters beside `bag`, for which nobody asked, are used."""
+    if own := evolve(plan, params=None).parameters_of(bag):
+        used = 'using' if plan.params is None else '--params is used in place of'
+        say(f'{used} the parameters of the recording, {own}', quiet=quiet)
 
 
 def _of_all(

@@ -24,10 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 import plotly.graph_objects as go
-from scipy.stats import chi2
 
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.association import gate_threshold
+from sonar_imm.estimation.consistency import average_bounds
 
 from .. import SECOND
 
@@ -59,11 +60,11 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
         mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
         add_line(figure, time[width - 1 :], mean, f'mean of {width}', INK, 2, gl=True)
         if shared:
-            low, high = chi2.ppf([0.025, 0.975], width * shared) / width
+            low, high = average_bounds(width, shared)
             figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
     if shared:
         figure.add_hline(
-            y=chi2.ppf(0.95, shared),
+            y=gate_threshold(0.95, shared),
             line={'color': COLOURS[1], 'dash': 'dash'},
             annotation_text='95 % of the hits should lie below',
         )

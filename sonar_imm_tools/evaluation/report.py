@@ -137,7 +137,7 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
         return
     folder = path.with_name(f'{path.stem}_runs')
     folder.mkdir(parents=True, exist_ok=True)
-    plotlyjs = packed(plotly.offline.get_plotlyjs())
+    plotlyjs = packed(_plotlyjs())
     _write(folder / PLOTLYJS, f"const packedPlotlyJs = '{plotlyjs}';\n")
     names = page_names(parts)
     for part, name in zip(parts, names):
@@ -163,7 +163,7 @@ def report_html(part: Part, front_page: str = '') -> str:
         part=part,
         front_page=quote(front_page),
         draw=partial(_packed_figure, _accelerated(figures)),
-        plotlyjs='' if front_page else packed(plotly.offline.get_plotlyjs()),
+        plotlyjs='' if front_page else packed(_plotlyjs()),
     )
 
 
@@ -190,6 +190,15 @@ def _rendered(template: str, **values: Any) -> str:
 def _write(path: Path, text: str) -> None:
     with whole(path) as unfinished:
         unfinished.write_text(text, encoding='utf-8')
+
+
+def _plotlyjs() -> str:
+    """plotly.js, its one function in parentheses where it begins as known: a browser compiles such
+    a one when it reads it, and others when they are called, after another look at 5 MB."""
+    text = plotly.offline.get_plotlyjs()
+    head, begin, body = text.partition(', () => {\n"use strict";')
+    known = begin and body.endswith('}));')
+    return f'{head}, ({begin[2:]}{body[:-2]}));' if known else text
 
 
 def packed(text: str) -> str:

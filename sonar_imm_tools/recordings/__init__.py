@@ -21,7 +21,6 @@ __all__ = [
     'csv_table',
     'export',
     'mcap_records',
-    'mcap_scan',
     'measurements',
     'messages',
     'options',

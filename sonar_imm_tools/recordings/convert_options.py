@@ -129,7 +129,7 @@ class _Receivers(_WithTruth):
 
 @frozen(kw_only=True)
 class FixesOptions(_Polar):
-    """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
+    """CSV of position fixes to /fix, or with names to /fixes.
 
     Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
     var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. In place of x and y: range
@@ -150,8 +150,7 @@ class FixesOptions(_Polar):
 
 @frozen(kw_only=True)
 class RelativeOptions(_Polar):
-    """CSV of positions that a vessel has measured from itself, with its own pose in the same row,
-    to /relative and /nav, or /nav_fix and /heading.
+    """CSV of positions seen from a vessel to /relative and /nav.
 
     Columns: stamp; forward and starboard [m], or range [m, horizontal] and bearing, with std_range
     and std_bearing, degrees unless the header says rad; vessel_x and vessel_y [m], or
@@ -169,8 +168,7 @@ class RelativeOptions(_Polar):
 
 @frozen(kw_only=True)
 class NmeaOptions(_WithTruth):
-    """Log of NMEA 0183 sentences and AIS messages to /fixes, /nav_fix and /heading. Needs pyais
-    and pynmea2.
+    """Log of NMEA 0183 and AIS to /fixes, /nav_fix and /heading. Needs pyais and pynmea2.
 
     Fixes are the targets of AIS (by MMSI), TLL and TTM; the vessel's own GGA, RMC, GLL, GNS, HDT
     and THS are its navigation, or the fixes where there are no targets. Times stand before a
@@ -200,7 +198,7 @@ class ArrivalsOptions(_Receivers):
 
 @frozen(kw_only=True)
 class DetectionsOptions(_Receivers):
-    """Detections of tags by telemetry receivers, a row for each, to /arrivals.
+    """Detections of tags by telemetry receivers to /arrivals.
 
     Columns: stamp (or date and time), receiver and tag; the usual names of exports are recognised.
     Detections of one tag within --window are one ping. With --sync, tags that lie at known places,
@@ -230,7 +228,7 @@ class DetectionsOptions(_Receivers):
 
 @frozen(kw_only=True)
 class TruthOptions(_Places):
-    """CSV of true positions to /truth/estimate, for `evaluate --truth`."""
+    """CSV of true positions to /truth/estimate, for `evaluate`."""
 
     EXAMPLES: ClassVar = ('gps.csv truth.bag',)
     options: CsvOptions = group(CsvOptions)
@@ -238,7 +236,7 @@ class TruthOptions(_Places):
 
 @frozen(kw_only=True)
 class AutoferryOptions(_Options):
-    """Detections of the Autoferry data set (JSON) to /fixes: boats in clutter."""
+    """Detections of boats of the Autoferry data set to /fixes."""
 
     EXAMPLES: ClassVar = (
         'scenario13.json boats.bag --truth scenario13_groundTruth.json --sensor radar --std 5',
@@ -276,7 +274,7 @@ class SnapshotsOptions(_OfSonar):
 
 @frozen(kw_only=True)
 class ImagesOptions(_Options):
-    """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
+    """Bag with images of a forward-looking sonar to /detections.
 
     Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage, pings of the Oculus, echoes
     of the Ping360, SonoptixECHO and sensor_msgs/Image. Navigation and altitudes are copied. --set
@@ -292,7 +290,7 @@ class ImagesOptions(_Options):
 
 @frozen(kw_only=True)
 class InterferometerOptions(_Options):
-    """Bag with images of amplitude and phase, or of each stave, to /snapshot.
+    """Bag with amplitude and phase, or staves, to /snapshot.
 
     Takes RawSonarImage of marine_acoustic_msgs and messages like it: their fields are found by
     name. --field names others: amplitude, phase, iq, sample_rate, sample0, frequency, sound_speed.
@@ -326,11 +324,11 @@ class InterferometerOptions(_Options):
 
 @frozen(kw_only=True)
 class HydrophonesOptions(_Options):
-    """Sound of a vertical array, WAV or FLAC with a channel for each hydrophone, to /pressure.
-    Needs soundfile.
+    """Sound of a vertical array to /pressure. Needs soundfile.
 
-    The deepest hydrophone comes first; --channels says another order. The first sample is taken at
-    --start, or when the name of the file says, as in 20240531_100000.wav.
+    WAV or FLAC with a channel for each hydrophone, the deepest first; --channels says another
+    order. The first sample is taken at --start, or when the name of the file says, as in
+    20240531_100000.wav.
     """
 
     EXAMPLES: ClassVar = (
@@ -396,7 +394,7 @@ class TracesOptions(_Options):
 
 @frozen(kw_only=True)
 class XtfOptions(_Detecting):
-    """Side scan in an XTF file to /detections, /nav and /altitude. Needs pyxtf.
+    """Side scan in an XTF file to /detections and /nav. Needs pyxtf.
 
     Each ping of --side is an image of one beam abeam, in which echoes are found; --set changes the
     detector (docs/parameters/fls_detector.md). Where a side has a channel whose name says phase,
@@ -433,8 +431,7 @@ class Ek80Options(_OfSonar):
 
 @frozen(kw_only=True)
 class KongsbergOptions(_Options):
-    """Soundings of a KMALL or .all file of a Kongsberg multibeam to /ground, and /nav. Needs
-    themachinethatgoesping.
+    """Soundings of a Kongsberg KMALL or .all file to /ground. Needs themachinethatgoesping.
 
     They are a reference, or the ground of the obstacle tracker: no tracker takes them alone. The
     last profile of sound speed is kept in parameters.yaml beside the bag.
@@ -445,14 +442,13 @@ class KongsbergOptions(_Options):
 
 @frozen(kw_only=True)
 class PicturesOptions(_Detecting):
-    """Folder of PNG and JPEG pictures of a forward-looking sonar to /detections and /nav. Needs
-    Pillow.
+    """Folder of pictures of a sonar to /detections. Needs Pillow.
 
-    A CSV in the folder says file and stamp of each, and where the vehicle was: x, y or latitude,
-    longitude [deg], heading [deg, clockwise from north], optional depth. near_range, far_range
-    [m] and fov [deg] stand there too, or are options. Rows of a picture are ranges from near to
-    far, columns beams from port to starboard; fans drawn on paper are none. --set changes the
-    detector (docs/parameters/fls_detector.md).
+    PNG or JPEG of a forward-looking sonar. A CSV in the folder says file and stamp of each, and
+    where the vehicle was: x, y or latitude, longitude [deg], heading [deg, clockwise from north],
+    optional depth. near_range, far_range [m] and fov [deg] stand there too, or are options. Rows
+    of a picture are ranges from near to far, columns beams from port to starboard; fans drawn on
+    paper are none. --set changes the detector (docs/parameters/fls_detector.md).
     """
 
     EXAMPLES: ClassVar = ('frames dive.bag --far-range 40 --fov 90',)

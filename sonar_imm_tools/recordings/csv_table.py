@@ -90,7 +90,7 @@ USUAL_NAMES = {
     'heading': 'hdg vessel_heading ship_heading boat_heading gyro',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
-    'id': 'track_id target target_id tag diver name taucher',
+    'id': 'track_id target target_id tag beacon beacon_id transponder diver name taucher',
     'valid': 'position_valid is_valid fix_valid validity',
     'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
     'ping': 'ping_id ping_number',
@@ -215,7 +215,8 @@ class Row:
         try:
             value = float(text if self.table.delimiter == ',' else text.replace(',', '.'))
         except ValueError:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
+            wanted = 'decimal degrees' if name in ('latitude', 'longitude') else 'a number'
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not {wanted}") from None
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
         return value
@@ -277,7 +278,7 @@ class Row:
         if not self.table.has('date'):
             raise BadRow(
                 f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
-                'the date'
+                'the date: add one, named date'
             )
         return dated(self.text('date'), text, self.table.header('date'))
 
@@ -327,7 +328,7 @@ class Table:
         if missing := [name for name in names if name not in self.index]:
             raise BagError(
                 f'{self.path} has no column for {" and ".join(missing)}; it has '
-                f'{", ".join(self.headers)}; say which column holds '
+                f'{", ".join(self.headers[:12])}; say which column holds '
                 f'{"it" if len(missing) == 1 else "them"}, as in --column {missing[0]}=HEADER'
             )
 

@@ -180,7 +180,7 @@ def _of_table(table: CsvTable) -> Guess:
         return Guess('arrivals', why)
     if table.has('receiver', 'stamp') and names_tags(table):
         return Guess('detections', f'{why}: which receiver heard which tag')
-    if table.has('stamp', 'depth', 'amplitude'):
+    if table.has('depth', 'amplitude'):
         return Guess('traces', why)
     if table.has('stamp') and (
         table.has('vessel_x', 'vessel_y') or table.has('vessel_latitude', 'vessel_longitude')

@@ -35,8 +35,16 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from sonar_imm.parameters import ConfigError, small_text, yaml_tree
 from sonar_imm.texts import in_one_line
 
-from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack, wrong_sums, zstd
-from .mcap_scan import Channel, McapScan
+from .mcap_records import (
+    Channel,
+    McapScan,
+    oversized_chunk,
+    oversized_file,
+    TooLargeError,
+    unpack,
+    wrong_sums,
+    zstd,
+)
 from .messages import decode_cdr, typestore
 
 MOST_LINES = 4000

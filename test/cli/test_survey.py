@@ -382,6 +382,8 @@ def record(line, bag, *topics):
 def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
     lines, tmp_path, capsys, change, options, words
 ):
+    if 'nonsense' in options:
+        pytest.importorskip('distributed')
     runs, out = tmp_path / 'runs', tmp_path / 'out'
     if change != 'missing':
         runs.mkdir()

@@ -86,13 +86,15 @@ def test_few_failures_leave_a_result(failing, status, monkeypatch, capsys):
 
     def moody(config, seed):
         if seed < failing:
-            raise ValueError('not today')
+            raise ZeroDivisionError('division\nby zero')
         return simulate(config, seed)
 
     monkeypatch.setattr(diver, 'simulate', moody)
     assert main(['sweep', 'diver', '--runs', '3', *TINY, '--json']) == status
     content = json.loads(capsys.readouterr().out)
-    assert list(content['failures']) == [str(seed) for seed in range(failing)]
+    sentence = 'ZeroDivisionError: division by zero'
+    assert content['failures'] == {str(seed): sentence for seed in range(failing)}
+    assert content['seeds'] == [0, 1, 2]
     assert content['summary']['position.rmse_m']['runs'] == 3 - failing
 
 

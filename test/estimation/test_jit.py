@@ -21,7 +21,6 @@ import importlib
 import math
 import os
 from pathlib import Path
-import resource
 import shutil
 
 from helpers.kernel_process import ROOT, run
@@ -63,6 +62,7 @@ def fresh(tmp_path, monkeypatch):
 def test_a_full_disk_costs_a_sentence_and_not_the_process(fresh, tmp_path):
     """The limit on the size of files fails a write as a full disk does: after the folder and the
     file were made."""
+    resource = pytest.importorskip('resource')
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:

@@ -15,7 +15,6 @@
 """Kernels that another process compiles."""
 
 import importlib
-import resource
 import signal
 import sys
 import threading
@@ -127,6 +126,7 @@ def test_without_locks_a_kernel_is_compiled_at_once(stranger, at_it, monkeypatch
 
 
 def test_what_cannot_be_kept_elsewhere_is_compiled_here(stranger):
+    resource = pytest.importorskip('resource')
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a full disk
     process = jit.Elsewhere.begin(stranger.steps)

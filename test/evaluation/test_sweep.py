@@ -35,7 +35,6 @@ from sonar_imm_tools.evaluation.sweep import Outcome, Sweep
 from sonar_imm_tools.offline import jobs
 from sonar_imm_tools.offline.tracking import InputOptions
 from sonar_imm_tools.recordings.sources import BagError
-from sonar_imm_tools.simulation import diver as diver_scenes
 
 TINY = {
     'bathymetry': ('paper', {'pings': 1, 'last_range': 22.0}, 'height.all.rmse_m'),
@@ -157,27 +156,6 @@ def test_nobody_at_the_address_is_one_sentence(diver, monkeypatch):
         next(sweeps.run_on_cluster(diver, [0], f'127.0.0.1:{port}'))  # closed by now
     with pytest.raises(ConfigError, match='no dask scheduler at nonsense: .*port'):
         next(sweeps.run_on_cluster(diver, [0], 'nonsense'))
-
-
-def test_a_failing_run_does_not_stop_the_others(diver, monkeypatch):
-    simulate = diver_scenes.simulate
-
-    def moody(config, seed):
-        if seed == 1:
-            raise ZeroDivisionError('division\nby zero')
-        return simulate(config, seed)
-
-    monkeypatch.setattr(diver_scenes, 'simulate', moody)
-    outcomes = list(sweeps.run_here(diver, range(3)))
-    assert [outcome.failure for outcome in outcomes] == [
-        '',
-        'ZeroDivisionError: division by zero',
-        '',
-    ]
-    content = sweeps.record(diver, outcomes)
-    assert content['seeds'] == [0, 1, 2]
-    assert content['failures'] == {'1': 'ZeroDivisionError: division by zero'}
-    assert content['summary']['position.rmse_m']['runs'] == 2
 
 
 def test_a_failure_tells_the_same_each_time():

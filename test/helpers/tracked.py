@@ -19,8 +19,7 @@ from pathlib import Path
 from msg_adapters.estimates import write_estimate
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import json_parameters, Saved
-from sonar_imm.trackers.state_values import frozen_state
+from sonar_imm.trackers.state_file import frozen_state, json_parameters, Saved
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message

@@ -38,7 +38,7 @@ from sonar_imm.measurements import (
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm.trackers.state_values import frozen_state
+from sonar_imm.trackers.state_file import frozen_state
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 

@@ -124,69 +124,6 @@ def test_a_diver_is_tracked_from_fixes(rig):
     assert probabilities[-1].name[best] == 'quiet'  # a straight line
 
 
-def test_a_bag_that_starts_over_is_tracked_again_without_a_clock(rig):
-    bench, node, odometry, _ = rig
-    publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10
-    )
-    bench.spin_until(publisher.get_subscription_count)
-    for count, second in enumerate((*range(1, 41), *range(1, 21)), start=1):
-        publisher.publish(
-            write_fix(
-                Fix(
-                    stamp_ns=second * 10**9,
-                    position=(0.0, 2.0 * second, 0.0),
-                    covariance=0.01 * np.eye(2),
-                    frame_id='map',
-                ),
-                make,
-            )
-        )
-        bench.spin_until(lambda want=count: node._meter.received['fix'] == want)
-    bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 20)
-    assert odometry[-1].pose.pose.position.y == pytest.approx(40.0, abs=0.5)
-
-
-def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
-    bench, node, _, _ = rig
-    tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
-    publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', lockstep_qos()
-    )
-    bench.spin_until(publisher.get_subscription_count)
-    rng = np.random.default_rng(7)
-    odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 5e-324, 1e-30, 1e30, 1.7e308])
-
-    def some(size):
-        values = rng.normal(scale=10.0, size=size)
-        hit = rng.random(size) < 0.15
-        values[hit] = rng.choice(odd, size=hit.sum())
-        return values
-
-    count = 500
-    for k in range(1, count + 1):
-        x, y, z = some(3)
-        message = make('geometry_msgs/msg/PoseWithCovarianceStamped')
-        message.pose.pose.position = make('geometry_msgs/msg/Point', x=x, y=y, z=z)
-        message.pose.covariance = some(36) if k % 3 == 0 else np.diag(np.abs(some(6))).ravel()
-        message.header.stamp.sec = int(rng.choice([k, k, k, k - 3, 0, -k, 2**31 - 1]))
-        message.header.stamp.nanosec = int(rng.choice([0, 5, 10**9 - 1, 10**9, 2**32 - 1]))
-        message.header.frame_id = str(rng.choice(['map'] * 8 + ['', 'map_ned', 'a' * 300]))
-        publisher.publish(message)
-        bench.spin_until(lambda want=k: node._meter.received['fix'] == want)
-    bench.spin_until(lambda: len(tables) == node._published)
-    refused = node._meter.refused
-    assert {'nan', 'bad_stamp', 'bad_covariance'} <= set(refused)
-    assert 0 < refused.total() < count
-    assert not node._errors
-    for table in tables:
-        estimate = read_estimate(table)
-        assert np.isfinite(estimate.state).all()
-        assert np.isfinite(estimate.covariance).all()
-        assert np.isfinite(estimate.probabilities).all()
-    assert len(tables) > 10
-
-
 def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
     bench = make_bench()
     node = bench.add(DiverNode(context=bench.context))

@@ -36,7 +36,6 @@ from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import input_qos, lockstep_qos, output_qos
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SMALL = ('phones:=8', 'element_spacing:=0.36', 'frequency_max:=2000.0', 'particles:=2000')
@@ -300,20 +299,3 @@ def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
     assert values['count: used'] == '4' and len(rig.tables) == 4 and not rig.node._errors
     offset = np.abs(read_estimate(rig.tables[-1]).state[:, :1] - scene.truth[-1].depth)
     assert (offset.min(axis=1) < 0.2).all()
-
-
-def test_offline_says_the_same_to_the_bit(rig):
-    measured, _ = traces(fading=(), layers=4)
-    rig.send('trace', *[write_trace(item, make) for item in measured])
-    system = SYSTEMS['fathometer']
-    tracker = system.build(
-        system.config_type()(phones=8, element_spacing=0.36, frequency_max=2000.0, particles=2000)
-    )
-    expected = [
-        estimate
-        for m in measured
-        for estimate in tracker.process(read_trace(write_trace(m, make)))
-    ]
-    for message, entry in zip(rig.tables, expected, strict=True):
-        live, offline = read_estimate(message).columns(), entry.columns()
-        assert all(live[name].tobytes() == offline[name].tobytes() for name in offline)

@@ -58,13 +58,7 @@ RVIZ = {
 DIAGNOSTICS = {'/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
 
 
-@pytest.fixture(params=list(SYSTEMS))
-def system(request):
-    return request.param
-
-
-@pytest.fixture
-def topics(system, make_bench):
+def topics_of(system, make_bench):
     """Every topic of the running node with its type."""
     bench = make_bench()
     module = import_module(f'sonar_imm.nodes.{system}')
@@ -80,8 +74,7 @@ def topics(system, make_bench):
     return found
 
 
-@pytest.fixture
-def estimate(system):
+def estimate_of(system):
     """The first estimate with a row that the tracker makes of a shipped recording."""
     path = shared_file(f'bags/{BAGS[system]}')
     record = SYSTEMS[system]
@@ -98,7 +91,14 @@ def layout_of(system):
     return json.loads(shared_file(f'config/foxglove_{system}.json').read_text())
 
 
-def test_foxglove_layout(system, topics, estimate):
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_layouts_name_what_the_node_has(system, make_bench):
+    topics, estimate = topics_of(system, make_bench), estimate_of(system)
+    check_foxglove(system, topics, estimate)
+    check_rviz(system, topics, estimate)
+
+
+def check_foxglove(system, topics, estimate):
     panels = layout_of(system)['configById']
     columns = estimate.columns()
     for name, panel in panels.items():
@@ -138,7 +138,7 @@ def placed(tree):
     return placed(tree['first']) | placed(tree['second'])
 
 
-def test_rviz_layout(system, topics, estimate):
+def check_rviz(system, topics, estimate):
     displays = yaml.safe_load(shared_file(f'config/{system}.rviz').read_text())
     displays = displays['Visualization Manager']['Displays']
     drawn = [display for display in displays if 'Topic' in display]

@@ -21,6 +21,7 @@ from helpers.rig import a_fix, Rig
 import pytest
 from std_srvs.srv import Trigger
 
+from sonar_imm.files import fcntl
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.state_file import read_state
@@ -53,6 +54,7 @@ def kill(rig):
     rig.node._saved_state.close()
 
 
+@pytest.mark.skipif(fcntl is None, reason='there are no locks')
 def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd):
     """As two namespaces do that share one parameter file; then the first one ends."""
     first = start()

@@ -76,7 +76,7 @@ def test_parquet_of_few_and_of_many_rows(tmp_path, rows, count):
 
 def test_track_writes_parquet_beside_csv(tmp_path, capsys):
     parquet = pytest.importorskip('pyarrow.parquet')
-    bags = [str(write_dive(tmp_path / name)) for name in 'ab']
+    bags = [str(write_dive(tmp_path / name, count=30)) for name in 'ab']
     out = tmp_path / 'out'
     assert main(['track', *bags, str(out)]) == 0
     assert main(['track', *bags, str(out), '--parquet']) == 0  # the same runs lack the files

@@ -69,21 +69,6 @@ def test_a_restarted_clock_begins_anew_and_loses_nothing():
     ]
 
 
-def test_shuffled_input_gives_the_same_estimates_as_sorted(tmp_path):
-    write_dive(tmp_path / 'sorted')
-    write_dive(tmp_path / 'shuffled', shuffle=True)
-    runs = []
-    for name in ('sorted', 'shuffled'):
-        with BagReader(tmp_path / name) as bag:
-            run = OfflineRun(bag, DIVER, CONFIG)
-            runs.append(list(run.estimates()))
-    assert run.outcomes()['late'] > 0
-    assert len(runs[0]) == len(runs[1]) == 120
-    for first, second in zip(*runs):
-        assert first.stamp_ns == second.stamp_ns
-        np.testing.assert_array_equal(first.state, second.state)
-
-
 def test_order_by_stamp_makes_late_input_punctual(tmp_path):
     with BagReader(write_dive(tmp_path / 'dive', shuffle=True)) as bag:
         run = OfflineRun(bag, DIVER, CONFIG, InputOptions(order='stamp'))

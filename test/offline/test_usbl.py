@@ -80,6 +80,7 @@ def test_wild_fixes_are_not_believed_with_and_without_names(tmp_path, name):
     assert not any('as far as they state' in text for text in warnings)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('name', ['', 'Diver 1'])
 def test_fixes_that_scatter_five_times_too_far_are_named_before_the_fiftieth(tmp_path, name):
     _, inside, _, early = tracked(tmp_path, name=name, std=STD / 5.0, wild=0.0)

@@ -178,10 +178,11 @@ def test_what_was_taken_and_what_was_not(table):
 
 
 def test_numbers(table):
-    (row,) = table('x,y,z,vx\n1.5, abc ,,inf\n')
+    (row,) = table('x,y,z,vx,lat\n1.5, abc ,,inf,59 25.8 N\n')
     assert row.number('x') == 1.5 and row.optional('z') != row.optional('z')
     for name, words in (
         ('y', "y is 'abc', not a number"),
+        ('latitude', "lat is '59 25.8 N', not decimal degrees"),
         ('z', 'z is empty'),
         ('vx', 'infinite'),
         ('depth', 'depth is empty'),

@@ -26,8 +26,7 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sonar_imm_tools.recordings import mcap_records
-from sonar_imm_tools.recordings.mcap_records import zstd
-from sonar_imm_tools.recordings.mcap_scan import McapScan
+from sonar_imm_tools.recordings.mcap_records import McapScan, zstd
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagError, BagReader
 

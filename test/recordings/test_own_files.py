@@ -97,6 +97,9 @@ def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
     other = tmp_path / 'other.yaml'
     other.write_text('components: 7\n')
     given = parameters_of(bag, tmp_path / 'given', '--params', str(other))
+    assert f'--params is used in place of the parameters of the recording, {bag}' in (
+        capsys.readouterr().out
+    )
     assert given['sonar_lever'] == [0.0, 0.0, 0.0] and given['components'] == 7
 
 

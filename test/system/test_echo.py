@@ -89,15 +89,15 @@ def test_silence_is_told(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
         wait_until_ready([node])
-        alone = command(domain, 'echo', '/divr/estimate', '--timeout', '25')
-        silent = command(domain, 'echo', '--timeout', '25')
+        alone = command(domain, 'echo', '/divr/estimate', '--timeout', '15')
+        silent = command(domain, 'echo', '--timeout', '15')
         message = alone.communicate(timeout=90)[1]
-        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 25 s' in message
+        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 15 s' in message
         assert "did you mean '/diver/estimate'" in message
         message = silent.communicate(timeout=90)[1]
         assert silent.returncode == 1
         assert own_words(message).splitlines() == [
             'listening to /diver/estimate',
-            'sonar-imm: nothing was published on /diver/estimate within 25 s',
+            'sonar-imm: nothing was published on /diver/estimate within 15 s',
         ]
         assert node.process.poll() is None

@@ -20,6 +20,7 @@ order. Numbers may differ by 5 %, or by one in the last digit; `...` stands for 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 import math
 import os
@@ -29,6 +30,7 @@ import signal
 import subprocess
 import sys
 
+from helpers.forked import commands
 from helpers.source import ROOT
 import pytest
 
@@ -86,8 +88,14 @@ def missing(shown: str, printed: str) -> str | None:
     return None
 
 
+@pytest.fixture(scope='module')
+def command(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with commands(tmp_path_factory.mktemp('command')) as folder:
+        yield folder
+
+
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: f'{path.parent.name}/{path.stem}')
-def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
+def test_the_commands_of_a_page_run(page: Path, tmp_path: Path, command: Path) -> None:
     pytest.importorskip('rclpy')
     given = blocks(page.read_text(encoding='utf-8'))
     mark = '=== block'
@@ -96,7 +104,9 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
     )
     environment = {
         **os.environ,
-        'PATH': f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}',
+        'PATH': os.pathsep.join(
+            map(str, [command, Path(sys.executable).parent, os.environ['PATH']])
+        ),
         'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }

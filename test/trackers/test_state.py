@@ -26,8 +26,15 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers import state_file, SYSTEMS
-from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
-from sonar_imm.trackers.state_values import frozen_state, put, restore, StateError
+from sonar_imm.trackers.state_file import (
+    frozen_state,
+    put,
+    read_state,
+    restore,
+    StateError,
+    tracker_from,
+    write_state,
+)
 
 
 def test_parameters_that_may_change_are_those_of_now(tmp_path):

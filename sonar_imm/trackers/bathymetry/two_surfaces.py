@@ -103,7 +103,8 @@ def possible_bins(iq: np.ndarray, second: Layover) -> BoolArray:
     """Bins (T,) of iq (T, P) in which a second surface is possible: the chain says so, or they are
     `BRIGHTER` than those around them."""
     power = np.nan_to_num(moving_mean(mean_power(iq), HALF_WIDTH, second.usable))
-    usual = median_filter(power, 2 * AROUND + 1, mode='nearest')
+    # Made longer here: scipy 1.15 gives zeros for fewer bins than half a window.
+    usual = median_filter(np.pad(power, AROUND, 'edge'), 2 * AROUND + 1)[AROUND:-AROUND]
     bright = second.usable & (power > BRIGHTER * usual)
     return np.asarray((second.existence > POSSIBLE) | bright)
 

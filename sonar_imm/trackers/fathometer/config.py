@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
@@ -25,9 +25,9 @@ from ...parameters import inherited, live, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
 
-PULSES = ('band', 'processor', 'envelope', 'gaussian', 'file')
+PULSES = ('auto', 'band', 'processor', 'envelope', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
-POLARITIES = ('positive', 'both')
+POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
 HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
@@ -127,10 +127,11 @@ class FathometerConfig(StampParameters):
         'for envelopes: subtract the median of the noise from the trace first')
 
     # -- pulse ------------------------------------------------------------------------------------
-    pulse: str = parameter('band', '',
+    pulse: str = parameter('auto', '',
         'shape that one reflector leaves in the response: band (of a flat band), processor (what '
         'mvdr makes of each record of an array; for other records as band), envelope (of the '
-        'envelope of a band), gaussian or file', choices=PULSES)
+        'envelope of a band), gaussian or file; auto: processor for an array with mvdr that is '
+        'longer than an eighth of the longest wave (frequency_min), else band', choices=PULSES)
     pulse_width: float = parameter(0.5, 'm',
         'pulse gaussian: standard deviation of the pulse', range=(1e-4, 100.0))
     pulse_file: str = parameter('', '',
@@ -184,9 +185,10 @@ class FathometerConfig(StampParameters):
         'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
-    polarity: str = parameter('positive', '',
+    polarity: str = parameter('auto', '',
         'sign of the reflectors looked for: positive where the impedance grows with depth; '
-        'envelopes (remove_background) have no negative ones', choices=POLARITIES)
+        'envelopes (remove_background) have no negative ones; auto: both for records of an array '
+        'with pulse processor, else positive', choices=POLARITIES)
     negative_probability: float = parameter(0.05, '',
         'polarity both: probability that a new reflector is negative', range=(1e-6, 0.999))
     amplitude_prior: str = parameter('marginal', '',
@@ -270,7 +272,7 @@ class FathometerConfig(StampParameters):
 
     def _scatter_problems(self) -> list[str]:
         problems = []
-        if self.pulse == 'band':
+        if self.pulse in ('auto', 'band'):
             problems.append('scatter_decay is for envelopes: it needs pulse gaussian or file')
         if self.negative_share:
             problems.append('scatter_decay is for envelopes: it needs polarity positive')
@@ -280,6 +282,20 @@ class FathometerConfig(StampParameters):
             problems.append(f'scatter_decay has at most {MAX_DECAYS} values')
         return problems
 
+    def settled(self, hydrophones: int) -> FathometerConfig:
+        """With the pulse and the polarity that `auto` stands for with the records of so many
+        hydrophones, 0 for traces. Shorter arrays hear themselves down to where layers are."""
+        if 'auto' not in (self.pulse, self.polarity):
+            return self
+        own = hydrophones > 1 and self.processor == 'mvdr' and self.pulse in ('auto', 'processor')
+        if self.pulse == 'auto':
+            aperture = self.element_spacing * (hydrophones - 1)
+            own &= 8.0 * aperture * self.frequency_min >= self.sound_speed
+            own &= self.output == 'coherence' and not self.envelope
+        pulse = ('processor' if own else 'band') if self.pulse == 'auto' else self.pulse
+        polarity = ('both' if own else 'positive') if self.polarity == 'auto' else self.polarity
+        return evolve(self, pulse=pulse, polarity=polarity)
+
     @property
     def noise_from_mirror(self) -> bool:
         """True when no depths of noise are given."""
@@ -288,7 +304,7 @@ class FathometerConfig(StampParameters):
     @property
     def negative_share(self) -> float:
         """How many of the new reflectors are negative."""
-        if self.polarity == 'positive' or self.remove_background:
+        if self.polarity != 'both' or self.remove_background:
             return 0.0
         return self.negative_probability
 

@@ -70,11 +70,13 @@ _PHASES = 4
 
 @frozen
 class Lattice:
-    """Depths ``first + step * (0 .. cells - 1)``, m."""
+    """Depths ``first + step * (0 .. cells - 1)``, m, of records of so many hydrophones, 0 for
+    traces."""
 
     first: float
     step: float
     cells: int
+    hydrophones: int = 0
 
     @property
     def depth(self) -> FloatArray:
@@ -111,7 +113,7 @@ class Response:
 def pulse_of(config: FathometerConfig) -> Pulse:
     """The pulse that is configured, that of the band where each record has its own.
     Raises `ConfigError` for a file that cannot be used."""
-    if config.pulse in ('band', 'processor'):
+    if config.pulse in ('auto', 'band', 'processor'):
         return band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
     if config.pulse == 'envelope':
         return envelope_pulse(config.frequency_min, config.frequency_max, config.sound_speed)

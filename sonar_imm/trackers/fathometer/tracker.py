@@ -173,6 +173,7 @@ class FathometerTracker:
         self._ids = self._ids.forget()
         self._multiples = Multiples()
         self._lattice: Lattice | None = None
+        self._settled = self.config
         self._padded: Lattice | None = None
         self._filter: SetFilter | None = None
         self._before: Weighted | None = None
@@ -194,6 +195,8 @@ class FathometerTracker:
         self.config.require_changeable(config)
         heave_differs = config.array_depth_std != self.config.array_depth_std
         self.config = config
+        if self._lattice is not None:
+            self._settled = config.settled(self._lattice.hydrophones)
         if config.heave != 'none' and heave_differs:
             # It is built into the filter as the spread of a state.
             self._forget()
@@ -328,28 +331,30 @@ class FathometerTracker:
         self.counts['heave_within_record'] += spread > MOST_HEAVE
         depth = self._array_depth(record, span_ns) or 0.0
         if self._lattice is None:
-            self._begin(lattice_of_array(depth, self.config))
+            lattice = lattice_of_array(depth, self.config)
+            self._begin(evolve(lattice, hydrophones=self._hydrophones))
         assert self._padded is not None
         # Lags beyond half a snapshot are those of the other side: automatic snapshots of pressure
         # can be too short for the depths of noise.
         way = 2.0 * (self.config.noise_depth_max - depth) / self.config.sound_speed
         folded = span_ns > 0 and not self.config.snapshot_seconds
         folded = folded and way > 0.5 * collected.seconds
-        return array_response(record, self._padded, self.config, depth, mirrored=folded)
+        return array_response(record, self._padded, self._settled, depth, mirrored=folded)
 
     def _begin(self, lattice: Lattice) -> None:
+        settled = self.config.settled(lattice.hydrophones)
         try:
             self._filter = SetFilter(
-                set_model(self.config, lattice), self.config.particles, self.config.threads
+                set_model(settled, lattice), self.config.particles, self.config.threads
             )
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
-        self._lattice = lattice
+        self._lattice, self._settled = lattice, settled
         self._padded = lattice.padded(self._filter.model.pad)
 
-    def _filtered(self, response: Response) -> tuple[Response, SetStep, int]:
-        """What this record would change, and how many records' time passed. Where its noise is not
-        known, it is measured in what the reflectors of a first round leave."""
+    def _filtered(self, response: Response) -> tuple[Response, SetStep, int, Pace]:
+        """What this record would change, how many records' time passed, and the pace with it.
+        Where its noise is not known, it is measured in what a first round's reflectors leave."""
         place = self._places.at(response.stamp_ns, self.config)
         records = self._pace.records(response.stamp_ns, self.config, place)
         step = self._cycle(response, records)
@@ -359,7 +364,7 @@ class FathometerTracker:
             response = residual_sigma(response, self.pulse(away) @ found.amplitude)
             step = self._cycle(response, records)
         self.response = response
-        return response, step, records
+        return response, step, records, self._pace.after(response.stamp_ns, place)
 
     def _cycle(self, response: Response, records: int) -> SetStep:
         """The particle filter over one record; what is kept of it is decided by the caller."""
@@ -403,10 +408,8 @@ class FathometerTracker:
         return known.name(reflectors.depth, reflectors.is_bottom, self.config, variance)
 
     def _record(self, response: Response) -> list[Estimate]:
-        response, step, records = self._filtered(response)
+        response, step, records, self._pace = self._filtered(response)
         self._before = step.after if step.ok else None
-        place = self._places.at(response.stamp_ns, self.config)
-        self._pace = self._pace.after(response.stamp_ns, place)
         self.counts['used'] += 1
         if records > 1:
             self.counts['gaps'] += 1
@@ -422,10 +425,11 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
-        negative = self.config.polarity == 'positive' and self._left_negative(reflectors, response)
+        positive = self._settled.polarity == 'positive'
+        negative = positive and self._left_negative(reflectors, response)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
-        self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config, records))
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, self._settled, records))
         return [*self._smoothed(step), newest]
 
     def _left_negative(self, reflectors: Reflectors, response: Response) -> bool:
@@ -440,7 +444,7 @@ class FathometerTracker:
         return bool(np.any(left & (np.abs(away) > self.config.min_separation).all(axis=1)))
 
     def _preview(self, response: Response) -> Estimate:
-        response, step, records = self._filtered(response)
+        response, step, records, _ = self._filtered(response)
         reflectors, pmf = self._summarise(step, response)
         known, ids = self._named(reflectors, records)
         self.counts['previews'] += 1
@@ -476,8 +480,8 @@ class FathometerTracker:
         if self.config.multiples == 'mark':
             assert self._lattice is not None
             span = self._lattice.step * self._lattice.cells
-            seen = seen_as(reflectors, ids, self.config, records)
-            multiple = self._multiples.probabilities(seen, self.config, span)
+            seen = seen_as(reflectors, ids, self._settled, records)
+            multiple = self._multiples.probabilities(seen, self._settled, span)
         slopes = known.slopes(ids)
         return write_estimate(
             reflectors, ids, pmf, multiple, slopes, response, self.config, preview=preview
@@ -531,7 +535,7 @@ class Fit:
             return []
         envelope = not any(self._signed)
         advice = 'noise_sigma, pulse and order_max may not fit'
-        if envelope and (config.pulse == 'band' or not config.scatter_decay):
+        if envelope and (config.pulse in ('auto', 'band') or not config.scatter_decay):
             advice = 'the records are never negative: envelopes need pulse gaussian or file, '
             advice += 'pulse_width and scatter_decay'
         sentences = []

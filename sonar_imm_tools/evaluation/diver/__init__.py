@@ -15,8 +15,8 @@
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
 `series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
-belongs to which diver, `scoring` compares them. `summary` and `figures` present the
-result.
+belongs to which diver, `scoring` compares them. `METRICS`, `summary_sentence` and `figures`
+present the result.
 """
 
 from __future__ import annotations
@@ -35,9 +35,20 @@ from sonar_imm.trackers.diver.georeferencing import Georeferencer
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from ..numbers import (
+    chi2,
+    counted,
+    coverage_sentence,
+    each,
+    error,
+    fill,
+    look_up,
+    Metric,
+    NO_TRUTH,
+    UNMATCHED,
+)
 from .scoring import fix_series, score
 from .series import series_of, Truth
-from .summary import METRICS, seen, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -100,3 +111,124 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
         remarks.insert(0, f'{metrics["tracks"]["completeness"]:.0%} complete')
     remark = f' ({", ".join(remarks)})' if remarks else ''
     return LIMIT.check(position['rmse_m'], at_most=at_most, remark=remark)
+
+
+def _unscored(metrics: Mapping[str, Any]) -> bool:
+    return not look_up(metrics, 'position.n')
+
+
+def _several(metrics: Mapping[str, Any]) -> bool:
+    """Whether there are several tracks or several divers."""
+    counts = [look_up(metrics, f'tracks.{name}') or 0 for name in ('tracks', 'true_targets')]
+    return max(counts) > 1 and not _unscored(metrics)
+
+
+def _truncated(metrics: Mapping[str, Any]) -> bool:
+    return bool(look_up(metrics, 'beyond_cutoff.n')) and not _unscored(metrics)
+
+
+METRICS = (
+    Metric(
+        label='divers found',
+        line='{tracks.completeness:.0%} of the time, within {cutoff_m:.3g} m; the errors below '
+        'are those of then',
+        card='Divers found',
+        value='{tracks.completeness:.0%}',
+        remark='within {cutoff_m:.3g} m; the errors are those of then',
+        when=_truncated,
+    ),
+    Metric(
+        card='Confirmed tracks',
+        value='{tracks_confirmed}',
+        remark='{stamps} stamps in {span_s:.0f} s',
+        when=_unscored,
+    ),
+    error('position', 'position error', card='Position error, RMS', front=True),
+    error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes', front=True),
+    error('velocity', 'velocity error', 'mps', card='Velocity error, RMS', remark=''),
+    error('depth', 'depth error', remark=''),
+    chi2('depth.nees_3d', 'NEES, three coordinates'),
+    chi2('consistency.nees_position', 'NEES, position', card='NEES of the position'),
+    chi2('consistency.nees_state', 'NEES, whole state'),
+    chi2('consistency.nis', 'NIS', card='NIS of the hits'),
+    Metric(
+        label='truth inside 50 / 90 / 95 % ellipse',
+        line=' / '.join(f'{{consistency.coverage.{level}:.0%}}' for level in (50, 90, 95)),
+        card='Truth inside the 95 % ellipse',
+        value='{consistency.coverage.95:.0%}',
+        remark='95 % would be perfect',
+        front=True,
+    ),
+    Metric(
+        covers=('consistency.coverage.95', 0.95),
+        when=lambda metrics: look_up(metrics, 'consistency.verdict') is not None,
+    ),
+    Metric(
+        label='best lag of the estimates',
+        line='{lag.best_s:.2f} s, then RMSE {lag.rmse_at_best_m:.3f} m',
+    ),
+    Metric(
+        card='Tracks / true targets',
+        value='{tracks.tracks} / {tracks.true_targets}',
+        remark='{tracks.identity_switches} identity switches, {tracks.false_tracks} false, '
+        '{tracks.completeness:.0%} complete',
+        when=_several,
+    ),
+    *each(
+        'tracks',
+        (
+            'true_targets',
+            'tracks',
+            'false_tracks',
+            'identity_switches',
+            'fragmentations',
+            'completeness',
+            'false_rows_per_scan',
+        ),
+    ),
+)
+
+
+def seen(metrics: Mapping[str, Any]) -> str:
+    """What was tracked, in a few words."""
+    true = look_up(metrics, 'tracks.true_targets')
+    of = '' if true is None else f' of {counted(true, "diver")}'
+    found = counted(metrics['tracks_confirmed'], 'track') + of
+    return fill(f'{found}, {{stamps}} stamps in {{span_s:.0f}} s', metrics)
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in a few sentences."""
+    if _unscored(metrics):
+        return fill('{tracks_confirmed} confirmed tracks in {span_s:.0f} s. ', metrics) + (
+            UNMATCHED if 'scored_stamps' in metrics else NO_TRUTH
+        )
+    sentences = ['On average the track lies {position.rmse_m:.2f} m from the truth (RMS).']
+    judged = metrics['consistency']['verdict'] is not None
+    if _truncated(metrics):
+        sentences = [
+            'The divers are found {tracks.completeness:.0%} of the time, within {cutoff_m:.3g} m; '
+            'then the track lies {position.rmse_m:.2f} m from the truth (RMS).'
+        ]
+    if judged and look_up(metrics, 'raw_fix.n'):
+        sentences.append(_against_fixes(metrics))
+    if judged:
+        sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
+    elif _truncated(metrics):
+        sentences.append(
+            'Whether the stated uncertainty holds cannot be said: {beyond_cutoff.share:.0%} of '
+            'the estimates that may be of a diver lie further away.'
+        )
+    return fill(' '.join(sentences), metrics)
+
+
+def _against_fixes(metrics: Mapping[str, Any]) -> str:
+    raw = metrics['raw_fix']['rmse_m']
+    if not raw > 0.0:
+        return 'The raw fixes are the truth itself: no tracker can be better than they are.'
+    change = 1.0 - metrics['position']['rmse_m'] / raw
+    return f'The raw fixes lie {raw:.2f} m away: tracking ' + (
+        f'removes {100 * change:.0f} % of the error.'
+        if change >= 0.0
+        else f'adds {-100 * change:.0f} % to it.'
+    )

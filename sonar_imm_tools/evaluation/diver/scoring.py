@@ -34,9 +34,9 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import chi2
 
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.association import gate_threshold
 from sonar_imm.estimation.consistency import gospa, switches_by_scan, switching_gospa
 from sonar_imm.measurements import Fix, Fixes, scan_of
 
@@ -192,7 +192,8 @@ def depth_summary(matching: Matching, truth: Truth) -> dict[str, Any]:
 
 def _coverage(position: FloatArray, level: float) -> float:
     """Share of the NEES of positions inside the ellipse of a level; NaN for none."""
-    return float(np.mean(position <= chi2.ppf(level, 2))) if len(position) else float('nan')
+    inside = position <= gate_threshold(level, 2)
+    return float(np.mean(inside)) if len(position) else float('nan')
 
 
 def _summary(nees: FloatArray, beyond: FloatArray, dof: int) -> dict[str, Any]:

@@ -15,7 +15,8 @@
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
 `records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
-reflectors. `summary` and `figures` present the result.
+reflectors. `METRICS`, `summary_sentence`
+and `figures` present the result.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from typing import Any, TYPE_CHECKING
 
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit
+from ..numbers import error, fill, Metric, NO_TRUTH
 from .records import records_of
 from .scoring import CUTOFF, score
-from .summary import METRICS, SEEN, summary_sentence
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -77,3 +78,74 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
         at_most=at_most,
         remark=f' (number right in {100 * metrics["order_right"]:.0f} % of the records)',
     )
+
+
+def _unscored(metrics: Mapping[str, Any]) -> bool:
+    return 'scored_records' not in metrics
+
+
+METRICS = (
+    Metric(label='records', line='{records}'),
+    Metric(label='reflectors per record', line='{reflectors_mean:.2f}'),
+    Metric(card='Reflectors per record', value='{reflectors_mean:.1f}', when=_unscored),
+    Metric(card='Reflectors in all', value='{ids}', remark='{records} records', when=_unscored),
+    Metric(
+        label='number of reflectors right',
+        line='{order_right:.1%}',
+        card='Number of reflectors right',
+        value='{order_right:.0%}',
+        front=True,
+    ),
+    Metric(
+        label='OSPA',
+        line='{ospa_m:.3f} m',
+        card='OSPA',
+        value='{ospa_m:.3f} m',
+        remark='cutoff {cutoff_m:g} m',
+        front=True,
+    ),
+    Metric(
+        label='false / missed per record',
+        line='{false_per_record:.3f} / {missed_per_record:.3f}',
+        card='False / missed per record',
+        value='{false_per_record:.2f} / {missed_per_record:.2f}',
+    ),
+    error(
+        'depth',
+        'depth error',
+        card='Depth error, RMS',
+        value='{depth.rmse_m:.3f} m',
+        remark='{depth.inside_2_sigma:.0%} within two stated sigma',
+        front=True,
+        covers=('depth.inside_2_sigma', 0.95),
+    ),
+    Metric(
+        label='amplitude error, median / 95 %',
+        line='{amplitude.median_relative_error:.1%} / {amplitude.p95_relative_error:.1%}',
+        card='Amplitude error, median',
+        value='{amplitude.median_relative_error:.0%}',
+    ),
+    Metric(label='identity switches', line='{identity_switches}'),
+)
+
+
+SEEN = '{reflectors_mean:.1f} reflectors per record, {records} records'
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in a few sentences."""
+    if not metrics['records']:
+        return 'There is no record in this run.'
+    if _unscored(metrics):
+        found = '{reflectors_mean:.1f} reflectors per record in {records} records. '
+        return fill(found, metrics) + NO_TRUTH
+    words = (
+        'The number of reflectors is right in {order_right:.0%} of the records; a record lies '
+        '{ospa_m:.3f} m from the true set (OSPA).'
+    )
+    if metrics['depth']['n']:
+        words += (
+            ' Depths are off by {depth.rmse_m:.3f} m (RMS); {false_per_record:.2f} reflectors per '
+            'record are false and {missed_per_record:.2f} are missed.'
+        )
+    return fill(words, metrics)

@@ -35,6 +35,7 @@ from sonar_imm.acoustics.pulse import independent_samples
 from sonar_imm.estimation.set_filter import SetStep
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.pressure import Pace
 from sonar_imm.trackers.fathometer.response import Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
@@ -92,8 +93,8 @@ class Scored(FathometerTracker):
         self.scores: Scores = {}
         super().__init__(config)
 
-    def _filtered(self, response: Response) -> tuple[Response, SetStep, int]:
-        response, step, records = super()._filtered(response)
+    def _filtered(self, response: Response) -> tuple[Response, SetStep, int, Pace]:
+        response, step, records, pace = super()._filtered(response)
         gained = step.log_evidence if step.ok else UNEXPLAINED
         seen = response.amplitude != 0.0
         assert self._lattice is not None
@@ -103,4 +104,4 @@ class Scored(FathometerTracker):
         noise = np.log(sigma) + 0.5 * np.square(amplitude / sigma)
         alone = -independent * float(np.mean(noise)) if seen.any() else 0.0
         self.scores[response.stamp_ns] = gained + alone, 1
-        return response, step, records
+        return response, step, records, pace

@@ -14,4 +14,4 @@
 
 """For other programs: soundings as XYZ, LAS, LAZ and GeoTIFF; horizons as CSV, GeoJSON, SEG-Y."""
 
-__all__ = ['horizons', 'picks', 'points', 'tracks']
+__all__ = ['horizons', 'points', 'tracks']

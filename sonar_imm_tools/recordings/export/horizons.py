@@ -12,20 +12,29 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tracked reflectors as horizons: picks in a CSV for interpretation packages, and GeoJSON.
+"""Tracked reflectors as horizons: picks in a CSV for interpretation packages, GeoJSON, and SEG-Y.
 
 The CSV has one line per pick, horizon after horizon, with a header: import wizards of seismic
 interpretation packages ask which column is what. Two-way times count from the array where its
 depth is known, else from depth 0, and belong to the water's speed of sound.
+
+SEG-Y is the file that was converted, with picks in place of its samples and all headers as they
+were, so that the picks lie over the line in any program that shows it. Each trace is zero but at
+its picks, where it has the number of the horizon. In the trace header, in words that revision 1 of
+SEG-Y leaves unassigned,
+
+    bytes 233-236   the sample of the bottom, in thousandths, from 0 at the first; -1 without one
+    bytes 237-240   the number of its horizon, 0 without one
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import csv
 from datetime import datetime, timezone
 import json
 from pathlib import Path
+import shutil
 from typing import Any
 
 from attrs import frozen
@@ -34,6 +43,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
+from ..convert.segy import read_segy
 from ..positions import Positions
 from ..sources import BagError
 from .points import wkt_of
@@ -219,3 +229,65 @@ def utc_text(stamp_ns: int) -> str:
     seconds, rest = divmod(stamp_ns, 10**9)
     moment = datetime.fromtimestamp(seconds, timezone.utc)
     return f'{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z'
+
+
+_LARGEST = {2: 2**31 - 1, 3: 2**15 - 1, 8: 2**7 - 1, 10: 2**32 - 1, 11: 2**16 - 1, 16: 2**8 - 1}
+"""By the format of the samples; other formats are floats."""
+
+
+def write_picks(out: Path, picks: Picks, original: Path, notes: Mapping[str, str]) -> int:
+    """Write `out` from the SEG-Y file `original`; notes: what its conversion kept in the bag.
+    Gives how many picks lie outside of the traces. Raises `BagError`, and ModuleNotFoundError
+    without segyio."""
+    import segyio
+
+    try:
+        spacing = float(notes['sample_spacing'].split()[0])
+        first, stack = float(notes['depth_of_sample_0'].split()[0]), int(notes['stack'])
+    except (KeyError, ValueError, IndexError):
+        raise BagError(
+            'the recording does not say how it was made of SEG-Y; convert it again with '
+            'sonar-imm convert segy'
+        ) from None
+    if not spacing > 0.0 or stack < 1:
+        raise BagError('the recording states an impossible sample spacing or stack')
+    line = read_segy(original)
+    rows = {stamp: k for k, stamp in enumerate(line.stamps)}
+    ends = np.array([rows.get(int(stamp), -1) for stamp in picks.stamp_ns])
+    if (ends < 0).any():
+        raise BagError(f'{original} is not the file that was tracked: its times are others')
+    T, n = line.amplitude.shape
+    sample = (picks.depth - first) / spacing
+    nearest = np.round(sample).astype(np.int64)
+    inside = (nearest >= 0) & (nearest < n)
+    grid = np.zeros((T, n), np.float32)
+    bottom, number = np.full(T, -1, np.int64), np.zeros(T, np.int64)
+    for k in np.flatnonzero(inside):
+        traces = slice(max(0, ends[k] - stack + 1), ends[k] + 1)
+        grid[traces, nearest[k]] = picks.horizon[k]
+        if picks.columns['is_bottom'][k] > 0.5:
+            bottom[traces] = round(1e3 * float(sample[k]))
+            number[traces] = picks.horizon[k]
+    shutil.copyfile(original, out)
+    out.chmod(0o644)
+    try:
+        with segyio.open(str(out), 'r+', ignore_geometry=True) as file:
+            largest = _LARGEST.get(int(file.format), 2**24)
+            if picks.horizon.max() > largest:
+                raise BagError(
+                    f'horizons have numbers up to {picks.horizon.max()}, more than samples of '
+                    f'{original} hold ({largest})'
+                )
+            fields = segyio.TraceField
+            for trace in range(T):
+                file.trace[trace] = grid[trace].astype(file.dtype)
+                file.header[trace].update(
+                    {
+                        fields.UnassignedInt1: int(bottom[trace]),
+                        fields.UnassignedInt2: int(number[trace]),
+                    }
+                )
+    except BaseException:
+        out.unlink(missing_ok=True)
+        raise
+    return int((~inside).sum())

@@ -18,7 +18,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm_tools.evaluation.bathymetry import figures
+from sonar_imm_tools.evaluation.bathymetry import figures, METRICS, summary_sentence
 from sonar_imm_tools.evaluation.bathymetry.figures import (
     chart_figure,
     finest_chart,
@@ -27,7 +27,6 @@ from sonar_imm_tools.evaluation.bathymetry.figures import (
 )
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
-from sonar_imm_tools.evaluation.bathymetry.summary import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.numbers import cards, lines
 from sonar_imm_tools.survey.chart import Chart
 

@@ -31,9 +31,9 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Fix
+from sonar_imm_tools.evaluation.diver import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
 from sonar_imm_tools.evaluation.diver.series import series_of, Truth
-from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.numbers import lines
 from sonar_imm_tools.offline.run_folder import finite
 

@@ -85,8 +85,8 @@ def lines(tmp_path_factory):
         'late': line(
             folder, 'late', np.column_stack([np.full(41, -8.0), way]), lower=range(27, 41)
         ),
-        'far': line(folder, 'far', np.column_stack([np.full(41, 90.0), way])),
-        'lost': line(folder, 'lost', np.column_stack([way, way]), positions=False),
+        'far': line(folder, 'far', np.column_stack([np.full(8, 90.0), way[:8]])),
+        'lost': line(folder, 'lost', np.column_stack([way, way])[:8], positions=False),
     }
 
 

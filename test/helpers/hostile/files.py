@@ -35,8 +35,7 @@ import numpy as np
 from helpers.field_files import FORMATS, line
 from helpers.tracked import tracked
 from sonar_imm.trackers import state_file
-from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
-from sonar_imm.trackers.state_values import StateError
+from sonar_imm.trackers.state_file import read_state, StateError, tracker_from, write_state
 from sonar_imm_tools.cli import main
 
 SPOTS = 12

@@ -174,7 +174,7 @@ def test_a_date_can_be_told(tmp_path):
     assert messages_of(report.path)['/fix'][0].header.stamp.sec == ns(BEGIN) // 10**9
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 3), st.integers(0, 70), st.characters(max_codepoint=255)),

@@ -254,6 +254,7 @@ def test_polar_fixes_have_the_errors_of_a_polar_sonar():
     assert np.std(across) == pytest.approx(np.radians(1.5), rel=0.1)
 
 
+@pytest.mark.statistics
 def test_fixes_from_arrivals_are_as_accurate_as_they_say():
     squared = []
     for seed in range(5):

@@ -25,8 +25,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import read_state
-from sonar_imm.trackers.state_values import StateError
+from sonar_imm.trackers.state_file import read_state, StateError
 from sonar_imm_tools.offline.tracking import final_estimates
 
 pytestmark = pytest.mark.system

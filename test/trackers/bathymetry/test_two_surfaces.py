@@ -272,6 +272,8 @@ def test_an_even_floor_has_no_bright_bins():
     seen = look(Ping(BathymetryConfig(layover='resolved'), floor(0.0), None))
     quiet = seen.layover._replace(existence=np.zeros(len(seen.likelihood.echo)))
     assert two.possible_bins(seen.ping.snapshot.iq, quiet).mean() < 0.02
+    short = quiet._replace(existence=np.zeros(8), usable=np.ones(8, bool))
+    assert not two.possible_bins(np.ones((8, 8)), short).any()
 
 
 def test_the_grid_holds_both_ends_of_a_stretch():

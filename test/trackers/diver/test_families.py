@@ -19,7 +19,6 @@ from pathlib import Path
 
 from attrs import evolve
 from helpers.diver_runs import fix, SECOND
-from helpers.estimates import same
 import numpy as np
 import pytest
 
@@ -387,16 +386,6 @@ def test_smoothing_knows_when_behaviour_changed():
     assert np.mean([e.extras['hover'][0] for e in smoothed[52:]]) > 0.7
     speed = [np.hypot(*e.state[0, 2:]) for e in smoothed]
     np.testing.assert_allclose(speed[10:34], 2.0, atol=0.4)
-
-
-def test_a_late_fix_is_put_in_its_place():
-    items = path(40)
-    expected = run(DiverTracker(config()), items)
-    late = DiverTracker(config())
-    found = {}
-    for item in [*items[:20], *items[21:25], items[20], *items[25:]]:
-        found.update((e.stamp_ns, e) for e in late.process(item))
-    assert all(same(each, found[each.stamp_ns]) for each in expected)
 
 
 def test_depth_is_a_state_beside_families():

@@ -117,6 +117,7 @@ def dive(rng, n=60):
     return np.column_stack([flat, rng.uniform(-18.0, -2.0) + np.cumsum(rate)])
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('association', ['gnn', 'jipda'])
 def test_the_covariance_of_all_three_is_true(association):
     R, nees, depth = spatial(0.5, 0.3, -0.4), [], []

@@ -31,13 +31,13 @@ from sonar_imm.trackers.diver import jipda, kbest
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.trackers.state_file import (
+    frozen_state,
     json_parameters,
     read_state,
     Saved,
     tracker_from,
     write_state,
 )
-from sonar_imm.trackers.state_values import frozen_state
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 

@@ -63,6 +63,7 @@ def scores(runs):
     return np.sqrt(np.mean(squared)), np.mean(nees)
 
 
+@pytest.mark.statistics
 def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
     misplaced = judged('at_depth', {}, {})
     rmse, nees, estimates = judged('at_depth', {}, {'dimensions': 3})
@@ -208,6 +209,7 @@ def test_arrivals_that_miss_name_what_was_not_stated():
         assert 'target_z (or dimensions: 3) would explain it' in lasting
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize(
     'name, seeds, stated',
     [

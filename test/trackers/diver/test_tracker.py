@@ -16,8 +16,6 @@
 
 from helpers.diver_runs import errors, fix, run, SECOND
 from helpers.estimates import same
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -120,17 +118,6 @@ def test_consistency_where_the_models_hold():
         squared.append(d[:2] @ np.linalg.solve(estimate.covariance[0, :2, :2], d[:2]))
     low, high = average_bounds(runs, 2, 0.999)
     assert low < np.mean(squared) < high
-
-
-@settings(deadline=None, max_examples=8)
-@given(st.randoms(use_true_random=False))
-def test_shuffled_input_gives_the_same_bits(random):
-    scene = simulate(scenario('irregular', {'duration': 15.0, 'clutter': 1.0}), seed=8)
-    ordered = sorted((item.measurement for item in scene.measurements), key=lambda m: m.stamp_ns)
-    shuffled = sorted(ordered, key=lambda m: m.stamp_ns + random.uniform(0.0, 9.0) * SECOND)
-    expected, late = (run(DiverTracker(DiverConfig()), items) for items in (ordered, shuffled))
-    assert len(expected) == len(late)
-    assert all(same(*pair) for pair in zip(expected, late))
 
 
 def test_a_late_fix_revises_everything_after_it():
@@ -307,6 +294,7 @@ def test_parameters_that_may_change_do_and_others_do_not():
         tracker.reconfigure(DiverConfig(directions=8))
 
 
+@pytest.mark.statistics
 def test_smoothing_lowers_the_error_and_keeps_the_tracks():
     filtered, smooth = [], []
     for seed in range(3):

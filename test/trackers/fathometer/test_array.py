@@ -105,6 +105,7 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
     assert np.allclose(same[estimate.stamp_ns].probabilities, estimate.probabilities, atol=0.02)
 
 
+@pytest.mark.statistics
 def test_the_noise_is_measured_right_though_it_fades_with_depth():
     """What windows do to noise: between 180 m and 300 m there is an eighth less of it."""
     options = {'phones': 8, 'frequency_max': 2900.0, 'depth_min': 122.0, 'depth_max': 172.0}

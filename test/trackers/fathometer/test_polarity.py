@@ -23,11 +23,12 @@ import numpy as np
 from oracles.set_particles import weigh
 import pytest
 
+from benchmarks import fathometer_pulse
 from benchmarks.fathometer_vectors import signed_sets
 from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import SetModel
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 VECTORS = Path(__file__).parents[2] / 'vectors'
 
@@ -108,6 +109,42 @@ def test_negative_layers_are_found_where_they_are_looked_for():
     assert 'negative echoes' in ' '.join(tracker.warnings())
     assert score_scene(found, scene, after=5).right == 0.0
     assert all((each.extras['polarity'] >= 0).all() for each in found.values())
+
+
+def test_negative_layers_under_an_array_are_found_at_the_defaults():
+    """Six layers, of which two are negative, as cross-spectra; traces keep the plain defaults."""
+    config, floor, rng = fathometer_pulse.layers(7, 10, fathometer_pulse.SIGNS['signed'])
+    settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max, 'particles': 3000}
+    settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+    tracker = FathometerTracker(FathometerConfig(**settings, window='rectangular', overlap=0.0))
+    spectra, depth, amplitude = zip(*fathometer_pulse.records_of(config, floor, rng))
+    *_, (found,) = map(tracker.process, spectra)
+    assert found.state[:, 0] == pytest.approx(depth[-1], abs=0.2)
+    assert np.array_equal(found.extras['polarity'], np.sign(amplitude[-1]))
+    assert tracker.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ('hydrophones', 'changes', 'expected'),
+    [
+        (16, {}, ('processor', 'both')),
+        (0, {}, ('band', 'positive')),
+        (5, {}, ('band', 'positive')),
+        (16, {'processor': 'conventional'}, ('band', 'positive')),
+        (16, {'envelope': True}, ('band', 'positive')),
+        (16, {'pulse': 'band'}, ('band', 'positive')),
+        (16, {'polarity': 'positive'}, ('processor', 'positive')),
+        (5, {'pulse': 'processor'}, ('processor', 'both')),
+        (0, {'pulse': 'processor'}, ('processor', 'positive')),
+    ],
+)
+def test_what_auto_stands_for(hydrophones, changes, expected):
+    """Five hydrophones .25 m apart are a fifteenth of the wave of 100 Hz."""
+    config = FathometerConfig(element_spacing=0.25, frequency_min=100.0, **changes)
+    settled = config.settled(hydrophones)
+    assert (settled.pulse, settled.polarity) == expected
+    assert settled.settled(0) is settled
 
 
 def test_envelopes_have_no_negative_reflectors():

@@ -129,6 +129,7 @@ def test_a_perfect_depth_sensor_needs_no_allowance():
     assert 0.6 < depth_nees(found, {each.stamp_ns: each.depth for each in scene.truth}) < 1.2
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('memory', [0.0, 0.98])
 def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
     """A scene of known level: amplitudes change by a twentieth from record to record. What an
@@ -162,6 +163,7 @@ def test_what_came_later_corrects_an_estimate(vectors):
     assert later[1] <= now[1] + 0.003
 
 
+@pytest.mark.statistics
 def test_mistakes_of_print_cost_what_they_cost(vectors):
     records = range(0, 60)
     right, distance = score(run(traces(vectors, records), particles=3000)[1], vectors)

@@ -70,6 +70,7 @@ class Grid:
         return mean, np.sqrt(p @ (z - mean) ** 2), low, high, p[z < 0.0].sum()
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('offset, echoes', [(-2.5, 18), (-1.5, 35), (4.0, 32)])
 def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, echoes):
     """A sonar that looks down by 3 degrees on a level path: ranges say how far off an obstacle

@@ -27,13 +27,13 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.memory import Existence, kept, SUREST
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.trackers.state_file import (
+    frozen_state,
     json_parameters,
     read_state,
     Saved,
     tracker_from,
     write_state,
 )
-from sonar_imm.trackers.state_values import frozen_state
 
 OBSTACLES = np.array([[60.0, 5.0, 22.0], [80.0, -4.0, 18.5], [50.0, 20.0, 21.0]])
 SECOND = 10**9

@@ -14,7 +14,6 @@
 
 """The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
 
-from helpers.estimates import same
 from helpers.obstacle_runs import (
     approach,
     FIXED,
@@ -43,10 +42,6 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 NAME = 'approach_dst+3_noisy'
-
-
-def same_runs(first, other):
-    return list(first) == list(other) and all(same(first[stamp], other[stamp]) for stamp in first)
 
 
 # -- the contract ------------------------------------------------------------------------------
@@ -303,41 +298,6 @@ def test_pings_in_a_gap_of_the_navigation_are_skipped():
     assert not [stamp for stamp in final if 20 * SECOND < stamp < 23 * SECOND]
     identities = {int(i) for item in final.values() for i in item.extras['track_id']}
     assert identities == {1}
-
-
-@pytest.mark.parametrize('name', ['approach', 'six', 'late'])
-def test_shuffled_input_gives_the_same_bits(name):
-    config = scenario(name, {'ping_jitter': 0.3, 'last_range': 60.0, 'first_range': 80.0})
-    scene = simulate(config, 8)
-    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=config.sonar_lever))
-    ordered = sorted(scene.measurements, key=lambda item: item.measurement.stamp_ns)
-    straight = run(tracker, [item.measurement for item in ordered])
-    rng = np.random.default_rng(1)
-    key = [item.measurement.stamp_ns + rng.uniform(0.0, 3.0) * SECOND for item in ordered]
-    shuffled = [ordered[i].measurement for i in np.argsort(key)]
-    again = ObstacleTracker(tracker.config)
-    assert same_runs(run(again, shuffled), straight)
-    assert again.counts['late'] > 10
-    tracker.reset()
-    assert same_runs(run(tracker, [item.measurement for item in ordered]), straight)
-
-
-def test_what_comes_twice_counts_once():
-    doubled = [item for item in approach(NAME)[:150] for _ in range(2)]
-    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
-    plain = ObstacleTracker(tracker.config)
-    assert same_runs(run(tracker, doubled), run(plain, approach(NAME)[:150]))
-    assert tracker.counts['duplicate'] == 150
-
-
-def test_a_restarted_clock_begins_anew():
-    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
-    first = run(tracker, approach(NAME))
-    again = run(tracker, approach(NAME))
-    assert tracker.counts['restarts'] == 1
-    used = {int(i) for item in first.values() for i in item.extras['track_id']}
-    new = {int(i) for item in list(again.values())[20:] for i in item.extras['track_id']}
-    assert new and not used & new
 
 
 # -- where a sonar sees less -------------------------------------------------------------------
