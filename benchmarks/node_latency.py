@@ -94,7 +94,8 @@ def case_of(system: str, count: int) -> Case:
         changes = {'ping_rate': 10.0, 'obstacles': 2, 'speed': speed}
         scene = obstacle.scenario('rolling', changes)
         simulated, timed = obstacle.simulate(scene, 0), 'detections'
-    entries = {entry.measurement: entry for entry in inputs_of(system)}
+    # Of two arrays the first: the other is of the other side.
+    entries = {entry.measurement: entry for entry in reversed(inputs_of(system))}
     messages = [
         (entry.name, entry.write(item.measurement, make))
         for item in simulated.measurements

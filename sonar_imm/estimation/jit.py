@@ -107,30 +107,19 @@ _NEEDLESS = (
     'FindLiterallyCalls LiteralUnroll LiteralPropagationSubPipelinePass InlineOverloads '
     'AnnotateTypes'
 ).split()
-"""Passes of numba for closures, `with`, None and literals, which no kernel has, and for listings
-with types. Each goes over the whole kernel again."""
+"""Passes over a kernel for closures, `with`, None, literals, which none has, and for listings."""
 
 
 class _Lower(Lower):
     """Has LLVM optimise what a kernel and its callees are together, and not each alone before."""
 
     def lower(self) -> None:
-        with _unoptimised():
+        config: Any = numba.config
+        before, config.OPT = config.OPT, type(config.OPT)(0)
+        try:
             super().lower()
-
-    def create_cpython_wrapper(self, release_gil: bool = False) -> None:
-        with _unoptimised():
-            super().create_cpython_wrapper(release_gil)
-
-
-@contextlib.contextmanager
-def _unoptimised() -> Iterator[None]:
-    config: Any = numba.config
-    before, config.OPT = config.OPT, type(config.OPT)(0)
-    try:
-        yield
-    finally:
-        config.OPT = before
+        finally:
+            config.OPT = before
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -151,12 +140,8 @@ class _Passes(CompilerBase):
         return [passes]
 
 
-_OPTIONS: dict[str, Any] = {
-    'nogil': True,
-    'error_model': 'numpy',
-    'no_cfunc_wrapper': True,
-    'pipeline_class': _Passes,
-}
+_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+_OPTIONS['pipeline_class'] = _Passes
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -171,8 +156,7 @@ def kernel(function: F) -> F:
     compiled: Any = numba.njit(**_OPTIONS)(function)
     if compiled is function:  # with NUMBA_DISABLE_JIT
         return function
-    for_types = compiled.get_call_template
-    # Else a caller that says 0 or 1 has one compiled for each of these numbers.
+    for_types = compiled.get_call_template  # else there is one for each number a caller writes
     compiled.get_call_template = lambda args, kws: for_types([*map(types.unliteral, args)], kws)
     try:
         _attach_cache(compiled, function)
@@ -401,8 +385,7 @@ _resolved: dict[tuple[int, tuple[types.Type, ...]], tuple[Any, Any]] = {}
 def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
     """What `function`, an operator or a function of numpy, is for arguments of these types.
 
-    numba tries every way to call it, and writes down why each does not fit, for each place in the
-    source and again when it writes code; that was a fifth of the time."""
+    numba tries every way to call it anew at each place in the source; a fifth of the time."""
     if kws or not all(isinstance(each, _PLAIN) for each in args):
         return _resolve(function, context, args, kws)
     key = id(function), tuple(args)
@@ -412,13 +395,12 @@ def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
 
 
 _Function: Any = types.Function
-_resolve: Any = getattr(_Function, 'get_call_type', None)
+_resolve: Any = _Function.get_call_type
 
 
 class _WhileCompiling(event.Listener):
-    """Have Python look for cycles of garbage rarely while numba compiles: it makes millions of
-    objects that stay, and a tenth of the time went into looking at them. And have numba find out
-    once what it would find out again and again."""
+    """While numba compiles: `_resolve_once`, and Python looks for cycles of garbage rarely, for it
+    makes millions of objects that stay, and a tenth of the time went into looking at them."""
 
     COLLECTIONS = 1_000_000, 50, 100
 
@@ -430,16 +412,14 @@ class _WhileCompiling(event.Listener):
             self._before = gc.get_threshold()
             if self._before[0]:  # else somebody wants none at all
                 gc.set_threshold(*self.COLLECTIONS)
-            if _resolve:
-                _Function.get_call_type = _resolve_once
+            _Function.get_call_type = _resolve_once
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             gc.set_threshold(*self._before)
-            if _resolve:
-                _Function.get_call_type = _resolve
+            _Function.get_call_type = _resolve
 
 
 event.register('numba:compile', _WhileCompiling())
