@@ -402,7 +402,7 @@ class _WhileCompiling(event.Listener):
     """While numba compiles: `_resolve_once`, and Python looks for cycles of garbage rarely, for it
     makes millions of objects that stay, and a tenth of the time went into looking at them."""
 
-    COLLECTIONS = 1_000_000, 50, 100
+    COLLECTIONS = 100_000, 50, 100
 
     def __init__(self) -> None:
         self._depth, self._before = 0, gc.get_threshold()

@@ -181,7 +181,7 @@ def test_garbage_is_looked_for_rarely_while_numba_compiles_and_then_as_before(be
     finally:
         gc.set_threshold(*other)
     # The callee is compiled inside of the caller, which is kept when it is compiled.
-    assert seen == [(1_000_000, 50, 100) if before[0] else before, before] and after == before
+    assert seen == [(100_000, 50, 100) if before[0] else before, before] and after == before
 
 
 DAMAGE = {
