@@ -20,18 +20,20 @@ Each run is one drift as cross-spectra (seven to nine reflectors over 300 record
 `fathometer_pulse`), processed twice (MVDR and conventional) and tracked by every configuration.
 OSPA has a cutoff of 2 m and order 2; a reflector within 0.4 m of a true one is neither false nor
 missed. Birth delay: records from the presence of a new reflector to the first of three records in
-a row that have it. The numbers so far are written after each run.
+a row that have it. Numbers are written after each run; other rows that are in the file are kept.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks import fathometer_paper, fathometer_pulse
 from benchmarks.fathometer_paper import ORDERS, reflectors
-from benchmarks.study import final_estimates, mean_of, Parts, standard_error, study
+from benchmarks.study import final_estimates, known, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
@@ -154,24 +156,37 @@ def _delay(history: list[tuple[int, bool]]) -> int:
     return len(there)
 
 
-def main(runs: int = 3, records: int = 300, particles: int = 20_000) -> Parts:
-    scores: dict[str, list[dict[str, float]]] = {}
+def main(
+    runs: int = 3,
+    records: int = 300,
+    particles: int = 20_000,
+    rows: Sequence[str] = (),
+    out: Path | None = None,
+) -> Parts:
+    yield known(out)
+    wanted = {
+        label: given
+        for label, given in CONFIGURATIONS.items()
+        if not rows or any(word in label for word in rows)
+    }
+    scores: dict[str, list[dict[str, float]]] = {label: [] for label in wanted}
     for seed in range(runs):
         traces, truth = drift(seed, records)
-        for label, (processor, values) in CONFIGURATIONS.items():
+        for label, (processor, values) in wanted.items():
             exact = {'particles': particles, 'sound_speed_std': 0.0}
             config = FathometerConfig(**{**exact, **values}, seed=seed)
-            scores.setdefault(label, []).append(score(config, traces[processor], truth))
+            scores[label].append(score(config, traces[processor], truth))
         table = {
-            label: mean_of(each)
+            label: {'runs': float(len(each))}
+            | mean_of(each)
             | {
                 f'{name}, s.e.': standard_error([row[name] for row in each])
                 for name in ('P(order right)', 'OSPA')
             }
             for label, each in scores.items()
         }
-        yield {'runs': seed + 1, 'records': records, 'table': table}
+        yield {'records': records, 'table': table}
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, rows={'help': 'only rows with one of these words in the name'})

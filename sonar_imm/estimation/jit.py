@@ -452,7 +452,7 @@ def _warn_of_other_numba() -> None:
         "numba's own cache is used: after every update of sonar_imm delete its __pycache__ "
         'folders, or code of the old version may run.',
         RuntimeWarning,
-        stacklevel=4,
+        stacklevel=3,
     )
 
 

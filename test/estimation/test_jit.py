@@ -534,9 +534,10 @@ def test_with_another_numba_its_own_cache_is_used_and_a_warning_says_so(change, 
 
 
 def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkeypatch):
-    monkeypatch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
-    monkeypatch.delattr(caching, 'FunctionCache')
-    jit._warn_of_other_numba.cache_clear()
-    with pytest.warns(RuntimeWarning):
-        tripled = jit.kernel(lambda x: 3.0 * x)
+    with monkeypatch.context() as patch:
+        patch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
+        patch.delattr(caching, 'FunctionCache')
+        jit._warn_of_other_numba.cache_clear()
+        with pytest.warns(RuntimeWarning):
+            tripled = jit.kernel(lambda x: 3.0 * x)
     assert tripled(2.0) == 6.0 and tripled.stats.cache_path is None
