@@ -94,7 +94,8 @@ def case_of(system: str, count: int) -> Case:
         changes = {'ping_rate': 10.0, 'obstacles': 2, 'speed': speed}
         scene = obstacle.scenario('rolling', changes)
         simulated, timed = obstacle.simulate(scene, 0), 'detections'
-    entries = {entry.measurement: entry for entry in inputs_of(system)}
+    # Of two arrays the first: the other is of the other side.
+    entries = {entry.measurement: entry for entry in reversed(inputs_of(system))}
     messages = [
         (entry.name, entry.write(item.measurement, make))
         for item in simulated.measurements
@@ -254,7 +255,7 @@ def main(
             rclpy.spin(Echo())
         except (KeyboardInterrupt, ExternalShutdownException):
             return
-    for name in [system] if system else ['diver', 'obstacle']:
+    for name in [system] if system else SYSTEMS:
         for rate in rates:
             spent = latencies(case_of(name, messages), rate)
             node, other = np.percentile(spent, (50, 99), axis=0).T

@@ -230,7 +230,8 @@ def across_beams(power: FloatArray, half: int) -> FloatArray:
     for b in range(B):
         inverse[b] = 1.0 / (min(b + half, B - 1) - max(b - half, 0) + 1)
     for r in range(R):
-        row[half : half + B] = power[r]
+        for b in range(B):
+            row[half + b] = power[r, b]
         total = mean[r]
         total[:] = 0.0
         for k in range(2 * half + 1):

@@ -42,7 +42,8 @@ numba has no public way to do this. The private parts in use are
   ``save(key, data)`` and ``flush()``; and its methods ``load_overload(signature, context)`` and
   ``save_overload(signature, data)``, which are guarded;
 * the attribute ``_cache`` of a compiled function;
-* ``numba.core.serialize.dumps``, which pickles that data.
+* ``numba.core.serialize.dumps``, which pickles that data;
+* ``numba.core.types.Function.get_call_type``, which is remembered.
 
 They are the same in numba 0.58 to 0.68. Where one is missing or has another form, numba's own
 cache is used, and a warning says so.
@@ -73,8 +74,12 @@ import uuid
 import warnings
 
 import numba
-from numba.core import event
+from numba.core import event, types
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.dispatcher import Dispatcher
+from numba.core.lowering import Lower
+from numba.core.typed_passes import NativeLowering
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -97,7 +102,46 @@ LONGEST_SECONDS = 120.0
 other was stopped, and is not waited for again."""
 
 _CHECKSUM = hashlib.sha256().digest_size
+_NEEDLESS = (
+    'WithLifting InlineClosureLikes DeadBranchPrune MakeFunctionToJitFunction InlineInlinables '
+    'FindLiterallyCalls LiteralUnroll LiteralPropagationSubPipelinePass InlineOverloads '
+    'AnnotateTypes'
+).split()
+"""Passes over a kernel for closures, `with`, None, literals, which none has, and for listings."""
+
+
+class _Lower(Lower):
+    """Has LLVM optimise what a kernel and its callees are together, and not each alone before."""
+
+    def lower(self) -> None:
+        config: Any = numba.config
+        before, config.OPT = config.OPT, type(config.OPT)(0)
+        try:
+            super().lower()
+        finally:
+            config.OPT = before
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Lowering(NativeLowering):
+    _name = 'kernel_lowering'
+    lowering_class = _Lower
+
+
+class _Passes(CompilerBase):
+    """numba's way from Python to machine code without what is `_NEEDLESS`."""
+
+    def define_pipelines(self) -> list[PassManager]:
+        passes = PassManager('kernel')
+        for each, description in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            if each.__name__ not in _NEEDLESS:
+                passes.add_pass(_Lowering if each is NativeLowering else each, description)
+        passes.finalize()
+        return [passes]
+
+
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+_OPTIONS['pipeline_class'] = _Passes
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -112,6 +156,8 @@ def kernel(function: F) -> F:
     compiled: Any = numba.njit(**_OPTIONS)(function)
     if compiled is function:  # with NUMBA_DISABLE_JIT
         return function
+    for_types = compiled.get_call_template  # else there is one for each number a caller writes
+    compiled.get_call_template = lambda args, kws: for_types([*map(types.unliteral, args)], kws)
     try:
         _attach_cache(compiled, function)
     except (ImportError, AttributeError, TypeError):
@@ -332,11 +378,31 @@ def _compile_for_another() -> None:
         print('{}', file=answers, flush=True)
 
 
-class _RareCollections(event.Listener):
-    """Have Python look for cycles of garbage rarely while numba compiles: it makes millions of
-    objects that stay, and a tenth of the time went into looking at them."""
+_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.SliceType
+_resolved: dict[tuple[int, tuple[types.Type, ...]], tuple[Any, Any]] = {}
 
-    WHILE_COMPILING = 100_000, 50, 100
+
+def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """What `function`, an operator or a function of numpy, is for arguments of these types.
+
+    numba tries every way to call it anew at each place in the source; a fifth of the time."""
+    if kws or not all(isinstance(each, _PLAIN) for each in args):
+        return _resolve(function, context, args, kws)
+    key = id(function), tuple(args)
+    if key not in _resolved:
+        _resolved[key] = _resolve(function, context, args, kws), function  # which keeps the id
+    return _resolved[key][0]
+
+
+_Function: Any = types.Function
+_resolve: Any = _Function.get_call_type
+
+
+class _WhileCompiling(event.Listener):
+    """While numba compiles: `_resolve_once`, and Python looks for cycles of garbage rarely, for it
+    makes millions of objects that stay, and a tenth of the time went into looking at them."""
+
+    COLLECTIONS = 100_000, 50, 100
 
     def __init__(self) -> None:
         self._depth, self._before = 0, gc.get_threshold()
@@ -345,16 +411,18 @@ class _RareCollections(event.Listener):
         if self._depth == 0:
             self._before = gc.get_threshold()
             if self._before[0]:  # else somebody wants none at all
-                gc.set_threshold(*self.WHILE_COMPILING)
+                gc.set_threshold(*self.COLLECTIONS)
+            _Function.get_call_type = _resolve_once
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             gc.set_threshold(*self._before)
+            _Function.get_call_type = _resolve
 
 
-event.register('numba:compile', _RareCollections())
+event.register('numba:compile', _WhileCompiling())
 
 
 @cache

@@ -534,8 +534,8 @@ def _explain_from(
             if not a[r] * sign[i, r] > 0.0:
                 value = -math.inf
                 break
-        if scattered:
-            a[:m] *= scale[:m]
+        for r in range(m if scattered else 0):
+            a[r] *= scale[r]
     return value
 
 

@@ -215,7 +215,8 @@ def score_shifts(
     given."""
     step, weight, running = tables.step, driven[0], driven[1]
     G = len(weight)
-    weight[:] = tables.log_prior[before]
+    for g in range(G):
+        weight[g] = tables.log_prior[before, g]
     for k in range(count):
         negative = rows[k] // cells
         z = rows[k] - negative * cells

@@ -294,10 +294,14 @@ def square_root_update(
     A = np.empty((m + n, m + n + m))
     for attempt in range(2):
         A[:] = 0.0
-        A[:m, :m] = noise
-        A[:m, m : m + n] = seen
-        A[m:, m : m + n] = root
+        for a in range(n):
+            for b in range(n):
+                A[m + a, m + b] = root[a, b]
         for r in range(m):
+            for s in range(m):
+                A[r, s] = noise[r, s]
+            for b in range(n):
+                A[r, m + b] = seen[r, b]
             if attempt == 1 or not R[r, r] > LIMIT * own[r]:
                 A[r, m + n + r] = math.sqrt(JITTER * own[r])
         triangularise(A)

@@ -14,16 +14,19 @@
 
 """Compiling: the cache is used when it can be, and is no condition."""
 
+import ast
 import gc
 import hashlib
 import importlib
+import math
 import os
 from pathlib import Path
 import shutil
 
 from helpers.kernel_process import ROOT, run
 import numba
-from numba.core import caching
+from numba.core import caching, types
+import numpy as np
 import pytest
 
 from sonar_imm.estimation import jit
@@ -107,6 +110,60 @@ def test_a_loaded_kernel_counts_with_its_callees(monkeypatch):
     loaded = jit.kernel(caller.py_func)
     assert loaded(1.0, 2.0) == 1.5 and sum(loaded.stats.cache_hits.values()) == 1
     assert set(jit.present) == {f'{__name__}.caller', f'{__name__}.callee'}
+
+
+def test_what_is_left_out_of_compiling_changes_no_bit(monkeypatch):
+    def spread(P, count):
+        out, total = np.zeros((count, P.shape[1])), 0.0
+        for k in range(count):
+            row = P[k % len(P)]
+            for a in range(len(row)):
+                out[k, a] = math.exp(-row[a]) / (1.0 + abs(total)) + 0.1 * k
+                total += out[k, a] if row[a] > 0.0 else -(row[a] ** 2)
+        if not total > -1e6:
+            raise ValueError('too far')
+        return out[1:], total, np.sum(P[:, 0]), max(k, 2)
+
+    resolved, resolve = [], types.Function.get_call_type
+    monkeypatch.setattr(types.Function, 'get_call_type', resolve)  # and back, at the end
+    monkeypatch.setattr(jit, '_resolve', lambda *args: resolved.append(args) or resolve(*args))
+    monkeypatch.setattr(jit, '_resolved', {})
+    P = np.random.default_rng(3).normal(size=(5, 4))
+    options = {name: jit._OPTIONS[name] for name in ('nogil', 'error_model')}
+    own, numbas = jit.kernel(spread), numba.njit(**options)(spread)
+    (out, *rest), (expected, *others) = own(P, 7), numbas(P, 7)
+    assert out.tobytes() == expected.tobytes() and rest == others
+    with pytest.raises(ValueError, match='too far'):
+        own(np.full((5, 4), -1e6), 7)
+    asked = [(id(function), args) for function, _, args, _ in resolved]
+    scalars = [each for each in asked if set(each[1]) == {types.float64}]
+    assert scalars and len(scalars) == len(set(scalars))
+
+
+def test_a_number_that_a_caller_writes_out_is_no_type_of_its_own():
+    inner = jit.kernel(lambda values, k: values[k])
+    outer = jit.kernel(lambda values, k: inner(values, 0) + inner(values, 1) + inner(values, k))
+    assert outer(np.arange(5.0), 2) == 3.0 and len(inner.signatures) == 1
+
+
+def test_no_kernel_gives_an_array_to_a_slice():
+    """numba then compiles thirty functions more, which say what does not fit."""
+    found = []
+    for file in (ROOT / 'sonar_imm').rglob('*.py'):
+        for function in ast.walk(ast.parse(file.read_text())):
+            decorators = getattr(function, 'decorator_list', [])
+            if 'kernel' not in [getattr(each, 'id', '') for each in decorators]:
+                continue
+            for node in ast.walk(function):
+                slices = [
+                    part
+                    for target in getattr(node, 'targets', [getattr(node, 'target', node)])
+                    for part in ast.walk(target)
+                    if isinstance(node, ast.Assign | ast.AugAssign) and isinstance(part, ast.Slice)
+                ]
+                if slices and not isinstance(node.value, ast.Constant):
+                    found.append(f'{file.name}:{node.lineno}')
+    assert not found
 
 
 @pytest.mark.parametrize('before', [(700, 10, 10), (0, 10, 10)])

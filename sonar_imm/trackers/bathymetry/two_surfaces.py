@@ -379,7 +379,8 @@ def smooth_stretch(
                 y[t], ratio[t], sines, geometry.spacing, gap, work, price, alone, likelihood
             )
             if reached:
-                likely_lone[t] = alone
+                for i in range(G):
+                    likely_lone[t, i] = alone[i]
                 pack(likelihood, 0, gap, likely_two[t])
         weigh_orders(lone, two, likely_lone[t], likely_two[t], K, gap)
         for i in range(G):

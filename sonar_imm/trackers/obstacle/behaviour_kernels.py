@@ -333,7 +333,9 @@ def _repair(
                 n = size if prior[j] > 0.0 else COMMON
                 own = P[t, j, :n, :n].copy()
                 repaired[t, j] = add_jitter(own, np.empty((n, n)))
-                P[t, j, :n, :n] = own
+                for a in range(n):
+                    for b in range(n):
+                        P[t, j, a, b] = own[a, b]
                 some = True
         if some:
             _fill(x, P, mu, t)

@@ -358,7 +358,10 @@ def _square_root_jipda_update(
     its likelihood. What cannot be used, because it is not finite, leaves x and P as they are."""
     n = len(x)
     L, K, H, w = np.zeros((2, 2)), np.empty((n, 2)), np.eye(2, n), np.empty(2)
-    x1[:], P1[:] = x, P
+    for a in range(n):
+        x1[a] = x[a]
+        for b in range(n):
+            P1[a, b] = P[a, b]
     updated = np.empty((n, n))
     if not square_root_update(P, H, R, L, K, updated):
         return outlier
