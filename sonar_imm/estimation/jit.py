@@ -43,10 +43,11 @@ numba has no public way to do this. The private parts in use are
   ``save_overload(signature, data)``, which are guarded;
 * the attribute ``_cache`` of a compiled function;
 * ``numba.core.serialize.dumps``, which pickles that data;
-* ``numba.core.types.Function.get_call_type``, which is remembered.
+* ``numba.core.types.Function.get_call_type``, which is remembered, and the passes of
+  ``numba.core.compiler.DefaultPassBuilder``, some of which are left out.
 
-They are the same in numba 0.58 to 0.68. Where one is missing or has another form, numba's own
-cache is used, and a warning says so.
+They are the same in numba 0.58 to 0.68. Where one of the cache is missing or has another form,
+numba's own cache is used, and a warning says so; without the others it only takes longer.
 """
 
 from __future__ import annotations
@@ -75,11 +76,7 @@ import warnings
 
 import numba
 from numba.core import event, types
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.dispatcher import Dispatcher
-from numba.core.lowering import Lower
-from numba.core.typed_passes import NativeLowering
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -110,38 +107,48 @@ _NEEDLESS = (
 """Passes over a kernel for closures, `with`, None, literals, which none has, and for listings."""
 
 
-class _Lower(Lower):
-    """Has LLVM optimise what a kernel and its callees are together, and not each alone before."""
+def _fewer_passes() -> dict[str, Any]:
+    """numba's way from Python to machine code without what is `_NEEDLESS`; LLVM optimises what a
+    kernel and its callees are together, and not each alone before. Nothing of it where numba's
+    private parts are others: kernels are the same without, later."""
+    try:
+        from numba.core.compiler import CompilerBase, DefaultPassBuilder
+        from numba.core.compiler_machinery import PassManager, register_pass
+        from numba.core.lowering import Lower
+        from numba.core.typed_passes import NativeLowering
 
-    def lower(self) -> None:
-        config: Any = numba.config
-        before, config.OPT = config.OPT, type(config.OPT)(0)
-        try:
-            super().lower()
-        finally:
-            config.OPT = before
+        passes_of, _ = DefaultPassBuilder.define_nopython_pipeline, NativeLowering.lowering_class
+    except (ImportError, AttributeError):
+        return {}
 
+    class TogetherOnly(Lower):
+        def lower(self) -> None:
+            config: Any = numba.config
+            before, config.OPT = config.OPT, type(config.OPT)(0)
+            try:
+                super().lower()
+            finally:
+                config.OPT = before
 
-@register_pass(mutates_CFG=True, analysis_only=False)
-class _Lowering(NativeLowering):
-    _name = 'kernel_lowering'
-    lowering_class = _Lower
+    @register_pass(mutates_CFG=True, analysis_only=False)
+    class Lowering(NativeLowering):
+        _name = 'kernel_lowering'
+        lowering_class = TogetherOnly
 
+    class Passes(CompilerBase):
+        def define_pipelines(self) -> list[PassManager]:
+            passes = PassManager('kernel')
+            for each, description in passes_of(self.state).passes:
+                if each.__name__ not in _NEEDLESS:
+                    passes.add_pass(Lowering if each is NativeLowering else each, description)
+            passes.finalize()
+            return [passes]
 
-class _Passes(CompilerBase):
-    """numba's way from Python to machine code without what is `_NEEDLESS`."""
-
-    def define_pipelines(self) -> list[PassManager]:
-        passes = PassManager('kernel')
-        for each, description in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
-            if each.__name__ not in _NEEDLESS:
-                passes.add_pass(_Lowering if each is NativeLowering else each, description)
-        passes.finalize()
-        return [passes]
+    return {'pipeline_class': Passes}
 
 
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
-_OPTIONS['pipeline_class'] = _Passes
+_OPTIONS |= _fewer_passes()
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -379,7 +386,7 @@ def _compile_for_another() -> None:
 
 
 _PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.SliceType
-_resolved: dict[tuple[int, tuple[types.Type, ...]], tuple[Any, Any]] = {}
+_resolved: dict[Any, tuple[Any, ...]] = {}
 
 
 def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -388,14 +395,14 @@ def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
     numba tries every way to call it anew at each place in the source; a fifth of the time."""
     if kws or not all(isinstance(each, _PLAIN) for each in args):
         return _resolve(function, context, args, kws)
-    key = id(function), tuple(args)
+    key = id(function), id(context), tuple(args)
     if key not in _resolved:
-        _resolved[key] = _resolve(function, context, args, kws), function  # which keeps the id
+        _resolved[key] = _resolve(function, context, args, kws), function, context  # keep the ids
     return _resolved[key][0]
 
 
 _Function: Any = types.Function
-_resolve: Any = _Function.get_call_type
+_resolve: Any = getattr(_Function, 'get_call_type', None)
 
 
 class _WhileCompiling(event.Listener):
@@ -412,14 +419,16 @@ class _WhileCompiling(event.Listener):
             self._before = gc.get_threshold()
             if self._before[0]:  # else somebody wants none at all
                 gc.set_threshold(*self.COLLECTIONS)
-            _Function.get_call_type = _resolve_once
+            if _resolve:
+                _Function.get_call_type = _resolve_once
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             gc.set_threshold(*self._before)
-            _Function.get_call_type = _resolve
+            if _resolve:
+                _Function.get_call_type = _resolve
 
 
 event.register('numba:compile', _WhileCompiling())

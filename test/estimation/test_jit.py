@@ -533,6 +533,15 @@ def test_with_another_numba_its_own_cache_is_used_and_a_warning_says_so(change, 
         path.unlink()
 
 
+@pytest.mark.parametrize(
+    'part', ['compiler.DefaultPassBuilder', 'lowering.Lower', 'typed_passes.NativeLowering']
+)
+def test_without_a_part_of_numbas_compiler_kernels_take_all_of_its_passes(part, monkeypatch):
+    module, _, name = part.partition('.')
+    monkeypatch.delattr(importlib.import_module(f'numba.core.{module}'), name)
+    assert jit._fewer_passes() == {}
+
+
 def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
