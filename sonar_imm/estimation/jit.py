@@ -24,10 +24,10 @@ numba itself compiles anew only when the kernel's own file changes. Here a compi
 as long as its own file and every file of the package that it imports, directly or not, have the
 same contents. Their dates do not matter, so a copy, a checkout or a wheel keeps what is compiled.
 
-numba keeps an index file beside files of code with running numbers. Processes that compile at the
-same time take the same number for different code, and one then runs the other's. Here each file
-has the name of what it holds, and says it inside. It begins with a checksum of the rest, so that
-LLVM never sees a damaged one. A process that needs what another one compiles waits, and loads it.
+numba numbers its files of code. Processes that compile at the same time take the same number for
+different code, and one then runs the other's. Here each file has the name of what it holds, and
+says it inside. It begins with a checksum of the rest, so that LLVM never sees a damaged one. A
+process that needs what another one compiles waits, and loads it.
 
 No cache is a condition. What cannot be loaded is compiled, and what cannot be kept (a full disk, a
 folder of another user) is compiled anew by each process; a warning says so once.
@@ -44,10 +44,10 @@ numba has no public way to do this. The private parts in use are
 * the attribute ``_cache`` of a compiled function;
 * ``numba.core.serialize.dumps``, which pickles that data;
 * ``numba.core.types.Function.get_call_type``, which is remembered, and the passes of
-  ``numba.core.compiler.DefaultPassBuilder``, some of which are left out.
+  ``DefaultPassBuilder``, some of which are left out: without these it only takes longer.
 
-They are the same in numba 0.58 to 0.68. Where one of the cache is missing or has another form,
-numba's own cache is used, and a warning says so; without the others it only takes longer.
+They are the same in numba 0.58 to 0.68. Where one of the others is missing or has another form,
+numba's own cache is used, and a warning says so.
 """
 
 from __future__ import annotations
@@ -108,17 +108,14 @@ _NEEDLESS = (
 
 
 def _fewer_passes() -> dict[str, Any]:
-    """numba's way from Python to machine code without what is `_NEEDLESS`; LLVM optimises what a
-    kernel and its callees are together, and not each alone before. Nothing of it where numba's
-    private parts are others: kernels are the same without, later."""
+    """numba's way to machine code without what is `_NEEDLESS`; LLVM optimises a kernel and its
+    callees together, not each alone before. Without numba's private parts nothing of it."""
     try:
         from numba.core.compiler import CompilerBase, DefaultPassBuilder
         from numba.core.compiler_machinery import PassManager, register_pass
         from numba.core.lowering import Lower
         from numba.core.typed_passes import NativeLowering
-
-        passes_of, _ = DefaultPassBuilder.define_nopython_pipeline, NativeLowering.lowering_class
-    except (ImportError, AttributeError):
+    except ImportError:
         return {}
 
     class TogetherOnly(Lower):
@@ -137,8 +134,8 @@ def _fewer_passes() -> dict[str, Any]:
 
     class Passes(CompilerBase):
         def define_pipelines(self) -> list[PassManager]:
-            passes = PassManager('kernel')
-            for each, description in passes_of(self.state).passes:
+            state, passes = self.state, PassManager('kernel')
+            for each, description in DefaultPassBuilder.define_nopython_pipeline(state).passes:
                 if each.__name__ not in _NEEDLESS:
                     passes.add_pass(Lowering if each is NativeLowering else each, description)
             passes.finalize()
@@ -224,7 +221,7 @@ def _or_none(
 
 
 def with_callees(function: Callable[..., Any]) -> dict[str, int]:
-    """A kernel's function and the kernels it calls, directly or not: lines of source by name."""
+    """A kernel's function and all kernels it calls: lines of source by name."""
     waiting, found = [function], dict[str, int]()
     while waiting:
         caller = waiting.pop()
@@ -284,8 +281,7 @@ _thread = threading.local()
 
 
 def kept(step: Callable[[], object]) -> bool:
-    """Run `step` as long as it has nothing to compile that could be kept; whether it ran to its
-    end. For other threads nothing changes."""
+    """Run `step` until it has to compile what could be kept; whether it ran to its end."""
     _thread.only_kept = True
     try:
         step()
@@ -320,11 +316,9 @@ class Elsewhere:
 
     def __init__(self, steps: Steps):
         request = pickle.dumps([entry or os.getcwd() for entry in sys.path]) + pickle.dumps(steps)
-        pipe = subprocess.PIPE
+        pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
         program = [sys.executable, '-c', self._PROGRAM]
-        self._process = subprocess.Popen(
-            program, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL
-        )
+        self._process = subprocess.Popen(program, stdin=pipe, stdout=pipe, stderr=nowhere)
         self._say(request)
 
     def compile(self, name: str) -> None:
@@ -390,9 +384,8 @@ _resolved: dict[Any, tuple[Any, ...]] = {}
 
 
 def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """What `function`, an operator or a function of numpy, is for arguments of these types.
-
-    numba tries every way to call it anew at each place in the source; a fifth of the time."""
+    """What `function`, an operator or one of numpy, is for these types. numba tries every way to
+    call it, anew at each place in the source; a fifth of the time."""
     if kws or not all(isinstance(each, _PLAIN) for each in args):
         return _resolve(function, context, args, kws)
     key = id(function), id(context), tuple(args)
@@ -419,16 +412,14 @@ class _WhileCompiling(event.Listener):
             self._before = gc.get_threshold()
             if self._before[0]:  # else somebody wants none at all
                 gc.set_threshold(*self.COLLECTIONS)
-            if _resolve:
-                _Function.get_call_type = _resolve_once
+            _Function.get_call_type = _resolve_once
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             gc.set_threshold(*self._before)
-            if _resolve:
-                _Function.get_call_type = _resolve
+            _Function.get_call_type = _resolve
 
 
 event.register('numba:compile', _WhileCompiling())
