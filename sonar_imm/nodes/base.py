@@ -533,6 +533,7 @@ class TrackerNode(BaseNode):
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self.start_afresh()
+        self._reporter.unused.forget()
         self.get_logger().info('reset on request')
         response.success, response.message = True, 'all tracks are forgotten'
         return response

@@ -220,6 +220,10 @@ class UnusedShare:
     def __init__(self) -> None:
         self._past: deque[tuple[float, int, Counter[str]]] = deque()
 
+    def forget(self) -> None:
+        """Begin anew: what came before says nothing about what comes."""
+        self._past.clear()
+
     def sentence(self, now: float, received: int, counts: Mapping[str, int]) -> str:
         """What to say, nothing where all is well. now: steady s; received, counts: so far."""
         unused = Counter({name: n for name, n in counts.items() if name in UNUSED_REASONS})
@@ -279,7 +283,7 @@ class Reporter:
         self._meter = meter
         self._before: _Totals = None, Counter(), Counter(), 0, Counter()
         self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
-        self._unused = UnusedShare()
+        self.unused = UnusedShare()
 
     def report(
         self,
@@ -311,7 +315,7 @@ class Reporter:
             enabled,
         )
         self._before = now, meter.received.copy(), meter.refused.copy(), dropped, all_lost
-        unused = self._unused.sentence(now, meter.received.total(), counts)
+        unused = self.unused.sentence(now, meter.received.total(), counts)
         sentences = [*warnings, *filter(None, [unused])]
         message = DiagnosticArray()
         message.header.stamp = stamp

@@ -349,7 +349,15 @@ FAULTS = (
         level='WARN',
         says='not used: too_late',
         settle=0,
-        systems=IN_ORDER,
+        systems=('diver', 'obstacle'),
+    ),
+    # Four messages, which are too few for a warning.
+    Fault(
+        name='a second publisher, its clock late',
+        disturb=lambda case: second_publisher(case.window + 3.0),
+        counted=['too_late'],
+        settle=0,
+        systems=['fathometer'],
     ),
     Fault(
         name='bearings in degrees',
