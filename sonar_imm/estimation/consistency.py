@@ -38,6 +38,7 @@ from attrs import frozen
 import numpy as np
 
 from .arrays import FloatArray, IntArray
+from .association import gate_threshold
 from .kalman import factorise, log_density
 
 
@@ -71,11 +72,9 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     >>> round(low, 3), round(high, 3)
     (1.627, 2.411)
     """
-    from scipy.special import gammaincinv  # scipy.stats takes a second to import
-
     tail = 0.5 * (1.0 - probability)
-    low, high = 2.0 * gammaincinv(0.5 * count * dimension, [tail, 1.0 - tail])
-    return float(low) / count, float(high) / count
+    low, high = (gate_threshold(p, count * dimension) for p in (tail, 1.0 - tail))
+    return low / count, high / count
 
 
 NIS_MEMORY = 50.0

@@ -145,8 +145,8 @@ def _fewer_passes() -> dict[str, Any]:
 
 
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
-_OPTIONS |= _fewer_passes()
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
+_OPTIONS |= _fewer_passes()
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)

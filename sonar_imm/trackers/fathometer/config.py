@@ -285,15 +285,17 @@ class FathometerConfig(StampParameters):
     def settled(self, hydrophones: int) -> FathometerConfig:
         """With the pulse and the polarity that `auto` stands for with the records of so many
         hydrophones, 0 for traces. Shorter arrays hear themselves down to where layers are."""
-        if 'auto' not in (self.pulse, self.polarity):
+        pulse, polarity = self.pulse, self.polarity
+        if 'auto' not in (pulse, polarity):
             return self
-        own = hydrophones > 1 and self.processor == 'mvdr' and self.pulse in ('auto', 'processor')
-        if self.pulse == 'auto':
+        array = hydrophones > 1 and self.processor == 'mvdr'
+        if pulse == 'auto':
             aperture = self.element_spacing * (hydrophones - 1)
-            own &= 8.0 * aperture * self.frequency_min >= self.sound_speed
-            own &= self.output == 'coherence' and not self.envelope
-        pulse = ('processor' if own else 'band') if self.pulse == 'auto' else self.pulse
-        polarity = ('both' if own else 'positive') if self.polarity == 'auto' else self.polarity
+            is_long = 8.0 * aperture * self.frequency_min >= self.sound_speed
+            plain = self.output == 'coherence' and not self.envelope
+            pulse = 'processor' if array and is_long and plain else 'band'
+        if polarity == 'auto':
+            polarity = 'both' if array and pulse == 'processor' else 'positive'
         return evolve(self, pulse=pulse, polarity=polarity)
 
     @property
