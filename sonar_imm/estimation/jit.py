@@ -56,7 +56,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
-import gc
 import hashlib
 import inspect
 import json
@@ -75,8 +74,10 @@ import uuid
 import warnings
 
 import numba
-from numba.core import event, types
+from numba.core import types
 from numba.core.dispatcher import Dispatcher
+
+from .lowering import fewer_passes
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -99,54 +100,10 @@ LONGEST_SECONDS = 120.0
 other was stopped, and is not waited for again."""
 
 _CHECKSUM = hashlib.sha256().digest_size
-_NEEDLESS = (
-    'WithLifting InlineClosureLikes DeadBranchPrune MakeFunctionToJitFunction InlineInlinables '
-    'FindLiterallyCalls LiteralUnroll LiteralPropagationSubPipelinePass InlineOverloads '
-    'AnnotateTypes'
-).split()
-"""Passes over a kernel for closures, `with`, None, literals, which none has, and for listings."""
-
-
-def _fewer_passes() -> dict[str, Any]:
-    """numba's way to machine code without what is `_NEEDLESS`; LLVM optimises a kernel and its
-    callees together, not each alone before. Without numba's private parts nothing of it."""
-    try:
-        from numba.core.compiler import CompilerBase, DefaultPassBuilder
-        from numba.core.compiler_machinery import PassManager, register_pass
-        from numba.core.lowering import Lower
-        from numba.core.typed_passes import NativeLowering
-    except ImportError:
-        return {}
-
-    class TogetherOnly(Lower):
-        def lower(self) -> None:
-            config: Any = numba.config
-            before, config.OPT = config.OPT, type(config.OPT)(0)
-            try:
-                super().lower()
-            finally:
-                config.OPT = before
-
-    @register_pass(mutates_CFG=True, analysis_only=False)
-    class Lowering(NativeLowering):
-        _name = 'kernel_lowering'
-        lowering_class = TogetherOnly
-
-    class Passes(CompilerBase):
-        def define_pipelines(self) -> list[PassManager]:
-            state, passes = self.state, PassManager('kernel')
-            for each, description in DefaultPassBuilder.define_nopython_pipeline(state).passes:
-                if each.__name__ not in _NEEDLESS:
-                    passes.add_pass(Lowering if each is NativeLowering else each, description)
-            passes.finalize()
-            return [passes]
-
-    return {'pipeline_class': Passes}
-
 
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
 """Nobody hands a kernel to C, and what that would need is a tenth of the code."""
-_OPTIONS |= _fewer_passes()
+_OPTIONS |= fewer_passes()
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
@@ -377,52 +334,6 @@ def _compile_for_another() -> None:
     for line in sys.stdin.buffer:
         steps[json.loads(line)]()
         print('{}', file=answers, flush=True)
-
-
-_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.SliceType
-_resolved: dict[Any, tuple[Any, ...]] = {}
-
-
-def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """What `function`, an operator or one of numpy, is for these types. numba tries every way to
-    call it, anew at each place in the source; a fifth of the time."""
-    if kws or not all(isinstance(each, _PLAIN) for each in args):
-        return _resolve(function, context, args, kws)
-    key = id(function), id(context), tuple(args)
-    if key not in _resolved:
-        _resolved[key] = _resolve(function, context, args, kws), function, context  # keep the ids
-    return _resolved[key][0]
-
-
-_Function: Any = types.Function
-_resolve: Any = getattr(_Function, 'get_call_type', None)
-
-
-class _WhileCompiling(event.Listener):
-    """While numba compiles: `_resolve_once`, and Python looks for cycles of garbage rarely, for it
-    makes millions of objects that stay, and a tenth of the time went into looking at them."""
-
-    COLLECTIONS = 100_000, 50, 100
-
-    def __init__(self) -> None:
-        self._depth, self._before = 0, gc.get_threshold()
-
-    def on_start(self, event: Any) -> None:
-        if self._depth == 0:
-            self._before = gc.get_threshold()
-            if self._before[0]:  # else somebody wants none at all
-                gc.set_threshold(*self.COLLECTIONS)
-            _Function.get_call_type = _resolve_once
-        self._depth += 1
-
-    def on_end(self, event: Any) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            gc.set_threshold(*self._before)
-            _Function.get_call_type = _resolve
-
-
-event.register('numba:compile', _WhileCompiling())
 
 
 @cache

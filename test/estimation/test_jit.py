@@ -29,7 +29,7 @@ from numba.core import caching, types
 import numpy as np
 import pytest
 
-from sonar_imm.estimation import jit
+from sonar_imm.estimation import jit, lowering
 
 
 def test_without_any_place_for_a_cache_a_kernel_still_works(monkeypatch):
@@ -126,8 +126,10 @@ def test_what_is_left_out_of_compiling_changes_no_bit(monkeypatch):
 
     resolved, resolve = [], types.Function.get_call_type
     monkeypatch.setattr(types.Function, 'get_call_type', resolve)  # and back, at the end
-    monkeypatch.setattr(jit, '_resolve', lambda *args: resolved.append(args) or resolve(*args))
-    monkeypatch.setattr(jit, '_resolved', {})
+    monkeypatch.setattr(
+        lowering, '_resolve', lambda *args: resolved.append(args) or resolve(*args)
+    )
+    monkeypatch.setattr(lowering, '_resolved', {})
     P = np.random.default_rng(3).normal(size=(5, 4))
     options = {name: jit._OPTIONS[name] for name in ('nogil', 'error_model')}
     own, numbas = jit.kernel(spread), numba.njit(**options)(spread)
@@ -304,7 +306,8 @@ def root(tmp_path):
     (package / '__init__.py').touch()  # else one that is installed is found first
     for name, text in SMALL.items():
         (package / name).write_text(text)
-    shutil.copy(jit.__file__, package / 'estimation')
+    for module in (jit, lowering):
+        shutil.copy(module.__file__, package / 'estimation')
     return package.parent
 
 
@@ -539,7 +542,7 @@ def test_with_another_numba_its_own_cache_is_used_and_a_warning_says_so(change, 
 def test_without_a_part_of_numbas_compiler_kernels_take_all_of_its_passes(part, monkeypatch):
     module, _, name = part.partition('.')
     monkeypatch.delattr(importlib.import_module(f'numba.core.{module}'), name)
-    assert jit._fewer_passes() == {}
+    assert lowering.fewer_passes() == {}
 
 
 def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkeypatch):
