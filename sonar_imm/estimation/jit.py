@@ -43,8 +43,7 @@ numba has no public way to do this. The private parts in use are
   ``save_overload(signature, data)``, which are guarded;
 * the attribute ``_cache`` of a compiled function;
 * ``numba.core.serialize.dumps``, which pickles that data;
-* ``numba.core.types.Function.get_call_type``, which is remembered, and the passes of
-  ``DefaultPassBuilder``, some of which are left out: without these it only takes longer.
+* what `lowering` changes, without which it only takes longer.
 
 They are the same in numba 0.58 to 0.68. Where one of the others is missing or has another form,
 numba's own cache is used, and a warning says so.

@@ -26,6 +26,7 @@ import shutil
 from helpers.kernel_process import ROOT, run
 import numba
 from numba.core import caching, types
+from numba.core.lowering import Lower
 from numba.core.runtime import _nrt_python, rtsys
 import numpy as np
 import pytest
@@ -604,6 +605,12 @@ def test_with_another_numba_its_own_cache_is_used_and_a_warning_says_so(change, 
 def test_without_a_part_of_numbas_compiler_kernels_take_all_of_its_passes(part, monkeypatch):
     module, _, name = part.partition('.')
     monkeypatch.delattr(importlib.import_module(f'numba.core.{module}'), name)
+    assert lowering.fewer_passes() == {}
+
+
+def test_where_numbas_lowering_has_another_form_it_is_left_as_it_is(monkeypatch):
+    assert lowering.fewer_passes()
+    monkeypatch.setattr(Lower, 'storevar', lambda self, value, name: None)
     assert lowering.fewer_passes() == {}
 
 
