@@ -20,7 +20,6 @@ Run it with ``make docs``; a test compares the files with what the code says now
 from __future__ import annotations
 
 from collections.abc import Sequence
-import json
 from pathlib import Path
 import textwrap
 
@@ -48,8 +47,8 @@ MARKDOWN = """\
 
 {summary}.
 Written by `make docs` from the configuration classes, as is `config/{name}.yaml`, ready to copy.
-
-A *live* parameter may change while the node runs, and tracks are kept; others are read at start.
+*Live* parameters may change while the node runs, and tracks are kept. A default with a decimal
+point is a double, one without an integer, one in quotes a string.
 
 ## The ten that matter
 
@@ -59,7 +58,8 @@ A *live* parameter may change while the node runs, and tracks are kept; others a
 {tracker}
 ## Node
 
-The live node takes these besides, and [those of every node](nodes.md).
+The live node takes these besides, and [those of every node](nodes.md). Recordings state the
+types of their messages.
 
 {node}"""
 
@@ -175,12 +175,9 @@ def generated() -> dict[str, str]:
 
 def matter_table(name: str, specs: Sequence[ParameterSpec]) -> str:
     """The parameters that most users set, in the order in which they meet them."""
-    found = {spec.name: spec for spec in specs}
-    rows = ['| parameter | default | when to set it |', '|---|---|---|']
-    for parameter, when in MATTER[name].items():
-        default = json.dumps(found[parameter].default)
-        rows.append(f'| `{parameter}` | `{default}` {found[parameter].unit} | {when} |')
-    return '\n'.join(rows).replace('`  |', '` |') + '\n'
+    assert set(MATTER[name]) <= {spec.name for spec in specs}
+    rows = [f'| `{parameter}` | {when} |' for parameter, when in MATTER[name].items()]
+    return '\n'.join(['| parameter | when to set it |', '|---|---|', *rows]) + '\n'
 
 
 def parameter_file(system: System) -> str:

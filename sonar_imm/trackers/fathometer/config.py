@@ -177,9 +177,9 @@ class FathometerConfig(StampParameters):
         'slopes (slope_std): probability that from a record to the next a reflector begins to '
         'dip, ends it, or has a new slope', range=(1e-6, 0.3))
     record_interval: float = parameter(0.0, 's',
-        'time from record to record that depth_std, order_switch_probability and what else is per '
-        'record are meant for: after a gap they count as often as records would have come; 0: the '
-        'median of the first intervals', range=(0.0, 86400.0))
+        'time from record to record that depth_std, order_switch_probability and all else per '
+        'record are meant for; after a gap they count as often as records would have come; 0: '
+        'the median of the first intervals', range=(0.0, 86400.0))
     record_distance: float = parameter(0.0, 'm',
         'distance from record to record that they are meant for instead, where positions tell how '
         'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
