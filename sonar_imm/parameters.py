@@ -388,7 +388,7 @@ def _sections(tree: Mapping[Any, Any], before: str) -> Iterable[str]:
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
     """The table of `specs` for the documentation, one row a parameter; *live* ones may change
     while a node runs. Choices that the description explains are not listed besides."""
-    rows = ['| parameter | default | range | what |', '|---|---|---|---|']
+    rows = ['| parameter | default, range | what |', '|---|---|---|']
     for spec in specs:
         between = spec.range_text().removeprefix('between ').replace(' and ', ' to ')
         words = set(re.findall(r'\w+', spec.description))
@@ -397,7 +397,7 @@ def markdown_table(specs: Iterable[ParameterSpec]) -> str:
         kind = f'{spec.ros_kind} ' if spec.ros_kind.endswith('[]') else ''
         text = spec.description + ('' if spec.read_only else ' (*live*)')
         value = f'{kind}`{json.dumps(spec.default)}` {spec.unit}'.rstrip()
-        rows.append(f'| `{spec.name}` | {value} | {limits} | {text} |')
+        rows.append(f'| `{spec.name}` | {"; ".join(filter(None, (value, limits)))} | {text} |')
     return '\n'.join(rows) + '\n'
 
 
