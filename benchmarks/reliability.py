@@ -191,14 +191,13 @@ def table_of(name: str, part: Part) -> list[list[str]]:
         kinds = list(dict.fromkeys(row[kind] for row in rows))
         text = _recovery if name == 'faults' else _clean
         cells = {(row['system'], row[kind]): text(row) for row in rows}
-        if name == 'faults':
-            alike: dict[tuple[str, ...], list[str]] = {}
-            for k in kinds:
-                each = tuple(cells.get((system, k), '') for system in SYSTEMS)
-                alike.setdefault(each, []).append(k)
-            return [['fault', *SYSTEMS], *(['; '.join(k), *each] for each, k in alike.items())]
-        body = [[system, *(cells.get((system, k), '') for k in kinds)] for system in SYSTEMS]
-        return [['node', *kinds], *body]
+        across, down = (SYSTEMS, kinds) if name == 'faults' else (kinds, SYSTEMS)
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for row in down:
+            pairs = ((k, row) if name == 'faults' else (row, k) for k in across)
+            alike.setdefault(tuple(cells.get(pair, '') for pair in pairs), []).append(row)
+        head = ['fault' if name == 'faults' else 'node', *across]
+        return [head, *(['; '.join(names), *each] for each, names in alike.items())]
     if name == 'metamorphic':
         rows = _hardest(rows)
     columns = COLUMNS[name]
