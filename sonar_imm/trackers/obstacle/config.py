@@ -205,8 +205,8 @@ class ObstacleConfig(
 
     # -- memory ----------------------------------------------------------------------------------
     max_landmarks: int = live(200, '',
-        'largest number of obstacles remembered after they left the field of view, to come back '
-        'under their own number; 0: none; the oldest and least certain ones are given up for more',
+        'largest number of obstacles remembered after they left the field of view; 0: none; the '
+        'oldest and least certain go first',
         range=(0, 10000))
     landmark_time: float = live(86400.0, 's',
         'mean time for which an obstacle that nobody sees stays where it was',
