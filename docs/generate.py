@@ -20,6 +20,7 @@ Run it with ``make docs``; a test compares the files with what the code says now
 from __future__ import annotations
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 import textwrap
 
@@ -175,9 +176,12 @@ def generated() -> dict[str, str]:
 
 def matter_table(name: str, specs: Sequence[ParameterSpec]) -> str:
     """The parameters that most users set, in the order in which they meet them."""
-    assert set(MATTER[name]) <= {spec.name for spec in specs}
-    rows = [f'| `{parameter}` | {when} |' for parameter, when in MATTER[name].items()]
-    return '\n'.join(['| parameter | when to set it |', '|---|---|', *rows]) + '\n'
+    found = {spec.name: spec for spec in specs}
+    rows = ['| parameter | default | when to set it |', '|---|---|---|']
+    for parameter, when in MATTER[name].items():
+        default = json.dumps(found[parameter].default)
+        rows.append(f'| `{parameter}` | `{default}` {found[parameter].unit} | {when} |')
+    return '\n'.join(rows).replace('`  |', '` |') + '\n'
 
 
 def parameter_file(system: System) -> str:
