@@ -56,7 +56,7 @@ def pytest_addoption(parser):
 
 
 def pytest_collection(session):
-    """What is imported stays: nothing looks for garbage in it, which took a third of collection."""
+    """What is imported stays: nobody looks for garbage in it, which took a third of the time."""
     gc.disable()
 
 
