@@ -94,11 +94,12 @@ $(TEST_STAMP): $(STAMP)
 demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
 	$(BIN)/sonar-imm demo --out demo
 
-# Both parts at once: nodes wait half of their time, and answer first, for what only computes is nice. What the system
-# tests print comes in one piece at the end. Ctrl-C ends both; the first part that failed decides on the exit code.
+# Both parts at once: nodes wait half of their time, and what only computes is nice to them. What the system tests print
+# comes in one piece at the end. Ctrl-C ends both.
 test: venv ## run the tests; of the Monte Carlo ones an eighth, in turn
 	@log=$$(mktemp); trap 'rm -f "$$log"' EXIT; code=0; set -m; \
-	$(MAKE) test-system >"$$log" 2>&1 & system=$$!; nice -n 5 $(MAKE) test-core & core=$$!; \
+	$(MAKE) --no-print-directory test-system >"$$log" 2>&1 & system=$$!; \
+	nice -n 5 $(MAKE) --no-print-directory test-core & core=$$!; set +m; \
 	trap 'kill -INT -- -$$core -$$system; wait; cat "$$log"; exit 130' INT TERM HUP; \
 	wait $$core || code=$$?; wait $$system || code=$$?; cat "$$log"; exit $$code
 
