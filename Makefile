@@ -117,8 +117,10 @@ fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and st
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) --files $(FILES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
-# The pages of tutorials take longest: they come first, so that nothing waits for them at the end.
+# A node that compiles answers late: kernels first. The pages of tutorials take longest: they come before the rest, so that
+# nothing waits for them at the end.
 test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
+	$(BIN)/sonar-imm warm
 	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) $(SHARED) test/system/test_tutorials.py test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)
