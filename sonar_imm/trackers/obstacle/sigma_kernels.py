@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Sigma points of many components at once, compiled: see `estimation.lanes` for what a lane is.
+"""Sigma points of many components at once, compiled; a lane: see `estimation.small_matrices`.
 
 A component has states y (n, lanes), the first four being (d, delta, z, s) of `kernels`. Its sigma
 points are on the columns of F (n, n, lanes), the lower Cholesky root of its covariance times the
