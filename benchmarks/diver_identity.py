@@ -16,10 +16,7 @@
 
     python -m benchmarks.diver_identity --out docs/results/diver_identity.json
 
-`buddies` (see `diver_named`): two divers 2 m apart, a scan per second, .5 m on each axis, P_D .9,
-two false fixes in a square of 120 m; from the 20th second on the transponder of the first is heard
-every four seconds, good to 2 m. `crossing` (see `diver_crossing`): two pairs of divers that cross
-within a metre, .7 m on each axis, P_D .7, 10 false fixes in a square of 160 m. `harbour`: eight
+`buddies` is the scene of `diver_named`, `crossing` that of `diver_crossing`; `harbour`: eight
 boats on legs of 10 to 30 s at 3 m/s, 2 m on each axis, a scan each 2 s, P_D .9, 20 false fixes in
 a square of 400 m.
 

@@ -95,10 +95,6 @@ def _failures(row: Row) -> str:
     return str(len(row['messages']['failures']) + len(row['parameters']['failures']))
 
 
-def _worst(kind: str) -> Callable[[Row], str]:
-    return lambda row: '' if row.get(kind) is None else f'{row[kind]:.1g}'
-
-
 def _of_tolerance(row: Row) -> str:
     return f'{row["share"]:.1g}' if row['share'] else 'equal'
 
@@ -106,10 +102,8 @@ def _of_tolerance(row: Row) -> str:
 SOAK: dict[str, Callable[[Row], str]] = {
     'system': _plain('system'),
     'hours': _plain('hours', 'g'),
-    'messages': _plain('messages', '.0f'),
     'memory, MB': _plain('memory_mb', '.0f'),
     'slope, MB/h': _plain('slope_mb_per_h', '.3f'),
-    'its 95 % interval': lambda row: f'{row["slope_low"]:.3f} to {row["slope_high"]:.3f}',
     'p99 first tenth, ms': _plain('p99_first_ms', '.2f'),
     'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
     'not counted': _plain('uncounted', '.0f'),
@@ -132,8 +126,6 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
         'MB': _plain('size_mb', '.2f'),
         'CPU s': _plain('cpu_s', '.2f'),
         'memory MB': _plain('memory_mb', '.0f'),
-        'CPU s per MB': _plain('cpu_s_per_mb', '.2g'),
-        'memory, bytes per byte': _plain('memory_per_byte', '.0f'),
     },
     'restart': {
         'node': _plain('system'),
@@ -154,7 +146,6 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
         'node': _plain('system'),
         'can, 1/s': _plain('capacity', '.0f'),
         'sent, 1/s': _plain('rate', '.0f'),
-        'messages': _plain('sent'),
         'used': _plain('used'),
         'dropped': _plain('dropped'),
         'lost': _plain('lost'),
@@ -178,7 +169,7 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
         'with': _plain('how'),
         'scene': _plain('moved'),
         'states, of the tolerance': _of_tolerance,
-        **{kind: _worst(kind) for kind in ('places', 'states', 'covariances', 'probabilities')},
+        'states': _plain('states', '.1g'),
     },
 }
 """The columns of each table with a row for each row of the part; two have one for each fault and
@@ -200,11 +191,13 @@ def table_of(name: str, part: Part) -> list[list[str]]:
         kinds = list(dict.fromkeys(row[kind] for row in rows))
         text = _recovery if name == 'faults' else _clean
         cells = {(row['system'], row[kind]): text(row) for row in rows}
-        if name == 'faults':
-            body = [[k, *(cells.get((system, k), '') for system in SYSTEMS)] for k in kinds]
-            return [['fault', *SYSTEMS], *body]
-        body = [[system, *(cells.get((system, k), '') for k in kinds)] for system in SYSTEMS]
-        return [['node', *kinds], *body]
+        across, down = (SYSTEMS, kinds) if name == 'faults' else (kinds, SYSTEMS)
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for row in down:
+            pairs = ((k, row) if name == 'faults' else (row, k) for k in across)
+            alike.setdefault(tuple(cells.get(pair, '') for pair in pairs), []).append(row)
+        head = ['fault' if name == 'faults' else 'node', *across]
+        return [head, *(['; '.join(names), *each] for each, names in alike.items())]
     if name == 'metamorphic':
         rows = _hardest(rows)
     columns = COLUMNS[name]
@@ -212,9 +205,7 @@ def table_of(name: str, part: Part) -> list[list[str]]:
 
 
 def _hardest(rows: list[Row]) -> list[Row]:
-    """Of each system and way to track the scene nearest to its tolerance, and its worst
-    differences of all scenes."""
-    kinds = ('places', 'states', 'covariances', 'probabilities')
+    """Of each system and way to track the scene whose states came nearest to what is tolerated."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row['system'], row['how']), []).append(row)
@@ -222,12 +213,8 @@ def _hardest(rows: list[Row]) -> list[Row]:
     for _, group in sorted(groups.items()):
         hardest = max(group, key=lambda row: row['states'] / (row['tolerance'] or 1.0))
         moved = hardest['moved'] if hardest['states'] or len(group) == 1 else 'all of them'
-        worst = {
-            kind: max((row[kind] for row in group if row.get(kind) is not None), default=None)
-            for kind in kinds
-        }
         share = hardest['states'] / (hardest['tolerance'] or 1.0)
-        found.append({**hardest, **worst, 'moved': moved, 'share': share})
+        found.append({**hardest, 'moved': moved, 'share': share})
     return found
 
 

@@ -48,8 +48,8 @@ MARKDOWN = """\
 
 {summary}.
 Written by `make docs` from the configuration classes, as is `config/{name}.yaml`, ready to copy.
-
-A *live* parameter may change while the node runs, and tracks are kept; others are read at start.
+*Live* parameters may change while the node runs, and tracks are kept. A default with a decimal
+point is a double, one without an integer, one in quotes a string.
 
 ## The ten that matter
 
@@ -59,7 +59,8 @@ A *live* parameter may change while the node runs, and tracks are kept; others a
 {tracker}
 ## Node
 
-The live node takes these besides, and [those of every node](nodes.md).
+The live node takes these besides, and [those of every node](nodes.md). Recordings state the
+types of their messages.
 
 {node}"""
 

@@ -23,19 +23,7 @@ refused. What is stated of z is used with it, or left out where it cannot be tru
 
 Positions that a transceiver on a vessel has measured from itself (USBL), and those of
 geographic_msgs, are read by field names, so that the packages of the drivers need not be
-installed:
-
-- geometry_msgs/PointStamped, Vector3Stamped, PoseWithCovarianceStamped: x y z, in the axes that
-  `relative_axes` names;
-- seatrac_interfaces/ModemRec: range, azimuth and elevation in the axes of the beacon, clockwise
-  and up, tenths of a metre and a degree; without those its position east and north, by the compass
-  of the beacon. ``src_id`` says whose it is;
-- acomms_msgs/UsblData (EvoLogics): east, north, up where the device knows its attitude, else x y
-  z; ``accuracy`` is taken as the standard deviation on each axis, ``remote_address`` says whose it
-  is. The stamp is that of reception: the age of the measurement by the clock of the device,
-  ``current_time - measurement_time``, is taken off;
-- stonefish_ros2/BeaconInfo: ``relative_position`` in the axes of the simulated transceiver,
-  forward, starboard, down; ``beacon_id`` says whose it is.
+installed. What is used of each type: docs/topics.md.
 
 What a driver flags as invalid is refused.
 

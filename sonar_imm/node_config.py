@@ -37,8 +37,8 @@ class NodeConfig(Config):
     queue_depth: int = parameter(50, '',
         'messages that an input queue holds while the tracker is busy', range=(1, 100000))
     max_wait: float = live(0.0, 's',
-        'messages that waited longer for a busy tracker are dropped and counted, so that the '
-        'output does not lag; 0: never', range=(0.0, 1e6))
+        'messages that waited longer for a busy tracker are dropped and counted; 0: never',
+        range=(0.0, 1e6))
     frame_id: str = parameter('', '',
         'frame that the input must be in; empty: the frame of the first message accepted')
     world_frame_convention: str = parameter('enu', '',
@@ -214,6 +214,6 @@ def type_spec(topic: InputTopic) -> ParameterSpec | None:
         name=f'{topic.name}_type',
         kind='str',
         default=next(iter(topic.readers)),
-        description=f"message type of the input '{topic.name}'; a recording states its own",
+        description=f"message type of the input '{topic.name}'",
         choices=tuple(topic.readers),
     )

@@ -39,8 +39,10 @@ from collections.abc import Iterable, Mapping
 import difflib
 from functools import lru_cache, partial
 from importlib.metadata import entry_points, EntryPoint
+import json
 import math
 from pathlib import Path
+import re
 import sys
 from typing import Any, TypeVar
 
@@ -385,16 +387,17 @@ def _sections(tree: Mapping[Any, Any], before: str) -> Iterable[str]:
 
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
     """The table of `specs` for the documentation, one row a parameter; *live* ones may change
-    while a node runs."""
-    rows = ['| parameter | type, default | range | what |', '|---|---|---|---|']
+    while a node runs. Choices that the description explains are not listed besides."""
+    rows = ['| parameter | default, range | what |', '|---|---|---|']
     for spec in specs:
         between = spec.range_text().removeprefix('between ').replace(' and ', ' to ')
-        limits = ', '.join(f'`{choice}`' for choice in spec.choices) or between
-        default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
-        default = str(default).lower() if isinstance(default, bool) else default
+        words = set(re.findall(r'\w+', spec.description))
+        listed = () if words.issuperset(spec.choices) else spec.choices
+        limits = ', '.join(f'`{choice}`' for choice in listed) or between
+        kind = f'{spec.ros_kind} ' if spec.ros_kind.endswith('[]') else ''
         text = spec.description + ('' if spec.read_only else ' (*live*)')
-        value = f'{spec.ros_kind} `{default}` {spec.unit}'.rstrip()
-        rows.append(f'| `{spec.name}` | {value} | {limits} | {text} |')
+        value = f'{kind}`{json.dumps(spec.default)}` {spec.unit}'.rstrip()
+        rows.append(f'| `{spec.name}` | {"; ".join(filter(None, (value, limits)))} | {text} |')
     return '\n'.join(rows) + '\n'
 
 

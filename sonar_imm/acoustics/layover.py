@@ -29,8 +29,8 @@ monotonic by pooling neighbours, so that its mean under one surface stays 1. The
 noise that is the same in all bins and one for noise that fades with the echo, which makes large L
 of one surface: each ping measures between which of them it lies, see `fading`.
 
-One bin says little, runs of bins say much: `existence` is the smoothed probability of the second
-surface in a chain of two states along the ping.
+`existence` is the smoothed probability of the second surface in a chain of two states along the
+ping.
 
 **No array is exact.** What of an echo is no plane wave acts as noise that grows with it, so that
 echoes of 30 dB would all seem to be two. Each ping measures that itself: `array_error`.

@@ -101,7 +101,7 @@ class StampParameters(Config):
     restart_after: int = parameter(5, '',
         'number of consecutive agreeing stamps that count as a restarted clock: further ahead '
         'than max_gap, more than five minutes late, or a repeated beginning; 20 times as many '
-        'where it may be a burst of late messages', range=(2, 1000))
+        'where late messages may be the reason', range=(2, 1000))
     # fmt: on
 
 

@@ -202,17 +202,27 @@ def test_a_try_of_the_machinery_leaves_the_page_alone(toy, monkeypatch):
     assert '`SHARE` 0.1; minutes of each part' in (toy / 'page.md').read_text()
 
 
-def test_of_moved_scenes_the_hardest_is_shown_with_the_worst_of_all():
-    some = {'system': 'diver', 'how': 'gnn', 'probabilities': None}
+def test_of_moved_scenes_the_hardest_is_shown():
+    some = {'system': 'diver', 'how': 'gnn'}
     scenes = [
-        {**some, 'moved': 'later', 'tolerance': 0.0, 'states': 0.0, 'places': 3e-9},
-        {**some, 'moved': 'turned', 'tolerance': 1e-5, 'states': 1e-9, 'places': 1e-9},
-        {**some, 'moved': 'mirrored', 'tolerance': 1e-7, 'states': 5e-10, 'places': 2e-9},
+        {**some, 'moved': 'later', 'tolerance': 0.0, 'states': 0.0},
+        {**some, 'moved': 'turned', 'tolerance': 1e-5, 'states': 1e-9},
+        {**some, 'moved': 'mirrored', 'tolerance': 1e-7, 'states': 5e-10},
     ]
     _, row = reliability.table_of('metamorphic', scenes)
-    assert row == ['diver', 'gnn', 'mirrored', '0.005', '3e-09', '1e-09', '', '']
+    assert row == ['diver', 'gnn', 'mirrored', '0.005', '5e-10']
     _, row = reliability.table_of('metamorphic', scenes[:1])
     assert row[2:4] == ['later', 'equal']
+
+
+def test_faults_that_do_the_same_share_a_row():
+    rows = [
+        {'fault': fault, 'system': 'diver', 'recovered': recovered, 'losses': {}}
+        for fault, recovered in (('a burst', 0), ('a reset', 2), ('a loop', 0))
+    ]
+    _, *body = reliability.table_of('faults', rows)
+    assert [row[0] for row in body] == ['a burst; a loop', 'a reset']
+    assert [row[2] for row in body] == ['0', '2']
 
 
 def test_every_part_has_a_program_and_a_table():

@@ -61,9 +61,9 @@ class BathymetryConfig(MountingParameters):
     model_set: str = live('height_two_rw', '',
         'terrain models run side by side', choices=MODEL_SETS)
     variant: str = live('corrected', '',
-        'formulas: corrected, or paper (as printed, see the docs for what is wrong). Where '
-        'nothing else is stated, paper takes sigmas 1 m and 1/m of height_rw_ncs, 0.01 and 1 m of '
-        'height_two_rw, stay_probability 0.98, and neither shadow_gate nor angle_drift',
+        'formulas: corrected, or paper (as printed). Where nothing else is stated, paper takes '
+        'sigmas 1 m and 1/m of height_rw_ncs, 0.01 and 1 m of height_two_rw, stay_probability '
+        '0.98, and neither shadow_gate nor angle_drift',
         choices=('corrected', 'paper'))
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
@@ -193,8 +193,8 @@ class BathymetryConfig(MountingParameters):
         'longest time between two poses of nav that is interpolated; pings in a longer gap are '
         'skipped and counted', range=(0.01, 60.0))
     max_extrapolation: float = live(0.0, 's',
-        'a ping is processed when its last bin lies no further than this beyond the newest pose '
-        'of nav, else it waits', range=(0.0, 10.0))
+        'time by which the last bin of a ping may be newer than the newest pose of nav; later '
+        'ones wait', range=(0.0, 10.0))
 
     # -- the water -------------------------------------------------------------------------------
     sound_speed_profile: tuple[float, ...] = live((), '',

@@ -34,10 +34,9 @@ There is no rejuvenation step, `move`: the noise of every terrain model keeps co
 apart. Through bins without an echo particles are only propagated. A model set of one state can run
 on a grid, whose verbs are the same, but for resampling, which cells do not need.
 
-Nothing is carried from one ping to the next: a floor that was taken over wrongly would do more
-harm than a floor that is taken over rightly does good. Late, shuffled or repeated pings therefore
-need no care; the random numbers of a ping come from its own stamp. Only the labels may lean on
-those of the neighbours (`Coupling`).
+Nothing is carried from one ping to the next, which loses more than it gains (docs/bathymetry.md).
+Late, shuffled or repeated pings therefore need no care; the random numbers of a ping come from its
+own stamp. Only the labels may lean on those of the neighbours (`Coupling`).
 
 On a ship that moves each bin has a pose of its own, and a ping waits until the navigation has
 covered its last bin (`PoseQueue`). The state is then the height of the floor in the world, so

@@ -115,8 +115,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'motion models run side by side; also a set that another package registers',
         choices=MODEL_SETS, group=MODELS)
     target: str = parameter('diver', '',
-        'kind of target, for the motion of families: diver, rov, fish, boat or ship set speeds, '
-        'accelerations and turns of that kind, wherever a parameter is at its default',
+        'kind of target (diver, rov, fish, boat or ship): sets speeds, accelerations and turns '
+        'of families wherever a parameter is at its default',
         choices=tuple(TARGETS))
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))
@@ -146,13 +146,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     family_switch_rate: float = parameter(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
-        'families: the filter runs in copies, each of which multiplies the covariances of all '
-        'measurements by one of these; with dimensions 3: one copy, times 1',
+        'families: factors by which copies of the filter multiply the covariances of all '
+        'measurements; with dimensions 3: one copy, times 1',
         range=(0.01, 1e4), kind='float[]')
     least_covariance_scale: float = parameter(1.0, '',
         'families: copies with a lower scale say where the diver is, but not how well that is '
-        'known: fixes better than stated look like fixes whose errors last; lower it only where '
-        'errors are known not to last', range=(0.01, 1.0))
+        'known; lower it only where errors are known not to last', range=(0.01, 1.0))
     adaptation: str = parameter('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
         'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',
@@ -170,8 +169,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
         'families)', range=(1e-3, 20.0))
     velocity_std: float = parameter(0.7, 'm/s',
-        'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
-        'velocity state; families: 2 at a fix of a diver, so that boats begin, too)',
+        'standard deviation on each axis of the velocity of a new track, around zero (sets with '
+        'a velocity state; families: 2 at a fix of a diver)',
         range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
         'random walk of the speed over a reference step (heading_speed sets, families)',
@@ -227,9 +226,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'for transponders polled in turn')
 
     scan_period: float = parameter(0.0, 's',
-        'time in which a sensor that rotates or polls, and stamps each fix by itself, looks at '
-        'everyone once: fixes without a name within a whole multiple of it and the next are one '
-        'scan, at the middle; 0: those of one stamp are', range=(0.0, 3600.0))
+        'time in which a sensor that rotates or polls looks at everyone once: fixes without a '
+        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are',
+        range=(0.0, 3600.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
@@ -267,11 +266,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
         'place coverage_sector states', range=(0.0, 45.0))
     systematic_errors: str = parameter('mixed', '',
-        'treatment of the errors of receiver_position_std, receiver_clock_std, sound_speed_std '
-        'and bearing_bias_std_deg: consider (in the covariance, never estimated), estimate, or '
-        'mixed (receiver positions and bearings considered, clocks and sound speed estimated); '
-        'where none is stated, 0.3 m, 0.1 ms and 2 m/s are part of the covariance of tracks from '
-        'arrivals alone; exact: nothing is off', choices=SYSTEMATIC)
+        'treatment of errors of receivers, clocks, sound speed and bearings: consider (in the '
+        'covariance, never estimated), estimate, mixed (clocks and sound speed estimated, the '
+        'rest considered) or exact (nothing is off); where none is stated, 0.3 m, 0.1 ms and 2 '
+        'm/s are part of the covariance of tracks from arrivals alone', choices=SYSTEMATIC)
 
     # -- errors of fixes that last ---------------------------------------------------------------
     fix_bias_std: float = parameter(0.0, 'm',
@@ -288,9 +286,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'kbest learn it from the fixes that are no track of theirs, else 1e-6')
     association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
-        'jipda (all pairings weighed, tracks confirmed by their probability of existence), kbest '
-        '(the most probable histories of pairings kept, until later scans and names tell which '
-        'was right, for divers side by side) or auto (jipda with model_set families, else gnn)',
+        'jipda (all pairings weighed, tracks confirmed by existence), kbest (the most probable '
+        'histories of pairings, for divers side by side) or auto (jipda with model_set families, '
+        'else gnn)',
         choices=('auto', *ASSOCIATIONS))
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
         description='number of hits within confirm_window that confirm a track, with association '
@@ -310,13 +308,13 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # -- what the sensor covers ------------------------------------------------------------------
     coverage_sector: tuple[float, ...] = live((), 'm, deg',
         'six numbers: x and y of the sensor; direction of the middle of its sector, '
-        'counterclockwise from x, and width of the sector in degrees; least and greatest range. A '
-        'diver is detected with detection_probability inside and not at all outside; empty: '
-        'everywhere', kind='float[]')
+        'counterclockwise from x, and width in degrees; least and greatest range. A diver is '
+        'detected with detection_probability inside, never outside; empty: everywhere',
+        kind='float[]')
     coverage_file: str = parameter('', '',
-        'CSV file of the probability of detection, in place of detection_probability: a grid with '
-        'the columns x, y, probability, or range, probability with the range from the place in '
-        'coverage_sector, else the origin; outside it is 0; empty: none')
+        'CSV file in place of detection_probability: a grid with the columns x, y, probability, '
+        'or range, probability with the range from the place in coverage_sector, else the '
+        'origin; outside it is 0; empty: none')
 
     # -- names -----------------------------------------------------------------------------------
     tags: tuple[str, ...] = parameter((), '',
@@ -324,9 +322,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'that name, belongs to this diver and goes to his own track without association',
         kind='str[]')
     named_tracks: str = parameter('share', '',
-        'what a track with a known name does with fixes without a name: share (it takes part in '
-        'the association, and a track beside it that is never seen together with it is the same '
-        'diver) or alone (it takes only its own)', choices=NAMED_TRACKS)
+        'what a track with a name does with fixes without one: share (it takes part in the '
+        'association, and a track never seen together with it is the same diver) or alone (it '
+        'takes only its own)', choices=NAMED_TRACKS)
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '
         'counted; 0: use them', range=(0.0, 3600.0))
@@ -393,9 +391,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         "standard deviation of the vessel's heading where its message states none",
         range=(0.0, 45.0))
     magnetic_declination_deg: float = parameter(0.0, 'deg',
-        'angle from true to magnetic north, positive east: headings (input heading) and relative '
-        'fixes levelled by the compass of the transceiver are from magnetic north by it; 0: they '
-        'are from true north', range=(-180.0, 180.0))
+        'angle from true to magnetic north, positive east, for headings (input heading) and '
+        'relative fixes levelled by a compass; 0: they are from true north', range=(-180.0, 180.0))
     vessel_attitude_std_deg: float = live(0.5, 'deg',
         "standard deviation of the vessel's roll and pitch where its message states none",
         range=(0.0, 45.0))
@@ -403,8 +400,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'longest time between two poses of the vessel that is interpolated; relative fixes in a '
         'longer gap are left out and counted', range=(0.01, 600.0))
     vessel_max_extrapolation: float = parameter(0.0, 's',
-        'a relative fix is used when it is no further than this beyond the newest pose of the '
-        'vessel, else it waits for the next one', range=(0.0, 60.0))
+        'time by which a relative fix may be newer than the newest pose of the vessel; later '
+        'ones wait for the next pose', range=(0.0, 60.0))
     # fmt: on
 
     def check(self) -> list[str]:

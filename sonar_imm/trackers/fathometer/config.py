@@ -112,11 +112,10 @@ class FathometerConfig(StampParameters):
         'distance between the depths of the grid; 0: as the trace has it, or a sixth of the '
         'shortest half wavelength', range=(0.0, 100.0))
     noise_depth_min: float = live(180.0, 'm',
-        'upper end of the depths where noise is measured, down to noise_depth_max, where no '
-        'reflectors are; the whole trace when it does not reach there. 0 together with '
-        'noise_depth_max, and with automatic snapshots that are too short for it: where the '
-        'depths tracked have their mirror image at the array, or in what reflectors leave of a '
-        'trace', range=(0.0, 12000.0))
+        'upper end of the depths where noise is measured, down to noise_depth_max; the whole '
+        'trace when it does not reach there. 0 together with noise_depth_max, and with automatic '
+        'snapshots that are too short for it: at the mirror image of the depths tracked, or in '
+        'what reflectors leave of a trace', range=(0.0, 12000.0))
     noise_depth_max: float = live(300.0, 'm',
         'lower end of the depths where noise is measured, see noise_depth_min',
         range=(0.0, 12000.0))
@@ -177,9 +176,9 @@ class FathometerConfig(StampParameters):
         'slopes (slope_std): probability that from a record to the next a reflector begins to '
         'dip, ends it, or has a new slope', range=(1e-6, 0.3))
     record_interval: float = parameter(0.0, 's',
-        'time from record to record that depth_std, order_switch_probability and what else is per '
-        'record are meant for: after a gap they count as often as records would have come; 0: the '
-        'median of the first intervals', range=(0.0, 86400.0))
+        'time from record to record that depth_std, order_switch_probability and all else per '
+        'record are meant for; after a gap they count as often as records would have come; 0: '
+        'the median of the first intervals', range=(0.0, 86400.0))
     record_distance: float = parameter(0.0, 'm',
         'distance from record to record that they are meant for instead, where positions tell how '
         'far apart two records are; 0: time counts', range=(0.0, 100_000.0))

@@ -77,8 +77,8 @@ class ObstacleConfig(
         'relative to that below the vehicle', range=(0.01, 100.0))
 
     ground_std: float = parameter(0.5, 'm',
-        'behaviour seabed: standard deviation of the depth of an obstacle on the sea floor, '
-        'relative to the soundings of ground around it', range=(0.01, 100.0))
+        'behaviour seabed: standard deviation of the depth of an obstacle, relative to the '
+        'soundings of ground around it', range=(0.01, 100.0))
     ground_radius: float = parameter(5.0, 'm',
         'distance to which soundings of ground tell the depth of the sea floor at an obstacle',
         range=(0.5, 1000.0))
@@ -134,14 +134,14 @@ class ObstacleConfig(
         'full height of the beam of the sonar', range=(0.5, 90.0))
     vertical_beam_width_deg: float = parameter(0.0, 'deg',
         'gaussian_sum: height of the beam (-3 dB, one way) by which the intensity of detections '
-        'shows the elevation; 0: intensity is not used. Useful where the sonar tilts by degrees '
-        'and the width is known to a tenth', range=(0.0, 90.0))
+        'shows the elevation, where the sonar tilts by degrees and the height is known to a '
+        'tenth; 0: intensity is not used', range=(0.0, 90.0))
     fading_db: float = live(6.4, 'dB',
         'vertical_beam_width_deg: standard deviation of the level of echoes, which fade from ping '
         'to ping', range=(0.1, 40.0))
     intensity_weight: float = live(0.5, '',
         'vertical_beam_width_deg: power to which the likelihood of an intensity is raised, '
-        'because fading lasts and beam patterns are not known well', range=(0.0, 1.0))
+        'because fading lasts', range=(0.0, 1.0))
     gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.05,
         description='number of false detections expected in a ping, per metre of range and '
@@ -173,8 +173,7 @@ class ObstacleConfig(
         'ranges', range=(0.0, 0.2))
     range_scale_std: float = live(0.001, '',
         'standard deviation of the scale error of ranges, from the sound speed that the sonar '
-        'assumes; no ping reveals it, so it is added to the covariance of range, offset and '
-        'position', range=(0.0, 0.2))
+        'assumes; part of the covariance of range, offset and position', range=(0.0, 0.2))
     position_noise: float = parameter(0.01, 'm/sqrt(s)',
         'random walk of the error of the horizontal position in nav', range=(0.0, 10.0))
     yaw_noise_deg: float = parameter(0.02, 'deg/sqrt(s)',
@@ -195,8 +194,8 @@ class ObstacleConfig(
         'length of the latest positions of the vehicle from which its course is estimated',
         range=(1.0, 600.0))
     course_std: float = live(0.035, 'm/s',
-        'standard deviation of the velocity of the vehicle along its course, on each axis; a sway '
-        'of 0.14 m within 20 s leaves 0.034 in a course_window of 10 s', range=(0.0, 5.0))
+        'standard deviation of the velocity of the vehicle along its course, on each axis; a '
+        'sway of 0.14 m within 20 s leaves 0.034 in 10 s', range=(0.0, 5.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
@@ -206,8 +205,8 @@ class ObstacleConfig(
 
     # -- memory ----------------------------------------------------------------------------------
     max_landmarks: int = live(200, '',
-        'largest number of obstacles remembered after they left the field of view, to come back '
-        'under their own number; 0: none; the oldest and least certain ones are given up for more',
+        'largest number of obstacles remembered after they left the field of view; 0: none; the '
+        'oldest and least certain go first',
         range=(0, 10000))
     landmark_time: float = live(86400.0, 's',
         'mean time for which an obstacle that nobody sees stays where it was',

@@ -110,8 +110,7 @@ class DetectorConfig(Config):
         'distance below which echoes are joined to one obstacle', range=(0.0, 100.0))
     min_range: float = parameter(1.0, 'm',
         'range below which echoes are taken for the vehicle; none are found either in the first '
-        'rows of an image, half of training and guard, where there are no nearer rows to estimate '
-        'the noise from', range=(0.0, 1e4))
+        'rows of an image, half of training and guard', range=(0.0, 1e4))
     max_detections: int = parameter(100, '',
         'largest number of detections of a ping, the strongest', range=(1, 10_000))
 
