@@ -94,7 +94,14 @@ $(TEST_STAMP): $(STAMP)
 demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report
 	$(BIN)/sonar-imm demo --out demo
 
-test: test-core test-system ## run the tests; of the Monte Carlo ones an eighth, in turn
+# Both parts at once: nodes wait half of their time, and what only computes is nice to them. What the system tests print
+# comes in one piece at the end. Ctrl-C ends both.
+test: venv ## run the tests; of the Monte Carlo ones an eighth, in turn
+	@log=$$(mktemp); trap 'rm -f "$$log"' EXIT; code=0; set -m; \
+	$(MAKE) --no-print-directory test-system >"$$log" 2>&1 & system=$$!; \
+	nice -n 5 $(MAKE) --no-print-directory test-core & core=$$!; set +m; \
+	trap 'kill -INT -- -$$core -$$system; wait; cat "$$log"; exit 130' INT TERM HUP; \
+	wait $$core || code=$$?; wait $$system || code=$$?; cat "$$log"; exit $$code
 
 test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
 	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(SHARED) $(TESTS)
@@ -110,8 +117,10 @@ fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and st
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) --files $(FILES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
-# The pages of tutorials take longest: they come first, so that nothing waits for them at the end.
+# A node that compiles answers late: kernels first. The pages of tutorials take longest: they come before the rest, so that
+# nothing waits for them at the end.
 test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
+	$(BIN)/sonar-imm warm
 	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS) $(SHARED) test/system/test_tutorials.py test/system
 
 reliability: venv ## 40 minutes: all that may go wrong, and its page; goes on where it was broken off (SHARE=4 PARTS='soak flood' RELIABILITY=folder)

@@ -29,13 +29,14 @@ A geometry_msgs/PoseArray is a scan without covariances.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Fixes, in_space, NOBODY, Rejection, usable_fixes
+from sonar_imm.measurements import Fixes, NOBODY, Rejection, usable_fixes
 
 from .fixes import LEAST_VARIANCE, MOST_VARIANCE
 from .headers import (
@@ -67,16 +68,17 @@ def read_scan(message: Any, *, world_frame: str = 'enu') -> Fixes:
             raise Rejection('flagged_invalid', f'all {len(valid)} fixes are flagged as invalid')
         values = {name: column[valid] for name, column in values.items()}
     rows = len(values['x'])
-    z = values.get('z', np.zeros(rows))
-    position = np.column_stack([values['x'], values['y'], np.where(np.isfinite(z), z, 0.0)])
-    covariance = np.full((rows, 3, 3), np.nan)
-    covariance[:, :2, :2] = np.stack(
-        [values[name] for name in ('cov_x_x', 'cov_x_y', 'cov_x_y', 'cov_y_y')], axis=-1
-    ).reshape(rows, 2, 2)
-    if 'z' in values and 'cov_z_z' in values:
-        for name, (i, j) in OF_Z.items():
-            covariance[:, i, j] = covariance[:, j, i] = values.get(name, np.zeros(rows))
-        covariance[~np.isfinite(z), 2, 2] = np.nan
+    position, covariance = np.zeros((rows, 3)), np.full((rows, 3, 3), np.nan)
+    position[:, 0], position[:, 1] = values['x'], values['y']
+    covariance[:, 0, 0], covariance[:, 1, 1] = values['cov_x_x'], values['cov_y_y']
+    covariance[:, 0, 1] = covariance[:, 1, 0] = values['cov_x_y']
+    if 'z' in values:
+        known = np.isfinite(values['z'])
+        position[known, 2] = values['z'][known]
+        if 'cov_z_z' in values:
+            for name, (i, j) in OF_Z.items():
+                covariance[:, i, j] = covariance[:, j, i] = values.get(name, 0.0)
+            covariance[~known, 2, 2] = np.nan
     return _scan(message, position, covariance, _names(values.get('id')), world_frame)
 
 
@@ -135,35 +137,24 @@ def _scan(
     world_frame: str,
 ) -> Fixes:
     """The scan of the rows (n,) that can be used."""
-    if covariance is not None:
-        covariance = in_space(_known(covariance), position)
+    columns, scan = (position, covariance, target_id), None
     sized = _sized(covariance, len(position))
-    try:
+    with suppress(Rejection):
         # A scan looks at its rows itself: where all are good, once is enough.
-        scan = _of_rows(message, position, covariance, target_id) if sized.all() else None
-    except Rejection:
-        scan = None
+        scan = _of_rows(message, *columns) if sized.all() else None
     if scan is None:
         keep = usable_fixes(position, covariance) & sized
         if len(keep) and not keep.any():
             raise Rejection('nan', f'none of the {len(keep)} fixes of the scan can be used')
-        kept = (None if column is None else column[keep] for column in (covariance, target_id))
-        scan = _of_rows(message, position[keep], *kept)
+        kept = (None if column is None else column[keep] for column in columns)
+        scan = _of_rows(message, *kept)
     return to_enu(scan, world_frame, _turned)
 
 
-def _of_rows(
-    message: Any, position: NDArray, covariance: NDArray | None, target_id: NDArray | None
-) -> Fixes:
-    """The scan of all rows (n,); covariances that are unknown throughout are left out."""
-    if covariance is not None and np.isnan(covariance).all():
-        covariance = None
-    return Fixes(
-        **head_of(message),
-        position=position,
-        covariance=covariance,
-        target_id=target_id,
-    )
+def _of_rows(message: Any, position: Any, covariance: Any, target_id: Any) -> Fixes:
+    """The scan of all rows (n,)."""
+    head = head_of(message)
+    return Fixes(**head, position=position, covariance=covariance, target_id=target_id)
 
 
 def _turned(scan: Fixes) -> Fixes:
@@ -172,24 +163,20 @@ def _turned(scan: Fixes) -> Fixes:
     return evolve(scan, position=swap_axes(scan.position), covariance=covariance)
 
 
-def _known(covariance: NDArray) -> NDArray:
-    """Covariances (n, 3, 3) with NaN for those of x and y that are said to be unknown."""
-    flat = covariance[:, :2, :2]
-    variance = flat[:, (0, 1), (0, 1)]
-    unknown = (variance < 0.0).any(axis=1) | np.isnan(variance).any(axis=1)
-    unknown |= ~flat.any(axis=(1, 2))
-    covariance[:, :2, :2] = np.where(unknown[:, None, None], np.nan, flat)
-    return covariance
-
-
 def _sized(covariance: NDArray | None, rows: int) -> NDArray[np.bool_]:
-    """Which covariances (n,) are neither so small nor so large that arithmetic breaks down."""
+    """Which covariances (n,) are neither so small nor so large that arithmetic breaks down. Those
+    of x and y that are said to be unknown become NaN."""
     if covariance is None:
         return np.ones(rows, bool)
-    with np.errstate(invalid='ignore', over='ignore'):
-        variance = covariance[:, (0, 1), (0, 1)]
-        sized = (variance.min(axis=1) >= LEAST_VARIANCE) & (variance.max(axis=1) <= MOST_VARIANCE)
-    return sized | np.isnan(variance).all(axis=1)
+    variance = covariance[:, (0, 1), (0, 1)]
+    with np.errstate(invalid='ignore'):
+        sized = ((variance >= LEAST_VARIANCE) & (variance <= MOST_VARIANCE)).all(axis=1)
+        if not sized.all():
+            flat = covariance[:, :2, :2]
+            unknown = ~(variance >= 0.0).all(axis=1) | ~flat.any(axis=(1, 2))
+            flat[unknown] = np.nan
+            sized |= unknown
+    return np.asarray(sized)
 
 
 def _names(values: NDArray | None) -> NDArray[np.int32] | None:

@@ -205,6 +205,8 @@ def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float
         raise Rejection(
             'bad_field', f"column '{name}' holds {column.shape[1]} values per row, one is needed"
         )
+    if column.dtype == np.float64:
+        return column
     with np.errstate(invalid='ignore'):  # bytes can be a signalling NaN, which is just a NaN
         return column.astype(np.float64)
 

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,3 +26,12 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 IndexArray = NDArray[np.intp]
+
+
+def with_rows(array: NDArray[Any], count: int, value: Any) -> NDArray[Any]:
+    """`array` (n, ...) and behind it `count` rows with a value for all or one for each. For a few
+    rows this is quicker than to make an array of the value first."""
+    n = len(array)
+    out = np.empty((n + count, *array.shape[1:]), array.dtype)
+    out[:n], out[n:] = array, value
+    return out

@@ -36,6 +36,7 @@ Reference: Blackman, Popoli, *Design and Analysis of Modern Tracking Systems* (1
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 from functools import lru_cache
 import math
@@ -44,9 +45,12 @@ from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import BoolArray, FloatArray, IndexArray, IntArray
+from .arrays import BoolArray, FloatArray, IndexArray, IntArray, with_rows
 from .imm import pairs_inside
 from .jit import kernel
+
+Pair = tuple[int, int, float]
+"""A target, a detection, and the cost of taking them together."""
 
 TENTATIVE, CONFIRMED, COASTING = 0, 1, 2
 """The numbers of `TrackStatus`, plain: a scan asks for them often."""
@@ -92,28 +96,32 @@ def assign(
     >>> assign(target, detection, np.array([-3.0, -2.5, -4.0]), 2, 2).tolist()
     [1, 0]
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     chosen = np.full(targets, -1, np.int64)
     worthwhile = cost < 0.0
     target, detection, cost = target[worthwhile], detection[worthwhile], cost[worthwhile]
     if not (_repeats(target, targets) or _repeats(detection, detections)):
         chosen[target] = detection  # nothing is contested
         return chosen
-    nodes = targets + detections
-    graph = coo_matrix((np.ones(len(cost)), (target, targets + detection)), shape=(nodes, nodes))
-    label = connected_components(graph, directed=False)[1][target]
-    order = np.argsort(label, kind='stable')
-    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
-    sizes = np.diff(starts, append=len(order))
-    alone = order[starts[sizes == 1]]
-    chosen[target[alone]] = detection[alone]
-    for start, size in zip(starts[sizes > 1], sizes[sizes > 1]):
-        pairs = order[start : start + size]
-        for t, d in _solve_cluster(target[pairs], detection[pairs], cost[pairs]):
+    for pairs in _clusters(list(zip(target.tolist(), detection.tolist(), cost.tolist()))):
+        for t, d in _solve_cluster(pairs):
             chosen[t] = d
     return chosen
+
+
+def _clusters(pairs: list[Pair]) -> Iterable[list[Pair]]:
+    """The pairs that share a target or a detection, directly or by others between them."""
+    clusters: dict[int, list[Pair]] = {}
+    for pair in pairs:
+        t, d = pair[0], -1 - pair[1]
+        one, other = clusters.setdefault(t, []), clusters.setdefault(d, [])
+        if one is not other:
+            one, other = (one, other) if len(one) >= len(other) else (other, one)
+            one += other
+            for its_t, its_d, _ in other:
+                clusters[its_t] = clusters[-1 - its_d] = one
+            clusters[t] = clusters[d] = one
+        one.append(pair)
+    return {id(cluster): cluster for cluster in clusters.values()}.values()
 
 
 def _repeats(numbers: IntArray, count: int) -> bool:
@@ -151,18 +159,19 @@ def assign_fits(
     return assign_by_rank(target, detection, cost, tentative.astype(np.int64), fit.shape[1])
 
 
-def _solve_cluster(
-    target: IntArray, detection: IntArray, cost: FloatArray
-) -> list[tuple[int, int]]:
+def _solve_cluster(pairs: list[Pair]) -> list[tuple[int, int]]:
     """Solve one cluster as a dense table. A cell of cost zero stands for 'not assigned', so a full
     assignment always exists."""
+    if len(pairs) == 1:
+        return [pairs[0][:2]]
     from scipy.optimize import linear_sum_assignment
 
     # Plain dictionaries: most clusters hold two pairs, for which numpy.unique is the slowest part.
-    rows = {t: i for i, t in enumerate(sorted(set(target.tolist())))}
-    columns = {d: j for j, d in enumerate(sorted(set(detection.tolist())))}
+    rows = {t: i for i, t in enumerate(sorted({t for t, _, _ in pairs}))}
+    columns = {d: j for j, d in enumerate(sorted({d for _, d, _ in pairs}))}
     table = np.zeros((len(rows), len(columns)))
-    table[[rows[t] for t in target.tolist()], [columns[d] for d in detection.tolist()]] = cost
+    for t, d, cost in pairs:
+        table[rows[t], columns[d]] = cost
     targets, detections = list(rows), list(columns)
     return [
         (targets[i], detections[j])
@@ -257,31 +266,28 @@ class Tracks:
 
     def born(self, count: int, stamp_ns: int, rules: TrackRules) -> Tracks:
         """Append `count` tracks, each with its first hit."""
-        window = rules.confirm_window
-        seen = np.zeros((len(self) + count, window), np.bool_)
-        seen[: len(self)] = _window(self.seen, window)
-        seen[len(self) :, -1] = True
         track_id, next_id = new_ids(self.next_id, count, self.track_id)
-        status = np.full(count, CONFIRMED if rules.confirm_hits == 1 else TENTATIVE, np.uint8)
+        seen = with_rows(_window(self.seen, rules.confirm_window), count, False)
+        seen[len(self) :, -1] = True
         return Tracks(
-            np.concatenate([self.track_id, track_id]),
-            np.concatenate([self.status, status]),
-            np.concatenate([self.age, np.ones(count, np.int64)]),
+            with_rows(self.track_id, count, track_id),
+            with_rows(self.status, count, CONFIRMED if rules.confirm_hits == 1 else TENTATIVE),
+            with_rows(self.age, count, 1),
             seen,
-            np.concatenate([self.misses, np.zeros(count, np.int64)]),
-            np.concatenate([self.last_hit_ns, np.full(count, stamp_ns, np.int64)]),
+            with_rows(self.misses, count, 0),
+            with_rows(self.last_hit_ns, count, stamp_ns),
             next_id,
         )
 
     def resumed(self, track_id: int, stamp_ns: int, rules: TrackRules) -> Tracks:
         """Append a confirmed track that ended before, without a hit; it may coast from now on."""
         return Tracks(
-            np.append(self.track_id, np.uint32(track_id)),
-            np.append(self.status, np.uint8(COASTING)),
-            np.append(self.age, np.int64(0)),
-            np.pad(_window(self.seen, rules.confirm_window), ((0, 1), (0, 0))),
-            np.append(self.misses, np.int64(0)),
-            np.append(self.last_hit_ns, np.int64(stamp_ns)),
+            with_rows(self.track_id, 1, track_id),
+            with_rows(self.status, 1, COASTING),
+            with_rows(self.age, 1, 0),
+            with_rows(_window(self.seen, rules.confirm_window), 1, False),
+            with_rows(self.misses, 1, 0),
+            with_rows(self.last_hit_ns, 1, stamp_ns),
             self.next_id,
         )
 

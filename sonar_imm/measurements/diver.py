@@ -65,12 +65,12 @@ def in_space(covariance: Any, position: FloatArray) -> FloatArray:
     itself is not finite. x and y are then used without it. Where x and y are unknown (NaN), z may
     be stated all the same. Raises `Rejection` for other shapes.
     """
-    given, n = np.array(covariance, np.float64), len(position)
-    whole = np.full((n, 3, 3), np.nan)
+    given, n = np.asarray(covariance, np.float64), len(position)
     if given.shape == (n, 2, 2):
+        whole = np.full((n, 3, 3), np.nan)
         whole[:, :2, :2] = given
         return whole
-    whole[:] = floats(given, n, 3, 3)
+    whole = floats(given, n, 3, 3).copy()
     if np.isnan(whole[:, 2, 2]).all():  # z is not stated, which is so scan after scan
         whole[:, 2, :] = whole[:, :, 2] = np.nan
         return whole
@@ -181,7 +181,8 @@ class Fixes:
         if self.covariance is not None:
             covariance = in_space(self.covariance, self.position)
             covariance.flags.writeable = False
-            object.__setattr__(self, 'covariance', covariance)
+            known = not np.isnan(covariance).all()
+            object.__setattr__(self, 'covariance', covariance if known else None)
         if not usable_fixes(self.position, self.covariance).all():
             raise Rejection(
                 'bad_row', 'a fix of the scan has a position or a covariance that cannot be used'
@@ -217,14 +218,14 @@ def usable_fixes(position: FloatArray, covariance: FloatArray | None) -> NDArray
         usable = (np.abs(position[:, :2]) <= FARTHEST_FIX).all(axis=1)
         if covariance is None:
             return np.asarray(usable)
-        covariance = covariance[:, :2, :2]
-        a, b, c, d = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-        scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
-        # Relative to the largest entry, so that nothing overflows; as `check_covariance`.
-        a, b, c, d = (part / np.where(scale > 0.0, scale, 1.0) for part in (a, b, c, d))
-        least = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
-        known = np.isfinite(scale) & (scale > 0.0) & (np.abs(b - c) <= 1e-6) & (least > 1e-12)
-        return np.asarray(usable & (known | np.isnan(covariance).all(axis=(1, 2))))
+        a, b, c, d = covariance[:, :2, :2].reshape(-1, 4).T
+        scale = np.maximum(np.maximum(np.abs(a), np.abs(d)), np.abs(b))
+        # Halved before it is added, so that nothing overflows; as `check_covariance`.
+        least = 0.5 * a + 0.5 * d - np.hypot(0.5 * a - 0.5 * d, b)
+        known = (np.abs(b - c) <= 1e-6 * scale) & (least > 1e-12 * scale) & (scale < np.inf)
+        if not known.all():
+            known |= np.isnan(covariance[:, :2, :2]).all(axis=(1, 2))
+        return np.asarray(usable & known)
 
 
 OPTIONAL_ARRIVALS = ('elevation', 'var_elevation', 'depth', 'var_depth')

@@ -447,6 +447,8 @@ def _main(reader: str, path: str) -> None:
         out.flush()
 
     warnings.simplefilter('ignore')
+    for unused in ('matplotlib', 'numba'):  # a library loads them for its plots, for a second
+        sys.modules[unused] = None  # type: ignore[assignment]
     try:
         __import__(LIBRARIES[reader])
     except ImportError as error:

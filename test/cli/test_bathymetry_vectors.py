@@ -16,66 +16,28 @@
 
 import csv
 import json
-from pathlib import Path
 
+from attrs import evolve
+from helpers.bathymetry_cases import vector
 import numpy as np
 import pytest
 
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.state_file import json_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
-
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
 
 
 def tracked(name, tmp_path, **more):
     """The case and the columns of its estimate.csv."""
-    with np.load(VECTORS / f'{name}.npz') as archive:
-        case = dict(archive)
-    noise = np.full(len(case['r']), float(case['sn2']))
-    snapshot = Snapshot(
-        stamp_ns=10**9,
-        range=case['r'],
-        iq=case['Y'],
-        noise_variance=noise,
-        signal_variance=case['rho'] * noise,
-    )
-    with BagWriter(tmp_path / 'bag') as bag:
-        bag.write('/snapshot', write_snapshot(snapshot, ros_message), 10**9)
-    values = {
-        'sonar_height': float(case['H']),
-        'tilt_deg': float(np.degrees(case['tilt'])),
-        'element_spacing_wavelengths': float(case['dlam']),
-        'transition_matrix': case['Pi'].ravel().tolist(),
-        'initial_probabilities': case['mu0'].tolist(),
-        'initial_std': float(case['sd0']),
-        'particles_per_model': 3000,
-        'shadow_gate': False,
-        **more,
-    }
-    if name.startswith('set_iii'):
-        values |= {
-            'model_set': 'angle_two_rw',
-            'angle_drift': False,  # as the vectors were made
-            'initial_mean': float(case['th0']),
-            'sigmas_deg': [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()],
-        }
-    else:
-        values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}
-    (tmp_path / 'params.yaml').write_text(json.dumps({'/**': {'ros__parameters': values}}))
-    assert (
-        main(
-            [
-                'track',
-                str(tmp_path / 'bag'),
-                str(tmp_path / 'out'),
-                '--params',
-                str(tmp_path / 'params.yaml'),
-            ]
-        )
-        == 0
-    )
+    case, config, snapshot = vector(name)
+    bag, file = tmp_path / 'bag', tmp_path / 'params.yaml'
+    with BagWriter(bag) as writer:
+        message = write_snapshot(evolve(snapshot, stamp_ns=10**9), ros_message)
+        writer.write('/snapshot', message, 10**9)
+    values = json_parameters(evolve(config, **more))
+    file.write_text(json.dumps({'/**': {'ros__parameters': values}}))
+    assert main(['track', str(bag), str(tmp_path / 'out'), '--params', str(file)]) == 0
     with open(tmp_path / 'out' / 'estimate.csv', newline='') as file:
         rows = list(csv.DictReader(file))
     return case, {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}

@@ -263,7 +263,7 @@ def test_a_clock_set_back_beyond_any_lateness_is_believed_at_once(back):
     assert released(decisions)[-10:] == again
 
 
-@pytest.mark.parametrize('rate', [1, 10, 1000])
+@pytest.mark.parametrize('rate', [1, 10, 100])
 def test_a_clock_set_back_inside_the_stream_is_believed_after_a_long_run(rate):
     stream = [1000 + i / rate for i in range(500 * rate)]
     again = [1250 + i / rate for i in range(200 * rate)]
@@ -271,7 +271,7 @@ def test_a_clock_set_back_inside_the_stream_is_believed_after_a_long_run(rate):
     assert restarts(decisions) == 1
     assert released(decisions) == stream + again
     waited = [d.verdict for d in decisions].index('restart') - len(stream) + 1
-    assert waited == {1: 100, 10: 102, 1000: 1000}[rate]
+    assert waited == {1: 100, 10: 102, 100: 1000}[rate]
 
 
 def test_a_clock_set_back_a_little_reaches_its_old_time():

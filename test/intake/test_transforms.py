@@ -19,9 +19,10 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.intake import MOST_FRAMES, moved, TransformTree
+from sonar_imm.intake import KnownFrames, MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
     Altitude,
+    ArrayDepth,
     Arrivals,
     Detections,
     Fix,
@@ -194,3 +195,61 @@ def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
     assert tree.pose('hull', 'sonar') is not None
     assert tree.pose('f0', 'f1') is None
     assert tree.pose(f'f{3 * MOST_FRAMES - 2}', f'f{3 * MOST_FRAMES - 1}') is not None
+
+
+# One frame for one tracker.
+
+
+def fix(frame_id):
+    return Fix(stamp_ns=1, position=(0.0, 0.0, 0.0), frame_id=frame_id)
+
+
+def refused(frames, frame_id):
+    with pytest.raises(Rejection) as caught:
+        frames.admit(fix(frame_id))
+    return caught.value
+
+
+def test_the_first_named_frame_stays():
+    frames = KnownFrames()
+    frames.admit(fix(''))
+    frames.admit(fix('map'))
+    frames.admit(fix('map'))
+    rejection = refused(frames, 'odom')
+    assert rejection.reason == 'frame'
+    assert rejection.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
+    refused(frames, '')
+
+
+def test_a_required_frame_holds_before_any_is_known():
+    frames = KnownFrames()
+    with pytest.raises(Rejection, match="'map' is not the frame 'harbour' of the tracks"):
+        frames.check(fix('map'), 'harbour')
+    with pytest.raises(Rejection, match="'' is not the frame 'harbour' of the tracks"):
+        frames.check(fix(''), 'harbour')
+    frames.check(fix('harbour'), 'harbour')
+    frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
+    assert frames.frame_id == ''
+
+
+def test_what_sensors_on_board_say_is_in_frames_of_their_own():
+    frames = KnownFrames()
+    echo = Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar')
+    height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
+    place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
+    for measurement in (echo, height, place, echo, height, place):
+        frames.admit(measurement)
+    for other in (
+        Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
+        Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
+    ):
+        with pytest.raises(Rejection) as caught:
+            frames.admit(other)
+        assert caught.value.reason == 'frame'
+
+
+def test_a_depth_is_a_depth_in_any_frame():
+    frames = KnownFrames()
+    frames.admit(fix('map'))
+    frames.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    assert frames.frame_id == 'map'

@@ -28,7 +28,7 @@ LIMITS = {
     'fixes': (2.0, 100.0),
     'fixes_softly': (10.0, 200.0),
     'arrivals_wild_tag': (5.0, 50.0),
-    'arrivals_many_divers': (15.0, 50.0),
+    'arrivals_many_divers': (40.0, 50.0),
     'detections': (2.0, 100.0),
     'snapshot': (5.0, 100.0),
     'pressure': (5.0, 500.0),

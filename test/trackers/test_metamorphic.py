@@ -21,34 +21,257 @@ other ones: there the trackers without particles agree to the last bit, the othe
 say themselves.
 """
 
+import math
+
 from attrs import evolve
 from helpers.faults.figures import Figures
-from helpers.moved_scenes import (
-    agree,
-    divers,
-    LATER,
-    Motion,
-    MOTIONS,
-    obstacles,
-    pings,
-    run,
-    same_divers,
-    same_floor,
-    same_obstacles,
-    SECOND,
-    T0,
-    traces,
-    UTM,
-)
 import numpy as np
 import pytest
 
 from msg_adapters.displays.obstacle import write_markers, write_poses
 from msg_adapters.estimates import read_estimate, write_estimate
 from msg_adapters.soundings import read_soundings, write_soundings
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Arrivals, Detections, Fix, Fixes, Navigation, Snapshot, Trace
 from sonar_imm.soundings import soundings_of
+from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.messages import ros_message
+
+# Scenes of every system that can be turned, moved, mirrored, dated and numbered otherwise, and
+# what two runs of them must have in common.
+
+
+SECOND = 10**9
+T0 = 1_700_000_000 * SECOND
+UTM = np.array([5e5, 4e6, 0.0])
+LATER = 10**9 * SECOND // 4
+"""A quarter of 1e9 s: after more, the seconds of a header are over."""
+
+
+class Motion:
+    """Of the whole scene: mirrored at the x axis, then turned, then moved, then later."""
+
+    def __init__(self, turn_deg=0.0, shift=(0.0, 0.0, 0.0), mirror=False, late_ns=0):
+        angle = math.radians(turn_deg)
+        self.turn = np.array([
+            [math.cos(angle), -math.sin(angle), 0.0],
+            [math.sin(angle), math.cos(angle), 0.0],
+            [0.0, 0.0, 1.0],
+        ])  # fmt: skip
+        self.half = math.sin(angle / 2), math.cos(angle / 2)
+        self.sign = -1.0 if mirror else 1.0
+        self.A = self.turn @ np.diag([1.0, self.sign, 1.0])
+        self.shift, self.late_ns = np.asarray(shift), late_ns
+
+    def point(self, x):
+        return np.asarray(x, float) @ self.A.T + self.shift
+
+    def covariance(self, P):
+        n = P.shape[-1] // 2
+        A = np.kron(np.eye(n), self.A[:2, :2])
+        return A @ P @ A.T
+
+    def quaternion(self, q):
+        """Mirrored at the x-z plane, then turned about the vertical; x, y, z, w."""
+        x, y, z, w = q[0] * self.sign, q[1], q[2] * self.sign, q[3]
+        s, c = self.half
+        return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+
+
+MOTIONS = {
+    'turned by a quarter': Motion(turn_deg=90.0),
+    'turned by 22.5 degrees': Motion(turn_deg=22.5),
+    'moved to UTM': Motion(shift=UTM),
+    'mirrored': Motion(mirror=True),
+    'mirrored, turned and moved': Motion(45.0, UTM, True),
+    'later': Motion(late_ns=LATER),
+}
+
+
+def agree(given, kind, got, wanted, tolerance, relative=False):
+    """Hold two arrays to a tolerance, for `relative` of one plus what is wanted; told[kind] is the
+    worst difference seen."""
+    got, wanted = np.asarray(got, float), np.asarray(wanted, float)
+    assert got.shape == wanted.shape
+    same = (got == wanted) | (np.isnan(got) & np.isnan(wanted))
+    scale = 1.0 + np.abs(wanted) if relative else np.ones(wanted.shape)
+    worst = float(np.max(np.abs(got - wanted)[~same] / scale[~same], initial=0.0))
+    given[kind] = max(given.get(kind, 0.0), worst)
+    assert worst <= tolerance, f'{kind}: {worst}'
+
+
+def run(system, measurements, **parameters):
+    entry = SYSTEMS[system]
+    tracker = entry.build(entry.config_type().from_mapping(parameters))
+    return [estimate for item in measurements for estimate in tracker.process(item)]
+
+
+RX = np.array([[0.0, 0, 0], [70, 10, 0], [-60, 45, 0], [10, 85, 0]])
+
+
+def divers(motion, order=(0, 1), receivers=(0, 1, 2, 3)):
+    """Two divers, seen as scans of fixes and by echoes of pings."""
+    rng = np.random.default_rng(4)
+    found = []
+    for k in range(14):
+        stamp = T0 + k * SECOND + motion.late_ns
+        at = np.array([[0.7 * k, 5.0, 0.0], [30.0, 40.0 - 0.6 * k, 0.0]])
+        at[:, :2] += rng.normal(0.0, 0.3, (2, 2))
+        if k % 4 == 3:
+            legs = np.linalg.norm(RX[:, None] - at, axis=2)
+            toa = (legs + legs[0])[:, list(order)] / 1500.0
+            rx = motion.point(RX)[list(receivers)]
+            n = 4 * len(at)
+            found.append(Arrivals(
+                stamp_ns=stamp, frame_id='map', tx_id=np.zeros(n), tx=np.tile(motion.point(RX[0]),
+                (n, 1)), rx_id=np.repeat(receivers, 2), rx=np.repeat(rx, 2, axis=0),
+                toa=toa[list(receivers)].ravel(), var_toa=np.full(n, 1e-8),
+                bearing=np.full(n, np.nan), var_bearing=np.full(n, np.nan),
+            ))  # fmt: skip
+            continue
+        R = np.tile(motion.covariance(np.array([[0.2, 0.05], [0.05, 0.1]])), (2, 1, 1))
+        moved = motion.point(at)[list(order)]
+        found.append(Fixes(stamp_ns=stamp, frame_id='map', position=moved, covariance=R))
+    return found
+
+
+def same_divers(plain, moved, motion, tolerance):
+    values = {}
+    assert len(plain) == len(moved)
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns and len(first) == len(other)
+        place = motion.point(np.column_stack([first.state[:, :2], np.zeros(len(first))]))[:, :2]
+        velocity = first.state[:, 2:4] @ motion.A[:2, :2].T
+        gap = np.abs(place[:, None] - other.state[None, :, :2]).sum(axis=2)
+        row = gap.argmin(axis=1)  # tracks begin in the order of the fixes
+        assert sorted(row) == list(range(len(row)))
+        agree(values, 'places', other.state[row, :2], place, tolerance)
+        agree(values, 'states', other.state[row, 2:4], velocity, tolerance)
+        turned = motion.covariance(first.covariance)
+        agree(values, 'covariances', other.covariance[row], turned, tolerance)
+        permuted = np.empty_like(first.probabilities)
+        permuted[:, _headings(first.model_names, motion)] = first.probabilities
+        agree(values, 'probabilities', other.probabilities[row], permuted, tolerance)
+    return values
+
+
+def _headings(names, motion):
+    """Which model each model is after the motion, by the direction in its name."""
+    found = []
+    for name in names:
+        family, heading, _ = name.partition('heading_')
+        if not heading:
+            found.append(names.index(name))
+            continue
+        headings = [each for each in names if each.startswith(family + heading)]
+        k = headings.index(name)
+        direction = 2.0 * math.pi * k / len(headings)
+        x, y, _ = motion.A @ [math.cos(direction), math.sin(direction), 0.0]
+        turned = round(math.atan2(y, x) / (2.0 * math.pi) * len(headings)) % len(headings)
+        found.append(names.index(headings[turned]))
+    return found
+
+
+def obstacles(motion, order=(0, 1)):
+    """Two fixed obstacles ahead of a vehicle that yaws and rolls."""
+    world = np.array([[60.0, 4.0, -6.0], [52.0, -6.0, -12.0]])
+    found = []
+    for k in range(24):
+        stamp = T0 + k * SECOND // 2 + motion.late_ns
+        yaw, roll = 0.05 * math.sin(0.5 * k), 0.1 * math.sin(0.9 * k)
+        position = np.array([0.7 * k, 0.1 * k, -9.0])
+        turn = [
+            math.sin(roll / 2) * math.cos(yaw / 2),
+            math.sin(roll / 2) * math.sin(yaw / 2),
+            math.cos(roll / 2) * math.sin(yaw / 2),
+            math.cos(roll / 2) * math.cos(yaw / 2),
+        ]
+        found.append(Navigation(
+            stamp_ns=stamp, frame_id='odom', child_frame_id='base',
+            position=motion.point(position), orientation=motion.quaternion(turn),
+            velocity=[1.4, 0.2 * motion.sign, 0.0],
+        ))  # fmt: skip
+        offset = world - position
+        level = np.hypot(offset[:, 0], offset[:, 1])
+        bearing = np.arctan2(offset[:, 1], offset[:, 0]) - yaw
+        bearing = bearing + roll * offset[:, 2] / level
+        found.append(Detections(
+            stamp_ns=stamp, frame_id='sonar', range=np.linalg.norm(offset, axis=1)[list(order)],
+            bearing=motion.sign * bearing[list(order)],
+        ))  # fmt: skip
+    return found
+
+
+def same_obstacles(plain, moved, motion, tolerance):
+    values = {}
+
+    def close(kind, got, wanted):
+        agree(values, kind, got, wanted, tolerance, relative=True)
+
+    assert len(plain) == len(moved) > 20
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns and len(first) == len(other)
+        side = np.array([1.0, motion.sign, 1.0])
+        state = first.state * side
+        row = np.abs(state[:, None] - other.state[None]).sum(axis=2).argmin(axis=1)
+        close('states', other.state[row], state)
+        close('covariances', other.covariance[row], first.covariance * np.outer(side, side))
+        close('probabilities', other.probabilities[row], first.probabilities)
+        agree(values, 'places', other.xyz[row], motion.point(first.xyz), max(tolerance, 1e-8) * 10)
+    return values
+
+
+def pings(motion, side='starboard'):
+    """A ship over a slope, with an array that looks to one side."""
+    rng = np.random.default_rng(9)
+    ranges = 18.0 + 0.2 * np.arange(40)
+    found = []
+    for k in range(4):
+        stamp = T0 + k * SECOND // 5 + motion.late_ns
+        roll = 0.03 * math.sin(2.0 * k)
+        found.append(Navigation(
+            stamp_ns=stamp, frame_id='odom', position=motion.point([0.4 * k, 0.02 * k, 0.0]),
+            orientation=motion.quaternion([math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2)]),
+        ))  # fmt: skip
+        angle = np.arcsin(15.0 / ranges)
+        phase = np.pi * np.sin(angle - math.radians(30.0))[:, None] * np.arange(6)
+        loud = rng.normal(size=(40, 1)) + 1j * rng.normal(size=(40, 1))
+        noise = 0.1 * (rng.normal(size=(40, 6)) + 1j * rng.normal(size=(40, 6)))
+        found.append(Snapshot(
+            stamp_ns=stamp, range=ranges, iq=(loud * np.exp(1j * phase) + noise), side=side,
+            noise_variance=np.full(40, 0.02), frame_id='sonar', sound_speed=1500.0,
+        ))  # fmt: skip
+    return found
+
+
+def same_floor(plain, moved, motion, tolerance, place):
+    values = {}
+    assert len(plain) == len(moved) >= 3
+    for first, other in zip(plain, moved):
+        assert other.stamp_ns == first.stamp_ns + motion.late_ns
+        np.testing.assert_array_equal(first.extras['valid'], other.extras['valid'])
+        assert first.extras['valid'].mean() > 0.5
+        agree(values, 'states', other.state, first.state, tolerance)
+        agree(values, 'covariances', other.covariance, first.covariance, tolerance)
+        agree(values, 'probabilities', other.probabilities, first.probabilities, tolerance)
+        agree(values, 'places', other.xyz, motion.point(first.xyz), place)
+    return values
+
+
+def traces(deeper=0.0, late_ns=0, louder=1.0):
+    rng = np.random.default_rng(3)
+    depth = 20.0 + 0.1 * np.arange(120)
+    found = []
+    for k in range(6):
+        amplitude = 5.0 * np.exp(-np.square((depth - 23.0) / 0.25))
+        amplitude += 3.0 * np.exp(-np.square((depth - 27.0 - 0.05 * k) / 0.25))
+        amplitude += 0.3 * rng.normal(size=len(depth))
+        found.append(Trace(
+            stamp_ns=T0 + k * SECOND + late_ns, depth=depth + deeper, frame_id='array',
+            amplitude=louder * amplitude, sigma=np.full(120, 0.3 * louder),
+            reference_depth=10.0 + deeper,
+        ))  # fmt: skip
+    return found
+
 
 BILLION = 10**9 * SECOND
 """From 1970 on a stamp may be so much later."""

@@ -93,8 +93,8 @@ def births_from_fixes(
         known = math.nan if existence is None else float(existence[d])
         name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
         height = None if fixes.heights is None else fixes.heights.row(d)
-        birth = Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name, height=height)
-        births.append(birth._replace(seen_by=fixes.turned_by))
+        of_sensor = height, fixes.turned_by
+        births.append(Birth(fixes.z[d], fixes.R[d], None, None, known, name, True, *of_sensor))
     return births
 
 

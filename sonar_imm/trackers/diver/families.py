@@ -217,9 +217,9 @@ def shared(mu: FloatArray, models: ModelSet) -> FloatArray:
     """mu (T, K M) after a little of the weight of the copies is spread over them: over those that
     are `stated`, over the others, and over these two, so that what the stated ones weigh among
     themselves does not depend on the others."""
-    stated = np.array(models.stated)
-    if len(stated) == 1 or not len(mu):
+    if len(models.stated) == 1 or not len(mu):
         return mu
+    stated = np.array(models.stated)
     each, weight = _each_copy(mu, len(stated))
     groups = [group for group in (stated, ~stated) if group.any()]
     for group in groups:
@@ -259,9 +259,9 @@ def positions(now: DiverState, models: ModelSet) -> tuple[FloatArray, FloatArray
     two are apart. If they are better, this is cautious.
     """
     mean, covariance = now.positions(models.E)
-    stated = np.array(models.stated)
-    if not stated.all():
-        own, covariance = now._replace(mu=as_stated(now.mu, stated)).positions(models.E)
+    if not all(models.stated):
+        mu = as_stated(now.mu, np.array(models.stated))
+        own, covariance = now._replace(mu=mu).positions(models.E)
         off = mean - own
         covariance = covariance + off[:, :, None] * off[:, None, :]
     return mean, covariance

@@ -252,18 +252,17 @@ def _group(
     scan: Fixes, rows: IndexArray, config: DiverConfig, factor: float, *, named: bool
 ) -> Positions:
     """The rows of a scan, with their names or as all that there was to see."""
-    R = np.tile(np.eye(2) * config.fix_std**2, (len(scan), 1, 1))
-    heights = None
+    position, covariance = scan.position[rows], np.full((len(rows), 3, 3), np.nan)
     if scan.covariance is not None:
-        flat = scan.covariance[:, :2, :2]
-        stated = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
-        R = np.where(stated[:, None, None], flat, R)
-        if config.dimensions == 3:
-            heights = Heights.of(scan.position[rows], scan.covariance[rows], factor)
+        covariance = scan.covariance[rows]
+    R = np.ascontiguousarray(covariance[:, :2, :2])
+    if not (stated := np.isfinite(R)).all():
+        R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
+    heights = Heights.of(position, covariance, factor) if config.dimensions == 3 else None
     target_id = np.asarray(scan.target_id)[rows] if named else None
-    z = np.ascontiguousarray(scan.position[rows, :2])
+    z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _place(config)
-    return Positions(z, R[rows] * factor, config, factor, *named_rows)
+    return Positions(z, R * factor, config, factor, *named_rows)
 
 
 def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:

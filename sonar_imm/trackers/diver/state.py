@@ -25,7 +25,7 @@ import numpy as np
 
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray, with_rows
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from ...estimation.hypotheses import Hypotheses
@@ -303,21 +303,24 @@ class DiverState(NamedTuple):
         """The tracks where `kept` (T,) is True; `life` is that of those."""
         if kept.all():
             return self._replace(life=life)
-        return self.at(np.flatnonzero(kept), life)._replace(hypotheses=self.hypotheses.only(kept))
+        return self.at(kept.nonzero()[0], life, hypotheses=self.hypotheses.only(kept))
 
-    def at(self, rows: IndexArray, life: Tracks) -> DiverState:
-        """The rows of those numbers; `life` is that of them. Hypotheses are left as they are."""
+    def at(self, rows: IndexArray, life: Tracks, **other: Any) -> DiverState:
+        """The rows of those numbers; `life` is that of them. Hypotheses are left as they are, but
+        for what is `other`."""
         parts: dict[str, Any] = {name: getattr(self, name).take(rows, axis=0) for name in ROWS}
-        return self._replace(life=life, **parts)
+        return self._replace(life=life, **parts, **other)
 
     def only(self, kept: BoolArray) -> DiverState:
         """The tracks where `kept` (T,) is True."""
         return self if kept.all() else self.rows(kept, self.life.only(kept))
 
-    def with_rows(self, life: Tracks, new: Mapping[str, np.ndarray]) -> DiverState:
-        """With more tracks, `life` is that of all: `new` holds an array for each of `ROWS`."""
+    def with_rows(self, life: Tracks, new: Mapping[str, Any]) -> DiverState:
+        """With more tracks, `life` is that of all: `new` holds for each of `ROWS` an array, or a
+        number for all."""
+        count = len(life) - len(self.x)
         parts: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), new[name]]) for name in ROWS
+            name: with_rows(getattr(self, name), count, new[name]) for name in ROWS
         }
         return self._replace(life=life, **parts)
 

@@ -159,7 +159,8 @@ class ModelSet:
         P[..., :2, :2] = covariance[:, None]
         if from_fix and measured and len(self.scales) > 1:
             P[..., :2, :2] *= np.repeat(self.scales, M)[:, None, None]
-        P[..., range(2, n), range(2, n)] = self._for_copies(self.start_variance)
+        diagonal = P.reshape(*shape, n * n)[..., :: n + 1]
+        diagonal[..., 2:] = self._for_copies(self.start_variance)
         if self.height >= 0:
             x[..., self.height] = np.repeat(self.heights, M)
         if self.bias >= 0 and from_fix:

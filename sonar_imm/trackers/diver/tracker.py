@@ -544,21 +544,21 @@ class DiverTracker:
                 'P': P,
                 'mu': mu,
                 'learnt': self._chain.fresh(count),
-                'nis': np.full(count, np.nan),
-                'nis_dof': np.zeros(count, np.uint16),
-                'score': np.zeros(count),
-                'white': np.full((count, 2), np.nan),
-                'existence': np.array([birth.existence for birth in found]),
-                'evidence': np.ones(count),
-                'target_id': np.array([birth.target_id for birth in found]),
-                'near_to': np.zeros(count, np.int64),
-                'near_for': np.zeros(count, np.int64),
-                'refused': np.full((count, 6), np.nan),
-                'history': np.zeros((count, self._window), np.int64),
-                'came_from': np.full(count, -1),
-                'looks': np.zeros(count),
-                'refused_z': np.full((count, 3), np.nan),
-                'spreads': np.zeros(count, np.int64),
+                'nis': np.nan,
+                'nis_dof': 0,
+                'score': 0.0,
+                'white': np.nan,
+                'existence': [birth.existence for birth in found],
+                'evidence': 1.0,
+                'target_id': [birth.target_id for birth in found],
+                'near_to': 0,
+                'near_for': 0,
+                'refused': np.nan,
+                'history': 0,
+                'came_from': -1,
+                'looks': 0.0,
+                'refused_z': np.nan,
+                'spreads': 0,
             },
         )
 
@@ -569,10 +569,9 @@ class DiverTracker:
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = families.positions(state, self.models)
         covariance = state.offsets.widened(mean, covariance, self.config)
-        depth = np.full(len(mean), self.config.target_z)
-        if self.models.height >= 0:
-            depth = mean[:, 2]
-        xyz = np.column_stack([mean[:, :2], depth])
+        xyz = np.full((len(mean), 3), self.config.target_z)
+        known = 3 if self.models.height >= 0 else 2
+        xyz[:, :known] = mean[:, :known]
         extras: dict[str, np.ndarray] = {
             'track_id': state.life.track_id,
             'track_state': state.life.status,

@@ -86,6 +86,7 @@ class BehaviourSlices(DepthSlices):
         sways = behaviour == 'swaying'
         self._sway = config.sway_std * np.where(wide, WIDER, 1.0) * sways
         self._share = np.where(sways, np.where(wide, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
+        self._count, self._identity = round(self._share[: self.M].sum()), np.eye(self.M)
         self._is = {name: behaviour == name for name in known}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
@@ -151,12 +152,11 @@ class BehaviourSlices(DepthSlices):
     def _transition(self, dt: float) -> FloatArray:
         """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds
         later. As long as it sways it does so equally far."""
-        share = self._share[: self.M]
-        N = round(share.sum())  # what it may do
+        share, N = self._share[: self.M], self._count
         rate = N / ((N - 1) * self.config.behaviour_time) if N > 1 else 0.0
         change = (1.0 - 1.0 / N) * -math.expm1(-rate * dt)
         other = share * change / max(N - 1, 1)
-        return np.where(self._same, np.eye(self.M) * (1.0 - change), other)
+        return np.where(self._same, self._identity * (1.0 - change), other)
 
     def _motion(self, dt: float) -> Motion:
         config, swaying, moving = self.config, self._swaying, self._moving
@@ -194,7 +194,7 @@ def build_filter(config: ObstacleConfig) -> DepthSlices:
 def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
-    if not filter_.moves.any():
+    if np.count_nonzero(confirmed) < ALIKE_AT_LEAST or not filter_.moves.any():
         return False
     which = np.flatnonzero(confirmed)
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
