@@ -98,3 +98,9 @@ def test_where_numbas_lowering_has_another_form_it_is_left_as_it_is(monkeypatch)
     assert lowering.fewer_passes()
     monkeypatch.setattr(Lower, 'storevar', lambda self, value, name: None)
     assert lowering.fewer_passes() == {}
+
+
+@pytest.mark.parametrize('version', ['0.57.1', '0.69.0', '0.580.0', '1.0.0'])
+def test_a_version_of_numba_that_nobody_has_read_compiles_in_its_own_way(version, monkeypatch):
+    monkeypatch.setattr(lowering.numba, '__version__', version)
+    assert lowering.fewer_passes() == {}
