@@ -113,14 +113,13 @@ def _clusters(pairs: list[Pair]) -> Iterable[list[Pair]]:
     clusters: dict[int, list[Pair]] = {}
     for pair in pairs:
         t, d = pair[0], -1 - pair[1]
-        one, other = clusters.setdefault(t, []), clusters.setdefault(d, [])
-        if one is not other:
-            one, other = (one, other) if len(one) >= len(other) else (other, one)
-            one += other
-            for its_t, its_d, _ in other:
-                clusters[its_t] = clusters[-1 - its_d] = one
-            clusters[t] = clusters[d] = one
-        one.append(pair)
+        small, large = sorted((clusters.setdefault(t, []), clusters.setdefault(d, [])), key=len)
+        if small is not large:
+            large += small
+            for its_t, its_d, _ in small:
+                clusters[its_t] = clusters[-1 - its_d] = large
+            clusters[t] = clusters[d] = large
+        large.append(pair)
     return {id(cluster): cluster for cluster in clusters.values()}.values()
 
 

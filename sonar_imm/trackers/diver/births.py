@@ -93,8 +93,16 @@ def births_from_fixes(
         known = math.nan if existence is None else float(existence[d])
         name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
         height = None if fixes.heights is None else fixes.heights.row(d)
-        of_sensor = height, fixes.turned_by
-        births.append(Birth(fixes.z[d], fixes.R[d], None, None, known, name, True, *of_sensor))
+        births.append(
+            Birth(
+                fixes.z[d],
+                fixes.R[d],
+                existence=known,
+                target_id=name,
+                height=height,
+                seen_by=fixes.turned_by,
+            )
+        )
     return births
 
 
