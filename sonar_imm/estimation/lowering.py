@@ -40,7 +40,7 @@ KNOWN = range(58, 69)
 """The versions of numba, 0.58 to 0.68, whose methods were read; tests run with the first and the
 last."""
 
-_Base: Any = object
+_Base: Any = object  # not numba's class, which may be missing: `fewer_passes` joins the two
 
 
 class _Short(_Base):
@@ -116,9 +116,13 @@ class _Short(_Base):
         array = self.typeof(name)
         return type(array) is types.Array and array.layout == 'C' and array.aligned
 
+    def _kept(self, value: Any) -> dict[Any, Any]:
+        """The parts that are known of a structure."""
+        return self._parts.get(id(value), (None, {}))[1]
+
     def _part(self, array: Any, part: Any, keep: bool = False) -> Any:
         """A field of an array, or one entry of a tuple in it."""
-        kept = self._parts.get(id(array), (None, {}))[1]
+        kept = self._kept(array)
         if part in kept:
             return kept[part]
         found = self.builder.extract_value(array, part)
@@ -181,7 +185,7 @@ class _Short(_Base):
 
     def _short_getiter(self, resty: Any, expr: Any) -> Any:
         whole = self.loadvar(expr.value.name)
-        parts = self._parts.get(id(whole), (None, {}))[1]
+        parts = self._kept(whole)
         if self.typeof(expr.value.name) is not types.range_state64_type or not parts:
             return None
         builder, (start, stop, step) = self.builder, (parts[each] for each in range(3))
@@ -208,12 +212,10 @@ class _Short(_Base):
         return self._made(resty, {0: value, 1: more})
 
     def _short_pair_first(self, resty: Any, expr: Any) -> Any:
-        kept = self._parts.get(id(self.loadvar(expr.value.name)), (None, {}))[1]
-        return kept.get(0)
+        return self._kept(self.loadvar(expr.value.name)).get(0)
 
     def _short_pair_second(self, resty: Any, expr: Any) -> Any:
-        kept = self._parts.get(id(self.loadvar(expr.value.name)), (None, {}))[1]
-        return kept.get(1)
+        return self._kept(self.loadvar(expr.value.name)).get(1)
 
     def _at(self, array: Any, index: Any) -> tuple[Any, int, Any] | None:
         """Type of `array`, of how many of its axes the index is a whole number, and a pointer to
@@ -362,14 +364,18 @@ _Function: Any = types.Function
 _resolve: Any = getattr(_Function, 'get_call_type', None)
 
 
-def _without_locks(event_of: Any) -> Any:
-    """numba tells nobody that it takes a lock; it takes one for each call of LLVM."""
+def _without_locks(broadcast: Any) -> Any:
+    """numba tells nobody that it takes a lock; it takes one for each call of LLVM, and telling is
+    a twelfth of the time."""
 
-    def told(kind: str, *rest: Any, **named: Any) -> None:
+    def of_event(kind: str, *rest: Any, **named: Any) -> None:
         if not kind.endswith('_lock'):
-            event_of(kind, *rest, **named)
+            broadcast(kind, *rest, **named)
 
-    return told
+    return of_event
+
+
+_BROADCASTS = {name: getattr(event, name) for name in ('start_event', 'end_event')}
 
 
 class _WhileCompiling(event.Listener):
@@ -381,9 +387,6 @@ class _WhileCompiling(event.Listener):
 
     def __init__(self) -> None:
         self._depth, self._before = 0, gc.get_threshold()
-        self._numbas = tuple(getattr(event, name) for name in self._EVENTS)
-
-    _EVENTS = 'start_event', 'end_event'
 
     def on_start(self, _: Any) -> None:
         if self._depth == 0:
@@ -391,8 +394,8 @@ class _WhileCompiling(event.Listener):
             if self._before[0]:  # else somebody wants none at all
                 gc.set_threshold(*self.COLLECTIONS)
             _Function.get_call_type = _resolve_once
-            for name, numbas in zip(self._EVENTS, self._numbas, strict=True):
-                setattr(event, name, _without_locks(numbas))
+            for name, broadcast in _BROADCASTS.items():
+                setattr(event, name, _without_locks(broadcast))
         self._depth += 1
 
     def on_end(self, _: Any) -> None:
@@ -400,8 +403,8 @@ class _WhileCompiling(event.Listener):
         if self._depth == 0:
             gc.set_threshold(*self._before)
             _Function.get_call_type = _resolve
-            for name, numbas in zip(self._EVENTS, self._numbas, strict=True):
-                setattr(event, name, numbas)
+            for name, broadcast in _BROADCASTS.items():
+                setattr(event, name, broadcast)
 
 
 event.register('numba:compile', _WhileCompiling())
