@@ -360,7 +360,7 @@ class BaseNode(ManagedNode):
                 f'{self.message_words(name)} is refused: {rejection.sentence} '
                 f"(said once; '{rejection.reason}' is counted in /diagnostics)"
             )
-        self._meter.refused[rejection.reason] += 1
+        self._meter.refuse(name, rejection.reason)
 
     def _recover(self, name: str) -> None:
         """Outlive a bug: a node at sea must not end because of one message."""

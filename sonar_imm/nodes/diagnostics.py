@@ -23,7 +23,7 @@ From what is found in one period comes a level that a watchdog can use. A value 
 above and now below it. So a finding counts only after it was there in `RISE` periods in a row, and
 is over only after it was gone for `FALL` periods in a row. What is final by itself (an error that
 was caught, a silence, which has its own patience) counts at once. A period without a message says
-nothing of what only messages show, so that slow sensors count too.
+nothing of what only messages show, so that slow sensors count too, beside fast ones as well.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class Meter:
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self.refused_on: Counter[str] = Counter()
         self.doubted: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.first: dict[str, float] = {}
@@ -99,6 +100,11 @@ class Meter:
         self.received[topic] += 1
         self.first.setdefault(topic, now)
         self.last[topic] = now
+
+    def refuse(self, topic: str, reason: str) -> None:
+        """Note that a message on `topic` is refused."""
+        self.refused[reason] += 1
+        self.refused_on[topic] += 1
 
     def stamped(self, topic: str, age: float) -> None:
         """Note a stamp: `age` is the time of arrival less it, s, from any zero."""
@@ -161,10 +167,13 @@ class Hysteresis:
         self._missed: dict[tuple[str, bytes], int] = {}
         self._counting: dict[tuple[str, bytes], Finding] = {}
 
-    def settle(self, findings: Iterable[Finding], *, quiet: bool = False) -> list[Finding]:
+    def settle(
+        self, findings: Iterable[Finding], *, quiet: bool = False, unheard: Collection[str] = ()
+    ) -> list[Finding]:
         """The findings that count now, the worst first. quiet: no message came, which says nothing
-        for or against what messages show. One that is just not there keeps its last sentence until
-        it is over."""
+        for or against what messages show; unheard: keys of findings of which only messages speak
+        that did not come, though others did. One that is just not there keeps its last sentence
+        until it is over."""
         now = {(finding.key, finding.level): finding for finding in findings}
         for name, finding in now.items():
             self._found[name] = self._found.get(name, 0) + 1
@@ -173,7 +182,7 @@ class Hysteresis:
                 self._counting[name] = finding
         for name in [name for name in self._found if name not in now]:
             known = self._counting.get(name)
-            if quiet and not (known and (known.timed or known.passing)):
+            if name[0] in unheard or quiet and not (known and (known.timed or known.passing)):
                 continue
             if known is None:
                 del self._found[name]
@@ -376,12 +385,13 @@ class Reporter:
             Finding(silence.split(' for ')[0], STALE, silence, at_once=True, passing=True)
             for silence in period.stale
         ]
-        if refused and refused.total() >= fresh.total():
-            sentence = f'every message is refused: {_most(refused)}'
-            found.append(Finding('refused', ERROR, sentence))
-        elif refused:
-            sentence = f'messages are refused: {_most(refused)}'
-            found.append(Finding('refused', WARN, sentence))
+        if refused:
+            every = refused.total() >= fresh.total()
+            which = 'every message is' if every else 'messages are'
+            sentence = f'{which} refused: {_most(refused)}'
+            # A period of all beside one of some: at least some are refused in both.
+            levels = (WARN, ERROR) if every else (WARN,)
+            found += [Finding('refused', level, sentence) for level in levels]
         if period.missing:
             many = period.missing.total() > max(2, MUCH_LOST * fresh.total())
             found.append(Finding('lost', WARN, _share_lost(period.missing, fresh), at_once=many))
@@ -401,7 +411,9 @@ class Reporter:
         if not period.stale:
             gone = self._gone(now, stale_after)
             found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
-        counting = self._of_input.settle(found, quiet=not fresh)
+        speaking = {'refused': meter.refused_on, 'lost': lost}
+        unheard = [key for key, topics in speaking.items() if not any(map(fresh.get, topics))]
+        counting = self._of_input.settle(found, quiet=not fresh, unheard=unheard)
         level, text = level_and_text(counting, 'receiving')
         if not period.enabled:
             text += ' (disabled, input is not used)'

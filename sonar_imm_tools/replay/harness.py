@@ -37,6 +37,7 @@ import numpy as np
 
 from msg_adapters.inputs import FEEDERS, InputTopic
 from sonar_imm.estimates import Estimate
+from sonar_imm.files import lock
 from sonar_imm.nodes.stopping import ENDING
 from sonar_imm.trackers import SYSTEMS
 
@@ -231,29 +232,46 @@ class NodeProcess:
 def reserved_domain_id() -> Iterator[int]:
     """Reserve a ROS domain on this machine, so that checks neither meddle nor are meddled with.
 
-    A listening port stands for the domain, as in the isolation of launch_testing. A domain whose
-    shared memory a killed process left behind comes last: Fast DDS may not get over it. Raises
-    `LinkError` when all are taken.
+    A listening port stands for the domain, as in the isolation of launch_testing. What ended
+    processes left of the domain's shared memory is removed, for Fast DDS 2.14 may not get over it;
+    a domain where a process of somebody else lives comes last. Raises `LinkError` when all are
+    taken.
     """
     candidates = list(range(1, 101))
     random.SystemRandom().shuffle(candidates)
-    for domain_id in sorted(candidates, key=_domains_left_behind().__contains__):
-        with socket.socket() as claim:
-            try:
-                claim.bind(('127.0.0.1', 22119 + domain_id))
-            except OSError:
-                continue
-            yield domain_id
-            return
+    for living in (False, True):
+        for domain_id in candidates:
+            with socket.socket() as claim:
+                try:
+                    claim.bind(('127.0.0.1', 22119 + domain_id))
+                except OSError:
+                    continue
+                if _swept(domain_id) or living:
+                    yield domain_id
+                    return
     raise LinkError('no free ROS domain on this machine')
 
 
-def _domains_left_behind() -> set[int]:
-    """Domains in which Fast DDS has, or had when it was killed, ports of shared memory."""
-    ports = (
-        path.name.partition('fastrtps_port')[2] for path in _SHARED_MEMORY.glob('fastrtps_port*')
-    )
-    return {(int(port) - 7400) // 250 for port in ports if port.isdecimal()}
+def _swept(domain_id: int) -> bool:
+    """Remove the ports of shared memory that nobody has any more from a domain; whether none is
+    left. Who has one holds a lock; the names are those of Fast DDS."""
+    first = 7400 + 250 * domain_id
+    living = False
+    for port in _SHARED_MEMORY.glob('fastrtps_port*'):
+        number, _, kind = port.name.removeprefix('fastrtps_port').partition('_')
+        if kind or not number.isdecimal() or not first <= int(number) < first + 250:
+            continue
+        beside = [port.with_name(f'{port.name}_{kind}') for kind in ('el', 'sl')]
+        try:
+            with contextlib.ExitStack() as held:
+                for path in beside:
+                    if path.exists():
+                        lock(held.enter_context(path.open('ab')).fileno())
+                for path in (*beside, port.with_name(f'sem.{port.name}_mutex'), port):
+                    path.unlink(missing_ok=True)
+        except OSError:
+            living = True
+    return not living
 
 
 def local_discovery() -> contextlib.AbstractContextManager[None]:

@@ -209,12 +209,12 @@ def test_refusals_warn_while_they_last(desk):
     desk.report(0.0)
     for k in range(4):
         desk.meter.arrived('fix', 0.1 * k)
-    desk.meter.refused['nan'] += 1
+    desk.meter.refuse('fix', 'nan')
     desk.report(1.0)
     assert desk.input.level == DiagnosticStatus.WARN
     assert desk.values['refused: nan'] == '1'
     desk.meter.arrived('fix', 1.5)
-    desk.meter.refused['frame'] += 1
+    desk.meter.refuse('fix', 'frame')
     desk.report(2.0)
     assert desk.input.level == DiagnosticStatus.ERROR
     assert desk.input.message == 'every message is refused: frame'
@@ -324,7 +324,7 @@ def run(desk, *refused):
         for k in range(2):
             desk.meter.arrived('fix', second + 0.5 * k)
         if bad:
-            desk.meter.refused['nan'] += 1
+            desk.meter.refuse('fix', 'nan')
         desk.report(second + 0.9)
         levels.append(desk.input.level[0])
     return levels
@@ -354,11 +354,39 @@ def test_periods_without_a_message_say_nothing():
         if second % 4 == 0:
             desk.meter.arrived('fix', second)
             if second < 30:
-                desk.meter.refused['nan'] += 1
+                desk.meter.refuse('fix', 'nan')
         desk.report(second + 0.9)
         levels.append(desk.input.level[0])
     assert levels[:4] == [0] * 4 and levels[4:32] == [2] * 28
     assert levels[47] == 2 and levels[48:] == [0] * 12
+
+
+def test_a_slow_input_is_judged_beside_a_fast_one():
+    """What is heard in every period says nothing of what is heard in every fourth."""
+    desk = Desk(rise=2, fall=5)
+    levels = []
+    for second in range(60):
+        desk.meter.arrived('altitude', second)
+        if second % 4 == 0:
+            desk.meter.arrived('fix', second)
+            if second < 30:
+                desk.meter.refuse('fix', 'out_of_range')
+        desk.report(second + 0.9, stale_after=10.0)
+        levels.append(desk.input.level[0])
+    assert levels[:4] == [0] * 4 and levels[4:32] == [1] * 28
+    assert levels[47] == 1 and levels[48:] == [0] * 12
+
+
+def test_all_refused_in_one_period_and_some_in_the_next_are_some_in_both():
+    desk = Desk(rise=2, fall=5)
+    levels = []
+    for second in range(6):
+        for k in range(1 + second % 2):
+            desk.meter.arrived('fix', second + 0.5 * k)
+        desk.meter.refuse('fix', 'nan')
+        desk.report(second + 0.9)
+        levels.append(desk.input.level[0])
+    assert levels == [0] + [1] * 5
 
 
 def test_the_health_of_a_node_is_its_worst_entry(desk):

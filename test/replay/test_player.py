@@ -14,6 +14,7 @@
 
 """Playing bags: pace, selection, clock, pause and lock-step, with real publishers."""
 
+import contextlib
 import os
 import threading
 import time
@@ -26,6 +27,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from msg_adapters.fixes import write_fix
+from sonar_imm.files import lock
 from sonar_imm.measurements import Fix
 from sonar_imm.nodes.qos import profiles_of
 from sonar_imm.parameters import ConfigError
@@ -238,12 +240,21 @@ def test_reserved_domains_differ_and_come_free_again():
         pass
 
 
-def test_a_domain_of_a_killed_process_is_reserved_last(tmp_path, monkeypatch):
+def test_what_ended_processes_left_of_a_domain_is_removed_and_a_living_one_comes_last(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(harness, '_SHARED_MEMORY', tmp_path)
-    for domain in {*range(1, 101)} - {37}:
-        (tmp_path / f'fastrtps_port{7400 + 250 * domain + 11}').touch()
-    with reserved_domain_id() as first, reserved_domain_id() as second:
-        assert first == 37 != second
+    with contextlib.ExitStack() as living:
+        for domain in range(1, 101):
+            name = f'fastrtps_port{7400 + 250 * domain + 11}'
+            for path in (name, f'{name}_el', f'sem.{name}_mutex'):
+                (tmp_path / path).touch()
+            if domain != 37:
+                lock(living.enter_context((tmp_path / f'{name}_el').open('rb')).fileno())
+        with reserved_domain_id() as first, reserved_domain_id() as second:
+            assert first == 37 != second
+        assert not list(tmp_path.glob('*fastrtps_port16661*'))
+        assert len(list(tmp_path.iterdir())) == 3 * 99
 
 
 def test_an_input_recorded_with_two_types_cannot_be_played_to_one_node(tmp_path):

@@ -20,7 +20,7 @@ import time
 from helpers.estimates import same
 from helpers.faults.cases import CASES
 from helpers.faults.figures import count
-from helpers.faults.rig import Rig
+from helpers.faults.rig import Rig, without_shared_memory
 import numpy as np
 import pytest
 
@@ -65,7 +65,7 @@ def saved_after(path, stamp_ns):
 def killed(case, arguments, path, messages, at_once, rng):
     """The life of a node that gets `messages` one by one and those `at_once` that nobody waits
     for, and is killed at a random moment of these; gives its estimates."""
-    with Rig(case, arguments) as rig:
+    with Rig(case, arguments, discovery=without_shared_memory) as rig:
         estimates = rig.play(messages)
         stamp_ns = messages[-round(AGAIN * len(case.messages()))].stamp_ns
         assert rig.wait_for(lambda: saved_after(path, stamp_ns))

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import contextlib
 from pathlib import Path
 import signal
@@ -26,6 +26,7 @@ from typing import Any
 
 from helpers.faults.cases import CASES
 from helpers.faults.figures import count
+from helpers.faults.rig import without_shared_memory
 from helpers.live import own_words
 import numpy as np
 import pytest
@@ -54,7 +55,8 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
     figures.skip_if_measured(turns, system=SYSTEMS[-1], signal=how.name)
     rng = np.random.default_rng(int(how))
     for _ in range(turns):
-        with Running(SYSTEMS) as running:
+        discovery = without_shared_memory if how == signal.SIGKILL else local_discovery
+        with Running(SYSTEMS, discovery) as running:
             for system in SYSTEMS:
                 running.send(system, int(rng.integers(1, len(CASES[system].messages()))))
             time.sleep(0.2 * rng.random())
@@ -117,8 +119,14 @@ END_LIMIT = 120.0
 class Running:
     """Nodes in a ROS domain of their own, ready and connected; ended by ``with``."""
 
-    def __init__(self, systems: Iterable[str]):
+    def __init__(
+        self,
+        systems: Iterable[str],
+        discovery: Callable[[], contextlib.AbstractContextManager[None]],
+    ):
+        """Start them; discovery: how link and nodes find each other."""
         self._stack = contextlib.ExitStack()
+        self._discovery = discovery
         self.nodes: dict[str, NodeProcess] = {}
         self._lockstep: dict[str, LockStep] = {}
         self._publishers: dict[tuple[str, str], Any] = {}
@@ -146,8 +154,7 @@ class Running:
 
     def start_again(self) -> None:
         """Start all nodes anew, under the names of those that were killed, with a new link and in
-        another domain: that of before takes them for alive for a while, and Fast DDS 2.14 may spin
-        without end on the shared memory that they left there."""
+        another domain: that of before takes them for alive for a while."""
         self._start([*self.nodes])
 
     def stop(self) -> list[tuple[str, str]]:
@@ -158,7 +165,7 @@ class Running:
 
     def _start(self, systems: list[str]) -> None:
         domain = self._stack.enter_context(reserved_domain_id())
-        with local_discovery():
+        with self._discovery():
             self._link = self._stack.enter_context(Link('rig', domain_id=domain))
         for system in systems:
             for topic, cls in {m.topic: type(m.content) for m in CASES[system].messages()}.items():
@@ -176,7 +183,7 @@ class Running:
                 for policy in ('history:=keep_all', 'reliability:=reliable')
                 for word in ('-p', f'{name}.{policy}')
             ]
-            with local_discovery():
+            with self._discovery():
                 self.nodes[system] = self._stack.enter_context(
                     NodeProcess(system, domain_id=domain, arguments=arguments)
                 )
