@@ -411,8 +411,8 @@ class Reporter:
         if not period.stale:
             gone = self._gone(now, stale_after)
             found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
-        speaking = {'refused': meter.refused_on, 'lost': lost}
-        unheard = [key for key, topics in speaking.items() if not any(map(fresh.get, topics))]
+        speaking = {'refused': {*meter.refused_on}, 'lost': {name.lstrip('~/') for name in lost}}
+        unheard = [key for key, names in speaking.items() if not fresh.keys() & names]
         counting = self._of_input.settle(found, quiet=not fresh, unheard=unheard)
         level, text = level_and_text(counting, 'receiving')
         if not period.enabled:

@@ -377,6 +377,18 @@ def test_a_slow_input_is_judged_beside_a_fast_one():
     assert levels[47] == 1 and levels[48:] == [0] * 12
 
 
+def test_losses_of_a_latched_input_are_over_as_others():
+    desk = Desk(rise=2, fall=5)
+    levels = []
+    for second in range(16):
+        desk.meter.arrived('fix', second)
+        if second % 2 == 0:
+            desk.meter.arrived('tf_static', second)
+        desk.report(second + 0.9, lost={'/tf_static': min(second + 1, 4)})
+        levels.append(desk.input.level[0])
+    assert levels[2:4] == [1, 1] and levels[-1] == 0
+
+
 def test_all_refused_in_one_period_and_some_in_the_next_are_some_in_both():
     desk = Desk(rise=2, fall=5)
     levels = []

@@ -89,12 +89,15 @@ def test_it_plays_in_order_and_never_early():
 
 
 def test_a_higher_rate_shortens_it():
-    with Played(rate=1000.0) as played:
-        begin = time.monotonic()
-        played.playback.change(play=True)
-        played.wait(lambda: played.states)
-        assert time.monotonic() - begin < 0.38 / 2  # at rate 1 it takes .38 s
-    assert played.stamps == TIMES
+    took = []
+    for _ in range(5):  # a busy machine may be late with some
+        with Played(rate=1000.0) as played:
+            begin = time.monotonic()
+            played.playback.change(play=True)
+            played.wait(lambda: played.states)
+            took.append(time.monotonic() - begin)
+        assert played.stamps == TIMES
+    assert min(took) < 0.38 / 2  # at rate 1 it takes .38 s
 
 
 def test_at_any_rate_messages_are_on_time():
