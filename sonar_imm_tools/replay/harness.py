@@ -52,6 +52,8 @@ START_LIMIT = 300.0
 _STOP_LIMIT = 10.0
 _LOG_TAIL = 12
 _SHARED_MEMORY = Path('/dev/shm')
+_RESERVED = 22119
+"""A port that listens, less the domain it reserves."""
 
 
 @frozen(eq=False)
@@ -243,7 +245,7 @@ def reserved_domain_id() -> Iterator[int]:
         for domain_id in candidates:
             with socket.socket() as claim:
                 try:
-                    claim.bind(('127.0.0.1', 22119 + domain_id))
+                    claim.bind(('127.0.0.1', _RESERVED + domain_id))
                 except OSError:
                     continue
                 if _swept(domain_id) or living:

@@ -244,6 +244,7 @@ def test_what_ended_processes_left_of_a_domain_is_removed_and_a_living_one_comes
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(harness, '_SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(harness, '_RESERVED', 23119)  # other tests reserve domains meanwhile
     with contextlib.ExitStack() as living:
         for domain in range(1, 101):
             name = f'fastrtps_port{7400 + 250 * domain + 11}'
