@@ -110,7 +110,8 @@ def runs(bag: Path, factor: float, seeds: range) -> Iterator[tuple[float, int]]:
         for measurement in measurements:
             tracker.process(misstated(measurement, factor))
             texts: list[str] = getattr(tracker, 'warnings', list)()
-            found = hysteresis.settle([Finding(text[:20], WARN, text) for text in texts])
+            heard = [type(measurement).__name__]
+            found = hysteresis.settle([Finding(text[:20], WARN, text) for text in texts], heard)
             raised += len({finding.key for finding in found} - active)
             active = {finding.key for finding in found}
         stamps = [measurement.stamp_ns for measurement in measurements]

@@ -32,6 +32,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from attrs import define
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
@@ -147,15 +148,28 @@ def clock_offset(ages: Sequence[float]) -> float:
 
 class Finding(NamedTuple):
     """Something that is not as it should be. key: what it is, the same from period to period;
-    at_once: it need not be found again to count; timed: it can be judged in a period without a
-    message; passing: it is over as soon as it is not found."""
+    inputs: whose messages show it, none where those of any do; at_once: it need not be found again
+    to count; timed: it can be judged in a period without a message; passing: it is over as soon as
+    it is not found."""
 
     key: str
     level: bytes
     sentence: str
+    inputs: frozenset[str] = frozenset()
     at_once: bool = False
     timed: bool = False
     passing: bool = False
+
+
+@define
+class _Known:
+    """A finding as it was last; in how many periods it was found, and missed since; whether it
+    counts."""
+
+    finding: Finding
+    found: int = 0
+    missed: int = 0
+    counts: bool = False
 
 
 class Hysteresis:
@@ -163,34 +177,28 @@ class Hysteresis:
 
     def __init__(self, rise: int = RISE, fall: int = FALL):
         self._rise, self._fall = rise, fall
-        self._found: dict[tuple[str, bytes], int] = {}
-        self._missed: dict[tuple[str, bytes], int] = {}
-        self._counting: dict[tuple[str, bytes], Finding] = {}
+        self._known: dict[tuple[str, bytes], _Known] = {}
 
-    def settle(
-        self, findings: Iterable[Finding], *, quiet: bool = False, unheard: Collection[str] = ()
-    ) -> list[Finding]:
-        """The findings that count now, the worst first. quiet: no message came, which says nothing
-        for or against what messages show; unheard: keys of findings of which only messages speak
-        that did not come, though others did. One that is just not there keeps its last sentence
-        until it is over."""
+    def settle(self, findings: Iterable[Finding], heard: Collection[str]) -> list[Finding]:
+        """The findings that count now, the worst first. heard: inputs with a message since the
+        last time; where none of them could show a finding, that it is not there says nothing. One
+        that is just not there keeps its last sentence until it is over."""
         now = {(finding.key, finding.level): finding for finding in findings}
         for name, finding in now.items():
-            self._found[name] = self._found.get(name, 0) + 1
-            self._missed.pop(name, None)
-            if finding.at_once or self._found[name] >= self._rise or name in self._counting:
-                self._counting[name] = finding
-        for name in [name for name in self._found if name not in now]:
-            known = self._counting.get(name)
-            if name[0] in unheard or quiet and not (known and (known.timed or known.passing)):
+            known = self._known.setdefault(name, _Known(finding))
+            known.finding, known.found, known.missed = finding, known.found + 1, 0
+            known.counts |= finding.at_once or known.found >= self._rise
+        for name in self._known.keys() - now.keys():
+            known = self._known[name]
+            finding = known.finding
+            shown = finding.inputs & set(heard) if finding.inputs else heard
+            if not shown and not (known.counts and (finding.timed or finding.passing)):
                 continue
-            if known is None:
-                del self._found[name]
-                continue
-            self._missed[name] = self._missed.get(name, 0) + 1
-            if known.passing or self._missed[name] >= self._fall:
-                del self._counting[name], self._found[name], self._missed[name]
-        return sorted(self._counting.values(), key=lambda finding: -_WORSE.index(finding.level))
+            known.missed += 1
+            if not known.counts or finding.passing or known.missed >= self._fall:
+                del self._known[name]
+        counting = [known.finding for known in self._known.values() if known.counts]
+        return sorted(counting, key=lambda finding: -_WORSE.index(finding.level))
 
 
 def worst(levels: Iterable[bytes]) -> bytes:
@@ -248,19 +256,27 @@ class UnusedShare:
         return f'{share:.0f} % of the messages of the last {now - then:.0f} s not used: {reasons}'
 
 
-_Totals = tuple[float | None, Counter[str], Counter[str], int, Counter[str]]
-"""Steady seconds of a report, and received, refused, dropped and lost messages until then."""
+class _Totals(NamedTuple):
+    """Steady seconds of a report, NaN before the first, and messages until then."""
+
+    now: float = np.nan
+    received: Counter[str] = Counter()
+    refused: Counter[str] = Counter()
+    refused_on: Counter[str] = Counter()
+    dropped: int = 0
+    lost: Counter[str] = Counter()
 
 
 class _Period(NamedTuple):
     """What happened since the report before. now: steady s; elapsed: s, NaN in the first one;
-    fresh, refused, missing: messages by topic or reason; stale: sentences about what does not
-    come."""
+    fresh, refused, refused_on, missing: messages by topic or reason; stale: sentences about what
+    does not come."""
 
     now: float
     elapsed: float
     fresh: Counter[str]
     refused: Counter[str]
+    refused_on: Counter[str]
     dropped: int
     missing: Counter[str]
     stale: Sequence[str]
@@ -290,7 +306,7 @@ class Reporter:
         self._topics = dict(topics)
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
-        self._before: _Totals = None, Counter(), Counter(), 0, Counter()
+        self._before = _Totals()
         self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
         self.unused = UnusedShare()
 
@@ -311,19 +327,26 @@ class Reporter:
     ) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; starting: why
         no input is heard yet, or empty; publishers: how many there are of a topic."""
-        then, received_before, refused_before, dropped_before, lost_before = self._before
-        meter, dropped, all_lost = self._meter, self._meter.dropped.total(), Counter(lost)
+        meter, before = self._meter, self._before
+        totals = self._before = _Totals(
+            now,
+            meter.received.copy(),
+            meter.refused.copy(),
+            meter.refused_on.copy(),
+            meter.dropped.total(),
+            Counter(lost),
+        )
         period = _Period(
             now,
-            np.nan if then is None else max(now - then, 1e-9),
-            meter.received - received_before,
-            meter.refused - refused_before,
-            dropped - dropped_before,
-            all_lost - lost_before,
+            max(now - before.now, 1e-9),  # NaN stays
+            totals.received - before.received,
+            totals.refused - before.refused,
+            totals.refused_on - before.refused_on,
+            totals.dropped - before.dropped,
+            totals.lost - before.lost,
             [starting] if starting else self._stale(now, stale_after),
             enabled,
         )
-        self._before = now, meter.received.copy(), meter.refused.copy(), dropped, all_lost
         unused = self.unused.sentence(now, meter.received.total(), counts)
         sentences = [*warnings, *filter(None, [unused])]
         message = DiagnosticArray()
@@ -391,10 +414,13 @@ class Reporter:
             sentence = f'{which} refused: {_most(refused)}'
             # A period of all beside one of some: at least some are refused in both.
             levels = (WARN, ERROR) if every else (WARN,)
-            found += [Finding('refused', level, sentence) for level in levels]
+            inputs = frozenset(period.refused_on)
+            found += [Finding('refused', level, sentence, inputs) for level in levels]
         if period.missing:
             many = period.missing.total() > max(2, MUCH_LOST * fresh.total())
-            found.append(Finding('lost', WARN, _share_lost(period.missing, fresh), at_once=many))
+            sentence = _share_lost(period.missing, fresh)
+            inputs = frozenset(name.lstrip('~/') for name in period.missing)
+            found.append(Finding('lost', WARN, sentence, inputs, at_once=many))
         if incompatible:
             sentence = 'a peer has an incompatible quality of service'
             found.append(Finding('incompatible', WARN, sentence, timed=True))
@@ -411,9 +437,7 @@ class Reporter:
         if not period.stale:
             gone = self._gone(now, stale_after)
             found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
-        speaking = {'refused': {*meter.refused_on}, 'lost': {name.lstrip('~/') for name in lost}}
-        unheard = [key for key, names in speaking.items() if not fresh.keys() & names]
-        counting = self._of_input.settle(found, quiet=not fresh, unheard=unheard)
+        counting = self._of_input.settle(found, fresh)
         level, text = level_and_text(counting, 'receiving')
         if not period.enabled:
             text += ' (disabled, input is not used)'
@@ -449,7 +473,7 @@ class Reporter:
         if counts.get('internal_error'):
             sentence = 'an internal error was caught, see the log'
             found.append(Finding('internal_error', ERROR, sentence, at_once=True))
-        counting = self._of_tracker.settle(found, quiet=not period.fresh)
+        counting = self._of_tracker.settle(found, period.fresh)
         level, text = level_and_text(counting, 'tracking' if enabled else 'disabled')
         return self._status('tracker', level, text, values)
 

@@ -260,8 +260,8 @@ def _swept(domain_id: int) -> bool:
     first = 7400 + 250 * domain_id
     living = False
     for port in _SHARED_MEMORY.glob('fastrtps_port*'):
-        number, _, kind = port.name.removeprefix('fastrtps_port').partition('_')
-        if kind or not number.isdecimal() or not first <= int(number) < first + 250:
+        number = port.name.removeprefix('fastrtps_port')
+        if not number.isdecimal() or not first <= int(number) < first + 250:
             continue
         beside = [port.with_name(f'{port.name}_{kind}') for kind in ('el', 'sl')]
         try:

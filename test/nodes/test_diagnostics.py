@@ -346,35 +346,26 @@ def test_a_value_at_its_limit_does_not_flap():
     assert not any(calm)  # every other period, never two in a row
 
 
-def test_periods_without_a_message_say_nothing():
-    """A sensor that is heard every few periods is judged by the periods in which it is."""
+@pytest.mark.parametrize('beside', ['', 'heard', 'heard, and refused once'])
+def test_periods_without_a_message_say_nothing(beside):
+    """A sensor that is heard every few periods is judged by the periods in which it is, whatever
+    is heard `beside` it in all of them."""
     desk = Desk(rise=2, fall=5)
     levels = []
     for second in range(60):
+        if beside:
+            desk.meter.arrived('altitude', second)
+        if 'refused' in beside and second == 0:
+            desk.meter.refuse('altitude', 'no_mounting')
         if second % 4 == 0:
             desk.meter.arrived('fix', second)
             if second < 30:
                 desk.meter.refuse('fix', 'nan')
         desk.report(second + 0.9)
         levels.append(desk.input.level[0])
-    assert levels[:4] == [0] * 4 and levels[4:32] == [2] * 28
-    assert levels[47] == 2 and levels[48:] == [0] * 12
-
-
-def test_a_slow_input_is_judged_beside_a_fast_one():
-    """What is heard in every period says nothing of what is heard in every fourth."""
-    desk = Desk(rise=2, fall=5)
-    levels = []
-    for second in range(60):
-        desk.meter.arrived('altitude', second)
-        if second % 4 == 0:
-            desk.meter.arrived('fix', second)
-            if second < 30:
-                desk.meter.refuse('fix', 'out_of_range')
-        desk.report(second + 0.9, stale_after=10.0)
-        levels.append(desk.input.level[0])
-    assert levels[:4] == [0] * 4 and levels[4:32] == [1] * 28
-    assert levels[47] == 1 and levels[48:] == [0] * 12
+    first, level = 8 if 'refused' in beside else 4, 1 if beside else 2
+    assert levels[:first] == [0] * first and levels[first:32] == [level] * (32 - first)
+    assert levels[47] == level and levels[48:] == [0] * 12
 
 
 def test_losses_of_a_latched_input_are_over_as_others():
