@@ -60,7 +60,7 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH PYTHONDONTWRITEBYTECODE
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-statistics test-bounds test-system fuzz reliability lint generate docs docs-numbers dist placeholders bench clean
+.PHONY: help venv demo test test-core test-statistics test-bounds test-system fuzz reliability lint generate docs dist placeholders bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
@@ -140,9 +140,6 @@ docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the 
 
 docs-version: docs ## the same site in pages/VERSION, beside those of earlier versions
 	@$(BIN)/python .ci/versioned_site.py site pages "$$($(BIN)/python -c 'import sonar_imm; print(sonar_imm.__version__)')"
-
-docs-numbers: venv ## check that the tables of docs/ still hold the numbers of docs/results/
-	$(BIN)/python docs/check_numbers.py
 
 dist: venv ## build wheel and sdist into dist/, check them and their size
 	@$(INSTALL) build twine

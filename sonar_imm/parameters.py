@@ -49,6 +49,8 @@ from typing import Any, TypeVar
 import attrs
 from attrs import frozen
 
+from .gone import GONE
+
 C = TypeVar('C', bound='Config')
 
 MODELS = 'sonar_imm.models'
@@ -108,6 +110,8 @@ class ParameterSpec:
                 known = ', '.join(self.choices)
                 if self.group:
                     known += f' or a name that a package registers as {self.group}'
+                if gone := GONE.get(f'choice {self.name} {value}'):
+                    return f"{name}: '{value}' {gone}"
                 hint = did_you_mean(value, self.choices)
                 return f"{name} must be one of {known}, got '{value}'{hint}"
             return None
@@ -259,11 +263,7 @@ class Config:
         suggestion) and bad value."""
         specs = {spec.name: spec for spec in cls.specs()}
         unknown = [key for key in values if key not in specs]
-        problems = (
-            []
-            if ignore_unknown
-            else [f"unknown parameter '{key}'{did_you_mean(key, specs)}" for key in unknown]
-        )
+        problems = [] if ignore_unknown else [unknown_parameter(key, specs) for key in unknown]
         known = {key: value for key, value in values.items() if key in specs}
         problems += [
             trouble for key, value in known.items() if (trouble := specs[key].problem(value))
@@ -420,6 +420,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``" (did you mean 'x'?)"`` or an empty text."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ''
+
+
+def unknown_parameter(name: str, known: Iterable[str]) -> str:
+    """Return the sentence for a parameter that does not exist, or no longer exists."""
+    if gone := GONE.get(f'parameter {name}'):
+        return f"parameter '{name}' {gone}"
+    return f"unknown parameter '{name}'{did_you_mean(name, known)}"
 
 
 def _field(spec: ParameterSpec) -> Any:

@@ -31,7 +31,6 @@ from helpers.source import (
     COME_WITH_RCLPY,
     COMMON_INTERFACES,
     imports,
-    known_module,
     module_name,
     MODULES,
     ROOT,
@@ -115,11 +114,6 @@ HEADER = """\
 """
 LONGEST = 600
 """Lines of a file that is one idea, the licence not counted."""
-MOST_WITH_ONE_IMPORTER = 59
-"""Modules that only one other imports; most of them are part of that one. This only falls."""
-MOST_ARGUMENTS = 12
-# Function, as module:name: why it takes more positional arguments.
-MANY_ARGUMENTS: dict[str, str] = {}
 
 
 @pytest.fixture(scope='module')
@@ -327,37 +321,6 @@ def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
     assert not {name: lines for name, lines in lengths.items() if lines > LONGEST}
 
 
-def test_few_modules_have_a_single_importer() -> None:
-    modules = {module_name(path): path for path in MODULES}
-    importers: dict[str, set[str]] = {}
-    for name, path in modules.items():
-        for imported in imports(path):
-            found = known_module(modules, imported)
-            if found and found != name and modules[found].name != '__init__.py':
-                importers.setdefault(found, set()).add(name)
-    single = sorted(name for name, users in importers.items() if len(users) == 1)
-    assert len(single) <= MOST_WITH_ONE_IMPORTER, single
-
-
-def test_no_function_takes_many_positional_arguments() -> None:
-    """Two of many arguments are swapped without a word: kernels take named tuples instead."""
-    found = {
-        f'{module_name(path)}:{name}'
-        for path in MODULES
-        for name, count in positional_arguments(tree_of(path))
-        if count > MOST_ARGUMENTS
-    }
-    assert found == set(MANY_ARGUMENTS), 'too many arguments, or listed without need'
-
-
-def test_the_argument_check_sees_every_kind_of_function() -> None:
-    source = (
-        'def f(a, /, b, *c, d=1):\n    return lambda x, y, z: 0\n'
-        'class C:\n    async def g(self, a, b, c):\n        pass\n'
-    )
-    assert sorted(positional_arguments(ast.parse(source))) == [('<lambda>', 3), ('f', 2), ('g', 4)]
-
-
 def test_generated_files_are_up_to_date() -> None:
     spec = importlib.util.spec_from_file_location('generate', ROOT / 'docs' / 'generate.py')
     generate = importlib.util.module_from_spec(spec)
@@ -543,13 +506,3 @@ def texts(manifest: ElementTree.Element, tag: str) -> set[str]:
 
 def distribution(requirement: str) -> str:
     return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
-
-
-def positional_arguments(tree: ast.Module) -> list[tuple[str, int]]:
-    """Name of every function in the module, and how many arguments it takes by position."""
-    kinds = ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda
-    return [
-        (getattr(node, 'name', '<lambda>'), len(node.args.posonlyargs) + len(node.args.args))
-        for node in ast.walk(tree)
-        if isinstance(node, kinds)
-    ]

@@ -35,6 +35,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from ..gone import GONE
 from ..parameters import Config, ConfigError, did_you_mean, ParameterSpec
 
 C = TypeVar('C', bound=Config)
@@ -118,9 +119,9 @@ class NodeParameters:
         """
         for name in _overrides(self._node):
             if not self._node.has_parameter(name):
-                self._node.get_logger().warning(
-                    f"parameter '{name}' is not known and has no effect{self._meant(name)}"
-                )
+                why = f'is not known and has no effect{self._meant(name)}'
+                why = GONE.get(f'parameter {name}', why)
+                self._node.get_logger().warning(f"parameter '{name}' {why}")
 
     def _meant(self, name: str) -> str:
         """What could be meant by an unknown name: of a quality of service often the topic as it

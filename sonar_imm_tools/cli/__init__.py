@@ -34,6 +34,7 @@ from typing import Any, NoReturn
 import click
 
 from sonar_imm import __version__
+from sonar_imm.gone import GONE
 from sonar_imm.parameters import did_you_mean
 from sonar_imm.texts import visible
 from sonar_imm.threads import one_blas_thread
@@ -90,6 +91,8 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in self._summaries and not args[0].startswith('-'):
+            if gone := GONE.get(f'command {args[0]}'):
+                ctx.fail(f"'{args[0]}' {gone}")
             ctx.fail(f"there is no command '{args[0]}'{did_you_mean(args[0], self._summaries)}")
         return super().resolve_command(ctx, args)
 

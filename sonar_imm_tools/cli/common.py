@@ -31,11 +31,11 @@ from sonar_imm.node_config import node_config_type, NodeConfig, type_specs
 from sonar_imm.parameters import (
     Config,
     ConfigError,
-    did_you_mean,
     parameters_from_yaml,
     ParameterSpec,
     sections_of,
     small_text,
+    unknown_parameter,
 )
 from sonar_imm.texts import visible
 from sonar_imm.trackers import System, SYSTEMS
@@ -200,7 +200,7 @@ def load_config(
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
     unknown = [
-        f"unknown parameter '{name}'{did_you_mean(name, specs)}"
+        unknown_parameter(name, specs)
         for name in values
         if name not in specs and name not in others
     ]

@@ -24,6 +24,7 @@ from typing import Any, TYPE_CHECKING
 import attrs
 import click
 
+from sonar_imm.gone import GONE
 from sonar_imm.texts import visible
 from sonar_imm.trackers import SYSTEMS
 
@@ -57,6 +58,8 @@ class Convert(click.Group):
         if not args or args[0] in self.commands:
             return super().resolve_command(ctx, args)
         source = Path(args[0])
+        if gone := GONE.get(f'kind {args[0]}'):
+            ctx.fail(f"'{args[0]}' {gone}")
         if source.exists():
             from ..recordings.sniffing import sniff
 
