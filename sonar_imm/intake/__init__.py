@@ -395,3 +395,7 @@ def _after(yaw: float, q: FloatArray) -> FloatArray:
     x, y, z, w = q
     s, c = np.sin(0.5 * yaw), np.cos(0.5 * yaw)
     return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+
+
+STATE_TYPES = (RepeatFilter, TransformTree, Pose)
+"""The classes that a saved state of the intake may hold, see `trackers.state_file`."""

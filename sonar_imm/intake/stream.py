@@ -40,7 +40,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from attrs import frozen
 
-from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
+from ..estimation.history import Held, MAX_LATE_NS, ReplayHistory, Run, Scan, StampGate, Step
 from ..measurements import nanoseconds, Rejection, VesselPose
 
 State = TypeVar('State')
@@ -244,3 +244,9 @@ class ReplayStream(Stream, Generic[State]):
                 self.counts['late'] += 1
             revised.update(inserted.revised)
         return sorted(revised.items(), key=itemgetter(0))
+
+
+STREAM_TYPES = (Stream, OnceStream, StreamRules, KnownFrames, StampGate, Run, Held)
+REPLAY_TYPES = (*STREAM_TYPES, ReplayStream, ReplayHistory, Scan)
+"""The classes that the states of either stream may hold, see `trackers.state_file`; measurements
+besides."""

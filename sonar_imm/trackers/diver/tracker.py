@@ -44,21 +44,45 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, TENTATIVE, Tracks
-from ...estimation.consistency import ENOUGH, excess
+from ...estimation.consistency import ENOUGH, excess, NisMemory
+from ...estimation.hypotheses import Hypotheses
 from ...intake import KnownFrames
-from ...intake.stream import ReplayStream, StreamRules
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
+from ...intake.stream import REPLAY_TYPES, ReplayStream, StreamRules
+from ...measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    Measurement,
+    Navigation,
+    NOBODY,
+    RelativeFix,
+    Start,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 from ..model_checks import track_rules
+from ..navigation import NavigationBuffer
 from ..protocol import WarmStep
 from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
-from .georeferencing import Georeferencer
+from .georeferencing import Georeferencer, Samples
 from .jipda import Association
 from .models import build_models
-from .offsets import RecentPairs
+from .offsets import Offsets, RecentPairs
 from .scan import Heights, Positions, Scan
-from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
+from .state import (
+    cross,
+    DiverState,
+    FixConsistency,
+    FIXES,
+    HeightCounts,
+    learnt_scale,
+    MEMORY,
+    Step,
+)
 from .state_space import as_stated, Instruments
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
@@ -597,3 +621,14 @@ class DiverTracker:
             probabilities=self.models.by_model(state.mu),
             extras=extras,
         )
+
+
+STATE_TYPES = (
+    *REPLAY_TYPES,
+    *(Arrivals, Fix, Fixes, Start),
+    *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
+    *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
+    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments, Hypotheses),
+    *(Offsets, RecentPairs, clutter.Clutter),
+)
+"""The classes that a saved state may hold, see `state_file`."""

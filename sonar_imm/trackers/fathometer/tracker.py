@@ -52,7 +52,9 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 
-from ...acoustics.pulse import independent_samples
+from ...acoustics.geodesy import Origin
+from ...acoustics.pulse import independent_samples, SampledPulse
+from ...acoustics.spectra import BlockAverage, SlidingAverage, SnapshotStream
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
@@ -61,14 +63,17 @@ from ...estimation.set_model import (
     gaussian_walk,
     independent_orders,
     SetModel,
+    Sets,
     walk_reach,
 )
+from ...estimation.set_shifts import ShiftPath
 from ...intake import KnownFrames
-from ...intake.stream import OnceStream, StreamRules
+from ...intake.stream import OnceStream, STREAM_TYPES, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from ..protocol import WarmStep
 from .config import FathometerConfig
 from .pressure import (
+    BlockDepths,
     Collected,
     CompanionDepths,
     CompanionPlaces,
@@ -84,6 +89,7 @@ from .reflectors import (
     nearest_ids,
     Reflectors,
     reflectors_of,
+    Seen,
     seen_as,
     write_estimate,
 )
@@ -103,7 +109,7 @@ from .response import (
     scatter_of,
     trace_response,
 )
-from .slopes import slopes_followed
+from .slopes import Slope, slopes_followed
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
@@ -115,7 +121,7 @@ _LEFT, _DEEP, _OF_STRONGEST = 0.5, 6.0, 0.25
 
 
 @frozen(eq=False)
-class _Taken:
+class Taken:
     """A record that was taken in: what was seen and how it was named."""
 
     response: Response
@@ -178,7 +184,7 @@ class FathometerTracker:
         self._filter: SetFilter | None = None
         self._before: Weighted | None = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
-        self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
+        self._taken: deque[Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
         self._fit = Fit()
 
@@ -418,7 +424,7 @@ class FathometerTracker:
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
         self._ids, ids = self._named(reflectors, records)
-        self._taken.append(_Taken(response, self._ids.reflectors))
+        self._taken.append(Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,
@@ -585,3 +591,14 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         start=independent_orders(config.order_min, config.orders),
         **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
+
+
+STATE_TYPES = (
+    *STREAM_TYPES,
+    *(ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace, Origin, FathometerConfig),
+    *(PressureStream, BlockDepths, SnapshotStream, BlockAverage, SlidingAverage),
+    *(CompanionDepths, CompanionPlaces, Pace, Response, SampledPulse, Lattice, Taken, Fit),
+    *(LagSmoother, SetStep, Weighted, Sets, ShiftPath),
+    *(Identities, Identified, Slope, Multiples, Seen),
+)
+"""The classes that a saved state may hold, see `state_file`."""
