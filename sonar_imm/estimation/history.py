@@ -306,6 +306,11 @@ class ReplayHistory(Generic[State, Item]):
         return self._states[-1] if self._states else self._base
 
     @property
+    def base(self) -> State:
+        """The state before the first scan that is kept."""
+        return self._base
+
+    @property
     def states(self) -> list[State]:
         """The state after each scan that is kept, oldest first."""
         return list(self._states)

@@ -229,6 +229,11 @@ class ReplayStream(Stream, Generic[State]):
         """The newest state."""
         return self._history.state
 
+    @property
+    def kept(self) -> list[State]:
+        """All states that are kept."""
+        return [self._history.base, *self._history.states]
+
     def revise(self, measurement: Any) -> list[tuple[int, State]]:
         """Take a measurement in: every stamp with a new or a changed state, and that state, oldest
         first."""

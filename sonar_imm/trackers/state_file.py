@@ -101,7 +101,7 @@ class Saved:
 
 def types_of(system: System) -> tuple[type, ...]:
     """The classes that a state of a tracker of `system`, and of the intake before it, may hold."""
-    return (*intake.STATE_TYPES, *system.state_types())
+    return tuple(dict.fromkeys((*intake.STATE_TYPES, *system.state_types())))
 
 
 def write_state(path: Path, saved: Saved) -> int:
@@ -177,6 +177,8 @@ def _parts(body: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Header and block of an npz, (bytes,) uint8, that holds these two, and as they are. What it
     says of its sizes is compared with the bytes that are there."""
     # The directory at its end first: zipfile reads it whole, however long it is.
+    if len(body) < _DIRECTORY.size:
+        raise ValueError('it has no end')
     mark, _, _, _, count, length, _, _ = _DIRECTORY.unpack(body[-_DIRECTORY.size :])
     if mark != b'PK\5\6' or count != 2 or length > _SHORT:
         raise ValueError('it holds other parts')

@@ -43,11 +43,8 @@ from ..texts import in_one_line
 
 _PLAIN = (type(None), bool, int, float, str)
 _NUMBERS = 'biufc'
-_DTYPES = {
-    order + kind
-    for order in '<>|'
-    for kind in 'b1 i1 i2 i4 i8 u1 u2 u4 u8 f2 f4 f8 c8 c16'.split()
-}
+_KINDS = 'b1 i1 i2 i4 i8 u1 u2 u4 u8 f2 f4 f8 c8 c16'.split()
+_DTYPES = {order + kind for order in (np.dtype(np.int64).str[0], '|') for kind in _KINDS}
 _SKIPPED = object()
 _LONGEST = 200
 """Characters of what a file says that are repeated in a sentence."""
@@ -55,6 +52,37 @@ _WORD = 1 << 63
 _KEYS = 10_000
 """Keys of one mapping that are no text or bytes: whoever chooses these can make all of them fall
 into one place of the table, which takes the square of their number."""
+
+_SHAPES = {
+    'Bodies': 'number:T std:T2',
+    'Cells': 'key:C number:C height:C variance:C stamp_ns:C',
+    'DiverState': 'x:TMn P:TMnn mu:TM learnt:T2MM nis:T nis_dof:T score:T white:T2 existence:T '
+    'evidence:T target_id:T near_to:T near_for:T refused:T6 refused_z:T3 spreads:T history:Tw '
+    'came_from:T looks:T scale:22 life.age:T',
+    'Existence': 'log_odds:T pings:T held:T silence:T',
+    'Hypotheses': 'cluster:H log_weight:H shown:H member:HT',
+    'Landmark': 'which:k x:kn P:knn mu:k place:3 covariance:33',
+    'Looks': 'seen:T due:T missed:T silent:T shown.mu:TK',
+    'Mixture': 'x:TKn P:TKnn mu:TK',
+    'Offsets': 'score:s variance:ss length:p',
+    'PingState': 'life.age:T mixture.x:TKn nis:T strengths.mean:TK bodies.number:T looks.seen:T '
+    'existence.pings:T looks.shown.x:TKn',
+    'Pose': 'position:*3 R:*33',
+    'RecentPairs': 'tx:p3 rx:p3 variance:p age:p',
+    'Response': 'depth:D amplitude:D sigma:D',
+    'SampledPulse': 'distance:d value:d',
+    'Seen': 'track_id:m depth:m variance:m sign:m',
+    'SetStep': 'sets.cell:NJ w:N amplitude:NJ source:N after.log_weight:N',
+    'Sets': 'order:N cell:NJ prior_mean:Na prior_variance:Na sign:NJ shift:N',
+    'ShiftPath': 'pull:N',
+    'Sonar': 'course:3',
+    'Strengths': 'mean:TK variance:TK',
+    'Tracks': 'track_id:T status:T age:T seen:Tw misses:T last_hit_ns:T',
+    'Weighted': 'sets.order:N log_weight:N path.pull:N',
+}
+"""Shapes of the arrays of values without checks of their own, by the name of the class: a letter
+is a length, the same for all of one value, a digit that length; ``*`` any number of axes. Compiled
+kernels rely on them."""
 
 UNFIT = (
     ArithmeticError,
@@ -141,7 +169,7 @@ def put(there: Any, value: Any) -> Any:
         return there
     if isinstance(value, FrozenObject):
         return _put_object(there, value)
-    if there is not None and value is not None and _sort(there) is not _sort(value):
+    if there is not None and _sort(there) is not _sort(value):
         raise ValueError(f'{type(value).__name__} in place of {type(there).__name__}')
     if isinstance(there, Config):
         there.require_changeable(value)
@@ -151,11 +179,12 @@ def put(there: Any, value: Any) -> Any:
         there.clear()
         there.update(value)
         return there
-    if isinstance(value, (list, deque)):
-        if isinstance(there, deque) and there.maxlen != value.maxlen:
+    if isinstance(value, list):
+        return [put(None, item) for item in value]
+    if isinstance(value, deque):
+        if there is not None and there.maxlen != value.maxlen:
             raise ValueError('a queue of another length')
-        whole = [put(None, item) for item in value]
-        return whole if isinstance(value, list) else deque(whole, value.maxlen)
+        return deque((put(None, item) for item in value), value.maxlen)
     if type(value) is dict:
         return {key: put(None, item) for key, item in value.items()}
     return value
@@ -405,7 +434,30 @@ def made(cls: Any, values: dict[str, Any]) -> Any:
         if name in values and not fits(values[name], hint):
             kind = type(values[name]).__name__
             raise ValueError(f'{cls.__name__}.{name} cannot be a {kind} like that')
+    _check_shapes(whole)
     return whole
+
+
+def _check_shapes(value: Any) -> None:
+    """Raise ValueError where the arrays of a value are not as `_SHAPES` has them."""
+    known: dict[str, int] = {}
+    for entry in _SHAPES.get(type(value).__name__, '').split():
+        path, _, axes = entry.partition(':')
+        array = value
+        for name in path.split('.'):
+            array = None if array is None else getattr(array, name)
+        if array is None:
+            continue
+        shape = array.shape
+        if axes[0] == '*':
+            axes = axes[1:]
+            shape = shape[-len(axes) :]
+        wanted = [
+            int(axis) if axis.isdigit() else known.setdefault(axis, length)
+            for axis, length in zip(axes, shape)
+        ]
+        if len(shape) != len(axes) or list(shape) != wanted:
+            raise ValueError(f'{type(value).__name__}.{path} has another shape')
 
 
 @cache

@@ -45,6 +45,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..offline.batch import Job, Outcome
+    from ..recordings.own_files import OwnParameters
     from ..recordings.reader import BagReader
 
 
@@ -174,7 +175,7 @@ class Plan:
     strict: bool = False
     parquet: bool = False
 
-    def parameters_of(self, bag: Path) -> Path | None:
+    def parameters_of(self, bag: Path) -> Path | OwnParameters | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
         from ..recordings.own_files import own_parameters
 

@@ -314,6 +314,11 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
 def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
     """Open a bag directory through its metadata.yaml or, when that fails, file by file."""
     problems = []
+    for file in path.iterdir():
+        # To open a pipe would wait for somebody who writes, and a device has no end.
+        named = file.name == 'metadata.yaml' or file.suffix in (*SUFFIXES, '.zstd')
+        if named and file.exists() and not (file.is_file() or file.is_dir()):
+            raise BagError(f'{file} is no regular file')
     if (path / 'metadata.yaml').exists():
         try:
             source = RosbagsSource(path)

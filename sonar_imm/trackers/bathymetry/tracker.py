@@ -513,9 +513,9 @@ def favour_of(alone: Alone, neighbours: list[Alone], strength: float) -> FloatAr
     distance = np.nan_to_num(seen.swath.distance(floor_of(seen, track)), nan=-1.0)
     field = np.zeros(len(distance))
     for near in neighbours:
-        place, rough = near.rough
-        if len(rough):
-            p = np.interp(distance, place, rough, left=0.5, right=0.5)
+        place, share = near.rough
+        if len(share):
+            p = np.interp(distance, place, share, left=0.5, right=0.5)
             field += _log_ratio(p, strength)
     rough = seen.models.rough
     favour = np.empty(track.probability.shape)

@@ -135,6 +135,19 @@ class DiverTracker:
         nobody = DiverState.of_nobody(life, self.models, self._chain.fresh(0))
         return nobody._replace(history=np.empty((0, self._window), np.int64))
 
+    def restored(self) -> None:
+        """Raise ValueError for states, put in, that are none of these models."""
+        nobody = self._nobody(Tracks.none(self.rules))
+        for state in self._stream.kept:
+            size = self._layout(state.instruments).size
+            if (
+                state.x.shape[1:] != (*nobody.x.shape[1:2], size)
+                or state.learnt.shape[1:] != nobody.learnt.shape[1:]
+                or state.history.shape[1:] != nobody.history.shape[1:]
+                or state.life.seen.shape[1:] != nobody.life.seen.shape[1:]
+            ):
+                raise ValueError('states are of other models')
+
     @property
     def _window(self) -> int:
         return kbest.WINDOW if self._keeps_hypotheses else 0

@@ -190,8 +190,14 @@ class FathometerTracker:
 
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
-        if self._lattice is not None:
-            self._begin(self._lattice)
+        if self._lattice is None:
+            if self._before is not None:
+                raise ValueError('sets without a lattice')
+            return
+        self._lattice.require(self.config)
+        self._begin(self._lattice)
+        if self._before is not None and self._filter is not None:
+            self._filter.require(self._before, self._smoother.steps)
 
     @property
     def frames(self) -> KnownFrames:

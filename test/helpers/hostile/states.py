@@ -10,6 +10,8 @@
 # distributed under the License is distributed on an "AS IS" BASIS,
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
+# limitations under the License.
+
 """State files taken apart, and put together under a checksum that is right."""
 
 import hashlib
@@ -43,43 +45,43 @@ def sealed(path, body):
 
 
 ODD = [None, -1, 0, 1, 2**31, 2**63 - 1, 2**70, 1.5, float('nan'), 1e308, '', 'os', [], {}, True]
-"""What may stand in place of a number, and is none that a tracker would have written."""
-MOST = 6
-"""Measurements that a tracker is given after a state was loaded."""
+"""What may stand where a tracker would have written something else."""
 
 
 def places_in(value):
-    """Every place in JSON, as a pair of what holds it and its key or number."""
+    """Every place in JSON: what holds it, and its key or number there."""
     found, todo = [], [value]
     while todo:
         owner = todo.pop()
-        keys = owner if isinstance(owner, dict) else range(len(owner))
-        for key in keys:
+        for key in owner if isinstance(owner, dict) else range(len(owner)):
             found.append((owner, key))
             if isinstance(owner[key], (dict, list)):
                 todo.append(owner[key])
     return found
 
 
-class Mutations:
-    """Ways to change one state, each by its number: header and block under a new checksum."""
-
-    def __init__(self, header, block):
-        self._text, self._block = json.dumps(header), block
-
-    def forged(self, number):
-        """Header and block, changed in one or two places."""
-        rng = np.random.default_rng(number)
-        header, block = json.loads(self._text), self._block
-        places = places_in(header)
-        arrays = [(entry, 1) for entry in header['arrays']]
-        for _ in range(1 + rng.integers(2)):
-            if rng.random() < 0.1:
-                block = block.copy()
-                block[rng.integers(len(block) or 1) :][:8] = rng.integers(256, size=1)
-                continue
-            owner, key = (arrays if rng.random() < 0.2 else places)[
-                rng.integers(len(arrays if False else places)) % len(places)
-            ]
-            self._change(owner, key, places, rng)
-        return header, block
+def forged(text, block, rng):
+    """A header, given as text, and its block, changed in one or two places."""
+    header = json.loads(text)
+    for _ in range(1 + int(rng.integers(2))):
+        kind = rng.random()
+        if kind < 0.15 and len(block):
+            block = block.copy()
+            at = int(rng.integers(len(block)))
+            block[at : at + 8] = rng.choice([0, 1, 127, 240, 255], size=1)
+            continue
+        part = header['arrays'] if kind < 0.3 else header['values'] if kind < 0.6 else header
+        places = places_in(part) or places_in(header)
+        owner, key = places[int(rng.integers(len(places)))]
+        value = ODD[int(rng.integers(len(ODD)))]
+        how = rng.random()
+        if how < 0.3 and type(owner[key]) in (int, float):
+            value = owner[key] + int(rng.choice([-1, 1]))
+        elif how < 0.5:  # something from elsewhere in it
+            other, place = places[int(rng.integers(len(places)))]
+            value = json.loads(json.dumps(other[place]))
+        elif how < 0.6 and type(owner) is list and len(owner) > 1:
+            del owner[key]
+            continue
+        owner[key] = value
+    return header, block
