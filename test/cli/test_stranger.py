@@ -32,7 +32,7 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sources import BagError
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
-TABLE = 'distance,probability\n0,0.9\n100,0.5\n'
+TABLE = 'range,probability\n0,0.9\n100,0.5\n'
 
 
 @pytest.fixture
@@ -193,3 +193,13 @@ def test_check_replaces_no_file_of_the_user(bag, tmp_path):
     assert all(check.good for check in played.checks)
     assert victim.read_text() == 'shopping list'
     assert [path.name for path in tmp_path.glob('precious*')] == ['precious']
+
+
+def test_metadata_name_no_file_outside_of_the_folder(bag, tmp_path):
+    (bag / 'diver_table1.mcap').rename(tmp_path / 'elsewhere.mcap')
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text()
+    for name in ('../elsewhere.mcap', str(tmp_path / 'elsewhere.mcap')):
+        metadata.write_text(text.replace('diver_table1.mcap', name))
+        with pytest.raises(BagError), BagReader(bag):
+            pass

@@ -157,17 +157,25 @@ def states_damaged(recording, draws, first=0):
     return taken, failures
 
 
-FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'} | {
-    f'state of {name.split("_")[0]}': (states_damaged, name) for name in RECORDED
-}
-"""What is damaged: each format that is taken in, and the state of each system."""
+FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'}
+"""What is damaged: each format that is taken in."""
 
 
 def file_results(name, draws):
     """What happened to `draws` damaged files, as plain values."""
     attempt, what = FILES[name]
     start = process_time()
-    used, failures = attempt(what, draws)
+    return _results(name, draws, start, *attempt(what, draws))
+
+
+def state_results(recording, draws, first):
+    """What happened to `draws` states of a run, from the number `first` on."""
+    start = process_time()
+    name = f'state of {recording.split("_")[0]}'
+    return _results(name, draws, start, *states_damaged(recording, draws, first))
+
+
+def _results(name, draws, start, used, failures):
     return {
         'name': name,
         'draws': draws,
