@@ -142,8 +142,7 @@ class System:
 
     def state_types(self) -> tuple[type, ...]:
         """The classes that a saved state of the tracker may hold: a literal table."""
-        module, _, _ = self.tracker.rpartition('.')
-        types: tuple[type, ...] = self._own(f'{module}.STATE_TYPES')
+        types: tuple[type, ...] = self._own('state_types.STATE_TYPES')
         return types
 
     def _own(self, dotted: str) -> Any:

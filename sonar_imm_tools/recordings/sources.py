@@ -109,6 +109,7 @@ class RosbagsSource:
 
     def __init__(self, path: Path):
         self._path = path
+        _require_regular(path)
         for file in self._mcaps():
             if oversized := oversized_chunk(file):
                 raise BagError(oversized)
@@ -314,11 +315,6 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
 def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
     """Open a bag directory through its metadata.yaml or, when that fails, file by file."""
     problems = []
-    for file in path.iterdir():
-        # To open a pipe would wait for somebody who writes, and a device has no end.
-        named = file.name == 'metadata.yaml' or file.suffix in (*SUFFIXES, '.zstd')
-        if named and file.exists() and not (file.is_file() or file.is_dir()):
-            raise BagError(f'{file} is no regular file')
     if (path / 'metadata.yaml').exists():
         try:
             source = RosbagsSource(path)
@@ -390,6 +386,14 @@ def _unpacked(raw: bytes) -> bytes:
 def _split_order(file: Path) -> tuple[int, str]:
     """Order the files of a split bag: name_2 comes before name_10."""
     return len(file.name), file.name
+
+
+def _require_regular(path: Path) -> None:
+    """Raise `BagError` for a file, or one in a folder, that is a pipe or a device: to open a pipe
+    would wait for somebody who writes, and a device has no end."""
+    for file in [path, *path.iterdir()] if path.is_dir() else [path]:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise BagError(f'{file} is not YAML or messages: it is no regular file')
 
 
 @lru_cache(maxsize=8)

@@ -25,7 +25,6 @@ from sonar_imm.parameters import ConfigError, parameters_from_yaml
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.cli.checking import play_recording
 from sonar_imm_tools.cli.common import load_config, node_file
 from sonar_imm_tools.recordings.own_files import MOST_BYTES, OF_FRAMES, own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
@@ -171,9 +170,19 @@ def test_a_parameter_file_that_is_none_is_refused(bag, tmp_path, kind):
 
 @pytest.mark.parametrize('name', ['metadata.yaml', 'more.mcap', 'more.db3', 'more.mcap.zstd'])
 def test_a_pipe_in_a_recording_is_not_opened(bag, name):
+    """What is beside it is read."""
     (bag / name).unlink(missing_ok=True)
     os.mkfifo(bag / name)
-    with pytest.raises(BagError, match='is no regular file'), BagReader(bag):
+    with BagReader(bag) as reader:
+        assert sum(1 for _ in reader.messages()) > 100
+        assert any('is no regular file' in sentence for sentence in reader.problems)
+    with pytest.raises(BagError, match='is no regular file'), BagReader(bag, strict=True):
+        pass
+
+
+def test_a_recording_that_is_a_pipe_is_not_opened(tmp_path):
+    os.mkfifo(tmp_path / 'bag.mcap')
+    with pytest.raises(BagError), BagReader(tmp_path / 'bag.mcap'):
         pass
 
 
@@ -181,18 +190,6 @@ def test_track_says_what_it_does_not_use(bag, tmp_path, capsys):
     state(bag, 'state_file: /etc/passwd', 'model_set: heading_speed')
     assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
     assert capsys.readouterr().err.count("'state_file' is not used") == 1
-
-
-@pytest.mark.system
-def test_check_replaces_no_file_of_the_user(bag, tmp_path):
-    """A real node has `state_file`, and saves its state there when it ends."""
-    victim = tmp_path / 'precious'
-    victim.write_text('shopping list')
-    state(bag, f'state_file: {victim}', 'model_set: heading_speed', node='/**')
-    played = play_recording(bag, 'diver', tmp_path / 'runs', quiet=True)
-    assert all(check.good for check in played.checks)
-    assert victim.read_text() == 'shopping list'
-    assert [path.name for path in tmp_path.glob('precious*')] == ['precious']
 
 
 def test_metadata_name_no_file_outside_of_the_folder(bag, tmp_path):

@@ -57,12 +57,11 @@ from typing import Any, NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
-from ...acoustics.geometry import Pose
 from ...acoustics.layover import Layover
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
-from ...intake.stream import Stream, STREAM_TYPES, StreamRules
+from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..protocol import WarmStep
@@ -527,11 +526,3 @@ def favour_of(alone: Alone, neighbours: list[Alone], strength: float) -> FloatAr
 def _log_ratio(p: FloatArray, strength: float) -> FloatArray:
     weak = math.exp(-strength)
     return np.asarray(np.log((p + (1.0 - p) * weak) / ((1.0 - p) + p * weak)))
-
-
-STATE_TYPES = (
-    *STREAM_TYPES,
-    *(Altitude, Navigation, Snapshot, NavigationBuffer, Pose, BathymetryConfig),
-    *(PoseQueue, Coupling, Alone, Ping, PosedPing, LoudBins),
-)
-"""The classes that a saved state may hold, see `state_file`."""

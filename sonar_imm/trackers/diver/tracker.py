@@ -44,41 +44,31 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, TENTATIVE, Tracks
-from ...estimation.consistency import ENOUGH, excess, NisMemory
-from ...estimation.hypotheses import Hypotheses
+from ...estimation.consistency import ENOUGH, excess
 from ...intake import KnownFrames
-from ...intake.stream import REPLAY_TYPES, ReplayStream, StreamRules
+from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import (
     Arrivals,
     Fix,
     Fixes,
-    GeodeticFix,
     Measurement,
-    Navigation,
     NOBODY,
-    RelativeFix,
     Start,
-    VesselFix,
-    VesselHeading,
-    VesselPose,
 )
 from ..model_checks import track_rules
-from ..navigation import NavigationBuffer
 from ..protocol import WarmStep
 from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
-from .georeferencing import Georeferencer, Samples
+from .georeferencing import Georeferencer
 from .jipda import Association
 from .models import build_models
-from .offsets import Offsets, RecentPairs
+from .offsets import RecentPairs
 from .scan import Heights, Positions, Scan
 from .state import (
     cross,
     DiverState,
-    FixConsistency,
     FIXES,
-    HeightCounts,
     learnt_scale,
     MEMORY,
     Step,
@@ -139,14 +129,7 @@ class DiverTracker:
         """Raise ValueError for states, put in, that are none of these models."""
         nobody = self._nobody(Tracks.none(self.rules))
         for state in self._stream.kept:
-            size = self._layout(state.instruments).size
-            if (
-                state.x.shape[1:] != (*nobody.x.shape[1:2], size)
-                or state.learnt.shape[1:] != nobody.learnt.shape[1:]
-                or state.history.shape[1:] != nobody.history.shape[1:]
-                or state.life.seen.shape[1:] != nobody.life.seen.shape[1:]
-            ):
-                raise ValueError('states are of other models')
+            state.require_like(nobody, self._layout(state.instruments).size)
 
     @property
     def _window(self) -> int:
@@ -634,14 +617,3 @@ class DiverTracker:
             probabilities=self.models.by_model(state.mu),
             extras=extras,
         )
-
-
-STATE_TYPES = (
-    *REPLAY_TYPES,
-    *(Arrivals, Fix, Fixes, Start),
-    *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
-    *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
-    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments, Hypotheses),
-    *(Offsets, RecentPairs, clutter.Clutter),
-)
-"""The classes that a saved state may hold, see `state_file`."""

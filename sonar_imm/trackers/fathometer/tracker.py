@@ -52,9 +52,7 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 
-from ...acoustics.geodesy import Origin
-from ...acoustics.pulse import independent_samples, SampledPulse
-from ...acoustics.spectra import BlockAverage, SlidingAverage, SnapshotStream
+from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
@@ -63,17 +61,14 @@ from ...estimation.set_model import (
     gaussian_walk,
     independent_orders,
     SetModel,
-    Sets,
     walk_reach,
 )
-from ...estimation.set_shifts import ShiftPath
 from ...intake import KnownFrames
-from ...intake.stream import OnceStream, STREAM_TYPES, StreamRules
+from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from ..protocol import WarmStep
 from .config import FathometerConfig
 from .pressure import (
-    BlockDepths,
     Collected,
     CompanionDepths,
     CompanionPlaces,
@@ -89,7 +84,6 @@ from .reflectors import (
     nearest_ids,
     Reflectors,
     reflectors_of,
-    Seen,
     seen_as,
     write_estimate,
 )
@@ -109,7 +103,7 @@ from .response import (
     scatter_of,
     trace_response,
 )
-from .slopes import Slope, slopes_followed
+from .slopes import slopes_followed
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
@@ -597,14 +591,3 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         start=independent_orders(config.order_min, config.orders),
         **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
-
-
-STATE_TYPES = (
-    *STREAM_TYPES,
-    *(ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace, Origin, FathometerConfig),
-    *(PressureStream, BlockDepths, SnapshotStream, BlockAverage, SlidingAverage),
-    *(CompanionDepths, CompanionPlaces, Pace, Response, SampledPulse, Lattice, Taken, Fit),
-    *(LagSmoother, SetStep, Weighted, Sets, ShiftPath),
-    *(Identities, Identified, Slope, Multiples, Seen),
-)
-"""The classes that a saved state may hold, see `state_file`."""

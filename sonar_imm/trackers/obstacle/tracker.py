@@ -40,9 +40,8 @@ from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
-from ...estimation.consistency import NisMemory
 from ...intake import KnownFrames
-from ...intake.stream import REPLAY_TYPES, ReplayStream, StreamRules
+from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
@@ -54,7 +53,7 @@ from .bodies import Bodies, considered
 from .config import ObstacleConfig
 from .elevation import Elevations, fits, outliers, updated
 from .filters import Hints, Mixture, Sonar
-from .ground import Cells, GroundMap
+from .ground import GroundMap
 from .intensity import by_intensity, level_db, Strengths
 from .looks import Looks
 from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
@@ -596,12 +595,3 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-STATE_TYPES = (
-    *REPLAY_TYPES,
-    *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
-    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Strengths, Looks),
-    *(Existence, Landmark, GroundMap, Cells),
-)
-"""The classes that a saved state may hold, see `state_file`."""
