@@ -47,14 +47,7 @@ from ...estimation.association import assign_fits, TENTATIVE, Tracks
 from ...estimation.consistency import ENOUGH, excess
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
-from ...measurements import (
-    Arrivals,
-    Fix,
-    Fixes,
-    Measurement,
-    NOBODY,
-    Start,
-)
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
 from ..protocol import WarmStep
 from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
@@ -65,14 +58,7 @@ from .jipda import Association
 from .models import build_models
 from .offsets import RecentPairs
 from .scan import Heights, Positions, Scan
-from .state import (
-    cross,
-    DiverState,
-    FIXES,
-    learnt_scale,
-    MEMORY,
-    Step,
-)
+from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import as_stated, Instruments
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
