@@ -28,7 +28,6 @@ import io
 import json
 from pathlib import Path
 import re
-import sys
 import tempfile
 from typing import Any
 
