@@ -58,7 +58,7 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     ),
     'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
     'height_rw_ncs, paper': (
-        {**PRINTED, **SLOPE_SET},
+        {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
         (0.106, 0.328, 0.165, 0.20, 0.72),
     ),
     'height_rw_ncs, corrected': (

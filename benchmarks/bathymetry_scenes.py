@@ -52,7 +52,7 @@ CASES: dict[str, Case] = {
     'slope .1 and patch, height_rw_ncs, paper': Case(
         'slope',
         {},
-        {**PRINTED, **SLOPE_SET},
+        {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
         PrintedTracker,
     ),
     'slope .1 and patch, height_rw_ncs, corrected': Case(
