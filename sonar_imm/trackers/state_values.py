@@ -65,7 +65,7 @@ _SHAPES = {
     'Looks': 'seen:T due:T missed:T silent:T shown.mu:TK',
     'Mixture': 'x:TKn P:TKnn mu:TK',
     'Offsets': 'score:s variance:ss length:p',
-    'PingState': 'life.age:T mixture.x:TKn nis:T strengths.mean:TK bodies.number:T looks.seen:T '
+    'PingState': 'life.age:T mixture.x:TKn nis:T bodies.number:T looks.seen:T '
     'existence.pings:T looks.shown.x:TKn',
     'Pose': 'position:*3 R:*33',
     'RecentPairs': 'tx:p3 rx:p3 variance:p age:p',
@@ -76,7 +76,6 @@ _SHAPES = {
     'Sets': 'order:N cell:NJ prior_mean:Na prior_variance:Na sign:NJ shift:N',
     'ShiftPath': 'pull:N',
     'Sonar': 'course:3',
-    'Strengths': 'mean:TK variance:TK',
     'Tracks': 'track_id:T status:T age:T seen:Tw misses:T last_hit_ns:T',
     'Weighted': 'sets.order:N log_weight:N path.pull:N',
 }

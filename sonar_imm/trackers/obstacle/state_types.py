@@ -25,7 +25,6 @@ from ..navigation import NavigationBuffer
 from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
-from .intensity import Strengths
 from .looks import Looks
 from .memory import Existence, Landmark
 from .state import ObstacleState, PingState
@@ -33,6 +32,6 @@ from .state import ObstacleState, PingState
 STATE_TYPES = (
     *REPLAY_TYPES,
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
-    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Strengths, Looks),
+    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Looks),
     *(Existence, Landmark, GroundMap, Cells),
 )
