@@ -35,11 +35,11 @@ from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
 from ..csv_table import BadRow, CsvTable, Row
-from ..foreign import Record
 from ..messages import ros_message
 from ..sources import BagError
+from ..xtf import pings_of
 from .bag_images import SYSTEM
-from .sonar_files import ground_message, Message, speed_of, write_pings, write_records
+from .sonar_files import ground_message, Message, Record, speed_of, write_records
 
 LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""
@@ -77,7 +77,7 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
                 phases = True
                 yield Message(f'/{side}/snapshot', write_snapshot(snapshot, ros_message))
 
-    write_pings(path, 'xtf', report, how, messages, {SYSTEM: mount})
+    write_records(path, pings_of(path, report), report, how, messages, {SYSTEM: mount})
     if set(report.messages) <= {'/nav', '/altitude', '/ground'}:
         return
     other = next(side for side in LOOKS if side != how.side)
