@@ -84,15 +84,10 @@ PEERS = {
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
     'sonar_imm_tools.recordings.convert.side_scan': {'PIL'},
-    'sonar_imm_tools.recordings.foreign': {
-        'ektools',
-        'pynmea2',
-        'pyxtf',
-        'themachinethatgoesping',
-    },
     'sonar_imm_tools.recordings.export.horizons': {'rasterio', 'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
     'sonar_imm_tools.recordings.export.tracks': {'pyarrow'},
+    'sonar_imm_tools.recordings.xtf': {'pyxtf'},
     'sonar_imm_tools.survey.chart': {'rasterio'},
     'sonar_imm_tools.survey.products': {'pyarrow', 'rasterio'},
 }
@@ -198,7 +193,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
         *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio'),
-        *('ektools', 'soundfile'),
+        'soundfile',
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 

@@ -22,6 +22,7 @@ of a CSV file, made with `group`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
 from typing import Any
 
 import attrs
@@ -81,3 +82,11 @@ def spec_of(attribute: attrs.Attribute[Any]) -> Option | Group:
     """What was declared of a field."""
     found: Option | Group = attribute.metadata.get(_KEY) or attribute.metadata[_GROUP]
     return found
+
+
+def nanoseconds(text: str) -> int:
+    """Integer nanoseconds of a number of seconds."""
+    try:
+        return int(Decimal(text) * 10**9)
+    except (InvalidOperation, ValueError, OverflowError):
+        raise ValueError(f"'{text}' is not a number of seconds") from None
