@@ -32,13 +32,10 @@ import numpy as np
 from .conversion import ConversionReport
 from .sources import BagError
 
-FILE_HEAD, PACKET_HEAD, LARGEST_PACKET = 1024, 14, 64 << 20
-"""Bytes."""
+FILE_HEAD, PACKET_HEAD, LARGEST_PACKET = 1024, 14, 64 << 20  # bytes
 MARK = b'\xce\xfa'
-SIDE_SCAN, SOUNDINGS = 0, 17
-VERSION, MOST_CHANNELS = 0x7B, 6
-SIDES = {1: 'port', 2: 'starboard'}
-UNITS = {3: 'degrees', 0: 'metres'}  # of positions
+SIDE_SCAN, SOUNDINGS, VERSION, MOST_CHANNELS = 0, 17, 0x7B, 6
+SIDES, UNITS = {1: 'port', 2: 'starboard'}, {3: 'degrees', 0: 'metres'}
 
 
 def pings_of(path: Path, report: ConversionReport) -> Iterator[dict[str, Any]]:
@@ -56,8 +53,11 @@ def pings_of(path: Path, report: ConversionReport) -> Iterator[dict[str, Any]]:
     others: Counter[int] = Counter()
     try:
         for head, packet in _packets(path, others, pyxtf):
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore')  # of a ping without soundings, or of NaN
+                ping = _ping(head, packet, pyxtf)
             report.rows += 1
-            yield {'where': f'ping {report.rows}', **_ping(head, packet, pyxtf)}
+            yield {'where': f'ping {report.rows}', **ping}
     except Exception as error:  # whatever a library of others raises
         own = isinstance(error, _DamageError)
         why = f'{"" if own else f"its reader gives up: {type(error).__name__} "}{error}'
@@ -77,7 +77,6 @@ def _packets(path: Path, others: Counter[int], pyxtf: Any) -> Iterator[tuple[Any
     if not path.is_file():
         raise _DamageError('this is no file')  # a pipe would never answer
     with path.open('rb') as file:
-        size = os.fstat(file.fileno()).st_size
         if len(start := file.read(FILE_HEAD)) < FILE_HEAD:
             raise _DamageError('the head of the file is cut off')
         head = pyxtf.XTFFileHeader.create_from_buffer(buffer=BytesIO(start))
@@ -93,7 +92,7 @@ def _packets(path: Path, others: Counter[int], pyxtf: Any) -> Iterator[tuple[Any
                 raise _DamageError('a packet does not begin as packets do')
             if start[2] in (SIDE_SCAN, SOUNDINGS):
                 yield head, start + file.read(length - PACKET_HEAD)
-            elif file.seek(length - PACKET_HEAD, 1) > size:
+            elif file.seek(length - PACKET_HEAD, 1) > os.fstat(file.fileno()).st_size:
                 raise _DamageError('a packet is cut off')
             else:
                 others[start[2]] += 1
@@ -101,10 +100,11 @@ def _packets(path: Path, others: Counter[int], pyxtf: Any) -> Iterator[tuple[Any
 
 def _ping(head: Any, content: bytes, pyxtf: Any) -> dict[str, Any]:
     """A ping as `pings_of` has it, by the bytes of its packet."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # of one without soundings
-        packet = pyxtf.XTFPingHeader.create_from_buffer(buffer=BytesIO(content), file_header=head)
-    channels, soundings = [], None
+    channels, soundings, make = [], None, pyxtf.XTFPingHeader.create_from_buffer
+    try:
+        packet = make(buffer=BytesIO(content), file_header=head)
+    except ValueError:  # that of ctypes or numpy for too few bytes
+        raise _DamageError('a ping is cut off') from None
     if packet.HeaderType == SOUNDINGS:
         beams = np.frombuffer(packet.data, np.dtype(pyxtf.XTFBeamXYZA))
         names = ('dPosOffsetTrX', 'dPosOffsetTrY', 'fDepth')

@@ -29,7 +29,7 @@ import numpy as np
 
 from msg_adapters.detections import write_detections
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Rejection, Snapshot, SonarImage
+from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, Snapshot, SonarImage
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
 from ..conversion import ConversionReport, converter
@@ -121,6 +121,8 @@ def _sides(ping: Record, port_samples: str) -> dict[str, list[Record]]:
     for channel in ping['channels']:
         if channel['side'] in LOOKS and len(channel['samples']):
             samples = channel['samples']
+            if len(samples) > MAX_IMAGE_CELLS:  # before each takes eight bytes and more
+                raise Rejection('too_large', f'a channel has {len(samples)} samples')
             if channel['side'] == 'port' and port_samples == 'far':
                 samples = samples[::-1]
             found.setdefault(channel['side'], []).append({**channel, 'samples': samples})

@@ -140,7 +140,8 @@ def write_records(
             stamp_ns = record['stamp_ns']
             try:
                 nav = frame.navigation(record)
-                made = list(messages({**record, 'nav': nav}))
+                with np.errstate(invalid='ignore'):  # of NaN, which the measurements reject
+                    made = list(messages({**record, 'nav': nav}))
             except (Rejection, BadRow) as error:
                 report.bad_row(path, record['where'], error)
                 continue

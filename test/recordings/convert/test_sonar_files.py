@@ -245,6 +245,12 @@ class TestXtf:
         assert report.messages['/detections'] == 2 and not report.problems
         assert report.notes['packets not taken'] == '1 raw_serial, 1 250'
 
+    def test_a_ping_too_long_for_an_image_is_counted(self, tmp_path):
+        channels = [('stbd', 'starboard', 'uint8')]
+        pings = [xtf_ping(0.2 * k, [np.zeros(n, 'u1')]) for k, n in enumerate([500, 4_000_001])]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings, channels), tmp_path / 'bag')
+        assert report.messages['/detections'] == 1 and report.reasons == {'too large': 1}
+
     def test_a_pipe_is_not_waited_for(self, tmp_path):
         os.mkfifo(tmp_path / 'a.xtf')
         with pytest.raises(BagError, match='this is no file'):
