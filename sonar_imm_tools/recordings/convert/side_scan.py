@@ -239,7 +239,10 @@ def _picture(folder: Path, record: Record, frame_id: str) -> SonarImage:
     if folder.resolve() not in path.resolve().parents:
         raise BadRow(f"'{record['file']}' lies outside of the folder", 'no picture')
     try:
-        with Image.open(path) as picture:
+        # By these names alone: other formats are read by programs that Pillow starts.
+        with Image.open(path, formats=('PNG', 'JPEG')) as picture:
+            if picture.width * picture.height > MAX_IMAGE_CELLS:
+                raise BadRow(f"'{record['file']}' has too many pixels", 'no picture')
             pixels = np.asarray(picture.convert('F'), np.float64)
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError) as error:
         raise BadRow(f"'{record['file']}' cannot be read: {error}", 'no picture') from None

@@ -292,13 +292,18 @@ def test_a_folder_of_pictures(tmp_path, folder):
 
 
 def test_pictures_that_cannot_be_used_are_counted(tmp_path, folder):
+    image = pytest.importorskip('PIL.Image')
     (folder / '1.png').write_bytes(b'no picture')
     (folder / '2.png').unlink()
     text = (folder / 'stamps.csv').read_text()
     (folder / 'stamps.csv').write_text(text.replace('3.png', '../../etc/passwd'))
+    (folder / '4.png').write_bytes(b'%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\nshowpage\n')
+    image.new('L', (4_000_001, 1)).save(folder / '5.png')
     report = convert_pictures(folder, tmp_path / 'bag', far_range=40.0, fov=82.0)
-    assert report.messages['/detections'] == 3 and report.reasons == {'no picture': 3}
-    assert 'outside of the folder' in ' '.join(report.problems)
+    assert report.messages['/detections'] == 1 and report.reasons == {'no picture': 5}
+    problems = ' '.join(report.problems)
+    assert 'outside of the folder' in problems and 'too many pixels' in problems
+    assert "'4.png' cannot be read: cannot identify image file" in problems
     with pytest.raises(BagError, match='--far-range and --fov'):
         convert_pictures(folder, tmp_path / 'none')
     (folder / 'other.csv').write_text('file\n')
