@@ -84,7 +84,7 @@ $(STAMP): setup.py pyproject.toml
 	@touch $@
 
 $(TEST_STAMP): $(STAMP)
-	@$(INSTALL) 'sonar_imm[test,lint,sweep]'
+	@$(INSTALL) 'sonar_imm[test,lint,cluster]'
 	@# Without what it brings along, 1.7 GB of Qt and notebooks. Where there is no wheel, its tests say so.
 	@$(INSTALL) --no-deps --only-binary :all: tqdm \
 	    'themachinethatgoesping>=0.33; python_version >= "3.11"' \

@@ -20,6 +20,5 @@ __all__ = [
     'numbers',
     'plotting',
     'report',
-    'sweep',
     'tuning',
 ]
