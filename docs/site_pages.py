@@ -28,7 +28,6 @@ import io
 import json
 from pathlib import Path
 import re
-import sys
 import tempfile
 from typing import Any
 
@@ -84,8 +83,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Called by mkdocs with each page: show where the numbers of its tables come from."""
-    return captioned(markdown, '../' * page.file.src_uri.count('/'))
+    """Leave out the comments that name the source of a table. Called by mkdocs with each page."""
+    return re.sub(r'<!-- numbers:.*?-->\n?', '', markdown, flags=re.DOTALL)
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
@@ -103,47 +102,6 @@ def labelled(found: re.Match[str]) -> str:
         return re.sub(r'<td', lambda _: f'<td data-label="{next(named, "")}"', row.group())
 
     return f'{head}</thead>' + re.sub(r'<tr>.*?</tr>', cells, body, flags=re.DOTALL)
-
-
-def caption(mark: str, up: str) -> str:
-    """What is shown below a table for its mark; `up` leads from the page to docs/."""
-    from check_numbers import aged, aged_reading, known_sources
-
-    kind, _, rest = mark.partition(';')
-    if kind == 'none':
-        return ''
-    if kind.startswith('read '):
-        return (
-            f'<small>*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`</small>'
-        )
-    sources = known_sources()
-    named = dict.fromkeys(
-        name for name in re.findall(r'[a-z_0-9]+\.json', mark) if name in sources
-    )
-    lines = '<br>'.join(
-        f'*Values of {sources[name]["date"]} ({aged(name)}), [{name}]({up}results/{name}):* '
-        f'`{sources[name]["command"]}`'
-        for name in named
-    )
-    return f'<small>{lines}</small>' if lines else ''
-
-
-def captioned(markdown: str, up: str) -> str:
-    """A page with a caption below each table that has a mark (`check_numbers`), in its place."""
-    sys.path.insert(0, str(ROOT / 'docs'))
-    from check_numbers import MARK, on_one_line
-
-    out: list[str] = []
-    waiting = ''
-    for line in [*on_one_line(markdown).splitlines(), '']:
-        if found := MARK.match(line):
-            waiting = caption(found.group(1), up)
-            continue
-        if waiting and out and out[-1].startswith('|') and not line.startswith('|'):
-            out += ['', waiting]
-            waiting = ''
-        out.append(line)
-    return '\n'.join(out)
 
 
 def on_post_build(config: Any) -> None:
