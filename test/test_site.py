@@ -133,9 +133,17 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
     ]
 
 
-def test_the_site_leaves_out_the_marks_of_tables(made: Any) -> None:
+def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
+    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
+    assert made.captioned(text, '') == (
+        '| a |\n|---|\n| 1.5 |\n\n'
+        '<small>*Read on 2026-11-20:* `sonar-imm bench`</small>\n\nAfter.\n'
+    )
     text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
-    assert made.on_page_markdown(text, None, None, None) == '| a |\n|---|\n| 1.5 |\n'
+    text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')
+    shown = made.captioned(text, '../')
+    assert '[tune.json](../results/tune.json)' in shown
+    assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
 
 
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:

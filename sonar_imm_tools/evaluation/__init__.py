@@ -20,5 +20,6 @@ __all__ = [
     'numbers',
     'plotting',
     'report',
+    'rerun_file',
     'tuning',
 ]
