@@ -48,6 +48,11 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.truth import Scene
 
+ENTRY = str(Path(__file__).parent / 'entry')
+"""Where the models of `diver_paper` are registered, as those of an installed package are."""
+if ENTRY not in sys.path:
+    sys.path.append(ENTRY)
+
 Parts = Iterator[Mapping[str, Any]]
 Row = Mapping[str, Any]
 T = TypeVar('T')

@@ -28,7 +28,7 @@ TINY = ('--set', 'duration=15', '--workers', '1')
 
 def test_a_seed_scores_as_simulate_track_and_evaluate_say(tmp_path, capsys):
     params = tmp_path / 'mine.yaml'
-    params.write_text('model_set: cv_cv\n')
+    params.write_text('model_set: heading_speed\ndirections: 4\n')
     out = tmp_path / 'out'
     circle = ['--scenario', 'circle']
     asked = ['--runs', '2', '--seed', '6', '--params', str(params), '--out', str(out)]

@@ -278,7 +278,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('fuse')
     for name, seed in (('a', 4), ('b', 5)):
         bag = write_dive(folder / f'{name}.bag', seed=seed, count=60)
-        assert main(['track', str(bag), str(folder / name), '--set', 'model_set=cv']) == 0
+        assert (
+            main(['track', str(bag), str(folder / name), '--set', 'model_set=heading_speed']) == 0
+        )
     return folder
 
 
@@ -331,7 +333,17 @@ def test_a_run_with_a_place_on_earth_keeps_it(tmp_path: Path) -> None:
         assert main(['simulate', 'diver', str(bag), *wanted]) == 0
         place = ['--set', 'origin_latitude=43.3', '--set', 'origin_longitude=5.35']
         assert (
-            main(['track', str(bag), str(tmp_path / name), '--set', 'model_set=cv', *place]) == 0
+            main(
+                [
+                    'track',
+                    str(bag),
+                    str(tmp_path / name),
+                    '--set',
+                    'model_set=heading_speed',
+                    *place,
+                ]
+            )
+            == 0
         )
     a, b, out = (str(tmp_path / name) for name in ('a', 'b', 'out'))
     assert main(['fuse', a, b, out]) == 0
