@@ -175,8 +175,8 @@ class LateralHeadings(OwnSet):
     std, time = 0.2, 10.0
 
     def __init__(self, config: DiverConfig):
-        plain = {'transition_matrix': (), 'initial_probabilities': (), 'dimensions': 2}
-        base = build_models(evolve(config, **HEADINGS, **plain, fix_bias_std=0.0))
+        plain = evolve(config, transition_matrix=(), initial_probabilities=(), **HEADINGS)
+        base = build_models(evolve(plain, dimensions=2, fix_bias_std=0.0))
 
         def step(j: int, x: FloatArray, dt: float) -> Motion:
             small, ux, uy = base.motion(dt), *base.E[j, 2:, 2]
@@ -348,14 +348,14 @@ def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.nda
 
 class Step(NamedTuple):
     """After a fix: mean (N, 4), covariance (N, 4, 4); x, P, mu of the models; the transition
-    matrices that led there, None at first."""
+    matrices that led there, at first those of the next step."""
 
     mean: np.ndarray
     covariance: np.ndarray
     x: np.ndarray
     P: np.ndarray
     mu: np.ndarray
-    transition: np.ndarray | None
+    transition: np.ndarray
 
 
 def forward(
@@ -366,7 +366,7 @@ def forward(
     F, Q, B = models.motion(1.0)
     H = models.E[:, :2]
     learnt = chain.fresh(len(z))
-    yield Step(*imm.combine(x, P, mu, models.E), x, P, mu, None)
+    yield Step(*imm.combine(x, P, mu, models.E), x, P, mu, chain.transition(learnt, 1.0))
     for k in range(1, z.shape[1]):
         transition, before = chain.transition(learnt, 1.0), mu
         x, P, c = imm.mix(x, P, mu, transition)
@@ -492,8 +492,7 @@ def smoothing(runs: int) -> dict[str, dict[str, float]]:
             x, P, mu = (
                 np.stack([getattr(s, name)[run] for s in steps]) for name in ('x', 'P', 'mu')
             )
-            led = (s.transition for s in (steps[1], *steps[1:]))
-            into = np.stack([np.broadcast_to(each, (runs, *each.shape[1:]))[run] for each in led])
+            into = np.stack([s.transition[run % len(s.transition)] for s in steps])
             smooth[run] = imm_smooth(x, P, mu, into, F, Q, B).combine(models.E)[0]
         table[label] = {
             'filter': rmse(np.stack([step.mean for step in steps], axis=1), truth),
