@@ -14,7 +14,9 @@
 
 """The study of the paper on divers: its equation (1), its model sets, and that it runs."""
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ import pytest
 from benchmarks import diver_paper
 from benchmarks.diver_paper import PaperChain, Program, TRACKERS
 from sonar_imm.estimation import imm
+from sonar_imm.estimation.motion import Motion
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm.trackers.own_models import checked
@@ -74,6 +77,27 @@ def test_impossible_transitions_stay_impossible(form):
     P = learnt(PaperChain(prior, form), np.random.default_rng(3).dirichlet(np.ones(3), (10, 1)))
     assert (P[prior == 0.0] == 0.0).all()
     np.testing.assert_allclose(P.sum(axis=-1), 1.0)
+
+
+def test_the_guarded_product_in_a_filter_is_that_of_the_reference():
+    with np.load(VECTORS / 'imm_reference.npz') as reference:
+        names = (name for name in reference if name.startswith('A6_world16_adaptA_guard/'))
+        given = {name.partition('/')[2]: reference[name] for name in names}
+    models = SimpleNamespace(
+        new_tracks=lambda z, R: tuple(given[name][None] for name in ('x0', 'P0', 'mu0')),
+        motion=lambda dt: Motion(given['F'], given['Q'], given['B']),
+        E=given['E'],
+    )
+    chain = PaperChain(given['Pi'], 'product', json.loads(str(given['opts']))['eps'])
+    # The first fix begins a track, which begins otherwise here.
+    z, R = (np.concatenate([part[:1], part])[None] for part in (given['Z'], given['R']))
+    steps = list(diver_paper.forward(models, chain, z, R))
+    for name in ('x', 'P', 'mu'):
+        ours = np.concatenate([getattr(step, name) for step in steps[1:]])
+        wanted = given['out_mu' if name == 'mu' else f'out_{name}j']
+        np.testing.assert_allclose(ours, wanted, rtol=0.0, atol=1e-9)
+    used = np.concatenate([step.transition for step in steps[2:]])
+    np.testing.assert_allclose(used, given['out_Pi'][:-1], rtol=0.0, atol=1e-9)
 
 
 def test_world_headings_are_those_of_the_reference(monkeypatch):

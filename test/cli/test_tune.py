@@ -38,8 +38,7 @@ from sonar_imm_tools.evaluation.obstacle import predictive as obstacles
 from sonar_imm_tools.evaluation.tuning import errors, maximise, Tunable, values_of
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'regret_free'
-HEADINGS = ['--set', 'model_set=heading_speed', '--set', 'directions=4']
-QUICK = ['--system', 'diver', *HEADINGS, '--parameters', 'covariance_scale']
+QUICK = ['--system', 'diver', '--set', 'model_set=linear', '--parameters', 'covariance_scale']
 
 
 def dive(folder: Path, duration: int) -> Path:
@@ -55,7 +54,7 @@ def test_covariances_that_are_too_small_are_found_and_written(tmp_path: Path) ->
         main(['tune', str(bag), *QUICK, '--set', 'covariance_scale=0.1', '--out', str(out)]) == 0
     )
     written = yaml.safe_load(out.read_text())['/**']['ros__parameters']
-    assert written['model_set'] == 'heading_speed' and 0.5 < written['covariance_scale'] <= 1.0
+    assert written['model_set'] == 'linear' and 0.5 < written['covariance_scale'] <= 1.0
     assert main(['track', str(bag), str(tmp_path / 'run'), '--params', str(out)]) == 0
 
 
@@ -84,7 +83,7 @@ def test_bad_input_is_named(
     sentence: str,
 ) -> None:
     bag = dive(tmp_path, duration)
-    options = ['--system', 'diver', *HEADINGS]
+    options = ['--system', 'diver', '--set', 'model_set=linear']
     assert main(['tune', str(bag), *options, '--parameters', name]) == 2
     assert sentence in capsys.readouterr().err
 

@@ -221,10 +221,9 @@ def test_optimistic_covariances_can_be_found_out():
     assert 5.0 < tracker.health()['scale_fixes'] < 14.0
 
 
-@pytest.mark.parametrize('adaptation', ['counts', 'paper'])
-def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns(adaptation):
+def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns():
     """Probabilities move by prediction alone then: learnt from, they would confirm the prior."""
-    tracker = DiverTracker(DiverConfig(adaptation=adaptation))
+    tracker = DiverTracker(DiverConfig())
     for second in range(1, 8):
         tracker.process(fix(second, 0.75 * second, 0.2 * second))
     before = tracker._stream.state
