@@ -279,7 +279,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, seed in (('a', 4), ('b', 5)):
         bag = write_dive(folder / f'{name}.bag', seed=seed, count=60)
         assert (
-            main(['track', str(bag), str(folder / name), '--set', 'model_set=heading_speed']) == 0
+            main(['track', str(bag), str(folder / name), '--set', 'model_set=linear']) == 0
         )
     return folder
 
@@ -339,7 +339,7 @@ def test_a_run_with_a_place_on_earth_keeps_it(tmp_path: Path) -> None:
                     str(bag),
                     str(tmp_path / name),
                     '--set',
-                    'model_set=heading_speed',
+                    'model_set=linear',
                     *place,
                 ]
             )
