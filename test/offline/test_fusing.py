@@ -278,9 +278,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('fuse')
     for name, seed in (('a', 4), ('b', 5)):
         bag = write_dive(folder / f'{name}.bag', seed=seed, count=60)
-        assert (
-            main(['track', str(bag), str(folder / name), '--set', 'model_set=linear']) == 0
-        )
+        assert main(['track', str(bag), str(folder / name), '--set', 'model_set=linear']) == 0
     return folder
 
 
