@@ -54,7 +54,7 @@ SINGLES: dict[str, dict[str, Any]] = {
     'heading .005': {'model_set': 'heading_speed'},
     'heading .07': {'model_set': 'heading_speed', 'speed_noise': 0.07},
     **{
-        f'CV {noise:g}': {'model_set': 'cv', 'acceleration_noise': (noise,)}
+        f'CV {noise:g}': {'model_set': 'bench_cv', 'acceleration_noise': (noise,)}
         for noise in (0.03, 0.1, 0.25, 0.6, 1.5)
     },
 }

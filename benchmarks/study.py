@@ -68,6 +68,11 @@ from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.scenes import write_scene
 
+ENTRY = str(Path(__file__).parent / 'entry')
+"""Where the models of `diver_paper` are registered, as those of an installed package are."""
+if ENTRY not in sys.path:
+    sys.path.append(ENTRY)
+
 Parts = Iterator[Mapping[str, Any]]
 Row = Mapping[str, Any]
 T = TypeVar('T')
