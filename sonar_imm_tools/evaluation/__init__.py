@@ -20,6 +20,6 @@ __all__ = [
     'numbers',
     'plotting',
     'report',
-    'sweep',
+    'rerun_file',
     'tuning',
 ]
