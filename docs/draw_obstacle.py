@@ -37,17 +37,17 @@ matplotlib.use('Agg')
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.obstacle_section5 import echoes, encounter, EXACT, OFFSETS, read  # noqa: E402
 from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
+from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
-from benchmarks.obstacle_section5 import echoes, encounter, EXACT, OFFSETS, read  # noqa: E402
 from benchmarks.study import truths  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
-from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.simulator import (  # noqa: E402
     scenario,

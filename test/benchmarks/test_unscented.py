@@ -15,13 +15,13 @@
 """The unscented filter: exact where it must be, indifferent to the choice of north, and never
 without an answer."""
 
+from benchmarks.unscented import unscented_transform
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from benchmarks import unscented
-from benchmarks.unscented import unscented_transform
 from sonar_imm.estimation import kalman
 from sonar_imm.estimation.kalman import CovarianceError
 from sonar_imm.estimation.smoothing import sigma_offsets

@@ -21,13 +21,13 @@ from helpers.obstacle_bags import tracked
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
-from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
 from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of

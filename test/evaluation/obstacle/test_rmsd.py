@@ -19,11 +19,11 @@ from pathlib import Path
 from helpers.obstacle_runs import approach, lever, meta, rows
 import numpy as np
 import pytest
+from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
 
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig
-from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
 
 SECTION5 = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'paper_section5.npz'
 GRID = np.arange(-12.0, 12.025, 0.05)
