@@ -48,7 +48,7 @@ import numpy as np
 
 from . import small_matrices
 from .arrays import BoolArray, FloatArray
-from .small_matrices import LIMIT
+from .small_matrices import JITTER, LIMIT
 
 
 class CovarianceError(ValueError):
@@ -163,3 +163,57 @@ def _square_root_correct(
     if small_matrices.square_root_update(P, H, R, factor, gain, out):
         return out, gain, factor, True
     return P, np.zeros((n, m)), np.eye(m), False
+
+
+# -- many small covariances at once, (n, n, ...): numpy runs along the last axes ------------------
+
+
+def semidefinite_roots(S: FloatArray) -> FloatArray:
+    """Return lower roots (n, n, ...), ``S = L L'``, of covariances S (n, n, ...) that may be
+    singular: a column without variance is zero. Only lower triangles are read."""
+    L = np.zeros(S.shape)
+    for b in range(len(S)):
+        pivot = S[b, b] - (L[b, :b] * L[b, :b]).sum(axis=0)
+        known = (pivot <= LIMIT * S[b, b]) | ~(pivot > 0.0)
+        root = np.sqrt(np.where(known, 0.0, pivot))
+        L[b, b] = root
+        inverse = np.where(known, 0.0, 1.0 / np.where(known, 1.0, root))
+        for a in range(b + 1, len(S)):
+            L[a, b] = (S[a, b] - (L[a, :b] * L[b, :b]).sum(axis=0)) * inverse
+    return L
+
+
+def are_sound(S: FloatArray) -> BoolArray:
+    """Return whether each covariance S (n, n, ...) keeps to the limit (...): `is_psd`, by pivots
+    without square roots. Only lower triangles are read."""
+    n = len(S)
+    L, D = np.zeros(S.shape), np.zeros(S.shape[1:])
+    good = np.ones(S.shape[2:], np.bool_)
+    for a in range(n):
+        rest = S[a, a] - LIMIT * S[a, a]
+        for b in range(a):
+            value = S[a, b] - (L[a, :b] * L[b, :b] * D[:b]).sum(axis=0)
+            good &= ~((D[b] == 0.0) & (value != 0.0))
+            L[a, b] = value * np.divide(1.0, D[b], out=np.zeros_like(value), where=D[b] != 0.0)
+            rest = rest - value * L[a, b]
+        positive = (rest > 0.0) & (rest < np.inf)
+        good &= positive | ((S[a, a] == 0.0) & (rest == 0.0))
+        D[a] = np.where(positive, rest, 0.0)
+    return good
+
+
+def with_jitter(S: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return covariances S (n, n, L), with larger diagonals where they did not keep to the limit,
+    and which (L,) these are: `add_jitter`. What no jitter cures stays as it is."""
+    bad = ~are_sound(S)
+    if not bad.any():
+        return S, bad
+    out, lanes, n = S.copy(), np.flatnonzero(bad), len(S)
+    share = JITTER
+    while len(lanes) and share < 2.0 * n:
+        trial = S[..., lanes].copy()
+        trial[range(n), range(n)] *= 1.0 + share
+        cured = are_sound(trial)
+        out[..., lanes[cured]] = trial[..., cured]
+        lanes, share = lanes[~cured], 10.0 * share
+    return out, bad
