@@ -34,7 +34,7 @@ from sonar_imm.estimation.small_matrices import (
     semidefinite_roots,
     turn_of,
 )
-from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
+from sonar_imm.trackers.obstacle import mixtures
 
 ROUNDING = 1e-14
 
@@ -277,7 +277,7 @@ def test_the_obstacle_update_stays_positive_definite():
     h, z = np.zeros((500, 4, 2)), np.zeros((500, 2))
     repairs = 0
     for _ in range(5):
-        x, P, mu, _, repaired = obstacle_kernels.jipda_update(x, P, mu, h, z, R, 0.05, 1e-3)
+        x, P, mu, _, repaired = mixtures.update(x, P, mu, h, z, R, 0.05, 1e-3)
         assert is_covariance(P)
         assert np.isfinite(x).all() and (mu >= 0.0).all()
         np.testing.assert_allclose(mu.sum(axis=1), 1.0, rtol=1e-12)
@@ -290,7 +290,7 @@ def test_a_probability_below_zero_depth_stays_in_its_interval():
     rng = np.random.default_rng(9)
     mu = rng.dirichlet(np.full(16, 0.3), 4000)
     mean, std = -10.0 * np.ones((4000, 16)), 0.1 * np.ones((4000, 16))
-    *_, negative = obstacle_kernels.bands(mean, std, mu, 0.05)
+    *_, negative = mixtures.bands(mean, std, mu, 0.05)
     assert (mu.sum(axis=1) > 1.0).any()
     assert (negative <= 1.0).all() and (negative > 1.0 - 1e-9).all()
 

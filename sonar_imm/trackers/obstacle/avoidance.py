@@ -242,7 +242,9 @@ def _closed_form(g: FloatArray, S: FloatArray, L: FloatArray, safety: Safety) ->
     (b, t), image = image_moments(image, centre, weight)
     spread = covariances(image, centre, weight)
     both = cross_covariance(image[:1], F[2:3], weight[0])[0, 0]
-    return _within(g[2], S[2, 2], b, spread[0, 0], both, safety) * _in_time(t, spread[1, 1], safety)
+    return _within(g[2], S[2, 2], b, spread[0, 0], both, safety) * _in_time(
+        t, spread[1, 1], safety
+    )
 
 
 def _in_time(t: FloatArray, variance: FloatArray, safety: Safety) -> FloatArray:

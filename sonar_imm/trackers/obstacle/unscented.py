@@ -130,9 +130,7 @@ def image_moments(
     return mean, image - mean[:, None]
 
 
-def covariances(
-    image: FloatArray, centre: FloatArray, weight: FloatArray
-) -> FloatArray:
+def covariances(image: FloatArray, centre: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the covariances (q, q, L) of images (q, 1 + 2 k, L) without their means."""
     weights = np.concatenate([centre[None], weight, weight])
     return np.einsum('akl,kl,bkl->abl', image, weights, image)
