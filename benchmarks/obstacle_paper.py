@@ -369,7 +369,6 @@ def distribution(table: dict[str, list[float]], truth: float) -> dict[str, dict[
 
 # -- tether: of a whole recording ----------------------------------------------------------------
 
-
 TETHERS = {'last_range': -17.0}
 """What the recording differs in from its scene."""
 CUTOFF, GAP = 5.0, 60.0
@@ -402,8 +401,8 @@ def most_echoes(
 
 
 def moored(setting: ObstacleScenario, seed: int) -> dict[str, float]:
-    """The estimates of a run, m below the sonar at the first echo, less the truth, which is last
-    but for the length of the tether; empty when no track was on an obstacle."""
+    """The errors of all estimates of a run, m below the sonar at the first echo, the truth, and
+    the length of the tether; empty when no track was on an obstacle."""
     scene = simulate(setting, seed)
     config = evolve(ObstacleConfig(), **unusual(setting.instruments(), ObstacleConfig))
     measurements = [item.measurement for item in scene.measurements]
@@ -422,13 +421,13 @@ def moored(setting: ObstacleScenario, seed: int) -> dict[str, float]:
     path = paths[matched.target[np.argmax(own)]]
     true = float(path.at(hits.stamp_ns[:1], GAP)[0, 2])
     sunk = poses.position[-1, 2] - poses.position[0, 2]
-    estimates = {
+    said = {
         'RMSD': deferred(z, poses, config).best,
         'RMSD, both sides': deferred(z, poses, config, both_sides=True).best,
         'refitted': deferred(z, poses, config, both_sides=True, refit=True).best,
         'online': float(hits.state[-1, 2] + sunk),
     }
-    errors = {name: value - true for name, value in estimates.items()}
+    errors = {name: value - true for name, value in said.items()}
     return {**errors, 'truth': true, **tether_length(series, measurements, config)}
 
 

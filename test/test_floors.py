@@ -40,6 +40,7 @@ if not (ROOT / 'setup.py').is_file():
 # A room may import from its own floor and from lower ones.
 FLOORS = {
     'sonar_imm.files': 0,
+    'sonar_imm.gone': 0,
     'sonar_imm.texts': 0,
     'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,

@@ -97,7 +97,8 @@ def closest_approach(
     config: ObstacleConfig,
 ) -> dict[str, FloatArray]:
     """``cpa_distance`` m, ``cpa_time`` s and ``collision_probability``, each (T,), of mixtures
-    mean (T, K, 5), covariance (T, K, 5, 5), mu (T, K) of g before a vehicle of that velocity (3,), NED. NaN where the velocity is."""
+    mean (T, K, 5), covariance (T, K, 5, 5), mu (T, K) of g before a vehicle of that velocity
+    (3,), NED. NaN where the velocity is."""
     names = ('cpa_distance', 'cpa_time', 'collision_probability')
     if not all(map(math.isfinite, velocity.tolist())):
         return {name: np.full(len(mu), np.nan) for name in names}
@@ -134,15 +135,16 @@ def draws() -> FloatArray:
 def assess(
     mean: FloatArray, covariance: FloatArray, mu: FloatArray, safety: Safety
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return distance (T,) m and time (T,) s of the closest approach, and the probability (T,) of a
-    collision, of mixtures (T, K) of g."""
+    """Return distance (T,) m and time (T,) s of the closest approach of mixtures (T, K) of g, and
+    the probability (T,) of a collision."""
     live = np.nonzero(mu >= WEIGHT)
     found = np.zeros((4, len(mu)))
     if len(live[0]):
         g, S = mean[live].T, np.moveaxis(covariance[live], 0, -1).copy()
         for a in (3, 4):
             S[a, a] += safety.std * safety.std
-        time, near = closest(g[0], g[1], *_apart(g, safety), safety.horizon)
+        w0, w1 = _apart(g, safety)
+        time, near = closest(g[0], g[1], w0, w1, safety.horizon)
         weight = mu[live]
         for row, value in zip(found, (near, time, _chances(g, S, safety), np.ones(len(weight)))):
             np.add.at(row, live[0], weight * value)
@@ -242,9 +244,8 @@ def _closed_form(g: FloatArray, S: FloatArray, L: FloatArray, safety: Safety) ->
     (b, t), image = image_moments(image, centre, weight)
     spread = covariances(image, centre, weight)
     both = cross_covariance(image[:1], F[2:3], weight[0])[0, 0]
-    return _within(g[2], S[2, 2], b, spread[0, 0], both, safety) * _in_time(
-        t, spread[1, 1], safety
-    )
+    near = _within(g[2], S[2, 2], b, spread[0, 0], both, safety)
+    return near * _in_time(t, spread[1, 1], safety)
 
 
 def _in_time(t: FloatArray, variance: FloatArray, safety: Safety) -> FloatArray:

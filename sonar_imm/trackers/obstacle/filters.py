@@ -109,7 +109,8 @@ class Mixture(NamedTuple):
 
     def is_finite(self) -> BoolArray:
         """Return which targets (T,) have finite numbers throughout."""
-        return np.isfinite(self.x).all(axis=(1, 2)) & np.isfinite(self.P).all(axis=(1, 2, 3))
+        means, covariances = np.isfinite(self.x), np.isfinite(self.P)
+        return np.asarray(means.all(axis=(1, 2)) & covariances.all(axis=(1, 2, 3)))
 
     def joined(self, other: Mixture) -> Mixture:
         return Mixture(*(np.concatenate(both) for both in zip(self, other)))
@@ -239,9 +240,8 @@ class DepthSlices:
         other = np.full(len(m), self.config.outlier_probability)
         vertical, *others = self._beam
         edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
-        return Mixture(
-            *mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, edge, soft, *others)[:3]
-        )
+        beam = edge, soft, *others
+        return Mixture(*mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, *beam)[:3])
 
     def missed(self, mixture: Mixture, p: FloatArray, sonar: Sonar) -> tuple[Mixture, FloatArray]:
         """After a ping without an echo of the targets, which each give one with the probability
@@ -249,9 +249,8 @@ class DepthSlices:
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         vertical, *others = self._beam
         edge, soft = (1.0 - EDGE) * vertical, SOFT * vertical
-        *after, inside = mixtures.weight_by_beam(
-            *mixture, m, np.ones(len(p)), -p, edge, soft, *others
-        )
+        beam = edge, soft, *others
+        *after, inside = mixtures.weight_by_beam(*mixture, m, np.ones(len(p)), -p, *beam)
         return Mixture(*after), inside
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:

@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is done with the mixture of an obstacle: mix behaviours, update by an echo, weigh by the beam,
-and say where it is.
+"""Operations on the mixtures of obstacles: mix behaviours, update by an echo, weigh by the beam,
+and the quantiles that are published.
 
 A target is K components x (K, n), P (K, n, n) with weights mu (K,); all functions take all T
 targets at once. A component of weight 0 is dropped: it takes no further part.
@@ -247,8 +247,8 @@ def weight_by_beam(
     horizontal: float,
     reach: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the density of mixtures (T, K) times `floor + slope B`, matched in mean and covariance
-    component by component, and the mean (T,) of B beforehand (`looks`).
+    """Return the density of mixtures (T, K) times `floor + slope B`, moment-matched component by
+    component, and the mean (T,) of B beforehand (`looks`).
 
     m (T, K, 3): where the means lie, seen from the sonar; floor, slope (T,); edge and soft, rad:
     half height of the pattern B and the standard deviation of its edges; horizontal, reach: half
@@ -326,11 +326,13 @@ def _halley(
     density there, with this slope, and are `missing` so much probability below; halfway through
     the bracket (2, q) where it would leave it; and which (q,) are the last."""
     known = density > 0.0
-    step = np.divide(missing, density, out=np.full_like(missing, np.inf), where=known)
-    bend = np.where(known, 0.5 * step * np.divide(slope, density, where=known, out=slope * 0.0), 0)
+    safe = np.where(known, density, 1.0)
+    newton = np.where(known, missing / safe, 0.0)
+    bend = 0.5 * newton * np.where(known, slope / safe, 0.0)
     # A step e leaves an error of e^3, but where the density bends within it.
-    done = (np.abs(step) <= 1e-5 * (1.0 + np.abs(value))) & (np.abs(bend) <= 1e-3)
-    step = np.where(np.abs(bend) < 0.5, step / np.where(np.abs(bend) < 0.5, 1.0 + bend, 1.0), step)
+    small = np.abs(bend) < 0.5
+    step = np.where(known, newton / np.where(small, 1.0 + bend, 1.0), np.inf)
+    done = known & (np.abs(newton) <= 1e-5 * (1.0 + np.abs(value))) & (np.abs(bend) <= 1e-3)
     after = value + step
     inside = (bracket[0] < after) & (after < bracket[1])
     return np.where(done | inside, after, 0.5 * (bracket[0] + bracket[1])), done

@@ -133,7 +133,8 @@ def image_moments(
 def covariances(image: FloatArray, centre: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the covariances (q, q, L) of images (q, 1 + 2 k, L) without their means."""
     weights = np.concatenate([centre[None], weight, weight])
-    return np.einsum('akl,kl,bkl->abl', image, weights, image)
+    found = np.einsum('akl,kl,bkl->abl', image, weights, image)
+    return 0.5 * (found + np.swapaxes(found, 0, 1))
 
 
 def cross_covariance(image: FloatArray, F: FloatArray, weight: FloatArray) -> FloatArray:
