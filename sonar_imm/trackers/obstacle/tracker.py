@@ -170,9 +170,11 @@ class ObstacleTracker:
         return self._stream.state.innovations.warnings('detections', advice)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
-        revised = self._stream.revise(measurement)
-        pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
-        return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
+        # Nonsense overflows: what is not finite then is dropped and counted.
+        with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
+            revised = self._stream.revise(measurement)
+            pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
+            return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
 
     @property
     def landmarks(self) -> Memory:
