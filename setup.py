@@ -54,19 +54,12 @@ EXTRAS = {
         'mkdocs-material>=9.5',
         'mkdocstrings[python]>=0.26',
     ],
-    # Brings Qt and notebooks along, 1.7 GB; docs/reference/formats.md says how to do without them.
-    'echosounders': [
-        'ektools>=0.1.2',
-        'themachinethatgoesping>=0.33; python_version >= "3.11"',
-    ],
     'nmea': ['pyais>=2.7', 'pynmea2>=1.18'],
     'parquet': ['pyarrow>=14'],
     'pictures': ['pillow>=9.1'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
-        'ektools>=0.1.2',
         'filterpy',
-        'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
         'pillow>=9.1',
@@ -82,13 +75,11 @@ EXTRAS = {
         'segyio>=1.9',
         'soundfile>=0.12',
         'stonesoup',
-        'websockets>=15',
     ],
     'lint': ['mypy', 'pre-commit', 'ruff'],
     'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
     'sound': ['soundfile>=0.12'],
-    'view': ['foxglove-sdk>=0.20'],
     'sweep': ['dask[distributed]>=2024.1'],
     'xtf': ['pyxtf>=1.4'],
 }

@@ -44,7 +44,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.real_recordings import DATA, load, TAG, tag_scores
+from benchmarks.real_recordings import load, TAG, tag_scores
+from benchmarks.recordings import DATA
 from benchmarks.study import final_estimates, Parts, rms, study
 from sonar_imm.measurements import Fix, NOBODY
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker

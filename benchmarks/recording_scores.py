@@ -39,8 +39,6 @@ import numpy as np
 
 from benchmarks.real_boats import PlainKalman
 from benchmarks.real_recordings import (
-    autoferry,
-    DATA,
     HEADINGS,
     LAG,
     PACE,
@@ -50,6 +48,7 @@ from benchmarks.real_recordings import (
     thinned,
 )
 from benchmarks.real_recordings import load as load_bag
+from benchmarks.recordings import autoferry, DATA
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.real_recordings import DATA
+from benchmarks.recordings import DATA
 from benchmarks.study import Parts, study
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig

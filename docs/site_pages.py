@@ -59,7 +59,6 @@ API = {
     'recordings': ('sonar_imm_tools.recordings', 'Bags in and out, other formats'),
     'offline': ('sonar_imm_tools.offline', 'Trackers on recordings'),
     'evaluation': ('sonar_imm_tools.evaluation', 'Scores and reports'),
-    'viewing': ('sonar_imm_tools.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
     'simulation': ('sonar_imm_tools.simulation', 'Scenes'),
     'msg_adapters': ('msg_adapters', 'ROS messages to measurements and estimates, and back'),
 }

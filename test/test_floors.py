@@ -62,8 +62,7 @@ FLOORS = {
     'sonar_imm_tools.offline': 8,
     'sonar_imm_tools.evaluation': 9,
     'sonar_imm_tools.survey': 9,
-    'sonar_imm_tools.viewing': 10,
-    'sonar_imm_tools.cli': 11,
+    'sonar_imm_tools.cli': 10,
 }
 # Rooms of one floor, or of neighbouring ones, that must not know each other.
 APART = (

@@ -26,7 +26,9 @@ from typing import Any, TYPE_CHECKING
 
 import click
 
-from .common import example, say, timeout_option
+from sonar_imm.texts import visible
+
+from .common import example, say, timeout_option, warn
 
 if TYPE_CHECKING:
     from ..replay.listening import ReceivedTable
@@ -84,7 +86,7 @@ def command(
                     # A look after it subscribed, so that publishers know of it by then.
                     if listener.topics != announced and not sys.stdout.isatty():
                         announced = listener.topics
-                        click.echo(f'listening to {", ".join(announced)}', err=True)
+                        warn(f'listening to {", ".join(announced)}')
                     continue
                 show(table)
                 if left is not None and (left := left - 1) == 0:
@@ -115,18 +117,26 @@ def _picture(newest: Mapping[str, ReceivedTable], most: int) -> Any:
     """The newest table of each topic, one below the other."""
     from rich.console import Group
     from rich.table import Table
+    from rich.text import Text
 
-    parts = []
+    def plain(text: str) -> Text:
+        return Text(visible(text))  # a str would be read for markup
+
+    parts: list[Text | Table] = []
     for name in sorted(newest):
         table = newest[name]
+        if table.problem:
+            parts.append(plain(f'{table.topic}: {table.problem}'))
+            continue
         names, rows = readable(table.columns or {}, most)
-        picture = Table(title=_head(table), title_justify='left', caption_justify='left')
-        picture.caption = table.problem or _further(table, most)
+        picture = Table()
         for column in names:
-            picture.add_column(column, justify='right')
+            picture.add_column(plain(column), justify='right')
         for row in rows:
-            picture.add_row(*(row[column] for column in names))
-        parts.append(picture)
+            picture.add_row(*(plain(row[column]) for column in names))
+        parts += [plain(_head(table)), picture]
+        if further := _further(table, most):
+            parts.append(plain(further))
     return Group(*parts)
 
 
@@ -158,8 +168,6 @@ def json_line(table: ReceivedTable) -> str:
 
 
 def _head(table: ReceivedTable) -> str:
-    if table.problem:
-        return table.topic
     moment = datetime.fromtimestamp(table.stamp_ns // 10**9, timezone.utc)
     millis = table.stamp_ns % 10**9 // 10**6
     rows = _count(table)

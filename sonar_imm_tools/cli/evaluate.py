@@ -135,12 +135,16 @@ def _name(folder: Path, out_dir: Path) -> str:
 def _compare_crossing(
     a: Path, b: Path, position_std: float, report: Path | None, as_json: bool
 ) -> None:
+    import plotly.graph_objects as go
+
     from ..evaluation.fathometer.crossing import crossing_lines, crossing_metrics, mistie_figure
+    from ..evaluation.plotting import plain_content
     from ..offline.run_folder import RunFolder
 
     metrics = crossing_metrics(RunFolder(a), RunFolder(b), position_std)
     if report is not None:
-        mistie_figure(metrics).write_html(report, include_plotlyjs=True)
+        figure = go.Figure(plain_content(mistie_figure(metrics)))
+        figure.write_html(report, include_plotlyjs=True)
     if as_json:
         print_json(metrics)
         return

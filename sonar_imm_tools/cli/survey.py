@@ -22,7 +22,7 @@ from pathlib import Path
 
 import click
 
-from .common import example, json_option, place_options, print_json, progress, say
+from .common import example, json_option, place_options, print_json, progress, say, warn
 
 
 def _resolution(_ctx: click.Context, _param: click.Parameter, value: str) -> float:
@@ -112,7 +112,7 @@ def command(
     with folder_of(out, options, resume=resume, overwrite=overwrite):
         with (
             contextlib.ExitStack() as stack,
-            workers(jobs, scheduler, lambda text: click.echo(text, err=True)) as run,
+            workers(jobs, scheduler, warn) as run,
         ):
 
             def begin(what: str, total: int) -> Callable[[int], None]:
@@ -122,7 +122,7 @@ def command(
             hooks = Progress(
                 begin=begin,
                 say=lambda text: say(text, quiet=as_json),
-                warn=lambda text: click.echo(text, err=True),
+                warn=warn,
             )
             survey = make(sources, out, options, run, hooks)
         content = write(survey, out)

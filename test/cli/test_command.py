@@ -59,7 +59,7 @@ def test_every_command_has_help(name, capsys):
         assert f'Example:\n    sonar-imm {name}' in printed
 
 
-@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'autoferry'])
+@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'xtf'])
 def test_every_kind_of_conversion_has_help(kind, capsys):
     assert main(['convert', kind, '--help']) == 0
     assert f'Example:\n    sonar-imm convert {kind}' in capsys.readouterr().out

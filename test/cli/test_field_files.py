@@ -21,7 +21,6 @@ import re
 
 from helpers.dive_scenes import legs
 from helpers.field_files import FORMATS, line, shipped_sound
-from helpers.sonar_files import kmall
 import numpy as np
 import pytest
 
@@ -93,13 +92,14 @@ def test_obstacles_of_a_file_with_positions_lie_on_earth_in_the_report(tmp_path)
 def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr('webbrowser.open', opened.append)
+    monkeypatch.setenv('DISPLAY', ':0')
     monkeypatch.setenv('TMPDIR', str(tmp_path))
     monkeypatch.setattr('tempfile.tempdir', None)
     each = MADE[name]
     each.make(tmp_path / name, line(60, each.step))
     bag = tmp_path / 'line.bag'
     assert main(['convert', str(tmp_path / name), str(bag)]) == 0
-    assert main(['view', str(bag), '--browser']) == 0
+    assert main(['view', str(bag)]) == 0
     report = Path(capsys.readouterr().out.rpartition('report: ')[2].strip())
     assert opened == [report.as_uri()] and report.is_relative_to(tmp_path)
     assert 'plotly' in report.read_text().lower()
@@ -108,10 +108,9 @@ def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkey
 def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alone(
     tmp_path, capsys
 ):
-    pytest.importorskip('themachinethatgoesping')
-    kmall(tmp_path / 'line.kmall')
+    MADE['swath.xtf'].make(tmp_path / 'swath.xtf', line(5, 0.2))
     bag, run = tmp_path / 'bag', tmp_path / 'run'
-    assert main(['convert', str(tmp_path / 'line.kmall'), str(bag)]) == 0
+    assert main(['convert', str(tmp_path / 'swath.xtf'), str(bag)]) == 0
     assert 'to track it' not in capsys.readouterr().out
     assert main(['info', str(bag)]) == 1
     printed = capsys.readouterr().out
