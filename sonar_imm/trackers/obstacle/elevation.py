@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics.geometry import Pose
-from ...estimation import imm_kernels
+from ...estimation import imm
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
 from .config import ObstacleConfig
@@ -144,7 +144,7 @@ def fits(
     R3[:, 2, 2] = np.where(known, seen.variance, fov**2 / 12.0)  # anywhere in the beam
     h3 = np.concatenate([h, angle[..., None]], axis=-1)
     threshold = gate_threshold(config.gate_probability, 3)
-    fit = imm_kernels.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
+    fit = imm.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
     return np.asarray(fit + np.log(fov))
 
 

@@ -37,7 +37,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...estimates import Estimate, places
-from ...estimation import imm_kernels
+from ...estimation import imm
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...intake import KnownFrames
@@ -338,7 +338,7 @@ class ObstacleTracker:
             fit = fits(now.mixture, h, now.sonar.pose, z, R, seen, config)
         else:
             threshold = gate_threshold(config.gate_probability, 2)
-            fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
+            fit = imm.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
         tentative = now.life.status == TENTATIVE
         usual = config.detection_probability
         weighed = fit
