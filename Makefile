@@ -84,7 +84,7 @@ $(STAMP): setup.py pyproject.toml
 	@touch $@
 
 $(TEST_STAMP): $(STAMP)
-	@$(INSTALL) 'sonar_imm[test,lint,sweep]'
+	@$(INSTALL) 'sonar_imm[test,lint,cluster]'
 	@touch $@
 
 demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report

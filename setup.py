@@ -49,6 +49,7 @@ REQUIRES = [
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
+    'cluster': ['dask[distributed]>=2024.1'],
     'docs': [
         'mkdocs>=1.6,<2',
         'mkdocs-material>=9.5',
@@ -80,7 +81,7 @@ EXTRAS = {
     'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
     'sound': ['soundfile>=0.12'],
-    'sweep': ['dask[distributed]>=2024.1'],
+    'sweep': ['dask[distributed]>=2024.1'],  # the former name of 'cluster', for one version
     'xtf': ['pyxtf>=1.4'],
 }
 
@@ -144,7 +145,7 @@ setup(
         'console_scripts': [
             'sonar-imm = sonar_imm_tools.cli:main',
             'fls_detector_node = sonar_imm.nodes.commands:main',
-            'composed_node = sonar_imm.nodes.commands:main',
+            'composed_node = sonar_imm.nodes.commands:main',  # only says that it was removed
             *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],
     },
