@@ -42,7 +42,7 @@ from typing import NamedTuple
 from attrs import evolve
 import numpy as np
 
-from ...estimation import imm_kernels, jipda, markov
+from ...estimation import imm, imm_kernels, jipda, markov
 from ...estimation.adaptation import AdaptiveChain, Chain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import gate_threshold, TENTATIVE
@@ -315,7 +315,7 @@ def fit(
         fit = found.whole + ratio
         return np.where(fit > bound(fixes), fit, -np.inf)
     threshold = gate_threshold(fixes.config.gate_probability, 2)
-    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
+    return imm.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
 
 
 def update(

@@ -34,7 +34,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from sonar_imm.estimation import imm_kernels
+from sonar_imm.estimation import imm
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig, MODEL_SETS
@@ -130,7 +130,7 @@ class Scored(DiverTracker):
             else:
                 H = self._layout(now.instruments).H
                 expected = found.expected
-                whole = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
+                whole = imm.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
             log_f[found.tracks] = whole[found.tracks, found.detection]
         score = m * math.log(density)
         nameless = fixes.whole and fixes.target_id is None
