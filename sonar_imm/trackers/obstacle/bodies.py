@@ -95,12 +95,18 @@ def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> Vi
     """The view with the errors that are the same in every ping."""
     centre = CENTRE * np.square(bodies.std)
     reach, away = view.state * [1.0, 0.0, 1.0], view.place - sonar.pose.position
-    covariance = view.covariance + scale_std**2 * reach[:, :, None] * reach[:, None]
+    covariance = view.covariance + scale_std**2 * _outer(reach)
     covariance[:, 0, 0] += centre[:, 0]
     covariance[:, 1, 1] += centre[:, 1] / np.square(view.state[:, 0])
-    place_covariance = view.place_covariance + scale_std**2 * away[:, :, None] * away[:, None]
+    place_covariance = view.place_covariance + scale_std**2 * _outer(away)
     along = away[:, :2] / np.maximum(np.hypot(*away[:, :2].T), 1e-9)[:, None]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     for axis, variance in zip((along, across), centre.T):
-        place_covariance[:, :2, :2] += variance[:, None, None] * axis[:, :, None] * axis[:, None]
+        place_covariance[:, :2, :2] += variance[:, None, None] * _outer(axis)
     return view._replace(covariance=covariance, place_covariance=place_covariance)
+
+
+def _outer(vector: FloatArray) -> FloatArray:
+    """Return the outer products (T, n, n) of vectors (T, n), equal to the last bit on both
+    sides."""
+    return np.asarray(vector[:, :, None] * vector[:, None])

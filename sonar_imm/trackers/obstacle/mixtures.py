@@ -50,7 +50,8 @@ def moment_match(
     mean = np.einsum('tk,tka->ta', mu, x)
     off = x - mean[:, None]
     spread = P + off[..., :, None] * off[..., None, :]
-    return mean, np.einsum('tk,tkab->tab', mu, spread)
+    covariance = np.einsum('tk,tkab->tab', mu, spread)
+    return mean, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
 def mix(

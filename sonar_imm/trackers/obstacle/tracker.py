@@ -32,7 +32,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -123,27 +122,10 @@ class ObstacleTracker:
         self.config, self.mount = config, Mount(config)
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
-        for _, compile_step in self.warm_steps(inputs):
-            compile_step()
+        """Do nothing: no kernel has to be compiled."""
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        if inputs is not None and Detections not in inputs:
-            return []
-        return [('pings', self._warm_pings)]
-
-    def _warm_pings(self) -> None:
-        # Pings in which everything happens once: births, contested hits, a pose to wait for.
-        nearby = min(self.config.max_range, 100.0)
-        tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0, max_range=nearby))
-        for step in range(1, 5):
-            stamp = step * 200_000_000
-            east = Navigation(
-                stamp_ns=stamp, position=[0.2 * step, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
-            )
-            echoes = np.array([50.0, 50.1]) - 0.2 * step
-            tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
-            tracker.process(east)
-            tracker.process(Detections(stamp_ns=stamp, range=echoes, bearing=[0.0, 0.001]))
+        return []
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
