@@ -34,7 +34,7 @@ The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measur
 than `LIMIT` of it as its own noise: there R is raised by `JITTER` of S's diagonal, so that a
 perfect measurement leaves a variance, and can be repeated.
 
-The rules and repairs are compiled in `small_matrices`. Reference: Bierman, *Factorization Methods
+`small_matrices` has the rules and repairs compiled. Reference: Bierman, *Factorization Methods
 for Discrete Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation*
 (2000), ch. 12.
 """
@@ -123,14 +123,9 @@ def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, 
     moved = symmetrise(F @ P @ transpose(F) + Q)
     bad = np.asarray(~is_psd(moved) & np.isfinite(moved).all(axis=(-1, -2)))
     if bad.any():
-        cases = zip(*(np.broadcast_to(each, moved.shape)[bad] for each in (P, F, Q)))
-        from . import small_matrices  # rarely needed, and compiled
-
-        again = np.empty_like(moved[bad])
-        for case, out in zip(cases, again):
-            root_P, root_F, root_Q = map(np.ascontiguousarray, case)
-            small_matrices.square_root_predict(root_P, root_F, root_Q, out)
-        moved[bad] = again
+        P, F, Q = (np.broadcast_to(each, moved.shape)[bad] for each in (P, F, Q))
+        turned = F @ _roots(P)
+        moved[bad] = add_jitter(turned @ transpose(turned) + symmetrise(Q))[0]
     return moved, bad
 
 
@@ -160,13 +155,37 @@ def _square_root_correct(
     P: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """P, gain, factor and usable of one case: P (n, n), H (m, n), R (m, m)."""
-    from . import small_matrices
-
     m, n = H.shape
-    out, gain, factor = np.empty((n, n)), np.empty((n, m)), np.empty((m, m))
-    if small_matrices.square_root_update(P, H, R, factor, gain, out):
-        return out, gain, factor, True
-    return P, np.zeros((n, m)), np.eye(m), False
+    unusable = P, np.zeros((n, m)), np.eye(m), False
+    if not all(np.isfinite(each).all() for each in (P, H, R)):
+        return unusable
+    root, noise = _roots(P), _roots(R)
+    seen = H @ root
+    own = (seen * seen).sum(axis=1) + (noise * noise).sum(axis=1)
+    if not ((own > 0.0) & (own < np.inf)).all():
+        return unusable
+    raised = ~(np.diag(R) > LIMIT * own)
+    for extra in (raised, np.ones(m, np.bool_)):
+        more = np.diag(np.sqrt(np.where(extra, JITTER * own, 0.0)))
+        blocks = [[noise, seen, more], [np.zeros((n, m)), root, np.zeros((n, m))]]
+        A = _triangular(np.block(blocks))
+        if (np.square(np.diag(A)[:m]) > LIMIT * own).all():
+            break
+    factor, cross, rest = A[:m, :m], A[m:, :m], A[m:, m:]
+    gain = transpose(solve(transpose(factor), transpose(cross)))
+    return add_jitter(rest @ transpose(rest))[0], gain, factor, True
+
+
+def _roots(P: FloatArray) -> FloatArray:
+    """Lower roots (..., n, n) of covariances that may be singular."""
+    return np.moveaxis(semidefinite_roots(np.moveaxis(P, (-2, -1), (0, 1))), (0, 1), (-2, -1))
+
+
+def _triangular(A: FloatArray) -> FloatArray:
+    """The lower triangle (r, r) with a diagonal that is not negative and the same ``A A'`` as A
+    (r, c)."""
+    lower = transpose(np.asarray(np.linalg.qr(transpose(A), mode='r')))
+    return np.asarray(lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0))
 
 
 # -- many small covariances at once, (n, n, ...): numpy runs along the last axes ------------------
