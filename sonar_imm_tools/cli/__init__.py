@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import functools
 from importlib import import_module
+import io
 import os
 import signal
 import sys
@@ -129,6 +130,10 @@ def command(ctx: click.Context) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that prints errors."""
     one_blas_thread()
+    # What the terminal cannot show is written as an escape, instead of an error.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
     with _signals_unwind():
         return _run(arguments)
 

@@ -27,7 +27,7 @@ import click
 
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, params_option, print_json, say
+from .common import BAG, example, json_option, params_option, print_json, say, warn
 
 if TYPE_CHECKING:
     from .checking import CheckedRecording, PlayedRecording
@@ -155,7 +155,7 @@ def _shared_out(
         for future in as_completed(running):
             recording = done[running[future]] = future.result().judged()
             state = 'ok' if recording.good else 'FAILED'
-            click.echo(f'{len(done)} of {len(plays)}: {recording.bag.name} {state}', err=True)
+            warn(f'{len(done)} of {len(plays)}: {recording.bag.name} {state}')
     return [done[i] for i in sorted(done)]
 
 

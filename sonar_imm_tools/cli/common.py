@@ -291,6 +291,12 @@ def say(text: str = '', *, quiet: bool = False) -> None:
         click.echo(visible(text))
 
 
+def warn(text: str) -> None:
+    """Print a line on standard error. Names in it may hold anything, so only this and `say` print
+    sentences."""
+    click.echo(visible(text), err=True)
+
+
 @contextlib.contextmanager
 def progress(
     what: str, total: int | None, *, quiet: bool = False, compiles: bool = False
@@ -349,7 +355,7 @@ def plain_lines() -> Callable[[str], None]:
         nonlocal printed
         if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
             printed = time.monotonic()
-            click.echo(sentence, err=True)
+            warn(sentence)
 
     return say_now
 

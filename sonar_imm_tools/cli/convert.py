@@ -25,7 +25,6 @@ import attrs
 import click
 
 from sonar_imm.gone import GONE
-from sonar_imm.texts import visible
 from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.convert_options import DETECTING, FROM_BAGS, OPTIONS
@@ -40,6 +39,7 @@ from .common import (
     progress,
     say,
     typed_overrides,
+    warn,
 )
 from .info import track_line
 
@@ -65,7 +65,7 @@ class Convert(click.Group):
 
             guess = sniff(source, _named_columns(args))
             taken = f'{source} is taken for {guess.why}: convert {guess.kind}'
-            click.echo(visible(taken), err=True)
+            warn(taken)
             args = [guess.kind, *args]
         elif source.suffix:
             ctx.fail(f'{source} does not exist')
@@ -262,7 +262,7 @@ def _convert_all(
     ):
         for k, report, failure in run(convert_file, calls):
             if failure:
-                click.echo(f'{sources[k]}: {failure}', err=True)
+                warn(f'{sources[k]}: {failure}')
             content[k] = {'source': str(sources[k]), 'failure': failure}
             if report is not None:
                 content[k] |= _described(report)

@@ -26,7 +26,9 @@ from typing import Any, TYPE_CHECKING
 
 import click
 
-from .common import example, say, timeout_option
+from sonar_imm.texts import visible
+
+from .common import example, say, timeout_option, warn
 
 if TYPE_CHECKING:
     from ..replay.listening import ReceivedTable
@@ -84,7 +86,7 @@ def command(
                     # A look after it subscribed, so that publishers know of it by then.
                     if listener.topics != announced and not sys.stdout.isatty():
                         announced = listener.topics
-                        click.echo(f'listening to {", ".join(announced)}', err=True)
+                        warn(f'listening to {", ".join(announced)}')
                     continue
                 show(table)
                 if left is not None and (left := left - 1) == 0:
@@ -115,17 +117,20 @@ def _picture(newest: Mapping[str, ReceivedTable], most: int) -> Any:
     """The newest table of each topic, one below the other."""
     from rich.console import Group
     from rich.table import Table
+    from rich.text import Text
 
     parts = []
     for name in sorted(newest):
         table = newest[name]
         names, rows = readable(table.columns or {}, most)
-        picture = Table(title=_head(table), title_justify='left', caption_justify='left')
-        picture.caption = table.problem or _further(table, most)
+        # As `Text` a name with brackets is no markup.
+        picture = Table(title=Text(visible(_head(table))), title_justify='left')
+        picture.caption = Text(visible(table.problem or _further(table, most)))
+        picture.caption_justify = 'left'
         for column in names:
-            picture.add_column(column, justify='right')
+            picture.add_column(Text(visible(column)), justify='right')
         for row in rows:
-            picture.add_row(*(row[column] for column in names))
+            picture.add_row(*(Text(visible(row[column])) for column in names))
         parts.append(picture)
     return Group(*parts)
 

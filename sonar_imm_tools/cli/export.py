@@ -102,6 +102,9 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     folder = RunFolder(run)
+    folder.keep_from(out)
+    if original is not None and out.exists() and out.samefile(original):
+        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
         result, text = _export_map(asked)
@@ -223,8 +226,6 @@ def _export_horizons(asked: _Asked, original: Path | None) -> Told:
         raise click.UsageError(
             'SEG-Y needs --segy, the file that the recording was converted from'
         )
-    if segy and original is not None and out.exists() and out.samefile(original):
-        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     positions, notes, degrees = None, {}, _to_degrees(asked)
     if Path(record['bag']).exists():
         with BagReader(record['bag']) as bag:

@@ -41,6 +41,7 @@ from .common import (
     set_option,
     system_option,
     topic_option,
+    warn,
 )
 
 if TYPE_CHECKING:
@@ -269,25 +270,24 @@ def _track_all(
     as_json: bool,
 ) -> None:
     """Do all runs, write and print their summary; ends with 1 when one failed."""
-    from ..offline.batch import run_jobs, summary_of, write_summary
+    from ..offline.batch import check_summary, run_jobs, summary_of, write_summary
     from ..offline.run_folder import RUN
     from ..recordings.reader import BagError
 
     if (out_dir / RUN).exists() and runs and runs[0].folder != out_dir:
         raise BagError(f'{out_dir} holds a run itself; choose another folder for several')
+    check_summary(out_dir, summary)
     outcomes = list(failures)
     for outcome in failures:
-        click.echo(f'{outcome.bag}: {outcome.failure}', err=True)
+        warn(f'{outcome.bag}: {outcome.failure}')
     todo = [evolve(job, resume=True) for job in runs]
     if scheduler is not None:
         todo = [evolve(job, bag=job.bag.resolve(), folder=job.folder.resolve()) for job in todo]
     with progress('runs', len(runs), quiet=as_json) as advance:
-        for outcome in run_jobs(
-            todo, count=jobs, address=scheduler, note=lambda text: click.echo(text, err=True)
-        ):
+        for outcome in run_jobs(todo, count=jobs, address=scheduler, note=warn):
             if outcome.failure:
                 name = ' '.join(filter(None, (str(outcome.bag), outcome.instrument)))
-                click.echo(f'{name}: {outcome.failure}', err=True)
+                warn(f'{name}: {outcome.failure}')
             outcomes.append(outcome)
             advance(1)
     content = summary_of(
