@@ -215,6 +215,9 @@ def _user_error(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, ModuleNotFoundError) and error.name:
         return missing_package(error.name.split('.')[0])
+    if isinstance(error, UnicodeEncodeError) and not error.object.isascii():
+        name = error.object.encode('utf-8', 'backslashreplace').decode()
+        return f'{name} is not UTF-8, which a library that is needed here cannot name; rename it'
     if isinstance(error, OSError):
         known = error.filename and error.strerror
         return f'{error.filename}: {error.strerror}' if known else str(error)

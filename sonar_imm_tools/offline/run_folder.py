@@ -163,6 +163,7 @@ class ParquetTable:
         self._path = path
         self._notes = dict(notes or {})
         self._writer: Any = None
+        self._file: Any = None
         self._held: list[dict[str, np.ndarray]] = []
         self._rows_held = 0
         self._types: dict[str, np.dtype] = {}
@@ -176,6 +177,7 @@ class ParquetTable:
                 self._write_group()
             if self._writer is not None:
                 self._writer.close()
+                self._file.close()
 
     def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
         """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
@@ -197,7 +199,9 @@ class ParquetTable:
         if self._writer is None:
             fields = [(name, arrow.from_numpy_dtype(dtype)) for name, dtype in types.items()]
             schema = arrow.schema(fields, metadata=self._notes)
-            self._writer = arrow.parquet.ParquetWriter(str(self._path), schema)
+            # The library names only files whose names are UTF-8.
+            self._file = self._path.open('wb')
+            self._writer = arrow.parquet.ParquetWriter(self._file, schema)
         if not self._held:
             return
         columns = [

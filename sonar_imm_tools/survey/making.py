@@ -86,8 +86,10 @@ def sources_of(runs: Path) -> list[Source]:
         found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
     for place in _recordings(runs):
         # The bag of a run whose table is gone stands for it.
-        folder = place.parent if place.name == BAG and _is_results(place.parent) else place
-        if folder not in found and place.parent not in found and _has_soundings(place):
+        bag = place if place.is_dir() else place.parent
+        folder = bag.parent if bag.name == BAG and _is_results(bag.parent) else place
+        known = {folder, place.parent, bag.parent} & found.keys()
+        if not known and _has_soundings(place):
             found[folder] = place
     if not found:
         raise BagError(
@@ -124,7 +126,7 @@ def _has_soundings(recording: Path) -> bool:
 
 def _is_results(folder: Path) -> bool:
     """Whether `track` made a folder, which has a run.json then."""
-    there = any(os.path.lexists(folder / name) for name in (RUN, CSV, BAG))
+    there = any(os.path.lexists(folder / name) for name in (RUN, CSV))
     return there or marked(folder).get('kind') == RESULTS
 
 

@@ -36,6 +36,7 @@ from sonar_imm import __version__
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.files import hindrance, mark, MARKER, remove_leftovers, replaced, whole
 from sonar_imm.parameters import ConfigError
+from sonar_imm.texts import visible
 
 from ..evaluation.plotting import add_points, COLOURS, styled
 from ..offline.run_folder import REPORT
@@ -233,10 +234,11 @@ def _write_provenance(path: Path, survey: Survey) -> None:
             ('residual', pyarrow.float32()),
         ]
     )
-    names = np.array([unit.line for unit in survey.units])
+    names = np.array([visible(unit.line) for unit in survey.units])
     with (
         whole(path, follow=False) as unfinished,
-        pyarrow.parquet.ParquetWriter(str(unfinished), schema) as writer,
+        unfinished.open('wb') as file,
+        pyarrow.parquet.ParquetWriter(file, schema) as writer,
     ):
         for tile, nodes in survey.nodes():
             node = nodes.seen_node
@@ -280,7 +282,7 @@ def _write_crossings(path: Path, survey: Survey) -> None:
 
     with (
         whole(path, follow=False) as unfinished,
-        unfinished.open('w', encoding='utf-8', newline='') as file,
+        unfinished.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file,
     ):
         writer = csv.writer(file, lineterminator='\n')
         kinds = ('median_before', 'rms_before', 'median_after', 'rms_after')

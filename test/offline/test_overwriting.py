@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Overwriting replaces only folders that this package made, as a whole, and never through links."""
+"""Overwriting replaces only folders that this package made, as a whole, not through links."""
 
 import json
 import os
@@ -115,13 +115,15 @@ def failing(monkeypatch, number, act):
     return left
 
 
-def no_space():
-    raise OSError(28, 'No space left on device')
-
-
-@pytest.mark.parametrize('linked', [False, True])
+@pytest.mark.parametrize(
+    ('linked', 'error'),
+    [
+        (False, OSError(28, 'No space left on device')),
+        (True, OSError(30, 'Read-only file system')),
+    ],
+)
 def test_a_failure_at_each_step_leaves_the_old_or_the_new_whole(
-    out, tmp_path, whole_runs, monkeypatch, linked
+    out, tmp_path, whole_runs, monkeypatch, linked, error
 ):
     old, new = whole_runs
     if linked:
@@ -130,15 +132,19 @@ def test_a_failure_at_each_step_leaves_the_old_or_the_new_whole(
         old = {k: v for k, v in old.items() if not k.startswith('estimate/')}
         old['estimate'] = str(tmp_path / 'disk2')
     shutil.copytree(out, tmp_path / 'kept', symlinks=True)
-    number, ends = 0, set()
-    while not number or left[0] <= 0:
+
+    def fail():
+        raise error
+
+    number, ends, left = 0, set(), [0]
+    while left[0] <= 0:
         number += 1
         with monkeypatch.context() as patches:
-            left = failing(patches, number, no_space)
+            left = failing(patches, number, fail)
             try:
                 make(out, SECOND, overwrite=True)
-            except (OSError, BagError) as error:
-                assert 'No space' in str(error)
+            except (OSError, BagError) as caught:
+                assert error.strerror in str(caught)
         # What is the user's may wait in the folder of an unfinished command for the next one.
         remove_leftovers(out)
         ends.add(is_whole(out, new))
@@ -314,17 +320,6 @@ def test_a_link_that_looks_unfinished_is_not_followed(out, tmp_path):
     (tmp_path / place.name).symlink_to(tmp_path / 'target')
     remove_leftovers(out)
     assert (tmp_path / 'target' / MARKER).exists() and (tmp_path / place.name).is_symlink()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason='root may write anywhere')
-def test_a_folder_that_is_read_only_keeps_its_run(out, whole_runs):
-    out.parent.chmod(0o555)
-    try:
-        with pytest.raises((OSError, BagError)):
-            make(out, SECOND, overwrite=True)
-    finally:
-        out.parent.chmod(0o755)
-    assert is_whole(out, whole_runs[0])
 
 
 def test_metrics_are_not_written_through_a_link(out, tmp_path):
