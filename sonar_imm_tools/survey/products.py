@@ -23,6 +23,7 @@ import csv
 from html import escape
 import json
 import math
+import os
 from pathlib import Path
 import shutil
 from typing import Any
@@ -89,7 +90,7 @@ def folder_of(
         raise BagError(
             f'{out} is there already; choose another folder, or say --resume or --overwrite'
         )
-    if there and overwrite:
+    if overwrite and any(os.path.lexists(out / name) for name in OWN):
         if why := hindrance(out, KIND, [runs], known=_is_survey(out)):
             raise BagError(why)
         with replaced(out, OWN) as place:
@@ -97,7 +98,7 @@ def folder_of(
             write_json(place / WORK / OPTIONS, wanted)
             yield place
         return
-    if there:
+    if there and resume:
         _check_options(out, wanted)
         yield out
         return

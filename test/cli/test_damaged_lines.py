@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A survey names each line that is damaged and leaves it out; it assumes no error budget unsaid."""
+"""A survey names damaged lines and leaves them out; it assumes no error budget in silence."""
 
 import json
 import os
