@@ -85,6 +85,8 @@ def folder_of(
     wanted = json.loads(json.dumps(asdict(options)))
     if out.exists() and not out.is_dir():
         raise BagError(f'{out} is a file; a folder is needed')
+    if out.is_dir() and out.samefile(runs):
+        raise BagError(f'{out} holds the lines; choose another folder for the survey')
     there = out.is_dir() and any(out.iterdir())
     if there and not (resume or overwrite):
         raise BagError(

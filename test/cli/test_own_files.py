@@ -154,3 +154,16 @@ def test_check_replaces_only_runs(here, capsys):
     assert run('check', 'diver', '--bag', here / 'dive.bag', '--out', here / 'checks') == 2
     assert 'is no results folder that sonar-imm made' in capsys.readouterr().err
     assert (mine / 'estimate.csv').read_text() == 'mine'
+
+
+@pytest.mark.parametrize('origin', [3, 'x', [1], {'a': 1}, {'latitude': 'x', 'longitude': 1}])
+def test_an_export_of_a_hostile_run_json_is_one_sentence(here, capsys, origin):
+    record = json.loads((here / 'out' / 'run.json').read_text())
+    (here / 'out' / 'run.json').write_text(json.dumps({**record, 'origin': origin}))
+    assert run('export', here / 'out', here / 'tracks.gpx') == 2
+    assert "'origin' in the run.json" in capsys.readouterr().err
+    (here / 'out' / 'run.json').write_text(json.dumps({**record, 'landmarks': origin}))
+    place = ('--crs', 32632, '--origin', '500000,6000000')
+    assert run('export', here / 'out', here / 'map.geojson', '--map', *place) == 2
+    assert "'landmarks' in the run.json" in capsys.readouterr().err
+    assert not (here / 'map.geojson').exists()
