@@ -66,7 +66,6 @@ EXTRAS = {
     'test': [
         'ektools>=0.1.2',
         'filterpy',
-        'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
         'pillow>=9.1',
@@ -82,13 +81,11 @@ EXTRAS = {
         'segyio>=1.9',
         'soundfile>=0.12',
         'stonesoup',
-        'websockets>=15',
     ],
     'lint': ['mypy', 'pre-commit', 'ruff'],
     'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
     'sound': ['soundfile>=0.12'],
-    'view': ['foxglove-sdk>=0.20'],
     'sweep': ['dask[distributed]>=2024.1'],
     'xtf': ['pyxtf>=1.4'],
 }

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.bathymetry_paper import PRINTED, PrintedTracker
 from benchmarks.study import cell, Parts, Row, study, truths
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
@@ -57,7 +58,7 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     ),
     'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
     'height_rw_ncs, paper': (
-        {**SLOPE_SET, 'transition_matrix': PAPER_CHAIN, 'variant': 'paper'},
+        {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
         (0.106, 0.328, 0.165, 0.20, 0.72),
     ),
     'height_rw_ncs, corrected': (
@@ -130,9 +131,9 @@ def classical(name: str, scene: Scene, config: BathymetryScenario) -> Answer:
     return Answer(np.array(heights), np.array(angles), None, None)
 
 
-def tracked(values: Mapping[str, Any], scene: Scene) -> Answer:
+def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
     config = BathymetryConfig(**{**COMMON, **values})
-    tracker = BathymetryTracker(config)
+    tracker = PrintedTracker(config) if printed else BathymetryTracker(config)
     tables = [tracker.process(item.measurement)[0].columns() for item in scene.measurements]
     height = np.array([table['height'] for table in tables])
     angle = np.array([table['angle'] for table in tables])
@@ -173,7 +174,8 @@ def main(pings: int = 120, seed: int = 1) -> Parts:
     for name, prototype in CLASSICAL.items():
         yield {'methods': {name: score(classical(name, scene, config), scene, prototype)}}
     for name, (values, prototype) in TRACKERS.items():
-        yield {'methods': {name: score(tracked(values, scene), scene, prototype)}}
+        answer = tracked(values, scene, printed=name.endswith(', paper'))
+        yield {'methods': {name: score(answer, scene, prototype)}}
 
 
 def shown(result: Row) -> dict[str, str]:

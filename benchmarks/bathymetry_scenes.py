@@ -23,19 +23,11 @@ deviations. The first two rows are the errata of the paper at work.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
+from benchmarks.bathymetry_paper import Case, judged, PRINTED, PrintedTracker
 from benchmarks.study import Parts, Row, study
-from msg_adapters.estimates import read_estimate
-from sonar_imm.estimates import Estimate
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm.truth import Scene
-from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm_tools.evaluation.bathymetry.scoring import score
-from sonar_imm_tools.recordings.truth import records_of
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 BANK: dict[str, Any] = {
     'model_set': 'height_bank',
@@ -49,59 +41,48 @@ OPEN: dict[str, Any] = {'shadow_gate': False}
 SLOPE: dict[str, Any] = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
 FLAT: dict[str, Any] = {'patch_std': 0.0, 'slope': 0.1}
 
-# Name: scenario, what it changes, parameters.
-CASES: dict[str, tuple[str, Mapping[str, Any], Mapping[str, Any]]] = {
-    'slope .1, constant slope only, paper': ('slope', FLAT, {**SLOPE, 'variant': 'paper'}),
-    'slope .1, constant slope only, corrected': ('slope', FLAT, SLOPE),
-    'slope .1 and patch, height_rw_ncs, paper': (
+CASES: dict[str, Case] = {
+    'slope .1, constant slope only, paper': Case(
+        'slope',
+        FLAT,
+        {**PRINTED, **SLOPE_SET, **SLOPES_ONLY},
+        PrintedTracker,
+    ),
+    'slope .1, constant slope only, corrected': Case('slope', FLAT, SLOPE),
+    'slope .1 and patch, height_rw_ncs, paper': Case(
         'slope',
         {},
-        {**OPEN, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN, 'variant': 'paper'},
+        {**PRINTED, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
+        PrintedTracker,
     ),
-    'slope .1 and patch, height_rw_ncs, corrected': (
+    'slope .1 and patch, height_rw_ncs, corrected': Case(
         'slope',
         {},
         {**OPEN, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
     ),
-    'shadows, no gate': ('shadow', {}, OPEN),
-    'shadows, gate': ('shadow', {}, {}),
-    'spikes, no gate': ('spikes', {}, OPEN),
-    'spikes, gate': ('spikes', {}, {}),
-    'multipath, not expected': ('multipath', {}, {}),
-    'multipath, expected': ('multipath', {}, {'multipath': True}),
-    'noise not stated': ('water_column', {}, {}),
-    'Gaussian echoes, Laplace law': ('gaussian', {}, {}),
-    'Gaussian echoes, Gaussian law': ('gaussian', {}, {'likelihood': 'gaussian'}),
-    'Laplace echoes, Gaussian law': ('paper', {}, {'likelihood': 'gaussian'}),
-    'undulating, two walks': ('undulating', {}, {}),
-    'undulating, bank': ('undulating', {}, BANK),
-    'roughness correlated, .01 and 1 m': ('correlated', {}, {'sigmas': (0.01, 1.0)}),
-    'roughness correlated, defaults': ('correlated', {}, {}),
-    'roughness correlated, .01 and .15 m': ('correlated', {}, {'sigmas': (0.01, 0.15)}),
-    'bins four times as fine': ('paper', {'bin_width': 0.0125}, {'sigma_reference_bin': 0.05}),
+    'shadows, no gate': Case('shadow', {}, OPEN),
+    'shadows, gate': Case('shadow', {}, {}),
+    'spikes, no gate': Case('spikes', {}, OPEN),
+    'spikes, gate': Case('spikes', {}, {}),
+    'multipath, not expected': Case('multipath', {}, {}),
+    'multipath, expected': Case('multipath', {}, {'multipath': True}),
+    'noise not stated': Case('water_column', {}, {}),
+    'Gaussian echoes, Laplace law': Case('gaussian', {}, {}),
+    'Gaussian echoes, Gaussian law': Case('gaussian', {}, {'likelihood': 'gaussian'}),
+    'Laplace echoes, Gaussian law': Case('paper', {}, {'likelihood': 'gaussian'}),
+    'undulating, two walks': Case('undulating', {}, {}),
+    'undulating, bank': Case('undulating', {}, BANK),
+    'roughness correlated, .01 and 1 m': Case('correlated', {}, {'sigmas': (0.01, 1.0)}),
+    'roughness correlated, defaults': Case('correlated', {}, {}),
+    'roughness correlated, .01 and .15 m': Case('correlated', {}, {'sigmas': (0.01, 0.15)}),
+    'bins four times as fine': Case('paper', {'bin_width': 0.0125}, {'sigma_reference_bin': 0.05}),
 }
-
-
-def judged(
-    scene_name: str, changes: Mapping[str, Any], values: Mapping[str, Any], pings: int, seed: int
-) -> dict[str, Any]:
-    """Scores of a tracker with `values` on a scene with `changes`."""
-    scene = simulate(scenario(scene_name, {'pings': pings, **changes}), seed)
-    tracker = BathymetryTracker(BathymetryConfig(**values))
-    estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
-    return score(profiles_of(estimates, truth_of(scene)))
-
-
-def truth_of(scene: Scene) -> list[Estimate]:
-    """The true floor of each ping, as a recording has it."""
-    records = [record for true in scene.truth for record in records_of(true, '')]
-    return [read_estimate(message) for *_, message in records]
 
 
 def main(pings: int = 60, seed: int = 1) -> Parts:
     yield {'pings': pings, 'seed': seed}
     for name, case in CASES.items():
-        yield {'cases': {name: judged(*case, pings, seed)}}
+        yield {'cases': {name: judged(case, pings, seed)}}
 
 
 def shown(metrics: Row) -> dict[str, float]:

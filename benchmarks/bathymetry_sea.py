@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bathymetry_scenes import truth_of
+from benchmarks.bathymetry_paper import truth_of
 from benchmarks.study import known, Parts, study
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of

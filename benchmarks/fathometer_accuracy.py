@@ -32,7 +32,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks import fathometer_paper, fathometer_pulse
-from benchmarks.fathometer_paper import ORDERS, reflectors
+from benchmarks.fathometer_paper import (
+    BOOTSTRAP,
+    ChangedTracker,
+    ENVELOPE,
+    ORDERS,
+    PENALTY,
+    reflectors,
+)
 from benchmarks.study import final_estimates, known, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.measurements import CrossSpectra, Trace
@@ -42,35 +49,33 @@ from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra
 DEPTHS = (122.0, 1 / 32, 1600)
 NEAR = 0.4
 CONVENTIONAL: dict[str, Any] = {'frequency_min': 200.0}
-OWN_PULSE: dict[str, Any] = {'pulse': 'envelope'}
-"""The envelope of a response has another pulse than its real part."""
-CONFIGURATIONS: dict[str, tuple[str, dict[str, Any]]] = {
-    'MVDR as the paper (envelope, bootstrap), N^-m': (
-        'envelope',
-        {**ORDERS, **OWN_PULSE, 'proposal': 'prior'},
-    ),
-    '+ data-driven proposals': ('envelope', {**ORDERS, **OWN_PULSE}),
-    '  with the pulse of the real part': ('envelope', ORDERS),
-    'MVDR real part, N^-m': ('mvdr', ORDERS),
-    'MVDR real part, N^(-m/2), 7-9': ('mvdr', {**ORDERS, 'amplitude_prior': 'bic_half'}),
-    'MVDR real part, marginal, 1-12 (default)': ('mvdr', {}),
-    '  smoothed, lag 2': ('mvdr', {'smoothing_lag': 2}),
-    '  2,000 particles': ('mvdr', {'particles': 2000}),
+CONFIGURATIONS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    'MVDR as the paper (envelope, bootstrap), N^-m': ('envelope', ENVELOPE, PENALTY | BOOTSTRAP),
+    '+ data-driven proposals': ('envelope', ENVELOPE, PENALTY),
+    '  with the pulse of the real part': ('envelope', ORDERS, PENALTY),
+    'MVDR real part, N^-m': ('mvdr', ORDERS, PENALTY),
+    'MVDR real part, N^(-m/2), 7-9': ('mvdr', ORDERS, {'amplitude_prior': 'bic_half'}),
+    'MVDR real part, marginal, 1-12 (default)': ('mvdr', {}, {}),
+    '  smoothed, lag 2': ('mvdr', {'smoothing_lag': 2}, {}),
+    '  2,000 particles': ('mvdr', {'particles': 2000}, {}),
     **{
-        f'fixed order {m}, {name}': ('mvdr', {'order_min': m, 'order_max': m, 'proposal': kind})
-        for kind, name in (('prior', 'bootstrap'), ('data', 'data-driven'))
+        f'fixed order {m}, {name}': ('mvdr', {'order_min': m, 'order_max': m}, changes)
+        for name, changes in (('bootstrap', BOOTSTRAP), ('data-driven', {}))
         for m in (7, 8, 9)
     },
     'conventional envelope, pulse of the real part, N^-m': (
         'conventional_envelope',
         {**ORDERS, **CONVENTIONAL},
+        PENALTY,
     ),
-    'conventional real part, N^-m': ('conventional', {**ORDERS, **CONVENTIONAL}),
+    'conventional real part, N^-m': ('conventional', {**ORDERS, **CONVENTIONAL}, PENALTY),
     'conventional real part, amplitude memory 0.98, 1-12': (
         'conventional',
         {'amplitude_memory': 0.98, **CONVENTIONAL},
+        {},
     ),
 }
+"""The trace, parameters, and what of `SetModel` is changed."""
 
 
 Truth = list[tuple[np.ndarray, np.ndarray]]
@@ -122,8 +127,8 @@ def drift(seed: int, records: int) -> Drift:
     return traces, truth
 
 
-def score(config: FathometerConfig, traces: list[Trace], truth: Truth) -> dict[str, float]:
-    found = final_estimates(FathometerTracker(config), traces)
+def score(tracker: FathometerTracker, traces: list[Trace], truth: Truth) -> dict[str, float]:
+    found = final_estimates(tracker, traces)
     rows: dict[str, list[float]] = {}
     seen_by_id: dict[int, list[tuple[int, bool]]] = {}
     for k, (trace, (ids, depth)) in enumerate(zip(traces, truth)):
@@ -172,10 +177,11 @@ def main(
     scores: dict[str, list[dict[str, float]]] = {label: [] for label in wanted}
     for seed in range(runs):
         traces, truth = drift(seed, records)
-        for label, (processor, values) in wanted.items():
+        for label, (processor, values, changes) in wanted.items():
             exact = {'particles': particles, 'sound_speed_std': 0.0}
             config = FathometerConfig(**{**exact, **values}, seed=seed)
-            scores[label].append(score(config, traces[processor], truth))
+            tracker = ChangedTracker(config, **changes)
+            scores[label].append(score(tracker, traces[processor], truth))
         table = {
             label: {'runs': float(len(each))}
             | mean_of(each)

@@ -12,16 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A baseline of the obstacle tracker: one Gaussian per obstacle in world coordinates."""
+"""A baseline of the obstacle tracker: one Gaussian per obstacle in world coordinates.
+
+Its filter is the unscented one, here first. Sigma points go through a function, and their weighted
+mean and covariance are those of the result: exact for linear functions; for quadratic ones the
+mean is exact. Components marked as angles are compared with the image of the centre point, wrapped
+once, averaged and added back. Functions are vectorised: they take points (..., s, n) and give
+(..., s, m).
+
+Reference: Julier, Uhlmann, *Unscented Filtering and Nonlinear Estimation*, Proc. IEEE 92(3), 2004.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 
-from benchmarks import unscented
 from sonar_imm.acoustics import geometry
 from sonar_imm.estimation import kalman
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.angles import wrap_angle
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.covariance import (
+    add_jitter,
+    CovarianceError,
+    solve,
+    symmetrise,
+    transpose,
+)
+from sonar_imm.estimation.kalman import apply, factorise, log_density, Updated
+from sonar_imm.estimation.smoothing import sigma_offsets
 from sonar_imm.trackers.obstacle import kernels
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import (
@@ -35,6 +56,109 @@ from sonar_imm.trackers.obstacle.filters import (
     View,
 )
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+Function = Callable[[FloatArray], FloatArray]
+
+
+class Transformed(NamedTuple):
+    """A Gaussian after a function: mean (..., m), covariance (..., m, m), and its cross covariance
+    (..., n, m) with the argument."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    cross_covariance: FloatArray
+
+
+class _Cloud(NamedTuple):
+    """Sigma points: offsets from the mean before (..., s, n) and after (..., s, m) the function,
+    weights (s,), mean after (..., m)."""
+
+    before: FloatArray
+    after: FloatArray
+    weights: FloatArray
+    mean: FloatArray
+
+
+def unscented_transform(
+    function: Function, x: FloatArray, P: FloatArray, *, angles: BoolArray | None = None
+) -> Transformed:
+    """Mean and covariance of ``function(X)``, ``X ~ N(x, P)``.
+
+    function: (..., s, n) to (..., s, m); x: (..., n); P: (..., n, n); angles: (m,), True for
+    components of the result that are angles in radians (the mean of those is in [-pi, pi]).
+
+    Raises CovarianceError when P or the result is not finite.
+    """
+    cloud = _transform(function, x, P, angles)
+    weighted = cloud.after * cloud.weights[:, None]
+    return Transformed(
+        cloud.mean,
+        symmetrise(transpose(weighted) @ cloud.after),
+        transpose(cloud.before) @ weighted,
+    )
+
+
+def update(
+    x: FloatArray,
+    P: FloatArray,
+    z: FloatArray,
+    h: Function,
+    R: FloatArray,
+    *,
+    angles: BoolArray | None = None,
+) -> Updated:
+    """Measurement update with ``z = h(x) + v``, ``v ~ N(0, R)``.
+
+    z: (..., m); h: (..., s, n) to (..., s, m); R: (..., m, m); angles: (m,), angles of the
+    measurement.
+
+    The covariance is ``sum w (dx - K dz)(.)' + K R K'``: squares only, equal to ``P - K S K'`` in
+    exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or a component of the
+    innovation has no variance.
+    """
+    cloud = _transform(h, x, P, angles)
+    weighted = cloud.after * cloud.weights[:, None]
+    S, singular = add_jitter(symmetrise(transpose(weighted) @ cloud.after + R))
+    factor = factorise(S, 'innovation covariance')
+    cross = transpose(weighted) @ cloud.before
+    gain = transpose(solve(transpose(factor), solve(factor, cross)))
+    innovation = _wrap(z - cloud.mean, angles)
+    rest = cloud.before - cloud.after @ transpose(gain)
+    covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)
+    covariance, repaired = add_jitter(symmetrise(covariance))
+    nis, log_likelihood = log_density(innovation, factor)
+    return Updated(
+        x + apply(gain, innovation),
+        covariance,
+        S,
+        nis,
+        log_likelihood,
+        repaired | singular,
+    )
+
+
+def _transform(
+    function: Function, x: FloatArray, P: FloatArray, angles: BoolArray | None
+) -> _Cloud:
+    before, weights = sigma_offsets(P)
+    images = function(x[..., None, :] + before)
+    finite = np.isfinite(images).all(axis=(-1, -2))
+    if not finite.all():
+        raise CovarianceError('the function is not finite at a sigma point', np.asarray(~finite))
+    reference = images[..., :1, :]
+    offsets = _wrap(images - reference, angles)
+    mean_offset = np.einsum('s,...sm->...m', weights, offsets)
+    return _Cloud(
+        before,
+        offsets - mean_offset[..., None, :],
+        weights,
+        _wrap(reference[..., 0, :] + mean_offset, angles),
+    )
+
+
+def _wrap(vector: FloatArray, angles: BoolArray | None) -> FloatArray:
+    return vector if angles is None else np.where(angles, wrap_angle(vector), vector)
+
 
 _ANGLES = np.array([False, True])
 
@@ -72,7 +196,7 @@ class Landmark:
             m = kernels.points(points, *sonar.pose, self.model == 'cone')
             return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
 
-        moved = unscented.unscented_transform(place, seen, covariance)
+        moved = unscented_transform(place, seen, covariance)
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
     def advance(
@@ -88,7 +212,7 @@ class Landmark:
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        seen = unscented.unscented_transform(
+        seen = unscented_transform(
             lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
         )
         return seen.mean, seen.covariance
@@ -96,7 +220,7 @@ class Landmark:
     def update(
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
-        after = unscented.update(
+        after = update(
             mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
             angles=_ANGLES,
         )  # fmt: skip
@@ -114,7 +238,7 @@ class Landmark:
             offset = points[..., 2] - sonar.pose.position[2]
             return np.stack([*geometry.project(m, self.model), offset], axis=-1)
 
-        seen = unscented.unscented_transform(words, x, P, angles=np.array([False, True, False]))
+        seen = unscented_transform(words, x, P, angles=np.array([False, True, False]))
         std = np.sqrt(seen.covariance[:, 2:, 2])
         low, high, above = kernels.bands(
             np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)

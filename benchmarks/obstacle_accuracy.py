@@ -12,17 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Accuracy of the obstacle tracker on simulated approaches, beside the methods of the paper.
+"""Accuracy of the obstacle tracker on simulated approaches.
 
     python -m benchmarks.obstacle_accuracy --runs 300 --out docs/results/obstacle_accuracy.json
 
 Each run is the whole tracker: gating, confirmation, track logic. The error of the vertical offset
 is taken from the confirmed track when the range first falls to 50, 30 and 20 m, also where the
-obstacle has left the beam by then. `deferred` is the paper's RMSD over all echoes so far, for
-offsets from 0 to 12 m below as in the paper; `refit` the same with first echo and navigation scale
-freed, 12 m to both sides. Every method holds obstacles for fixed (`behaviours: [fixed]`;
-`benchmarks.obstacle_sea` has the others). All methods see the same measurements, the others than
-`gaussian_sum` a third of the runs.
+obstacle has left the beam by then. Obstacles are held for fixed (`behaviours: [fixed]`;
+`benchmarks.obstacle_sea` has the others). What the paper does on the same measurements is in
+`benchmarks.obstacle_paper`.
 """
 
 from __future__ import annotations
@@ -33,14 +31,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.landmark import LandmarkTracker
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
-from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.truth import Scene
-from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
 from sonar_imm_tools.simulation.obstacle.simulator import (
     ObstacleScenario,
     scenario,
@@ -49,22 +44,20 @@ from sonar_imm_tools.simulation.obstacle.simulator import (
 )
 
 RANGES = (50.0, 30.0, 20.0)
-CASES = {
-    'approach': ('gaussian_sum', 'landmark', 'seafloor', 'deferred', 'refit'),
-    'nearly_level': ('gaussian_sum', 'deferred', 'refit'),
-    'above': ('gaussian_sum',),
-    'float': ('gaussian_sum',),
-    'rolling': ('gaussian_sum',),
-    'calm': ('gaussian_sum',),
-    'stress': ('gaussian_sum',),
-    'rough_seabed': ('gaussian_sum', 'seafloor'),
-    'diving': ('gaussian_sum',),
-}
+CASES = (
+    'approach',
+    'nearly_level',
+    'above',
+    'float',
+    'rolling',
+    'calm',
+    'stress',
+    'rough_seabed',
+    'diving',
+)
 LEVER = {'sonar_lever': (2.0, 0.0, -0.3)}
 """Where the study has its sonar, which is not where scenes have it."""
 GOSPA_CUTOFF = 5.0
-OFFSETS = {False: np.arange(0.0, 12.1, 0.5), True: np.arange(-12.0, 12.1, 0.5)}
-"""Offsets tried by `deferred` and, refitting, by `refit`."""
 NEAR = 5.0
 """Metres in range and bearing within which a track follows the obstacle."""
 
@@ -123,52 +116,19 @@ def offset_at(truth: TrueObstacle, final: dict[int, Estimate], at: float) -> lis
     return None
 
 
-def deferred_at(
-    scene: Scene, config: ObstacleConfig, at: float, refit: bool
-) -> list[float] | None:
-    """The same of the deferred estimate from the echoes so far, known for certain to be its."""
-    truth = truths(scene, TrueObstacle)[0]
-    received = [item.measurement for item in scene.measurements]
-    navigation = [item for item in received if isinstance(item, Navigation)]
-    last = np.flatnonzero(truth.range <= at)[0]
-    number = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
-    pings = [
-        item
-        for item in received
-        if isinstance(item, Detections) and len(item) and number[item.stamp_ns] <= last
-    ]
-    stamps = np.array([ping.stamp_ns for ping in pings] + [int(truth.stamp_ns[last])])
-    poses, _ = sonar_poses(navigation, stamps, config)
-    echoes = np.array([[ping.range[0], -ping.bearing[0]] for ping in pings])
-    seen = type(poses)(poses.position[:-1], poses.R[:-1])
-    best = deferred(echoes, seen, config, offsets=OFFSETS[refit], refit=refit).best
-    now = best + poses.position[0, 2] - poses.position[-1, 2]
-    return [now - truth.vertical_offset[last], np.nan, np.nan]
-
-
 def case(
     name: str, runs: int, scene_values: dict[str, Any], tracker_values: dict[str, Any]
 ) -> dict[str, dict[str, float]]:
-    """Every method of a case: RMSE, bias, NEES, coverage of the 90 % band at each range. Values
-    given replace those of the scene and of the tracker."""
-    results: dict[str, list[list[list[float] | None]]] = {method: [] for method in CASES[name]}
+    """RMSE, bias, NEES, coverage of the 90 % band at each range. Values given replace those of
+    the scene and of the tracker."""
+    rows = []
     for seed in range(runs):
         setting = scenario(name, {**LEVER, **scene_values})
         scene = simulate(setting, seed)
-        for method, rows in results.items():
-            if method != 'gaussian_sum' and seed >= runs // 3:
-                continue
-            if method in ('deferred', 'refit'):
-                config = config_of(setting, **tracker_values)
-                rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
-            else:
-                kind = LandmarkTracker if method == 'landmark' else ObstacleTracker
-                parameters = {} if method == 'landmark' else {'method': method}
-                config = config_of(setting, **parameters, **tracker_values)
-                final = track(scene, config, kind)
-                truth = truths(scene, TrueObstacle)[0]
-                rows.append([offset_at(truth, final, at) for at in RANGES])
-    return {f'{name}, {method}': summary(rows) for method, rows in results.items()}
+        final = track(scene, config_of(setting, method='gaussian_sum', **tracker_values))
+        truth = truths(scene, TrueObstacle)[0]
+        rows.append([offset_at(truth, final, at) for at in RANGES])
+    return {f'{name}, gaussian_sum': summary(rows)}
 
 
 def summary(rows: list[list[list[float] | None]]) -> dict[str, float]:

@@ -14,8 +14,8 @@
 
 """Draw the figures of docs/bathymetry.md from runs: python docs/draw_bathymetry.py
 
-The pictures of the paper are at the paper's settings, `variant: paper`. Needs matplotlib, which
-nothing else here does. Run it from the project root.
+The pictures of the paper are at the paper's settings, from benchmarks/bathymetry_paper.py. Needs
+matplotlib, which nothing else here does. Run it from the project root.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ sys.path.insert(0, str(ROOT))
 
 from matplotlib import pyplot as plt  # noqa: E402
 
+from benchmarks import bathymetry_paper as paper  # noqa: E402
 from sonar_imm.acoustics import array, spatial  # noqa: E402
-from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles  # noqa: E402
+from sonar_imm.trackers.bathymetry.ping import Ping, run_particles  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.objects import facets_of, surfaces_of  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.simulator import (  # noqa: E402
@@ -52,10 +53,9 @@ SETS = {
     'angle_two_rw': {'model_set': 'angle_two_rw'},
 }
 AS_PRINTED = {
-    'RW and NCS': {'variant': 'paper', 'model_set': 'height_rw_ncs'},
-    'two RW': {'variant': 'paper', 'model_set': 'height_two_rw'},
+    'RW and NCS': paper.SETS['height_rw_ncs'](1.0),
+    'two RW': paper.SETS['height_two_rw'](1.0),
 }
-ANGLES = {'variant': 'paper', 'model_set': 'angle_two_rw'}
 SURFACE_DB = -6.0
 """Power of the echoes by way of the surface, relative to those of the floor."""
 SHADOW = (35.0, 36.0)
@@ -73,10 +73,10 @@ def main() -> None:
         for name, values in SETS.items()
     }
     printed = {
-        name: BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
+        name: paper.PrintedTracker(BathymetryConfig(**values)).process(ping)[0]
         for name, values in AS_PRINTED.items()
     }
-    angles = BathymetryTracker(BathymetryConfig(**ANGLES)).process(ping)[0]
+    angles = paper.PrintedTracker(BathymetryConfig(**paper.ANGLES)).process(ping)[0]
     draw_scene(config, truth)
     draw_spectra(ping, truth, printed, angles)
     draw_multipath()
@@ -166,11 +166,13 @@ def draw_multipath() -> None:
     depth, tilt = config.sonar_height - truth.height, math.radians(config.tilt_deg)
     surface = array.multipath_sines(depth, truth.range, tilt, config.sonar_depth)
     figure, axes = plt.subplots(2, 1, figsize=(9, 5.5), sharex=True, layout='constrained')
-    for axis, values, name in (
-        (axes[0], ANGLES, 'as printed'),
-        (axes[1], expected, 'echoes by way of the surface expected'),
+    printed = paper.PrintedTracker(BathymetryConfig(**paper.ANGLES))
+    default = BathymetryTracker(BathymetryConfig(**expected))
+    for axis, tracker, name in (
+        (axes[0], printed, 'as printed'),
+        (axes[1], default, 'echoes by way of the surface expected'),
     ):
-        estimate = BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
+        estimate = tracker.process(ping)[0]
         spectrum(axis, ping, truth, 'capon', estimate)
         for sine in surface.T:
             angle = np.degrees(np.arcsin(sine))
@@ -188,7 +190,7 @@ def draw_clouds() -> None:
     config = scenario('paper', {'pings': 1, 'shadows': SHADOW})
     scene = simulate(config, 1)
     ping, truth = scene.measurements[0].measurement, scene.truth[0]
-    seen = look(Ping(BathymetryConfig(**ANGLES), ping, None))
+    seen = paper.as_printed(Ping(BathymetryConfig(**paper.ANGLES), ping, None))
     clouds = []
 
     def watch(_bin, particles) -> None:

@@ -35,6 +35,7 @@ sys.path.insert(0, str(ROOT))
 
 from matplotlib import pyplot as plt  # noqa: E402
 
+from benchmarks.fathometer_paper import BOOTSTRAP, ChangedTracker  # noqa: E402
 from sonar_imm.acoustics import fathometer  # noqa: E402
 from sonar_imm.measurements import Trace  # noqa: E402
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
@@ -81,9 +82,9 @@ def save(figure, name: str) -> None:
     print(IMAGES / name)
 
 
-def track(traces, config):
+def track(traces, tracker):
     """Records and responses (depths, records) in units of the noise."""
-    tracker, records, columns = FathometerTracker(config), [], []
+    records, columns = [], []
     for trace in traces:
         records += tracker.process(trace)
         columns.append(tracker.response.amplitude / tracker.response.sigma)
@@ -340,8 +341,9 @@ def draw_fixed_orders(processed) -> None:
     ]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True)
     for order, axis in zip((7, 8, 9), axes):
-        config = FathometerConfig(order_min=order, order_max=order, proposal='prior')
-        records, value, depth = track(traces, config)
+        config = FathometerConfig(order_min=order, order_max=order)
+        tracker = ChangedTracker(config, **BOOTSTRAP)
+        records, value, depth = track(traces, tracker)
         _draw_image(axis, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]))
         _draw_found(axis, records, 1.5)
         axis.set(xlabel='record', title=f'fixed order {order}, bootstrap')
@@ -367,7 +369,7 @@ def draw_lines() -> None:
             config = FathometerConfig.from_mapping(own)
             with BagReader(Path(folder) / 'bag') as bag:
                 traces = [item.measurement for item in measurements_of(bag, 'fathometer')]
-        records, value, depth = track(traces, config)
+        records, value, depth = track(traces, FathometerTracker(config))
         _draw_image(axis, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 20.0)
         _draw_found(axis, records, 4.0)
         axis.set(ylabel='depth [m]', title=name.split('_')[3])

@@ -18,7 +18,7 @@ obstacle_offset.png   the offset while the range closes, and the deferred estima
 obstacle_fig3.png     the paper's Figure 3, with its altitude
 obstacle_fig4.png     Figure 4: the diagram of the large obstacle and its image
 obstacle_fig5.png     Figure 5 from our scenes; the distributions are those of
-                      docs/results/obstacle_section5.json (benchmarks.obstacle_section5)
+                      docs/results/obstacle_paper.json (benchmarks.obstacle_paper)
 obstacle_calibration.png   stated against happened collisions (benchmarks.obstacle_calibration)
 
 Needs matplotlib, which nothing else here does. Run it from the project root.
@@ -41,13 +41,19 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
-from benchmarks.obstacle_section5 import echoes, encounter, EXACT, OFFSETS, read  # noqa: E402
+from benchmarks.obstacle_paper import (  # noqa: E402
+    deferred,
+    echoes,
+    encounter,
+    EXACT,
+    OFFSETS,
+    read,
+)
 from benchmarks.study import truths  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
-from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
+from sonar_imm.measurements import Altitude, SonarImage  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
-from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.simulator import (  # noqa: E402
     scenario,
@@ -57,7 +63,7 @@ from sonar_imm_tools.simulation.obstacle.simulator import (  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
 CALIBRATION = ROOT / 'docs' / 'results' / 'obstacle_calibration.json'
-SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
+PAPER = ROOT / 'docs' / 'results' / 'obstacle_paper.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
 COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN, '#56B4E9')
 SEED = 3
@@ -127,23 +133,10 @@ def draw_band(ax: Axes, name: str, title: str) -> None:
 def draw_curves(ax: Axes) -> None:
     """The deferred estimate of the same approach: RMSD against the offset that is tried."""
     setting = scenario('approach')
-    scene, config = simulate(setting, SEED), config_of(setting)
-    pings = [measurement.measurement for measurement in scene.measurements]
-    pings = [ping for ping in pings if isinstance(ping, Detections) and len(ping)]
-    echoes = np.array([[ping.range[0], -ping.bearing[0]] for ping in pings])
-    poses, known = sonar_poses(
-        [
-            measurement.measurement
-            for measurement in scene.measurements
-            if isinstance(measurement.measurement, Navigation)
-        ],
-        np.array([ping.stamp_ns for ping in pings]),
-        config,
-    )
-    poses = Pose(poses.position[known], poses.R[known])
+    z, poses = echoes(setting, simulate(setting, SEED))
     offsets = np.arange(-12.0, 12.1, 0.25)
     for refit, colour, label in ((False, RED, 'deferred (RMSD)'), (True, GREEN, 'refitted')):
-        found = deferred(echoes[known], poses, config, offsets=offsets, refit=refit)
+        found = deferred(z, poses, config_of(setting), offsets=offsets, refit=refit)
         ax.plot(found.offset, found.rmsd, color=colour, label=label)
         ax.plot(found.best, found.least, 'o', color=colour)
     ax.axvline(setting.vertical_offset, color=INK, ls='--', lw=1)
@@ -301,7 +294,7 @@ def draw_figure_4() -> None:
 
 def draw_figure_5() -> None:
     """Figure 5: RMSD by eye and by a noisy detector, and what a single such number is worth."""
-    estimates = json.loads(SECTION5.read_text(encoding='utf-8'))['large']['estimates']
+    estimates = json.loads(PAPER.read_text(encoding='utf-8'))['large']['estimates']
     # One encounter that reads as the paper's did: 8 m by eye, 11 m by the detector.
     off = np.abs(np.array(estimates['by eye']) - 8.0) + np.abs(
         np.array(estimates['noisy detector']) - 11.0

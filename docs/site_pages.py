@@ -28,7 +28,6 @@ import io
 import json
 from pathlib import Path
 import re
-import sys
 import tempfile
 from typing import Any
 
@@ -60,7 +59,6 @@ API = {
     'recordings': ('sonar_imm_tools.recordings', 'Bags in and out, other formats'),
     'offline': ('sonar_imm_tools.offline', 'Trackers on recordings'),
     'evaluation': ('sonar_imm_tools.evaluation', 'Scores and reports'),
-    'viewing': ('sonar_imm_tools.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
     'simulation': ('sonar_imm_tools.simulation', 'Scenes'),
     'msg_adapters': ('msg_adapters', 'ROS messages to measurements and estimates, and back'),
 }
@@ -105,23 +103,23 @@ def labelled(found: re.Match[str]) -> str:
     return f'{head}</thead>' + re.sub(r'<tr>.*?</tr>', cells, body, flags=re.DOTALL)
 
 
+MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
+"""Above a table: where its numbers come from."""
+
+
 def caption(mark: str, up: str) -> str:
     """What is shown below a table for its mark; `up` leads from the page to docs/."""
-    from check_numbers import aged, aged_reading, known_sources
-
     kind, _, rest = mark.partition(';')
     if kind == 'none':
         return ''
     if kind.startswith('read '):
-        return (
-            f'<small>*Read on {kind.split()[1]} ({aged_reading(mark)}):* `{rest.strip()}`</small>'
-        )
-    sources = known_sources()
+        return f'<small>*Read on {kind.split()[1]}:* `{rest.strip()}`</small>'
+    sources = json.loads((ROOT / 'docs/results/sources.json').read_text(encoding='utf-8'))
     named = dict.fromkeys(
         name for name in re.findall(r'[a-z_0-9]+\.json', mark) if name in sources
     )
     lines = '<br>'.join(
-        f'*Values of {sources[name]["date"]} ({aged(name)}), [{name}]({up}results/{name}):* '
+        f'*Values of {sources[name]["date"]}, [{name}]({up}results/{name}):* '
         f'`{sources[name]["command"]}`'
         for name in named
     )
@@ -129,13 +127,13 @@ def caption(mark: str, up: str) -> str:
 
 
 def captioned(markdown: str, up: str) -> str:
-    """A page with a caption below each table that has a mark (`check_numbers`), in its place."""
-    sys.path.insert(0, str(ROOT / 'docs'))
-    from check_numbers import MARK, on_one_line
-
+    """A page with a caption below each table that has a `MARK`, in its place."""
+    on_one_line = MARK.sub(
+        lambda found: f'<!-- numbers: {" ".join(found[1].split())} -->', markdown
+    )
     out: list[str] = []
     waiting = ''
-    for line in [*on_one_line(markdown).splitlines(), '']:
+    for line in [*on_one_line.splitlines(), '']:
         if found := MARK.match(line):
             waiting = caption(found.group(1), up)
             continue

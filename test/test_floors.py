@@ -40,6 +40,7 @@ if not (ROOT / 'setup.py').is_file():
 # A room may import from its own floor and from lower ones.
 FLOORS = {
     'sonar_imm.files': 0,
+    'sonar_imm.gone': 0,
     'sonar_imm.texts': 0,
     'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,
@@ -61,8 +62,7 @@ FLOORS = {
     'sonar_imm_tools.offline': 8,
     'sonar_imm_tools.evaluation': 9,
     'sonar_imm_tools.survey': 9,
-    'sonar_imm_tools.viewing': 10,
-    'sonar_imm_tools.cli': 11,
+    'sonar_imm_tools.cli': 10,
 }
 # Rooms of one floor, or of neighbouring ones, that must not know each other.
 APART = (

@@ -64,7 +64,6 @@ PYPI_OF_KEY = {
     'python3-rosbags-pip': 'rosbags',
     'python3-scipy': 'scipy',
     'python3-stonesoup-pip': 'stonesoup',
-    'python3-websockets': 'websockets',
     'python3-yaml': 'PyYAML',
 }
 """All keys are in rosdep/python.yaml of ros/rosdistro, as of 2026-08-22, with Ubuntu 24.04."""
@@ -77,8 +76,7 @@ PEERS = {
     'sonar_imm.nodes.tracks': {'pyais'},
     'sonar_imm_tools.offline.jobs': {'distributed'},
     'sonar_imm_tools.offline.run_folder': {'pyarrow'},
-    'sonar_imm_tools.viewing.rerun_file': {'rerun'},
-    'sonar_imm_tools.viewing.server': {'foxglove'},
+    'sonar_imm_tools.evaluation.rerun_file': {'rerun'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},
     'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
@@ -197,7 +195,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
-        *('foxglove-sdk', 'laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio'),
+        *('laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio'),
         *('ektools', 'soundfile'),
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}

@@ -137,7 +137,7 @@ def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
     text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
     assert made.captioned(text, '') == (
         '| a |\n|---|\n| 1.5 |\n\n'
-        '<small>*Read on 2026-11-20 (age unknown):* `sonar-imm bench`</small>\n\nAfter.\n'
+        '<small>*Read on 2026-11-20:* `sonar-imm bench`</small>\n\nAfter.\n'
     )
     text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
     text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')

@@ -12,9 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is drawn of an estimate besides its table: chosen here once, for the nodes and for the view
-of a run that was tracked offline. One module per system, as for the inputs.
-"""
+"""What a node draws of an estimate besides its table. One module per system, as for the inputs."""
 
 from __future__ import annotations
 

@@ -66,10 +66,10 @@ class Detections:
 
     The stamp is the transmission. range: (n,) metres; bearing: (n,) rad, REP-103: positive to
     port; var_range: (n,) m^2 and var_bearing: (n,) rad^2, NaN where the sender does not know them;
-    intensity: (n,), NaN where unknown; extent_range: (n,) m and extent_bearing: (n,) rad, spread
-    (standard deviation) of the echo, NaN where unknown; elevation: (n,) rad, positive up, NaN
-    where the sonar does not measure it, var_elevation: (n,) rad^2. Columns left out are unknown.
-    A row without a finite range and bearing is no echo.
+    intensity: (n,), NaN where unknown, not used by the tracker; extent_range: (n,) m and
+    extent_bearing: (n,) rad, spread (standard deviation) of the echo, NaN where unknown;
+    elevation: (n,) rad, positive up, NaN where the sonar does not measure it, var_elevation: (n,)
+    rad^2. Columns left out are unknown. A row without a finite range and bearing is no echo.
     """
 
     FRAME: ClassVar[str] = 'own'

@@ -53,7 +53,7 @@ COMMANDS = {
     'fuse': 'Fuse the diver tracks of two nodes into one run.',
     'export': 'Write soundings, horizons, tracks or obstacles of a run for other programs.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
-    'view': 'Show a recording, a run or running nodes in Foxglove.',
+    'view': 'Open the HTML report of a run; a bag is tracked and scored first.',
     'play': 'Publish a bag to live nodes.',
     'echo': 'Show the estimates of running nodes as a live table.',
     'chart': 'Make a chart of the soundings of running nodes, for RViz.',
@@ -236,8 +236,6 @@ def missing_package(name: str) -> str | None:
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
         'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
-        'foxglove': 'foxglove-sdk, which serves the view, is not here: pip install '
-        "'sonar_imm[view]', or use --browser",
         'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",
     }
     return remedies.get(name)

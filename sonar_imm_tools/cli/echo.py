@@ -119,19 +119,24 @@ def _picture(newest: Mapping[str, ReceivedTable], most: int) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    parts = []
+    def plain(text: str) -> Text:
+        return Text(visible(text))  # a str would be read for markup
+
+    parts: list[Text | Table] = []
     for name in sorted(newest):
         table = newest[name]
+        if table.problem:
+            parts.append(plain(f'{table.topic}: {table.problem}'))
+            continue
         names, rows = readable(table.columns or {}, most)
-        # As `Text` a name with brackets is no markup.
-        picture = Table(title=Text(visible(_head(table))), title_justify='left')
-        picture.caption = Text(visible(table.problem or _further(table, most)))
-        picture.caption_justify = 'left'
+        picture = Table()
         for column in names:
-            picture.add_column(Text(visible(column)), justify='right')
+            picture.add_column(plain(column), justify='right')
         for row in rows:
-            picture.add_row(*(Text(visible(row[column])) for column in names))
-        parts.append(picture)
+            picture.add_row(*(plain(row[column]) for column in names))
+        parts += [plain(_head(table)), picture]
+        if further := _further(table, most):
+            parts.append(plain(further))
     return Group(*parts)
 
 
@@ -163,8 +168,6 @@ def json_line(table: ReceivedTable) -> str:
 
 
 def _head(table: ReceivedTable) -> str:
-    if table.problem:
-        return table.topic
     moment = datetime.fromtimestamp(table.stamp_ns // 10**9, timezone.utc)
     millis = table.stamp_ns % 10**9 // 10**6
     rows = _count(table)

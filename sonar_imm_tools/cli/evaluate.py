@@ -140,7 +140,10 @@ def _name(folder: Path, out_dir: Path) -> str:
 def _compare_crossing(
     a: Path, b: Path, position_std: float, report: Path | None, as_json: bool
 ) -> None:
+    import plotly.graph_objects as go
+
     from ..evaluation.fathometer.crossing import crossing_lines, crossing_metrics, mistie_figure
+    from ..evaluation.plotting import plain_content
     from ..offline.run_folder import RunFolder
 
     for folder in (a, b):
@@ -150,9 +153,10 @@ def _compare_crossing(
     if report is not None:
         from ..evaluation.report import write_page
 
-        text = mistie_figure(metrics).to_html(include_plotlyjs=True)
+        figure = go.Figure(plain_content(mistie_figure(metrics)))
         head = '<head><meta name="generator" content="sonar_imm">'
-        write_page(report, '<!DOCTYPE html>\n' + text.replace('<head>', head, 1))
+        text = figure.to_html(include_plotlyjs=True).replace('<head>', head, 1)
+        write_page(report, f'<!DOCTYPE html>\n{text}')
     if as_json:
         print_json(metrics)
         return

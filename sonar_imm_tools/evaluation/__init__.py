@@ -20,6 +20,7 @@ __all__ = [
     'numbers',
     'plotting',
     'report',
+    'rerun_file',
     'sweep',
     'tuning',
 ]

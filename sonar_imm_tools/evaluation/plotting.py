@@ -19,6 +19,7 @@ Colours are those of Okabe and Ito, which people with any colour vision can tell
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.association import gate_threshold
 from sonar_imm.estimation.consistency import average_bounds
+from sonar_imm.texts import visible
 
 from .. import SECOND
 
@@ -41,6 +43,27 @@ TRUTH = {'color': INK, 'width': 1.5, 'dash': 'dot'}
 TIME = {'title': 'time [s]', 'zeroline': False}
 BARE = {'showgrid': False, 'zeroline': False}
 """An axis of an image."""
+_TAG = re.compile(r'<(?!/?(?:b|br|extra|i|sub|sup)>)')
+"""Where a tag begins that our own texts do not use."""
+
+
+def plain_content(figure: go.Figure) -> dict[str, Any]:
+    """The content of `figure` as a dict. Names in its texts make no links and load no pictures:
+    plotly reads tags in texts, of which those without attributes stay."""
+    content: dict[str, Any] = _plain(figure.to_dict())
+    return content
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, str):
+        return visible(_TAG.sub('&lt;', value))
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray) and value.dtype.kind in 'OU':
+        return [_plain(item) for item in value.tolist()]
+    return value
 
 
 def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:

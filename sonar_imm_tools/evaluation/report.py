@@ -41,9 +41,11 @@ import plotly.offline
 
 from sonar_imm import __version__
 from sonar_imm.files import whole
+from sonar_imm.texts import visible
 
 from ..recordings.sources import BagError
 from .numbers import Card, Check, counted, flatten, front
+from .plotting import plain_content
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
@@ -180,6 +182,7 @@ def _rendered(template: str, **values: Any) -> str:
     pages = Environment(
         loader=FileSystemLoader(Path(__file__).with_name('templates')),
         autoescape=True,
+        finalize=_visible,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -188,6 +191,12 @@ def _rendered(template: str, **values: Any) -> str:
     # A number and its percent sign stay on one line.
     pages.filters['unbroken'] = lambda text: text.replace(' %', '\u00a0%')
     return pages.get_template(template).render(version=__version__, **values)
+
+
+def _visible(value: object) -> object:
+    """What a page shows of a value: names may hold characters that turn text round."""
+    is_html = hasattr(value, '__html__')
+    return visible(value) if isinstance(value, str) and not is_html else value
 
 
 def write_page(path: Path, text: str) -> None:
@@ -233,7 +242,7 @@ def _gl_points(figure: go.Figure) -> int:
 
 def _packed_figure(accelerated: Sequence[go.Figure], figure: go.Figure) -> str:
     """Data and layout of a figure, `packed`."""
-    content = figure.to_dict()
+    content = plain_content(figure)
     if not any(figure is fast for fast in accelerated):
         for trace in content['data']:
             if trace['type'] == 'scattergl':

@@ -33,7 +33,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
-import csv
 import hashlib
 from importlib.metadata import version
 import json
@@ -66,6 +65,7 @@ from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 
+from ..recordings.csv_writer import CsvWriter
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
@@ -121,7 +121,7 @@ class CsvTable:
     def __init__(self, path: Path):
         self._path = path
         self._file = path.open('w', encoding='utf-8', newline='')
-        self._writer = csv.writer(self._file, lineterminator='\n')
+        self._writer = CsvWriter(self._file)
         self._names: list[str] | None = None
 
     def __enter__(self) -> CsvTable:
@@ -135,12 +135,12 @@ class CsvTable:
         """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
         if self._names is None:
             self._names = list(columns)
-            self._writer.writerow(['stamp_ns', *columns])
+            self._writer.write(['stamp_ns', *columns])
         elif self._names != list(columns):
             raise ValueError('the columns change from one estimate to another')
         with naming(self._path):
-            for row in zip(*(column.tolist() for column in columns.values())):
-                self._writer.writerow([stamp_ns, *row])
+            rows = zip(*(column.tolist() for column in columns.values()))
+            self._writer.write_numbers((stamp_ns, *row) for row in rows)
 
 
 def require_parquet() -> None:

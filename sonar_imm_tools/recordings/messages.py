@@ -47,16 +47,6 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def message_definition(type_name: str, types: Typestore | None = None) -> str | None:
-    """The fields of a message type as ``.msg`` text, those of inner types below, as MCAP and
-    Foxglove want them (encoding ``ros2msg``); None when `types`, by default those of Jazzy, have
-    no such type."""
-    types = types or typestore()
-    if type_name not in types.fielddefs:
-        return None
-    return types.generate_msgdef(type_name, ros_version=2)[0]
-
-
 def ros_message(type_name: str, /, **fields: Any) -> Any:
     """Build a rosbags message; the `make` of the adapters for recordings.
 

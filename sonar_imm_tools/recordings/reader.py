@@ -37,7 +37,7 @@ from attrs import evolve, frozen
 from msg_adapters.headers import stamp_ns
 from sonar_imm.measurements import Rejection
 
-from .messages import cdr_of, message_definition
+from .messages import cdr_of
 from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
@@ -128,22 +128,10 @@ class BagReader:
             for key, value in getattr(source, 'custom_data', {}).items()
         }
 
-    def definition(self, type_name: str) -> str | None:
-        """The definition of a message type, see `message_definition`; None when not known."""
-        found = (message_definition(type_name, source.types) for source in self._sources)
-        return next((text for text in found if text is not None), None)
-
     @property
     def is_ros1(self) -> bool:
         """Whether this is a ROS 1 bag, whose messages are not CDR."""
         return self.path.is_file() and self.path.suffix == '.bag'
-
-    def span(self) -> tuple[int, int] | None:
-        """First and last log time, ns; None when there is no message."""
-        spans = [span for source in self._sources if (span := source.span())]
-        if not spans:
-            return None
-        return min(span[0] for span in spans), max(span[1] for span in spans)
 
     def cdr(self, item: BagMessage) -> bytes:
         """The decoded message `item` as ROS 2 sends it; ROS 1 bags hold another serialization."""

@@ -210,12 +210,6 @@ class RosbagsSource:
             return decode_cdr(self.types, type_name, raw)
         return self._reader.deserialize(raw, type_name)
 
-    def span(self) -> tuple[int, int] | None:
-        """First and last log time, ns, by the index of the storage."""
-        if not self._reader.message_count:
-            return None
-        return self._reader.start_time, self._reader.end_time - 1
-
     def close(self) -> None:
         self._reader.close()
 
@@ -267,11 +261,6 @@ class ScanSource:
 
     def decode(self, type_name: str, raw: bytes) -> Any:
         return decode_cdr(self.types, type_name, raw)
-
-    def span(self) -> tuple[int, int] | None:
-        """First and last log time, ns, by reading the file."""
-        times = [item.log_ns for item in self.messages(None)]
-        return (min(times), max(times)) if times else None
 
     def close(self) -> None:
         self._scan.close()

@@ -19,8 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import csv
-from html import escape
+import html
 import json
 import math
 import os
@@ -41,6 +40,7 @@ from sonar_imm.texts import visible
 
 from ..evaluation.plotting import add_points, COLOURS, styled
 from ..offline.run_folder import REPORT
+from ..recordings.csv_writer import CsvWriter
 from ..recordings.sources import BagError
 from .adjustment import described, Mistie
 from .chart import BANDS, Chart, values_of, write_geotiff
@@ -287,14 +287,14 @@ def _write_crossings(path: Path, survey: Survey) -> None:
         whole(path, follow=False) as unfinished,
         unfinished.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file,
     ):
-        writer = csv.writer(file, lineterminator='\n')
+        writer = CsvWriter(file)
         kinds = ('median_before', 'rms_before', 'median_after', 'rms_after')
-        writer.writerow(['line_a', 'line_b', 'cells', *kinds])
+        writer.write(['line_a', 'line_b', 'cells', *kinds])
         for pair in sorted({*survey.before, *survey.after}):
             before, after = survey.before.get(pair), survey.after.get(pair)
             cells = (after or before or Mistie(0, math.nan, math.nan)).cells
             row = [*summary(before), *summary(after)]
-            writer.writerow([names[pair[0]], names[pair[1]], cells, *row])
+            writer.write([names[pair[0]], names[pair[1]], cells, *row])
 
 
 # -- the page of a survey: chart, uncertainty, what competes, misties, what could not be told -----
@@ -324,7 +324,7 @@ def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Survey</title>',
         f'<style>{STYLE}</style><script>{plotly.offline.get_plotlyjs()}</script></head><body>',
         f'<h1>Survey</h1><p>{_summary(survey, chart)}</p>',
-        *(f'<p><strong>{escape(sentence)}</strong></p>' for sentence in survey.warnings),
+        *(f'<p><strong>{_escaped(sentence)}</strong></p>' for sentence in survey.warnings),
     ]
     seen = chart.bands
     thin = max(1, math.ceil(max(chart.shape) / MOST_CELLS))
@@ -445,7 +445,7 @@ def _summary(survey: Survey, chart: Chart) -> str:
         )
     failed = [line['name'] for line in survey.lines if line['failure']]
     if failed:
-        words.append(f'Not read: {escape(", ".join(failed))}.')
+        words.append(f'Not read: {_escaped(", ".join(failed))}.')
     return ' '.join(words)
 
 
@@ -472,9 +472,13 @@ def _corrections(content: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _escaped(text: str) -> str:
+    return html.escape(visible(text))
+
+
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = ''.join(f'<th>{name}</th>' for name in heads)
     body = ''.join(
-        '<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>' for row in rows
+        '<tr>' + ''.join(f'<td>{_escaped(cell)}</td>' for cell in row) + '</tr>' for row in rows
     )
     return f'<table><tr>{head}</tr>{body}</table>'

@@ -12,13 +12,151 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The baseline in world coordinates follows, as a baseline should."""
+"""The baseline in world coordinates: its unscented filter is exact where it must be, indifferent
+to the choice of north, and never without an answer."""
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
+import pytest
 
-from benchmarks.landmark import LandmarkTracker
+from benchmarks.landmark import LandmarkTracker, unscented_transform, update
 from benchmarks.obstacle_accuracy import config_of, track
+from sonar_imm.estimation import kalman
+from sonar_imm.estimation.kalman import CovarianceError
+from sonar_imm.estimation.smoothing import sigma_offsets
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
+
+RANGE_BEARING = np.array([False, True])
+
+
+def range_bearing(points):
+    return np.stack(
+        [np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])],
+        axis=-1,
+    )
+
+
+def covariance(rng, *shape):
+    root = rng.normal(size=(*shape, shape[-1] + 1))
+    return root @ np.swapaxes(root, -1, -2)
+
+
+@pytest.mark.parametrize('n', range(1, 8))
+def test_points_have_the_moments_and_no_negative_weight(n):
+    P = covariance(np.random.default_rng(n), 3, n)
+    offsets, weights = sigma_offsets(P)
+    assert (weights >= 0.0).all() and weights.sum() == pytest.approx(1.0, abs=1e-15)
+    np.testing.assert_allclose(np.einsum('s,bsi->bi', weights, offsets), 0.0, atol=1e-14)
+    np.testing.assert_allclose(
+        np.einsum('s,bsi,bsj->bij', weights, offsets, offsets), P, rtol=1e-12, atol=1e-13
+    )
+
+
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_up_to_three_dimensions_the_fourth_moment_is_that_of_a_gaussian(n):
+    offsets, weights = sigma_offsets(np.eye(n))
+    np.testing.assert_allclose(weights @ offsets**4, 3.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize('n', [2, 4, 6])
+def test_linear_functions_give_the_kalman_filter(n):
+    rng = np.random.default_rng(n)
+    x, P, F, Q = (
+        rng.normal(size=(5, n)),
+        covariance(rng, 5, n),
+        rng.normal(size=(n, n)),
+        covariance(rng, n),
+    )
+    H, R, z = rng.normal(size=(2, n)), covariance(rng, 2), rng.normal(size=(5, 2))
+    expected = kalman.predict(x, P, F, Q, np.ones(n))
+    moved = unscented_transform(lambda points: points @ F.T + 1.0, x, P)
+    np.testing.assert_allclose(moved.mean, expected.x, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(moved.covariance + Q, expected.P, rtol=1e-9, atol=1e-10)
+    seen = update(x, P, z, lambda points: points @ H.T, R)
+    for got, want in zip(seen, kalman.update(x, P, z - x @ H.T, H, R)):
+        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-10)
+
+
+def test_the_mean_of_a_quadratic_is_exact():
+    rng = np.random.default_rng(1)
+    x, P, A = rng.normal(size=4), covariance(rng, 4), rng.normal(size=(4, 4))
+    mean = unscented_transform(
+        lambda p: np.einsum('...i,ij,...j->...', p, A, p)[..., None], x, P
+    ).mean
+    np.testing.assert_allclose(mean, [x @ A @ x + np.trace(A @ P)], rtol=1e-12)
+
+
+@settings(max_examples=60)
+@given(st.floats(-np.pi, np.pi), st.floats(-20.0, 20.0))
+def test_turning_the_scene_turns_the_answer(bearing, turn):
+    """A target at any bearing, all turned by any angle: same range, nis, likelihood; bearing and
+    position turned."""
+    position = 50.0 * np.array([np.cos(bearing), np.sin(bearing)])
+    P, R = np.array([[40.0, 11.0], [11.0, 25.0]]), np.diag([0.5, 0.01])
+    z = np.array([51.0, bearing + 0.05])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    plain = update(position, P, z, range_bearing, R, angles=RANGE_BEARING)
+    turned = update(
+        rotation @ position,
+        rotation @ P @ rotation.T,
+        z + [0.0, turn],
+        range_bearing,
+        R,
+        angles=RANGE_BEARING,
+    )
+    np.testing.assert_allclose(turned.x, rotation @ plain.x, atol=1e-9)
+    np.testing.assert_allclose(turned.P, rotation @ plain.P @ rotation.T, atol=1e-9)
+    np.testing.assert_allclose(turned[2:][0], plain.innovation_covariance, atol=1e-9)
+    np.testing.assert_allclose(
+        [turned.nis, turned.log_likelihood], [plain.nis, plain.log_likelihood], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    'P, function',
+    [(np.full((2, 2), np.nan), range_bearing), (np.eye(2), lambda points: points * np.inf)],
+)
+def test_what_is_not_finite_is_refused(P, function):
+    with np.errstate(invalid='ignore'), pytest.raises(CovarianceError, match='not finite'):
+        unscented_transform(function, np.array([1.0, 2.0]), P)
+
+
+def test_filterpy_agrees_where_angles_do_not_matter():
+    """FilterPy's Julier points with the same square root and kappa = 3 - n, far from the cut of
+    the bearing."""
+    filterpy = pytest.importorskip('filterpy.kalman')
+
+    def principal(scaled):
+        values, vectors = np.linalg.eigh(scaled)
+        return (vectors * np.sqrt(values)).T
+
+    points = filterpy.JulierSigmaPoints(2, kappa=1.0, sqrt_method=principal)
+    theirs = filterpy.UnscentedKalmanFilter(
+        2, 2, 1.0, hx=range_bearing, fx=lambda p, dt: p + 0.01 * p**2, points=points
+    )
+    theirs.x, theirs.P, theirs.Q, theirs.R = (
+        np.array([30.0, 10.0]),
+        np.diag([4.0, 2.0]),
+        np.eye(2) * 0.1,
+        np.diag([0.3, 0.01]),
+    )
+    theirs.predict()
+    moved = unscented_transform(
+        lambda p: p + 0.01 * p**2, np.array([30.0, 10.0]), np.diag([4.0, 2.0])
+    )
+    x, P = moved.mean, moved.covariance + theirs.Q
+    np.testing.assert_allclose(x, theirs.x, rtol=1e-12)
+    np.testing.assert_allclose(P, theirs.P, rtol=1e-12)
+    # FilterPy measures with the propagated points, not with new ones drawn from the prediction:
+    # draw them for it.
+    theirs.sigmas_f = points.sigma_points(theirs.x, theirs.P)
+    z = np.array([42.0, 0.35])
+    theirs.update(z)
+    updated = update(x, P, z, range_bearing, theirs.R, angles=RANGE_BEARING)
+    np.testing.assert_allclose(updated.x, theirs.x, rtol=1e-9)
+    np.testing.assert_allclose(updated.P, theirs.P, rtol=1e-7)
+    np.testing.assert_allclose(updated.log_likelihood, theirs.log_likelihood, rtol=1e-8)
 
 
 def test_one_gaussian_in_world_coordinates_follows_an_obstacle():

@@ -93,13 +93,14 @@ def test_obstacles_of_a_file_with_positions_lie_on_earth_in_the_report(tmp_path)
 def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr('webbrowser.open', opened.append)
+    monkeypatch.setenv('DISPLAY', ':0')
     monkeypatch.setenv('TMPDIR', str(tmp_path))
     monkeypatch.setattr('tempfile.tempdir', None)
     each = MADE[name]
     each.make(tmp_path / name, line(60, each.step))
     bag = tmp_path / 'line.bag'
     assert main(['convert', str(tmp_path / name), str(bag)]) == 0
-    assert main(['view', str(bag), '--browser']) == 0
+    assert main(['view', str(bag)]) == 0
     report = Path(capsys.readouterr().out.rpartition('report: ')[2].strip())
     assert opened == [report.as_uri()] and report.is_relative_to(tmp_path)
     assert 'plotly' in report.read_text().lower()

@@ -12,20 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``sonar-imm view``: what it refuses, the report in the browser, the file for Rerun."""
+"""``sonar-imm view``: removed options, the report in the browser, the file for Rerun."""
 
 from pathlib import Path
+import shutil
 import sys
 import webbrowser
 
-import numpy as np
 import pytest
 
-from msg_adapters.fixes import write_fix
-from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 from sonar_imm_tools.resources import shared_file
 
 
@@ -39,16 +36,23 @@ def run(tmp_path_factory):
     return folder / 'run'
 
 
+@pytest.fixture
+def opened(monkeypatch):
+    """The addresses that a browser was asked to open, on a machine with a screen."""
+    addresses = []
+    monkeypatch.setattr(webbrowser, 'open', addresses.append)
+    monkeypatch.setenv('DISPLAY', ':0')
+    return addresses
+
+
 @pytest.mark.parametrize(
     ('arguments', 'sentence'),
     [
-        ([], 'say either a BAG or RUN, or --live'),
-        (['somewhere', '--live'], 'say either a BAG or RUN, or --live'),
-        (['--live', '--browser'], '--browser and --rerun show what is recorded'),
-        (['nowhere.bag', '--port', '0'], 'nowhere.bag'),
-        (['nowhere.bag', '--browser'], 'nowhere.bag'),
-        (['somewhere', '--rate', '0'], '--rate'),
-        (['somewhere', '--port', '70000'], '--port'),
+        ([], "Missing argument 'RESULTS|BAG'"),
+        (['nowhere.bag'], 'nowhere.bag'),
+        (['--live'], "'--live' was removed: view opens the report"),
+        (['out', '--host=0.0.0.0'], 'foxglove_bridge and config/foxglove_SYSTEM.json'),
+        (['out', '--rate', '4', '--loop'], "'--rate' was removed"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, sentence, capsys):
@@ -57,27 +61,37 @@ def test_mistakes_are_one_sentence(arguments, sentence, capsys):
     assert sentence in errors and errors.count('\n') == 1
 
 
-def test_a_topic_that_is_not_there(run, capsys):
-    assert main(['view', str(run), '--port', '0', '--topics', '/nowhere']) == 2
-    assert "there is no topic '/nowhere'" in capsys.readouterr().err
-
-
-def test_without_the_package_it_says_what_to_do(run, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'foxglove', None)
-    monkeypatch.delitem(sys.modules, 'sonar_imm_tools.viewing.server', raising=False)
-    assert main(['view', str(run), '--port', '0']) == 2
-    errors = capsys.readouterr().err
-    assert "pip install 'sonar_imm[view]'" in errors and '--browser' in errors
-
-
 @pytest.mark.parametrize('kind', ['run', 'bag'])
-def test_the_browser_gets_the_report(run, kind, capsys, monkeypatch):
-    opened = []
-    monkeypatch.setattr(webbrowser, 'open', opened.append)
-    assert main(['view', str(run.parent / kind), '--browser']) == 0
+def test_the_browser_gets_the_report(run, kind, capsys, opened):
+    assert main(['view', str(run.parent / kind), *['--browser'] * (kind == 'run')]) == 0
     (address,) = opened
     assert address.startswith('file://') and address.endswith('/report.html')
     assert address.removeprefix('file://') in capsys.readouterr().out
+
+
+def test_a_report_that_is_there_is_opened_as_it_is(run, tmp_path, opened):
+    shutil.copytree(run, tmp_path / 'run')
+    (tmp_path / 'run' / 'report.html').write_text('made with --truth')
+    assert main(['view', str(tmp_path / 'run')]) == 0
+    assert Path(opened[0].removeprefix('file://')).read_text() == 'made with --truth'
+
+
+def test_without_a_screen_it_says_where_the_report_is(run, capsys, opened, monkeypatch):
+    monkeypatch.setattr(sys, 'platform', 'linux')
+    for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'):
+        monkeypatch.delenv(name, raising=False)
+    assert main(['view', str(run)]) == 0
+    assert opened == []
+    assert capsys.readouterr().out == f'report: {run.resolve() / "report.html"}\n'
+
+
+def test_a_browser_that_does_not_start_is_no_failure(run, monkeypatch):
+    def fail(_address):
+        raise webbrowser.Error('could not locate runnable browser')
+
+    monkeypatch.setattr(webbrowser, 'open', fail)
+    monkeypatch.setenv('DISPLAY', ':0')
+    assert main(['view', str(run)]) == 0
 
 
 def test_rerun_file(run, tmp_path, capsys):
@@ -93,29 +107,3 @@ def test_rerun_needs_a_run(tmp_path, capsys):
     bag = shared_file('bags/diver_table1')
     assert main(['view', str(bag), '--rerun', str(tmp_path / 'a.rrd')]) == 2
     assert 'holds no finished run' in capsys.readouterr().err
-
-
-def test_names_in_a_recording_do_not_steer_the_terminal_nor_the_page(
-    tmp_path, capsys, monkeypatch
-):
-    """A topic, a frame, a parameter and a refused message that would clear the screen, or be a
-    script in the report."""
-    name = '</script><script>alert(1)</script>\x1b[2J'
-    bag = tmp_path / 'bag'
-    with BagWriter(bag) as writer:
-        for k in range(8):
-            stamp = (1_700_000_000 + k) * 10**9
-            fix = Fix(stamp_ns=stamp, position=[k, 0.0, 0.0], frame_id=name, covariance=np.eye(2))
-            message = write_fix(fix, ros_message)
-            message.header.frame_id += '_ned' * (k == 5)  # refused, with a sentence
-            writer.write(f'/{name}/fix', message, stamp)
-    opened = []
-    monkeypatch.setattr(webbrowser, 'open', opened.append)
-    assert main(['info', str(bag)]) == 0
-    assert main(['view', str(bag), '--port', '0', '--topics', f'{name}']) == 2
-    assert main(['track', str(bag), str(tmp_path / 'run'), '--set', f'map_frame={name}']) == 0
-    assert main(['view', str(tmp_path / 'run'), '--browser']) == 0
-    output = capsys.readouterr()
-    assert '\\x1b[2J' in output.out and '\x1b' not in output.out + output.err
-    page = Path(opened[0].removeprefix('file://')).read_text()
-    assert page.count('&lt;script&gt;alert(1)') > 3 and '<script>alert(1)' not in page

@@ -33,7 +33,6 @@ from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.resources import shared_file
-from sonar_imm_tools.viewing.layouts import fitting_layouts, write_layout
 
 BAGS = {
     'bathymetry': 'bathymetry_paper',
@@ -147,22 +146,3 @@ def check_rviz(system, topics, estimate):
         assert topics[display['Topic']['Value']] == RVIZ[display['Class'].partition('/')[2]]
         if display['Class'].endswith('/PointCloud2'):
             assert display['Channel Name'] in estimate.columns()
-
-
-def test_a_layout_takes_the_names_of_other_topics(tmp_path):
-    topics = ['/auv/obstacle/estimate', '/auv/obstacle/markers', '/auv/dvl/nav', '/diagnostics']
-    assert list(fitting_layouts(topics)) == ['obstacle']
-    write_layout(tmp_path / 'layout.json', 'obstacle', topics)
-    panels = json.loads((tmp_path / 'layout.json').read_text())['configById']
-    assert set(panels['3D!obstacles']['topics']) == {
-        '/auv/obstacle/markers',
-        '/auv/obstacle/estimate',
-        '/auv/obstacle/obstacles',
-        '/auv/dvl/nav',
-    }
-    value = panels['Plot!above']['paths'][1]['value']
-    assert value == '/auv/obstacle/model_probabilities.position[1]'
-
-
-def test_there_is_no_layout_for_other_topics():
-    assert fitting_layouts(['/estimate', '/diver/odometry']) == {}

@@ -41,8 +41,7 @@ DEFAULT_SIGMAS = {
 the rough ones alone."""
 DEFAULT_SCATTERS = (0.2, 0.5, 0.0, 0.0, 0.0)
 """`scatter_bank`: standard deviation of the bins of each rough model about its base, m."""
-PAPER_SIGMAS = {'height_rw_ncs': (1.0, 1.0), 'height_two_rw': (0.01, 1.0)}
-DEFAULT_STAY, BANK_STAY, PAPER_STAY = 0.995, 0.998, 0.98
+DEFAULT_STAY, BANK_STAY = 0.995, 0.998
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 BANKS = ('height_bank', 'scatter_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
@@ -60,11 +59,6 @@ class BathymetryConfig(MountingParameters):
     # -- which models ----------------------------------------------------------------------------
     model_set: str = live('height_two_rw', '',
         'terrain models run side by side', choices=MODEL_SETS)
-    variant: str = live('corrected', '',
-        'formulas: corrected, or paper (as printed). Where nothing else is stated, paper takes '
-        'sigmas 1 m and 1/m of height_rw_ncs, 0.01 and 1 m of height_two_rw, stay_probability '
-        '0.98, and neither shadow_gate nor angle_drift',
-        choices=('corrected', 'paper'))
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
         'ncs; empty: values that suit most floors; height_bank takes any number of values, '
@@ -93,7 +87,7 @@ class BathymetryConfig(MountingParameters):
     stay_probability: float = live(0.0, '',
         'probability of keeping the model over a range bin, used without transition_matrix; 0: '
         '0.995, or 0.998 in height_bank and scatter_bank (of its smooth models, whose slopes '
-        'change besides), or 0.98 in variant paper', range=(0.0, 1.0))
+        'change besides)', range=(0.0, 1.0))
     initial_probabilities: tuple[float, ...] = live((), '',
         'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
         kind='float[]')
@@ -146,8 +140,7 @@ class BathymetryConfig(MountingParameters):
     layover: str = live('gated', '',
         'bins with echoes of two surfaces, as of a ledge, a box or a wall: gated (no soundings), '
         'resolved (the height of both, from four staves on; fewer are gated), or ignored (as if '
-        'of one), as always with multipath and in variant paper',
-        choices=LAYOVER)
+        'of one), as always with multipath', choices=LAYOVER)
     multipath: bool = live(False, '',
         'expect echoes by way of the surface, modelled as noise from their directions')
     sonar_depth: float = live(3.0, 'm',
@@ -336,16 +329,12 @@ class BathymetryConfig(MountingParameters):
     @property
     def stay_used(self) -> float:
         """Probability of keeping the model over a range bin."""
-        usual = BANK_STAY if self.in_bank else DEFAULT_STAY
-        return self.stay_probability or (PAPER_STAY if self.as_printed else usual)
+        return self.stay_probability or (BANK_STAY if self.in_bank else DEFAULT_STAY)
 
     @property
     def sigmas_used(self) -> tuple[float, ...]:
         """Noise of each model over a range bin, of the sets of heights."""
-        usual = DEFAULT_SIGMAS[self.model_set]
-        return self.sigmas or (
-            PAPER_SIGMAS.get(self.model_set, usual) if self.as_printed else usual
-        )
+        return self.sigmas or DEFAULT_SIGMAS[self.model_set]
 
     @property
     def scatters_used(self) -> tuple[float, ...]:
@@ -353,24 +342,10 @@ class BathymetryConfig(MountingParameters):
         return self.scatters or DEFAULT_SCATTERS
 
     @property
-    def gate_used(self) -> bool:
-        """Whether bins without an echo are passed over; the paper tracks through them."""
-        return self.shadow_gate and not self.as_printed
-
-    @property
     def layover_used(self) -> str:
         """``ignored``, ``gated`` or ``resolved``. An echo by way of the surface is a second
         surface in every bin, which says nothing of the floor."""
-        return 'ignored' if self.as_printed or self.multipath else self.layover
-
-    @property
-    def drift_used(self) -> bool:
-        """Whether angles are predicted at constant height; in the paper they are not."""
-        return self.angle_drift and not self.as_printed
-
-    @property
-    def as_printed(self) -> bool:
-        return self.variant == 'paper'
+        return 'ignored' if self.multipath else self.layover
 
     @property
     def in_bank(self) -> bool:

@@ -352,7 +352,7 @@ def _first_return(
 def _drifting(geometry: Geometry, echo: BoolArray, config: BathymetryConfig) -> Geometry:
     """With `angle_drift` angles go on at constant height after the first bin with an echo, for
     which the start is stated."""
-    if geometry.of_heights or not config.drift_used or not echo.any():
+    if geometry.of_heights or not config.angle_drift or not echo.any():
         return geometry
     return geometry._replace(drift_from=int(np.argmax(echo)) + 1)
 
@@ -390,7 +390,7 @@ def _in_white_noise(
         signal=signal,
         noise=noise,
         log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
-        coherence=coherence.coherence(iq, abs(spacing))[0] if config.gate_used else np.ones(T),
+        coherence=coherence.coherence(iq, abs(spacing))[0] if config.shadow_gate else np.ones(T),
         loudness=above_noise,
     )
 
@@ -437,7 +437,7 @@ def _echoes(
     """Bins (T,) with an echo. Many staves tell it by coherence, and by power where a whole stretch
     cannot be noise; few staves by power alone, where the noise is `known` (T,), since noise is
     coherent at two of them too often."""
-    if not config.gate_used:
+    if not config.shadow_gate:
         return np.array(usable)
     false_alarm = config.gate_false_alarm
     silent = coherence.silent_bins(

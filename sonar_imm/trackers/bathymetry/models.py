@@ -32,10 +32,9 @@ height_rw_ncs
 angle_two_rw
     The angle theta is a random walk, the second one growing linearly along the swath.
 
-variant `paper` uses the formulas as printed: F_NCS has dS^2/2 where the slope should persist (it
-forgets the slope at once and is a random walk in disguise), and b is zeroed, not drawn anew.
-
-Source: Saucan, Chonavel, Sintes, Le Caillec, OCEANS 2013, equations 7 to 12; see docs.
+Source: Saucan, Chonavel, Sintes, Le Caillec, OCEANS 2013, equations 7 to 12. Two formulas differ
+from the paper: its F_NCS has dS^2/2 in place of the 1 that keeps the slope, and its `rw` sets b to
+zero; see docs.
 """
 
 from __future__ import annotations
@@ -237,11 +236,10 @@ def _growth(config: BathymetryConfig, ranges: FloatArray) -> float:
 def _slope_motions(config: BathymetryConfig, ranges: FloatArray) -> tuple[FloatArray, FloatArray]:
     """F (2, 2, 2) and G (2, 2, 2) of `rw` and `ncs`, noises included."""
     rough, bend = _growth(config, ranges) * np.array(config.sigmas_used)
-    width, paper = _bin_width(ranges), config.as_printed
-    keep = 0.5 * width**2 if paper else 1.0
-    F = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, width], [0.0, keep]]])
+    width = _bin_width(ranges)
+    F = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, width], [0.0, 1.0]]])
     G = np.zeros((2, 2, 2))
-    G[0] = np.diag([rough, 0.0 if paper else config.redrawn_slope_std])
+    G[0] = np.diag([rough, config.redrawn_slope_std])
     G[1, :, 0] = bend * 0.5 * width**2, bend * width
     return F, G
 

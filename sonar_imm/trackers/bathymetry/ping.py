@@ -191,13 +191,7 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
         track = run_grid(models, likelihood, cells, smooth=config.smoothing_used == 'states')
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
-        track = run_particles(
-            models,
-            likelihood,
-            config.particles_per_model,
-            entropy,
-            resample=config.as_printed,
-        )
+        track = run_particles(models, likelihood, config.particles_per_model, entropy)
     if config.smoothing_used == 'modes':
         smoothed = smooth_modes(track.probability, models.transition, likelihood.echo)
         track = track._replace(probability=smoothed)
@@ -218,7 +212,8 @@ def run_particles(
 
     entropy: integers that name this ping; the same ones give the same bits, whatever other pings
     there were. resample: resample each model after the update, as the paper's effective sample
-    size of always one demands. watch: called with each bin and its particles, for pictures.
+    size of always one demands; benchmarks/bathymetry_paper.py uses it. watch: called with each
+    bin and its particles, for pictures.
     """
     seeds = np.random.SeedSequence(entropy).spawn(3)
     start, draws, noises = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)

@@ -20,13 +20,11 @@ from attrs import evolve, frozen
 
 from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
-from ...estimation.set_model import PRIORS
 from ...parameters import inherited, live, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
 
 PULSES = ('auto', 'band', 'processor', 'envelope', 'gaussian', 'file')
-PROPOSALS = ('data', 'prior')
 POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
 HEAVES = ('none', 'independent', 'memory')
@@ -190,24 +188,17 @@ class FathometerConfig(StampParameters):
         'with pulse processor, else positive', choices=POLARITIES)
     negative_probability: float = parameter(0.05, '',
         'polarity both: probability that a new reflector is negative', range=(1e-6, 0.999))
-    amplitude_prior: str = parameter('marginal', '',
-        'treatment of amplitudes: marginal (integrated out), or the best ones with a penalty of '
-        'log(N)/2 (bic_half) or log(N) (paper) for each', choices=PRIORS)
     amplitude_std_sigmas: float = parameter(7.5, '',
-        'amplitude_prior marginal: standard deviation of amplitudes, in units of the noise; a '
-        'third of it with processor conventional, whose echoes stand out by a third, unless '
-        'amplitudes have a memory',
+        'standard deviation of amplitudes, in units of the noise; a third of it with processor '
+        'conventional, whose echoes stand out by a third, unless amplitudes have a memory',
         range=(0.01, 1e6))
     amplitude_memory: float = parameter(0.0, '',
-        'amplitude_prior marginal: share of its amplitude that a reflector keeps from record to '
-        'record; 0: none', range=(0.0, 0.9999))
+        'share of its amplitude that a reflector keeps from record to record; 0: none',
+        range=(0.0, 0.9999))
 
     # -- computation ------------------------------------------------------------------------------
     particles: int = parameter(20_000, '',
         'number of particles, each a set of reflectors', range=(2, 10_000_000))
-    proposal: str = parameter('data', '',
-        'where particles are proposed: data (where the record has peaks) or prior (blindly, the '
-        'bootstrap filter)', choices=PROPOSALS)
     threads: int = parameter(1, '',
         'number of processor cores used; the result does not depend on it', range=(1, 256))
     seed: int = parameter(0, '', 'seed of the random number generator', range=(0, 2**63 - 1))
@@ -257,8 +248,6 @@ class FathometerConfig(StampParameters):
             problems.append('output printed needs processor conventional or mvdr')
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
-        if self.amplitude_memory and self.amplitude_prior != 'marginal':
-            problems.append('amplitude_memory needs amplitude_prior marginal')
         if self.scatter_decay:
             problems += self._scatter_problems()
         if self.preview_seconds > self.record_seconds:

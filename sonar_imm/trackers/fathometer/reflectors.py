@@ -287,7 +287,7 @@ def reflectors_of(
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
-    covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse, config)
+    covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse)
     scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
     covariance *= scale[:, :, None] * scale[:, None, :]
     # The particles know depths as they follow from the depth stated with this record: it alone
@@ -311,12 +311,11 @@ def reflectors_of(
 
 
 def _conditional_variance(
-    depth: FloatArray, prior_variance: FloatArray, pulse: Pulse, config: FathometerConfig
+    depth: FloatArray, prior_variance: FloatArray, pulse: Pulse
 ) -> FloatArray:
     """Variance (K,) of amplitudes in units of the noise, given all places; prior_variance (K,):
     before the record."""
-    ridge = 1.0 / prior_variance if config.amplitude_prior == 'marginal' else 1e-9
-    precision = gram(pulse, depth) + ridge * np.eye(len(depth))
+    precision = gram(pulse, depth) + np.diag(1.0 / prior_variance)
     return np.diag(np.linalg.pinv(precision, hermitian=True)).clip(min=0.0)
 
 

@@ -344,13 +344,38 @@ class FathometerTracker:
     def _begin(self, lattice: Lattice) -> None:
         settled = self.config.settled(lattice.hydrophones)
         try:
-            self._filter = SetFilter(
-                set_model(settled, lattice), self.config.particles, self.config.threads
-            )
+            model = self._set_model(lattice)
+            self._filter = SetFilter(model, self.config.particles, self.config.threads)
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
         self._lattice, self._settled = lattice, settled
         self._padded = lattice.padded(self._filter.model.pad)
+
+    def _set_model(self, lattice: Lattice) -> SetModel:
+        """Return what the particle filter assumes. A subclass can change it, as the printed form
+        in benchmarks/fathometer_paper.py does. Raises ValueError when the most reflectors do not
+        fit."""
+        config = self.config.settled(lattice.hydrophones)
+        pulse, step = pulse_of(config), lattice.step
+        transition = banded_transition(config.orders, config.order_switch_probability)
+        if config.order_transition_matrix:
+            square = config.orders, config.orders
+            transition = np.reshape(config.order_transition_matrix, square)
+        return SetModel(
+            cells=lattice.cells,
+            separation=max(1, math.ceil(config.min_separation / step - 1e-6)),
+            order_min=config.order_min,
+            transition=transition,
+            walk=gaussian_walk(config.depth_std / step),
+            gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells, dtype=np.float64))),
+            amplitude_std=config.amplitude_std,
+            independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
+            amplitude_memory=config.amplitude_memory,
+            negative_probability=config.negative_share,
+            shift=heave_shift(config, step),
+            scatter=scatter_of(config, lattice),
+            start=independent_orders(config.order_min, config.orders),
+        )
 
     def _filtered(self, response: Response) -> tuple[Response, SetStep, int, Pace]:
         """What this record would change, how many records' time passed, and the pace with it.
@@ -559,29 +584,3 @@ class Fit:
                 'an array with pulse processor'
             )
         return sentences
-
-
-def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
-    """What the particle filter assumes. Raises ValueError when the most reflectors do not fit."""
-    pulse, step = pulse_of(config), lattice.step
-    transition = banded_transition(config.orders, config.order_switch_probability)
-    if config.order_transition_matrix:
-        transition = np.reshape(config.order_transition_matrix, (config.orders, config.orders))
-    blind = config.proposal == 'prior'
-    return SetModel(
-        cells=lattice.cells,
-        separation=max(1, math.ceil(config.min_separation / step - 1e-6)),
-        order_min=config.order_min,
-        transition=transition,
-        walk=gaussian_walk(config.depth_std / step),
-        gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells, dtype=np.float64))),
-        amplitude_prior=config.amplitude_prior,
-        amplitude_std=config.amplitude_std,
-        independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
-        amplitude_memory=config.amplitude_memory,
-        negative_probability=config.negative_share,
-        shift=heave_shift(config, step),
-        scatter=scatter_of(config, lattice),
-        start=independent_orders(config.order_min, config.orders),
-        **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
-    )

@@ -132,16 +132,6 @@ class ObstacleConfig(
         'full width of the sector that the sonar sees', range=(1.0, 170.0))
     vertical_fov_deg: float = parameter(15.0, 'deg',
         'full height of the beam of the sonar', range=(0.5, 90.0))
-    vertical_beam_width_deg: float = parameter(0.0, 'deg',
-        'gaussian_sum: height of the beam (-3 dB, one way) by which the intensity of detections '
-        'shows the elevation, where the sonar tilts by degrees and the height is known to a '
-        'tenth; 0: intensity is not used', range=(0.0, 90.0))
-    fading_db: float = live(6.4, 'dB',
-        'vertical_beam_width_deg: standard deviation of the level of echoes, which fade from ping '
-        'to ping', range=(0.1, 40.0))
-    intensity_weight: float = live(0.5, '',
-        'vertical_beam_width_deg: power to which the likelihood of an intensity is raised, '
-        'because fading lasts', range=(0.0, 1.0))
     gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.05,
         description='number of false detections expected in a ping, per metre of range and '
@@ -233,8 +223,6 @@ class ObstacleConfig(
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
         ]
-        if self.vertical_beam_width_deg and self.method != 'gaussian_sum':
-            problems.append('vertical_beam_width_deg needs the method gaussian_sum')
         for name in self.own_behaviours():
             obstacle_behaviour(name, self)
         if set(self.behaviours) <= {'seabed'}:

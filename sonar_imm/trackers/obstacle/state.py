@@ -30,24 +30,21 @@ from ..navigation import NavigationBuffer
 from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .ground import GroundMap
-from .intensity import Strengths
 from .looks import Looks
 from .memory import Existence, Memory
 
 
 class PingState(NamedTuple):
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
-    alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them; bodies: how far their echoes wander; looks: pings that did not
-    show them, and what that says; existence: how sure it is that they are there; memory: those
-    that are not in view any more."""
+    alike: whether most obstacles move alike (`behaviours.moving_alike`); bodies: how far their
+    echoes wander; looks: pings that did not show them, and what that says; existence: how sure it
+    is that they are there; memory: those that are not in view any more."""
 
     stamp_ns: int
     sonar: Sonar
     life: Tracks
     mixture: Mixture
     nis: FloatArray
-    strengths: Strengths
     bodies: Bodies
     looks: Looks
     existence: Existence
@@ -62,7 +59,6 @@ class PingState(NamedTuple):
         return self._replace(
             mixture=self.mixture.rows(kept),
             nis=self.nis[kept],
-            strengths=self.strengths.rows(kept),
             bodies=self.bodies.rows(kept),
             looks=self.looks.rows(kept),
             existence=self.existence.rows(kept),

@@ -54,7 +54,6 @@ from .config import ObstacleConfig
 from .elevation import Elevations, fits, outliers, updated
 from .filters import Hints, Mixture, Sonar
 from .ground import GroundMap
-from .intensity import by_intensity, level_db, Strengths
 from .looks import Looks
 from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
 from .navigation import Mount
@@ -277,19 +276,12 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar, ground: GroundMap
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, intensity, extended, up, var_up = self._detections(ping)
+        z, R, extended, up, var_up = self._detections(ping)
         seen = Elevations.of(up, var_up, self.config)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         now = self._recall(now)
         chosen, expected, fit = self._associate(now, z, R, seen)
         now = self._update(now, chosen, expected, z, R, extended, seen)
-        if self.config.vertical_beam_width_deg and before:
-            dt = (now.stamp_ns - before.stamp_ns) * 1e-9
-            level = np.append(level_db(intensity), np.nan)[chosen]
-            mu, strengths = by_intensity(
-                *now.mixture, now.strengths, now.sonar.pose, level, dt, self.config
-            )
-            now = now._replace(mixture=now.mixture._replace(mu=mu), strengths=strengths)
         hit = chosen >= 0
         if self.config.misses == 'evidence' and before:
             looks = now.looks.after(hit, now.mixture, self.filter, sonar, before.sonar)
@@ -319,14 +311,14 @@ class ObstacleTracker:
         return (now.only(is_finite) if broken else now), broken
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
-        """z (D, 2), R (D, 2, 2), intensity (D,), whether an extent is stated (D,), elevation and
-        its variance (D,), of the rows that are echoes, azimuth positive to starboard. A row that
-        is as uncertain as it is far says nothing and is left out."""
+        """z (D, 2), R (D, 2, 2), whether an extent is stated (D,), elevation and its variance
+        (D,), of the rows that are echoes, azimuth positive to starboard. A row that is as
+        uncertain as it is far says nothing and is left out."""
         *echoes, real = ping_kernels.echoes(
             ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
         )
         extended = np.isfinite(ping.extent_range)
-        columns = *echoes, ping.intensity, extended, ping.elevation, ping.var_elevation
+        columns = *echoes, extended, ping.elevation, ping.var_elevation
         if np.count_nonzero(real) == len(real):
             return columns
         return tuple(column[real] for column in columns)
@@ -534,7 +526,6 @@ class ObstacleTracker:
             life=life,
             mixture=now.mixture.joined(fresh),
             nis=np.append(now.nis, np.full(B, np.nan)),
-            strengths=now.strengths.joined(Strengths.unknown(B, self.filter.K)),
             bodies=now.bodies.joined(bodies),
             looks=now.looks.joined(Looks.first(fresh, silent)),
             existence=now.existence.joined(Existence.of(np.full(B, log_odds))),
@@ -550,7 +541,6 @@ class ObstacleTracker:
             life=life,
             mixture=nothing,
             nis=np.empty(0),
-            strengths=Strengths.unknown(0, K),
             bodies=Bodies.unknown(0),
             looks=Looks.first(nothing),
             existence=Existence.of(np.empty(0)),

@@ -67,9 +67,8 @@ def tunables(config: FathometerConfig, measurements: Sequence[Any]) -> list[Tuna
     if traces and all(trace.sigma is None for trace in traces):
         start = config.noise_sigma or _measured(config, traces)
         found.insert(0, Tunable(name='noise_sigma', start=start, step=STEP))
-    if config.amplitude_prior == 'marginal':
-        start = config.amplitude_std_sigmas
-        found.append(Tunable(name='amplitude_std_sigmas', start=start, step=STEP, usual=False))
+    start = config.amplitude_std_sigmas
+    found.append(Tunable(name='amplitude_std_sigmas', start=start, step=STEP, usual=False))
     if config.pulse == 'gaussian':
         start = config.pulse_width
         found.append(Tunable(name='pulse_width', start=start, step=STEP, usual=False))

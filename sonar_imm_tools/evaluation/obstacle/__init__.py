@@ -15,13 +15,13 @@
 """How runs of the obstacle tracker are judged: heights and 90 % bands against the truth.
 
 `series` lays estimates end to end and says which track is which obstacle. `scoring` says how
-large the errors are and whether what is stated holds, `deferred` what the paper's deferred
-estimate would have been. `METRICS`, `summary_sentence` and `figures` present it.
+large the errors are and whether what is stated holds. `METRICS`, `summary_sentence` and `figures`
+present it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import functools
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -32,9 +32,8 @@ from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from ..numbers import chi2, counted, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
-from .deferred import deferred_estimates
-from .scoring import motion_metrics, NEAR, score
-from .series import Matching, series_of, TruePath, truth_of
+from .scoring import motion_metrics, NEAR, score, tether_length
+from .series import series_of, truth_of
 
 if TYPE_CHECKING:
     from ..report import Section
@@ -64,9 +63,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     if found is not None:
         metrics |= motion_metrics(found, truth, config)
     received = list(read_measurements(run))
-    deferred = deferred_estimates(series, received, config, _met_first(found, truth), options.gap)
-    if deferred is not None:
-        metrics['deferred'] = deferred.as_dict()
+    metrics |= tether_length(series, received, config)
 
     def sections() -> Iterable[Section]:
         # plotly, which only a report needs, takes a second to load.
@@ -74,7 +71,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
 
         origin = Origin(**run['origin']) if run.get('origin') else None
         yield from map_section(series, received, origin)
-        yield from sections(metrics, series, truth, found, deferred, received, options.gap)
+        yield from sections(metrics, series, truth, found, received, options.gap)
 
     return Judgement(
         run=run,
@@ -85,14 +82,6 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
-
-
-def _met_first(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:
-    """The obstacle that each track was matched with first, by track id."""
-    if found is None:
-        return {}
-    pairs = zip(found.series.track_id[found.row].tolist(), found.target.tolist())
-    return {track_id: truth[target] for track_id, target in reversed(list(pairs))}
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
@@ -175,11 +164,9 @@ METRICS = (
         remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping',
     ),
     Metric(
-        label='vertical offset: online / RMSD / of both sides / refitted',
-        line='{deferred.online_m:+.2f} / {deferred.rmsd_m:+.2f} / '
-        '{deferred.rmsd_both_sides_m:+.2f} / {deferred.refit_m:+.2f} m',
+        label='above the sea floor (tether, if moored)',
+        line='{tether_m:.2f} m, standard deviation {tether_std_m:.2f} m',
     ),
-    Metric(label='vertical offset, truth', line='{deferred.truth_m:+.2f} m'),
     *each(
         'tracks',
         ('true_obstacles', 'found_obstacles', 'tracks', 'false_tracks', 'identity_switches'),

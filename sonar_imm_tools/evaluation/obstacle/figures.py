@@ -44,8 +44,6 @@ from ..plotting import (
     view_of,
 )
 from ..report import Section
-from .deferred import DeferredEstimates
-from .rmsd import Deferred
 from .series import level, Matching, Series, TruePath
 
 NEARING = {'title': 'range [m]', 'autorange': 'reversed', 'zeroline': False}
@@ -57,7 +55,6 @@ def sections(
     series: Series,
     truth: Sequence[TruePath],
     found: Matching | None,
-    deferred: DeferredEstimates | None,
     received: Sequence[Any],
     gap: float,
 ) -> Iterator[Section]:
@@ -81,14 +78,6 @@ def sections(
         'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
         image_figure(series, pings, truth),
     )
-    if deferred is not None:
-        yield Section(
-            f'Deferred estimate: RMSD of track {deferred.track_id}',
-            'The paper estimates the offset afterwards, from all echoes of the track. The curve '
-            'shows how badly each assumed offset explains them. Diamonds: least RMSD. The paper '
-            'looks below the sonar alone; a single such number is worth some 4 m.',
-            rmsd_figure(deferred),
-        )
     if found is not None and len(found.row):
         yield Section(
             'Error, and the predicted error',
@@ -208,54 +197,6 @@ def image_figure(
         add_line(figure, -flat[:, 1], flat[:, 0], name, colour)
     y = {'title': 'ahead [m]', 'scaleanchor': 'x', 'scaleratio': 1, 'rangemode': 'tozero'}
     return styled(figure, 620, {'title': 'to starboard [m]'}, y)
-
-
-def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
-    """RMSD against the assumed offset, as in the paper's Figure 5."""
-    figure = go.Figure()
-    for curve, name, colour in (
-        (deferred.both, 'RMSD, both sides', COLOURS[1]),
-        (deferred.plain, 'RMSD, as the paper', COLOURS[0]),
-        (deferred.refit, 'first echo and scale refitted', COLOURS[2]),
-    ):
-        _add_curve(figure, curve, name, colour, deferred.altitude)
-    low, high = deferred.band
-    name = '90 % band, online'
-    look = {'fillcolor': AMBER, 'opacity': 0.25, 'line_width': 0}
-    figure.add_vrect(x0=low, x1=high, annotation_text=name, **look)
-    for value, name, dash, side in (
-        (deferred.online, 'online', 'dash', 'right'),
-        (deferred.truth, 'truth', 'dot', 'left'),
-        (deferred.altitude, 'sea floor', 'dashdot', 'right'),
-    ):
-        if np.isfinite(value):
-            figure.add_vline(
-                x=value,
-                line={'color': INK, 'width': 1.5, 'dash': dash},
-                annotation_text=name,
-                annotation_position=f'bottom {side}',
-            )
-    x = {'title': 'vertical offset at the first echo, below the sonar [m]'}
-    return styled(figure, 440, x, {'title': 'RMSD [pixels of range and bearing]', 'type': 'log'})
-
-
-def _add_curve(
-    figure: go.Figure, curve: Deferred, name: str, colour: str, altitude: float
-) -> None:
-    hover: dict[str, Any] = {
-        'customdata': altitude - curve.offset,
-        'hovertemplate': '%{x:.2f} m below, %{customdata:.2f} m above the floor: %{y:.2f}',
-    }
-    add_line(figure, curve.offset, curve.rmsd, name, colour, **hover)
-    if np.isfinite(curve.best):
-        figure.add_scatter(
-            x=[curve.best],
-            y=[curve.least],
-            mode='markers',
-            showlegend=False,
-            marker={'color': colour, 'size': 10, 'symbol': 'diamond'},
-            hovertemplate='least: %{x:.2f} m',
-        )
 
 
 def above_figure(series: Series) -> go.Figure:

@@ -21,6 +21,8 @@ above                             calibration of the stated probability of being
 gospa                             several obstacles: distance, missed and false per ping
 tracks                            how many, found and false, and identity switches: an obstacle
                                   is taken over by another track
+tether_m, tether_std_m            how far above the sea floor the obstacle is whose track has most
+                                  echoes: the length of its tether, if it is moored; needs altitude
 
 `motion_metrics` adds whether obstacles move as stated, and whether stated collisions happen.
 
@@ -45,6 +47,7 @@ from numpy.typing import NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import identity_switches, interval_coverage
+from sonar_imm.measurements import Altitude, Measurement
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
 from ... import SECOND
@@ -152,6 +155,27 @@ def gospa_summary(found: Matching, cutoff: float) -> dict[str, float]:
         'missed_per_ping': float(missed / half),
         'false_per_ping': float(false / half),
     }
+
+
+def tether_length(
+    series: Series, received: Sequence[Measurement], config: ObstacleConfig
+) -> dict[str, float]:
+    """``tether_m`` and ``tether_std_m``: the altitude of the sonar at the first echo of the track
+    with most echoes, less the offset then, as its last echo shows it. Empty without a track, or
+    without an altitude within `max_altitude_age` of the first echo."""
+    track = series.pick((series.track_id == series.longest_track()) & np.isfinite(series.nis))
+    heights = [item for item in received if isinstance(item, Altitude)]
+    if not (len(track) and heights):
+        return {}
+    first = int(track.stamp_ns[0])
+    nearest = min(heights, key=lambda item: abs(item.stamp_ns - first))
+    if abs(nearest.stamp_ns - first) > config.max_altitude_age * SECOND:
+        return {}
+    # The sonar may dive meanwhile: the obstacle lies where the last echo has it.
+    offset = track.height[0] + track.state[0, 2] - track.height[-1]
+    length = nearest.altitude + config.sonar_lever[2] - offset
+    std = np.hypot(np.sqrt(track.covariance[-1, 2, 2]), config.altitude_std)
+    return {'tether_m': float(length), 'tether_std_m': float(std)}
 
 
 def motion_metrics(

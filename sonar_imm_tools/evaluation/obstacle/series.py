@@ -47,16 +47,17 @@ _DOES = tuple(f'prob_{name}?' for name in BEHAVIOURS)
 
 @frozen(eq=False, kw_only=True)
 class Series(Rows):
-    """Rows of confirmed tracks; state: in the order of `STATES`; place: metres
-    east and north; low, high: the 90 % band of the
-    offset; above: its probability; nis: NaN without a hit; velocity: m/s; does: the probability of
-    each of `BEHAVIOURS`; risk: the probability of a collision. The last four are NaN where a run
-    does not state them."""
+    """Rows of confirmed tracks; state: in the order of `STATES`; place: metres east and north;
+    height: metres up; low, high: the 90 % band of the offset; above: its probability; nis: NaN
+    without a hit; velocity: m/s; does: the probability of each of `BEHAVIOURS`; risk: the
+    probability of a collision. height and the last four are NaN where a run does not state
+    them."""
 
     track_id: IntArray = column('track_id', dtype=np.int64)
     track_state: IntArray = column('track_state', dtype=np.int64)
     state: FloatArray = column(*STATES)
     place: FloatArray = column('x', 'y')
+    height: FloatArray = column('pz?')
     covariance: FloatArray = covariance_of(*STATES)
     low: FloatArray = column('vertical_offset_lo')
     high: FloatArray = column('vertical_offset_hi')

@@ -30,7 +30,6 @@ SEG-Y leaves unassigned,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import csv
 from datetime import datetime, timezone
 import json
 from pathlib import Path
@@ -44,6 +43,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..convert.segy import read_segy
+from ..csv_writer import CsvWriter
 from ..positions import Positions
 from ..sources import BagError
 from .points import wkt_of
@@ -136,15 +136,15 @@ def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> Non
     """The CSV. line: its name; epsg: of the columns x and y, which are empty without it."""
     x, y = _projected(picks, epsg)
     with path.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(
+        writer = CsvWriter(file)
+        writer.write(
             (
                 *('horizon', 'line', 'trace', 'x', 'y', 'longitude', 'latitude', 'twt_ms'),
                 *('depth_m', 'depth_std_m', *_COPIED, 'time_utc', 'distance_m'),
             )
         )
         for k in range(len(picks)):
-            writer.writerow(
+            writer.write(
                 (
                     int(picks.horizon[k]),
                     line,

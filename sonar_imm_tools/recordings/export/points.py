@@ -32,6 +32,7 @@ from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import COLUMNS, LATER
 
+from ..csv_writer import CsvWriter
 from ..reader import BagReader
 from ..sources import BagError, is_recording
 
@@ -171,9 +172,9 @@ def write_table(path: Path, points: Points) -> None:
     names = list(COLUMNS)
     values = [points[exact.get(name, name)].astype(COLUMNS[name]).tolist() for name in names]
     with path.open('w', encoding='utf-8', newline='') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(['stamp_ns', *names])
-        writer.writerows(zip(points.stamp_ns.tolist(), *values))
+        writer = CsvWriter(file)
+        writer.write(['stamp_ns', *names])
+        writer.write_numbers(zip(points.stamp_ns.tolist(), *values))
 
 
 def write_xyz(path: Path, points: Points) -> None:

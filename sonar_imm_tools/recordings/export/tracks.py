@@ -21,7 +21,6 @@ position has one standard deviation on its axes; times 2.45 it holds 95 %.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-import csv
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -32,7 +31,9 @@ from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.texts import visible
 
+from ..csv_writer import CsvWriter
 from ..sources import BagError
 from .horizons import feature, utc_text, write_features
 from .points import degrees_of
@@ -184,10 +185,10 @@ def write_tracks(path: Path, tracks: Tracks, kind: str, name: str) -> int:
 
 def _write_csv(path: Path, tracks: Tracks) -> None:
     with path.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(tracks.columns)
+        writer = CsvWriter(file)
+        writer.write(tracks.columns)
         for k in range(len(tracks)):
-            writer.writerow('' if value is None else value for value in tracks.row(k).values())
+            writer.write('' if value is None else value for value in tracks.row(k).values())
 
 
 def _write_parquet(path: Path, tracks: Tracks) -> None:
@@ -286,6 +287,8 @@ def _write_kml(path: Path, tracks: Tracks, name: str) -> None:
 
 
 def _write_xml(path: Path, root: ElementTree.Element) -> None:
+    for element in root.iter():
+        element.text = visible(element.text or '')  # XML has no place for control characters
     ElementTree.indent(root, ' ')
     ElementTree.ElementTree(root).write(path, encoding='utf-8', xml_declaration=True)
 

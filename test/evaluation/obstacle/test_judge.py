@@ -22,14 +22,13 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.estimates import Estimate, places
+from sonar_imm.measurements import Altitude, Detections
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
-from sonar_imm_tools.evaluation.obstacle.deferred import deferred_estimates
 from sonar_imm_tools.evaluation.obstacle.figures import error_figure, image_figure
-from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
 
@@ -243,61 +242,38 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
     metrics = verdict.metrics
     assert metrics['tracks']['found_obstacles'] == 2 and metrics['tracks']['false_tracks'] == 0
     assert metrics['range']['rmse_m'] < 0.2 and metrics['bearing']['rmse_deg'] < 0.3
-    back = metrics['deferred']
-    assert abs(back['refit_error_m']) < 2.0 and back['echoes'] > 50
-    assert abs(back['online_error_m']) < 2.0
-    off = min(abs(back['tether_m'] - length) for length in (15.0, 12.0))
-    assert off < 2.0 * back['tether_std_m'] < 3.0
+    off = min(abs(metrics['tether_m'] - length) for length in (15.0, 12.0))
+    assert off < 2.0 * metrics['tether_std_m'] < 3.0
     assert verdict.accuracy(None).good and not verdict.accuracy(0.01).good
     assert 'obstacles were found' in verdict.summary
     titles = [section.title for section in verdict.part([]).sections]
     assert {'Height over range', 'Image of the sonar', 'Above or below'} <= set(titles)
-    assert any(title.startswith('Deferred estimate: RMSD') for title in titles)
     assert main(['evaluate', str(run), '--report', str(tmp_path / 'report.html')]) == 0
-    assert 'Diamonds: least RMSD' in (tmp_path / 'report.html').read_text()
+    assert 'Dotted: truth, while the beam' in (tmp_path / 'report.html').read_text()
 
 
-def test_online_and_deferred_estimates_hold_at_the_first_echo_of_a_vehicle_that_dives():
+def test_the_length_of_a_tether_is_that_at_the_first_echo_of_a_vehicle_that_dives():
     """An obstacle 8 m below the sonar at first, which sinks towards it by 0.2 m each second."""
-    received, estimates = [], []
+    estimates = []
     for k in range(20):
         below, ahead = 8.0 - 0.2 * k, 60.0 - 2.0 * k
-        slant = np.hypot(ahead, below)
-        row = [4, 1, slant, 0.0, below, 1.0, below - 1.0, below + 2.0, 0.1]
-        estimates.append(estimate(k + 1, [row]))
-        pose = {'position': [2.0 * k, 0.0, -10.0 - 0.2 * k], 'orientation': [0.0, 0.0, 0.0, 1.0]}
-        received.append(Navigation(stamp_ns=(k + 1) * SECOND, **pose))
-        echo = {'range': [slant], 'bearing': [0.0], 'var_range': [0.01], 'var_bearing': [1e-4]}
-        received.append(Detections(stamp_ns=(k + 1) * SECOND, **echo))
-    found = deferred_estimates(series_of(estimates), received, ObstacleConfig(), {}, 60.0)
-    assert found.echoes == 20 and found.plain.best == pytest.approx(8.0, abs=0.3)
-    assert (found.online, *found.band) == pytest.approx((8.0, 7.0, 10.0))
-    assert np.isnan(found.as_dict()['tether_m'])
-    known = found.as_dict() | evolve(found, truth=7.5).as_dict()
-    for name in ('rmsd', 'rmsd_both_sides', 'refit', 'online'):
-        assert known[f'{name}_error_m'] == pytest.approx(known[f'{name}_m'] - 7.5)
-    received.append(Altitude(stamp_ns=SECOND, altitude=20.0))
+        row = [4, 1, np.hypot(ahead, below), 0.0, below, 1.0 + k, below - 1.0, below + 2.0, 0.1]
+        other = [5, 1, 30.0, 0.4, 1.0, 1.0, 0.0, 2.0, 0.1]
+        rows = [row, other] if k < 5 else [row]
+        at = np.array([[0.0, 0.0, -18.0], [0.0, 0.0, -11.0]])[: len(rows)]
+        table = estimate(k + 1, rows)
+        estimates.append(evolve(table, extras={**table.extras, **places(at)}))
+    series = series_of(estimates)
     config = ObstacleConfig(sonar_lever=(0.0, 0.0, -0.5), altitude_std=0.3)
-    found = deferred_estimates(series_of(estimates), received, config, {}, 60.0)
-    assert found.as_dict()['tether_m'] == pytest.approx(19.5 - 8.0)
-    std = np.sqrt(estimates[-1].covariance[0, 2, 2])
-    assert found.as_dict()['tether_std_m'] == pytest.approx(np.hypot(std, 0.3))
-
-
-def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
-    run = tracked(
-        tmp_path,
-        'approach',
-        ideal_navigation='true',
-        sound_speed_error='0',
-        range_std='0.001',
-        bearing_std_deg='0.001',
-        range_step='0',
-        bearing_step_deg='0',
-    )
-    back = judge(RunFolder(run)).metrics['deferred']
-    assert back['truth_m'] == pytest.approx(3.0, abs=0.2)
-    assert abs(back['rmsd_error_m']) < 0.1 and abs(back['refit_error_m']) < 0.1
+    heights = [Altitude(stamp_ns=k * SECOND, altitude=20.0 + k - 1) for k in (9, 1, 3)]
+    found = tether_length(series, heights, config)
+    assert found['tether_m'] == pytest.approx(19.5 - 8.0)
+    # As sure as the last echo made it.
+    assert found['tether_std_m'] == pytest.approx(np.hypot(20.0, 0.3))
+    late = [Altitude(stamp_ns=k * SECOND, altitude=20.0) for k in (7, 8)]
+    assert tether_length(series, late, config) == {}
+    assert tether_length(series, [], config) == {}
+    assert tether_length(series.pick(np.zeros(len(series), bool)), heights, config) == {}
 
 
 def test_without_truth_and_bag_there_is_still_a_page(run, tmp_path):

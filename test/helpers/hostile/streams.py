@@ -96,7 +96,6 @@ VARIANTS = {
         {'max_tracks': 6, 'history': 1.0},
         {
             'ping_timing': 'two_way',
-            'vertical_beam_width_deg': 15.0,
             'max_tracks': 4,
             'history': 1.0,
         },

@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.bathymetry_scenes import truth_of
+from benchmarks.bathymetry_paper import truth_of
 from sonar_imm.acoustics import sounding
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of

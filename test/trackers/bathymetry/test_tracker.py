@@ -88,9 +88,8 @@ def test_columns_are_those_of_the_contract(model_set, columns):
 
 
 @pytest.mark.parametrize('model_set', MODEL_SETS)
-@pytest.mark.parametrize('variant', ['corrected', 'paper'])
-def test_every_set_finds_a_flat_floor(model_set, variant):
-    estimate = run(floor(0.4), model_set=model_set, variant=variant)
+def test_every_set_finds_a_flat_floor(model_set):
+    estimate = run(floor(0.4), model_set=model_set)
     assert rmse(estimate, 0.4) < 0.15
 
 
@@ -175,31 +174,14 @@ def test_the_scale_of_the_samples_does_not_matter(scale):
     assert other.state == pytest.approx(quiet.state, abs=1e-5)
 
 
-# -- errata of the paper --------------------------------------------------------------------------
-
-
-def ncs_only(snapshot, variant):
-    return run(
-        snapshot,
+def test_the_slope_is_found_where_the_slope_model_holds():
+    ranges = 20.0 + 0.05 * np.arange(600)
+    estimate = run(
+        floor(-0.1 * (ranges - 20.0), ranges=ranges),
         model_set='height_rw_ncs',
-        variant=variant,
         transition_matrix=(1.0, 0.0, 0.0, 1.0),
         initial_probabilities=(0.0, 1.0),
     )
-
-
-def test_the_slope_model_as_printed_is_a_random_walk_in_disguise():
-    ranges = 17.0 + 0.05 * np.arange(800)
-    height = 0.1 * (ranges - ranges[0])
-    snapshot = floor(height, ranges=ranges)
-    corrected = rmse(ncs_only(snapshot, 'corrected'), height)
-    assert corrected < 0.25
-    assert rmse(ncs_only(snapshot, 'paper'), height) > 3.0 * corrected
-
-
-def test_the_slope_is_found_where_the_slope_model_holds():
-    ranges = 20.0 + 0.05 * np.arange(600)
-    estimate = ncs_only(floor(-0.1 * (ranges - 20.0), ranges=ranges), 'corrected')
     assert estimate.state[200:, 1].mean() == pytest.approx(-0.1, abs=0.03)
 
 
@@ -332,7 +314,6 @@ def test_sizes_may_change_from_ping_to_ping():
             'shadow_gate': st.booleans(),
             'multipath': st.booleans(),
             'likelihood': st.sampled_from(['laplace', 'gaussian']),
-            'variant': st.sampled_from(['corrected', 'paper']),
             'sonar_height': st.floats(0.1, 200.0),
         }
     ),

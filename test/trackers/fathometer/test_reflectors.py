@@ -173,7 +173,7 @@ def members(count):
 
 
 def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_them():
-    config = FathometerConfig(amplitude_prior='marginal', array_depth_std=0.5)
+    config = FathometerConfig(array_depth_std=0.5)
     lattice = Lattice(50.0, 0.1, 200)
     sigma = 2.0 + np.arange(200) / 100.0
     response = Response(1, 'array', lattice.depth, np.zeros(200), sigma)

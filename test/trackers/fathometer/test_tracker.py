@@ -164,15 +164,11 @@ def test_what_came_later_corrects_an_estimate(vectors):
 
 
 @pytest.mark.statistics
-def test_mistakes_of_print_cost_what_they_cost(vectors):
+def test_noise_that_is_stated_too_low_gives_wrong_numbers(vectors):
     records = range(0, 60)
-    right, distance = score(run(traces(vectors, records), particles=3000)[1], vectors)
-    low = score(run(traces(vectors, records, scale=0.7), particles=3000)[1], vectors)
-    assert low[0] < right - 0.5
-    blind = {'particles': 3000, 'proposal': 'prior'}
-    assert score(run(traces(vectors, records), **blind)[1], vectors)[1] > 5.0 * distance
-    fixed = {**blind, 'order_min': 7, 'order_max': 7}
-    assert score(run(traces(vectors, records), **fixed)[1], vectors)[1] > 0.5
+    right, _ = score(run(traces(vectors, records), particles=3000)[1], vectors)
+    low, _ = score(run(traces(vectors, records, scale=0.7), particles=3000)[1], vectors)
+    assert low < right - 0.5
 
 
 def test_noise_alone_has_no_reflector():
@@ -306,7 +302,6 @@ def test_a_warm_tracker_is_as_new():
         ({'pulse': 'file'}, 'pulse_file'),
         ({'frequency_min': 5000.0}, 'frequency_max'),
         ({'depth_min': 50.0}, 'depth_max'),
-        ({'amplitude_prior': 'paper', 'amplitude_memory': 0.5}, 'marginal'),
         ({'particles': 0}, 'particles'),
         ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
     ],
@@ -367,18 +362,15 @@ def test_a_fine_trace_is_tracked_where_reflectors_move_little():
     scale=st.floats(-30.0, 30.0),
     sigma=st.floats(-40.0, 30.0),
     seed=st.integers(0, 1000),
-    prior=st.sampled_from(['marginal', 'bic_half', 'paper']),
     separation=st.floats(1e-3, 3.0),
 )
-def test_states_are_finite_however_strange_the_numbers(scale, sigma, seed, prior, separation):
+def test_states_are_finite_however_strange_the_numbers(scale, sigma, seed, separation):
     rng = np.random.default_rng(seed)
     depth = np.linspace(20.0, 40.0, 200)
     amplitude = 10.0**scale * rng.standard_normal(200)
     amplitude[::17] *= 1e6
     amplitude[::23] = np.nan
-    tracker = FathometerTracker(
-        FathometerConfig(particles=50, amplitude_prior=prior, min_separation=separation)
-    )
+    tracker = FathometerTracker(FathometerConfig(particles=50, min_separation=separation))
     for stamp in (1, 2, 3):
         trace = Trace(
             stamp_ns=stamp,

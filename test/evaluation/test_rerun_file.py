@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_imm.estimates import Estimate
 
-NAME = 'sonar_imm_tools.viewing.rerun_file'
+NAME = 'sonar_imm_tools.evaluation.rerun_file'
 
 
 @pytest.fixture

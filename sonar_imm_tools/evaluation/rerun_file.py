@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A run as a file of the Rerun viewer, which draws what Foxglove cannot: every track with the
-ellipsoid of its covariance, and its states, their standard deviations and its models as curves.
+"""A results folder as a file of the Rerun viewer: every track with the ellipsoid of its
+covariance, and its states, their standard deviations and its models as curves.
 
 Needs the package ``rerun-sdk`` (extra ``[rerun]``), which is imported here only.
 """

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The deferred estimate of the paper on approaches computed elsewhere."""
+"""The estimates of the paper: on approaches computed elsewhere, and on whole recordings."""
 
 from pathlib import Path
 
@@ -20,12 +20,14 @@ from helpers.obstacle_runs import approach, lever, meta, rows
 import numpy as np
 import pytest
 
+from benchmarks import obstacle_paper
+from benchmarks.obstacle_paper import deferred, moored, sonar_poses
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig
-from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
+from sonar_imm_tools.simulation.obstacle.simulator import scenario
 
-SECTION5 = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'paper_section5.npz'
+SECTION5 = Path(__file__).parents[1] / 'vectors' / 'obstacle_sea' / 'paper_section5.npz'
 GRID = np.arange(-12.0, 12.025, 0.05)
 NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
 
@@ -122,3 +124,40 @@ def test_curves_of_the_papers_encounters(body, echo):
     found = deferred(z[seen], poses, ObstacleConfig(), offsets=values['d_st'])
     np.testing.assert_allclose(found.rmsd, values[f'{echo}_rmsd'], rtol=1e-9)
     assert found.best == pytest.approx(float(values[f'{echo}_estimate']), abs=0.05)
+
+
+CLEAN = {
+    'ideal_navigation': True,
+    'sound_speed_error': 0.0,
+    'range_std': 0.001,
+    'bearing_std_deg': 0.001,
+    'range_step': 0.0,
+    'bearing_step_deg': 0.0,
+}
+
+
+def test_the_deferred_estimate_of_a_clean_run_finds_the_truth():
+    found = moored(scenario('approach', CLEAN), 1)
+    assert found['truth'] == pytest.approx(3.0, abs=0.2)
+    assert abs(found['RMSD']) < 0.1 and abs(found['refitted']) < 0.1
+
+
+def test_all_estimates_of_a_moored_sphere_hold_at_the_first_echo():
+    found = moored(scenario('tethers', obstacle_paper.TETHERS), 1)
+    assert abs(found['refitted']) < 2.0 and abs(found['online']) < 2.0
+    assert abs(found['tether_m'] - 15.0) < 2.0 * found['tether_std_m'] < 3.0
+    # Where the tracker has the obstacle is how long it has the tether.
+    assert found['tether_m'] == pytest.approx(15.0 - found['online'], abs=0.5)
+
+
+def test_the_study_has_all_its_tables():
+    parts = {}
+    for part in obstacle_paper.main(runs=2, seeds=1):
+        parts |= part
+    assert set(parts['approach']) == {
+        f'approach, {method}' for method in ('landmark', 'seafloor', 'deferred', 'refit')
+    }
+    assert set(parts['large']['distribution']) == set(obstacle_paper.READINGS)
+    assert len(parts['sphere']['estimates']['by eye']) == 2
+    assert list(parts['tether']['errors']) == ['seed 1']
+    assert parts['tether']['size of the errors']['online']['runs'] == 1
