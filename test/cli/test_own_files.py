@@ -167,3 +167,10 @@ def test_an_export_of_a_hostile_run_json_is_one_sentence(here, capsys, origin):
     assert run('export', here / 'out', here / 'map.geojson', '--map', *place) == 2
     assert "'landmarks' in the run.json" in capsys.readouterr().err
     assert not (here / 'map.geojson').exists()
+
+
+def test_a_file_for_rerun_keeps_them_too(here, capsys):
+    pytest.importorskip('rerun')
+    before = contents(here)
+    assert run('view', here / 'out', '--rerun', here / 'out' / 'estimate.csv') == 2
+    assert 'choose another name' in capsys.readouterr().err and contents(here) == before
