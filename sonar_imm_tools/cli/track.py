@@ -65,7 +65,7 @@ def _shard(
 @click.command(
     epilog=example(
         'sonar-imm track dive.bag out',
-        'sonar-imm track dive.bag out --set model_set=cv_cv',
+        'sonar-imm track dive.bag out --set model_set=heading_speed',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
         'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',

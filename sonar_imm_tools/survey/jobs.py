@@ -227,7 +227,7 @@ def make_tile(job: TileJob) -> None:
     low = (np.array(job.tile.box[:2]) - HALO) * job.tile.cell
     high = (np.array(job.tile.box[:2]) + TILE + HALO) * job.tile.cell
     for k, (_, source, ranges) in enumerate(job.parts):
-        table = np.load(source, mmap_mode='r')
+        table = np.load(source, mmap_mode='r', allow_pickle=False)
         rows = np.concatenate([np.array(table[a:b]) for a, b in ranges])
         rows = rows[np.all((rows['xy'] >= low) & (rows['xy'] < high), axis=1)]
         rows = rows[np.lexsort((rows['xy'][:, 1], rows['xy'][:, 0], rows['stamp_ns']))]
@@ -294,7 +294,7 @@ def _save(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def _load(path: Path) -> Line:
-    with np.load(path) as kept:
+    with np.load(path, allow_pickle=False) as kept:
         return _line(kept['table'], float(kept['sound_speed']))
 
 
@@ -308,7 +308,7 @@ class KeptLooks(Sequence[Looks]):
         return len(self._places)
 
     def __getitem__(self, k: Any) -> Any:
-        table = np.load(self._places[k])
+        table = np.load(self._places[k], allow_pickle=False)
         columns = {name: np.ascontiguousarray(table[name]) for name in table.dtype.names}
         return Looks(self._cell, **columns)
 

@@ -273,7 +273,7 @@ class Survey:
     def nodes(self) -> Iterator[tuple[Tile, Nodes]]:
         """The tiles with their nodes, in order; those without any are left out."""
         for tile, file in self.tiles.items():
-            with np.load(file) as kept:
+            with np.load(file, allow_pickle=False) as kept:
                 nodes = Nodes(**{name: kept[name] for name in kept.files})
             if len(nodes.z):
                 yield tile, nodes
