@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import functools
 from importlib import import_module
+import io
 import os
 import signal
 import sys
@@ -132,6 +133,10 @@ def command(ctx: click.Context) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that prints errors."""
     one_blas_thread()
+    # What the terminal cannot show is written as an escape, instead of an error.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
     with _signals_unwind():
         return _run(arguments)
 
@@ -213,6 +218,9 @@ def _user_error(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, ModuleNotFoundError) and error.name:
         return missing_package(error.name.split('.')[0])
+    if isinstance(error, UnicodeEncodeError) and not error.object.isascii():
+        name = error.object.encode('utf-8', 'backslashreplace').decode()
+        return f'{name} is not UTF-8, which a library that is needed here cannot name; rename it'
     if isinstance(error, OSError):
         known = error.filename and error.strerror
         return f'{error.filename}: {error.strerror}' if known else str(error)

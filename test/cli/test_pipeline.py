@@ -71,7 +71,7 @@ def test_track_twice_writes_the_same_bytes_and_accounts_for_every_message(
     assert main(['track', str(dive), str(tmp_path / 'out')]) == 2
     assert '--overwrite' in capsys.readouterr().err
     call('track', dive, tmp_path / 'out', '--overwrite')
-    assert contents(tmp_path / 'out') == first and len(first) == 3
+    assert contents(tmp_path / 'out') == first and len(first) == 4
 
 
 def test_evaluate_scores_and_reports(call, tmp_path):
