@@ -23,8 +23,6 @@ RUNS = {'eval', 'exec', 'compile', '__import__'}
 UNPICKLE = {'pickle', '_pickle', 'cPickle', 'marshal', 'shelve', 'joblib', 'dill', 'cloudpickle'}
 YAML = {'load', 'load_all', 'unsafe_load', 'full_load', 'UnsafeLoader', 'FullLoader', 'Loader'}
 KERNELS = {'sonar_imm.estimation.jit', 'sonar_imm.estimation.lowering'}
-LEAVES = {'sonar_imm_tools.recordings.foreign'}
-"""Removed with the readers of echo sounders."""
 
 
 def faults(tree):
@@ -60,8 +58,6 @@ def _calls(node):
 
 @pytest.mark.parametrize('path', MODULES, ids=module_name)
 def test_no_module_runs_what_it_reads(path):
-    if module_name(path) in LEAVES:
-        return
     found = list(faults(ast.parse(path.read_text(encoding='utf-8'))))
     # What numba keeps of compiled kernels it reads by pickle: it lies in a folder of the user.
     if module_name(path) in KERNELS:
