@@ -56,7 +56,7 @@ into one place of the table, which takes the square of their number."""
 _SHAPES = {
     'Bodies': 'number:T std:T2',
     'Cells': 'key:C number:C height:C variance:C stamp_ns:C',
-    'DiverState': 'x:TMn P:TMnn mu:TM learnt:T2MM nis:T nis_dof:T score:T white:T2 existence:T '
+    'DiverState': 'x:TMn P:TMnn mu:TM learnt:TaLL nis:T nis_dof:T score:T white:T2 existence:T '
     'evidence:T target_id:T near_to:T near_for:T refused:T6 refused_z:T3 spreads:T history:Tw '
     'came_from:T looks:T scale:22 life.age:T',
     'Existence': 'log_odds:T pings:T held:T silence:T',

@@ -272,7 +272,7 @@ class DiverState(NamedTuple):
             for state in (self, other)
         ]
         seen = self.life.seen.shape[1:] == other.life.seen.shape[1:]
-        if shapes[0] != shapes[1] or self.x.shape[2] != n or not seen:
+        if shapes[0] != shapes[1] or (len(self.x) and self.x.shape[2] != n) or not seen:
             raise ValueError('states are of other models')
 
     @classmethod

@@ -50,7 +50,7 @@ ODD = [None, -1, 0, 1, 2**31, 2**63 - 1, 2**70, 1.5, float('nan'), 1e308, '', 'o
 
 def places_in(value):
     """Every place in JSON: what holds it, and its key or number there."""
-    found, todo = [], [value]
+    found, todo = [], [value] if isinstance(value, (dict, list)) else []
     while todo:
         owner = todo.pop()
         for key in owner if isinstance(owner, dict) else range(len(owner)):
@@ -70,8 +70,10 @@ def forged(text, block, rng):
             at = int(rng.integers(len(block)))
             block[at : at + 8] = rng.choice([0, 1, 127, 240, 255], size=1)
             continue
-        part = header['arrays'] if kind < 0.3 else header['values'] if kind < 0.6 else header
-        places = places_in(part) or places_in(header)
+        part = 'arrays' if kind < 0.3 else 'values' if kind < 0.6 else ''
+        places = places_in(header.get(part, header)) or places_in(header)
+        if not places:
+            break
         owner, key = places[int(rng.integers(len(places)))]
         value = ODD[int(rng.integers(len(ODD)))]
         how = rng.random()
