@@ -43,6 +43,7 @@ from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 QUICK = {'fathometer': {'particles': '200'}}
+SHORT = {'fathometer': ['--set', 'records=8']}
 MOST = 60
 SCENES = [
     (system, scene)
@@ -135,6 +136,7 @@ def test_states_with_every_option(system, name, value, tmp_path):
 @pytest.mark.statistics
 @pytest.mark.parametrize('system, scene', SCENES)
 def test_states_on_every_scene(system, scene, tmp_path, capsys):
-    assert main(['simulate', system, str(tmp_path / 'bag'), '--scenario', scene]) == 0
+    words = ['simulate', system, str(tmp_path / 'bag'), '--scenario', scene]
+    assert main([*words, *SHORT.get(system, [])]) == 0
     own = own_parameters(tmp_path / 'bag')
     take_again(system, tmp_path / 'bag', own, {}, tmp_path / 'state')
