@@ -90,8 +90,8 @@ def test_nothing_stands_out_of_noise_and_blind_proposals_see_nothing():
     g, peaks = gains(blind, b, NO_SCATTER, GRAM)
     assert not len(peaks.first) and np.array_equal(g[0], 0.5 * np.square(np.maximum(b, 0.0)))
     beginning, births = begin(blind, g, peaks)
-    assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births[0])
-    assert np.diff(births[0]) == pytest.approx(1.0 / N)
+    assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births.running)
+    assert np.diff(births.running) == pytest.approx(1.0 / N)
 
 
 @pytest.mark.parametrize('seed', range(3))
