@@ -19,7 +19,7 @@ importance sampler for sets of every size at once. A cycle takes in one record::
 
     record = filter.record(b, key)                 # tables of this record
     before = before or filter.start(record)        # sets before the first record
-    sets = filter.propagate(before, record)        # shift, deaths, walks, births
+    sets = filter.propagate(before, record)        # deaths, shift, walks, births
     step = filter.weigh(sets, record)              # each set meets the record
     step = filter.resample(step, record)           # where few of the sets count
     step = filter.move(step, record)               # copies of a set differ again
@@ -308,7 +308,8 @@ class SetFilter:
 
         def work(first: int, last: int) -> None:
             J, slots = self.model.order_max, kernels.SLOTS
-            scratch = np.empty((J, J)), np.empty((3, J)), np.full(slots, -1), np.empty(slots)
+            owner, kept = np.full(slots, -1, np.int64), np.empty(slots)
+            scratch = np.empty((J, J)), np.empty((3, J)), owner, kept
             seen = record.b, *record.amplitudes, *record.background
             kernels.weigh(first, last, *seen, *sets, *scratch, log_weight, amplitude)
 
@@ -423,10 +424,8 @@ class SetFilter:
         found, slots, G = np.empty_like(old), shift_kernels.SLOTS, shift.count
 
         def work(first: int, last: int) -> None:
-            key, span = (
-                np.full((slots, left.cell.shape[1] + 2), -1),
-                np.empty((slots, 2), np.int64),
-            )
+            key = np.full((slots, left.cell.shape[1] + 2), -1, np.int64)
+            span = np.empty((slots, 2), np.int64)
             scratch = key, np.empty((slots, G)), np.empty((slots, G)), span
             shift_kernels.draw_shifts(first, last, *known, *left, old, *scratch, found, log_ratio)
 

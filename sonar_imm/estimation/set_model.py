@@ -329,7 +329,7 @@ class Left(NamedTuple):
     @classmethod
     def all_of(cls, sets: Sets) -> Left:
         N, J = sets.cell.shape
-        parent = np.tile(np.arange(J), (N, 1))
+        parent = np.tile(np.arange(J, dtype=np.int64), (N, 1))
         return cls(sets.order, np.zeros(N, np.int64), sets.cell, sets.sign, parent)
 
 

@@ -174,8 +174,8 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
-            kernels={'records': (16, 540)},
-            all_kernels=(16, 540),
+            kernels={'records': (3, 277)},
+            all_kernels=(3, 277),
         ),
         System(
             name='obstacle',
