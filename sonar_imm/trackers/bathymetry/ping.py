@@ -38,17 +38,14 @@ from ...acoustics.layover import GATE, Layover, layover
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.elementary import normals
 from ...estimation.smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
+from .filter_kernels import filter_block, normals
 from .kernels import (
-    Draws,
-    filter_block,
     filter_ping,
     GridMotion,
-    Motion,
     Particles,
     PingLikelihood,
     smooth_ping,
@@ -220,28 +217,37 @@ def run_particles(
     T, M = models.scale.shape
     n, k = models.F.shape[1], models.G.shape[2]
     x, w = models.draw(count, start), np.full((M, count), 1.0 / count)
-    particles = Particles(x, w, models.initial.copy())
-    motion = Motion(
-        models.F, models.G, models.scale, models.transition, models.coast, models.favour
-    )
-    track = _empty(T, M, n)
-    block = max(1, min(_BLOCK // (M * k * count), T))
-    size = M * k * count
+    mu, g, track = models.initial.copy(), ping.geometry, _empty(T, M, n)
+    chains = np.stack([models.transition, np.eye(M)][: 1 + resample])
+    work, size = np.empty((5, count)), M * k * count
+    block = max(1, min(_BLOCK // size, T))
     uniform = np.empty(block * size + block * size % 2)
     noise = np.empty_like(uniform)
     for first in range(0, T, block):
         bins = min(block, T - first)
         noises.random(out=uniform)
-        normals(uniform, noise)
-        block_noise = noise[: bins * size].reshape(bins, M, k, count)
-        random = Draws(draws.random((bins, 2, M)), block_noise)
-        if watch is None:
-            filter_block(first, particles, motion, random, ping, resample, track)
-            continue
-        for b in range(bins):
-            single = Draws(random.uniform[b : b + 1], random.noise[b : b + 1])
-            filter_block(first + b, particles, motion, single, ping, resample, track)
-            watch(first + b, particles)
+        normals(uniform, uniform.view(np.int64), noise, noise.view(np.int64))
+        moves, resampling = noise[: bins * size].reshape(bins, M, k, count), draws.random((bins, 2, M))
+        at_once = bins if watch is None else 1
+        for b in range(0, bins, at_once):
+            filter_block(
+                first + b,
+                *(x, w, mu),
+                *(models.F, models.G, models.scale, chains, models.coast, models.favour),
+                *(resampling[b : b + at_once], moves[b : b + at_once]),
+                *(ping.echo, ping.form, ping.base),
+                ping.spread if ping.spread.shape[1] else None,
+                *(ping.signal, ping.table, g.height, g.reach, g.cos_tilt, g.sin_tilt, g.spacing),
+                g.launch if len(g.launch) else None,
+                *(g.row, g.first_depth, g.depth_step),
+                None if g.of_heights else g.tilt,
+                g.drift_from,
+                *(np.empty(M), np.empty((M, count)), np.empty((M, count)), np.empty_like(x)),
+                *(np.empty(count + 1, np.int64), work, work.view(np.int64)),
+                *track,
+            )
+            if watch is not None:
+                watch(first + b, Particles(x, w, mu))
     return _with_constants(track, ping)
 
 
