@@ -35,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import likelihood_kernels, rays
+from ...acoustics import likelihood_kernels
 from ...estimation import grid
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...estimation.elementary import phasors
@@ -147,7 +147,7 @@ def sines_of(
         for s in range(n):
             first[s] = height - state[s]
         if geometry.launch.shape[0] > 0:
-            rays.look_up(
+            look_up(
                 geometry.launch,
                 geometry.row[t],
                 geometry.first_depth,
@@ -162,6 +162,27 @@ def sines_of(
         for s in range(n):
             if not abs(state[s]) <= _HALF_CIRCLE:
                 out[s] = math.nan
+
+
+@kernel
+def look_up(
+    value: FloatArray, row: float, first_depth: float, depth_step: float, depth: FloatArray
+) -> None:
+    """Replace depths (n,) by ``r sin(phi)`` from a launch table (R, D), bilinearly; row: the range
+    over its range step. NaN outside the table."""
+    k = min(max(int(row), 0), value.shape[0] - 2)
+    f = row - k
+    near, far, last = value[k], value[k + 1], value.shape[1] - 2
+    for s in range(depth.shape[0]):
+        place = (depth[s] - first_depth) / depth_step
+        if not 0.0 <= place <= last + 1.0:
+            depth[s] = math.nan
+            continue
+        i = min(int(place), last)
+        g = place - i
+        low = near[i] + g * (near[i + 1] - near[i])
+        high = far[i] + g * (far[i + 1] - far[i])
+        depth[s] = low + f * (high - low)
 
 
 @kernel

@@ -227,7 +227,8 @@ def run_particles(
         bins = min(block, T - first)
         noises.random(out=uniform)
         normals(uniform, uniform.view(np.int64), noise, noise.view(np.int64))
-        moves, resampling = noise[: bins * size].reshape(bins, M, k, count), draws.random((bins, 2, M))
+        moves = noise[: bins * size].reshape(bins, M, k, count)
+        resampling = draws.random((bins, 2, M))
         at_once = bins if watch is None else 1
         for b in range(0, bins, at_once):
             filter_block(
