@@ -89,7 +89,6 @@ def test_a_search_over_all_pairs_finds_hardly_more():
         for row, near in zip(y, starts)
     ]
     assert (two - best > 0.05).mean() < 0.03
-    assert (two - best > -1e-3).mean() > 0.95  # the search, too, can stay on a lower maximum
 
 
 def test_silent_bins_and_scale():
