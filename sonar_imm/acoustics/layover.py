@@ -120,13 +120,14 @@ def residuals(iq: ArrayLike, spacing: float) -> tuple[FloatArray, FloatArray, Fl
     phase = step * np.arange(points) - widest
     half = 0.5 * (staves - 1)
     multiples = 1.0, half, 0.5, 0.5 * staves
-    found = np.zeros((n, 2))
+    found, (real, imaginary) = np.zeros((n, 2)), np.empty((2, points))
     fit_waves(
         y,
         phase,
         np.concatenate([[np.cos(k * phase), np.sin(k * phase)] for k in multiples]),
         math.inf if circle else widest,
-        *np.empty((2, points)),
+        real,
+        imaginary,
         found,
     )
     power = np.square(np.abs(y)).sum(axis=1)

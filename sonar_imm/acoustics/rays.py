@@ -142,7 +142,7 @@ def launch_table(
     reached = np.zeros((rows, _ELEVATIONS))
     start, end = np.full(_ELEVATIONS, depth), np.empty((4, _ELEVATIONS))
     trace_rays(profile.depth, profile.speed, start, elevation, time, reached[1:], end)
-    column = -reach * column_step + np.arange(2 * reach + 1) * column_step
+    column = -reach * column_step + np.arange(2.0 * reach + 1.0) * column_step
     value = _invert(np.sin(elevation), reached, row_step, column)
     return LaunchTable(value, row_step, -reach * column_step, column_step)
 

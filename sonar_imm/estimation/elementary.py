@@ -36,11 +36,6 @@ _PER_LN2 = 1.0 / math.log(2.0)
 _LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LEAST = -700.0
 _E = tuple(1.0 / math.factorial(k) for k in range(13))
-_ROOT2 = math.sqrt(2.0)
-_MANTISSA = (1 << 52) - 1
-_ONE = 1023 << 52
-# A double with these bits and a small whole number in its lowest ones is 2^52 plus that number.
-_WHOLE = 1075 << 52
 
 
 def _even_polynomial(function: str) -> tuple[float, ...]:
@@ -134,33 +129,3 @@ def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatAr
         c = _C[0] + t * (_C[1] + t * (_C[2] + t * (_C[3] + t * c)))
         cosine[i] = c * c - s * s
         sine[i] = 2.0 * s * c
-
-
-@kernel
-def normals(uniform: FloatArray, out: FloatArray) -> None:
-    """Standard normal numbers (n,) from uniform ones in [0, 1) (n,), n even; uniform is used up.
-
-    Box and Muller: sqrt(-2 ln v) times the cosine and the sine of a random angle. v = 2^e m, and
-    ln m is the series of the inverse hyperbolic tangent of (m - 1) / (m + 1).
-    """
-    half = uniform.shape[0] // 2
-    first, cosine, sine = uniform[:half], out[:half], out[half:]
-    bits, exponent = first.view(np.int64), cosine.view(np.int64)
-    for i in range(half):
-        first[i] = 1.0 - first[i]
-    for i in range(half):
-        exponent[i] = (bits[i] >> 52) | _WHOLE
-        bits[i] = (bits[i] & _MANTISSA) | _ONE
-    for i in range(half):
-        m, e = first[i], cosine[i] - (2.0**52 + 1023.0)
-        e = e + 1.0 if m > _ROOT2 else e
-        m = 0.5 * m if m > _ROOT2 else m
-        f = (m - 1.0) / (m + 1.0)
-        t = f * f
-        p = 1.0 / 11.0 + t * (1.0 / 13.0 + t * (1.0 / 15.0 + t * (1.0 / 17.0 + t / 19.0)))
-        p = 1.0 / 3.0 + t * (1.0 / 5.0 + t * (1.0 / 7.0 + t * (1.0 / 9.0 + t * p)))
-        first[i] = math.sqrt(max(-2.0 * (e * math.log(2.0) + 2.0 * f * (1.0 + t * p)), 0.0))
-    phasors(uniform[half:], 1.0, cosine, sine)
-    for i in range(half):
-        cosine[i] *= first[i]
-        sine[i] *= first[i]

@@ -15,9 +15,9 @@
 """exp of a row."""
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
-from sonar_imm.estimation.elementary import exponentials, gaussians, normals, phasors
+from sonar_imm.estimation.elementary import exponentials, gaussians, phasors
 
 
 def row(values):
@@ -74,22 +74,3 @@ def test_phasors_are_cosines_and_sines():
     assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
     assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
     assert np.isnan(cosine[-1]) and np.isnan(sine[-1])
-
-
-def test_normals_are_those_of_box_and_muller():
-    uniform = np.random.default_rng(1).random(10_000)
-    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
-    radius = np.sqrt(-2.0 * np.log1p(-uniform[:5000]))
-    angle = 2.0 * np.pi * uniform[5000:]
-    exact = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-    out = np.empty(10_000)
-    normals(uniform, out)
-    assert np.abs(out - exact).max() < 1e-13
-
-
-def test_normals_are_normal():
-    uniform = np.random.default_rng(2).random(200_000)
-    out = np.empty_like(uniform)
-    normals(uniform, out)
-    assert stats.kstest(out, 'norm').pvalue > 1e-3
-    assert abs(np.corrcoef(out[:100_000], out[100_000:])[0, 1]) < 0.015

@@ -40,6 +40,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ...acoustics import rays
@@ -94,7 +95,7 @@ class Moves(NamedTuple):
     end: float
     anywhere: float
     walk: FloatArray
-    walk_of_two: FloatArray
+    walk_of_two: NDArray[np.float32]
     gap: int
 
 
