@@ -12,20 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The filters along the range bins of one ping, each compiled as one loop: particles and grid.
+"""What the filters along the range bins of one ping work on; and the filter on a grid.
 
-In `filter_block`, bin after bin, are the verbs of `estimation.imm_particles`:
+`filter_ping` and `smooth_ping` do on a grid, with the verbs of `estimation.grid`, what
+`filter_kernels` does with particles. What they work on stays in the cache.
 
-    resample    the particles of each model, from those of all models that could become it
-    propagate   each model moves its particles to the next bin
-    weigh       each particle meets the snapshot (`acoustics.likelihood_kernels`)
-    summarise   one answer for the bin
-
-`filter_ping` and `smooth_ping` do the same on a grid, with the verbs of `estimation.grid`. What
-they work on stays in the cache.
-
-Shapes: T bins of a ping, M models, n states, k noises, N particles per model, G cells of the grid,
-P staves.
+Shapes: T bins of a ping, M models, n states, N particles per model, G cells of the grid, P staves.
 """
 
 from __future__ import annotations
