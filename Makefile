@@ -84,11 +84,7 @@ $(STAMP): setup.py pyproject.toml
 	@touch $@
 
 $(TEST_STAMP): $(STAMP)
-	@$(INSTALL) 'sonar_imm[test,lint,sweep]'
-	@# Without what it brings along, 1.7 GB of Qt and notebooks. Where there is no wheel, its tests say so.
-	@$(INSTALL) --no-deps --only-binary :all: tqdm \
-	    'themachinethatgoesping>=0.33; python_version >= "3.11"' \
-	    'nanobind-backend>=1.0; python_version >= "3.12"' || true
+	@$(INSTALL) 'sonar_imm[test,lint,cluster]'
 	@touch $@
 
 demo: $(STAMP) ## play shipped bags to the live nodes, track all offline, say what they saw, write a report

@@ -49,22 +49,17 @@ REQUIRES = [
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
+    'cluster': ['dask[distributed]>=2024.1'],
     'docs': [
         'mkdocs>=1.6,<2',
         'mkdocs-material>=9.5',
         'mkdocstrings[python]>=0.26',
-    ],
-    # Brings Qt and notebooks along, 1.7 GB; docs/reference/formats.md says how to do without them.
-    'echosounders': [
-        'ektools>=0.1.2',
-        'themachinethatgoesping>=0.33; python_version >= "3.11"',
     ],
     'nmea': ['pyais>=2.7', 'pynmea2>=1.18'],
     'parquet': ['pyarrow>=14'],
     'pictures': ['pillow>=9.1'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
-        'ektools>=0.1.2',
         'filterpy',
         'hypothesis',
         'laspy[lazrs]>=2.5',
@@ -86,7 +81,7 @@ EXTRAS = {
     'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
     'sound': ['soundfile>=0.12'],
-    'sweep': ['dask[distributed]>=2024.1'],
+    'sweep': ['dask[distributed]>=2024.1'],  # the former name of 'cluster', for one version
     'xtf': ['pyxtf>=1.4'],
 }
 
@@ -150,7 +145,7 @@ setup(
         'console_scripts': [
             'sonar-imm = sonar_imm_tools.cli:main',
             'fls_detector_node = sonar_imm.nodes.commands:main',
-            'composed_node = sonar_imm.nodes.commands:main',
+            'composed_node = sonar_imm.nodes.commands:main',  # only says that it was removed
             *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],
     },

@@ -44,7 +44,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.real_recordings import DATA, load, TAG, tag_scores
+from benchmarks.real_recordings import load, TAG, tag_scores
+from benchmarks.recordings import DATA
 from benchmarks.study import final_estimates, Parts, rms, study
 from sonar_imm.measurements import Fix, NOBODY
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -53,7 +54,7 @@ SINGLES: dict[str, dict[str, Any]] = {
     'heading .005': {'model_set': 'heading_speed'},
     'heading .07': {'model_set': 'heading_speed', 'speed_noise': 0.07},
     **{
-        f'CV {noise:g}': {'model_set': 'cv', 'acceleration_noise': (noise,)}
+        f'CV {noise:g}': {'model_set': 'bench_cv', 'acceleration_noise': (noise,)}
         for noise in (0.03, 0.1, 0.25, 0.6, 1.5)
     },
 }

@@ -44,7 +44,8 @@ import numpy as np
 from benchmarks.diver_crossing import identities_kept, true_paths
 from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
 from benchmarks.diver_named import FALSE, HALF, measured, named_errors, P_DETECTION, truth_of
-from benchmarks.real_recordings import autoferry, boat_scores, DATA
+from benchmarks.real_recordings import boat_scores
+from benchmarks.recordings import autoferry, DATA
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack

@@ -90,7 +90,7 @@ def main(runs: int = 4) -> Parts:
         ways: dict[str, dict[str, Any]] = {
             'default': {},
             'named': {'target': kind},
-            'cv': {'model_set': 'cv', 'acceleration_noise': (1.0,), 'velocity_std': 10.0},
+            'cv': {'model_set': 'bench_cv', 'acceleration_noise': (1.0,), 'velocity_std': 10.0},
         }
         for way, values in ways.items():
             yield {'table': {f'{name}, {way}': case(name, values, runs)}}

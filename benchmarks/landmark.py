@@ -43,7 +43,7 @@ from sonar_imm.estimation.covariance import (
 )
 from sonar_imm.estimation.kalman import apply, factorise, log_density, Updated
 from sonar_imm.estimation.smoothing import sigma_offsets
-from sonar_imm.trackers.obstacle import kernels
+from sonar_imm.trackers.obstacle import mixtures, unscented
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import (
     BAND,
@@ -193,7 +193,7 @@ class Landmark:
         covariance[:, 3, 3] = self.config.scale_std**2
 
         def place(points: FloatArray) -> FloatArray:
-            m = kernels.points(points, *sonar.pose, self.model == 'cone')
+            m = unscented.points(points, *sonar.pose, self.model == 'cone')
             return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
 
         moved = unscented_transform(place, seen, covariance)
@@ -240,7 +240,7 @@ class Landmark:
 
         seen = unscented_transform(words, x, P, angles=np.array([False, True, False]))
         std = np.sqrt(seen.covariance[:, 2:, 2])
-        low, high, above = kernels.bands(
+        low, high, above = mixtures.bands(
             np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
         )
         place = mixture.x[..., :3] - sonar.pose.position
@@ -254,7 +254,7 @@ class Landmark:
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         m = geometry.to_body(sonar.pose, mixture.x[..., :3])
         spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
-        return kernels.outlook(m, spread, mixture.mu, *self._beam)
+        return mixtures.beam_probability(m, spread, mixture.mu, *self._beam)
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])

@@ -30,7 +30,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.real_recordings import autoferry, boat_scores, BOATS, DATA, HEADINGS
+from benchmarks.real_recordings import boat_scores, BOATS, HEADINGS
+from benchmarks.recordings import autoferry, DATA
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
@@ -128,7 +129,7 @@ def ours(**values: Any) -> Make:
 
     def make(noise: float, std: float, life: tuple[int, int]) -> DiverTracker:
         motions: dict[str, dict[str, Any]] = {
-            'cv': {'acceleration_noise': (noise,)},
+            'bench_cv': {'acceleration_noise': (noise,)},
             'heading_speed': {'speed_noise': noise},
             'families': {},
         }
@@ -145,8 +146,8 @@ def ours(**values: Any) -> Make:
 
 TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
     'plain CV Kalman': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
-    'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
-    'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
+    'CV Kalman, gnn': (ours(model_set='bench_cv'), (0.1, 0.3, 1.0)),
+    'CV Kalman, jipda': (ours(model_set='bench_cv', association='jipda'), (0.1, 0.3, 1.0)),
     'families, gnn': (ours(model_set='families', association='gnn'), (0.0,)),
     'families (default), jipda': (ours(model_set='families'), (0.0,)),
     'heading_speed, gnn': (ours(**HEADINGS, **BOATS), (0.03, 0.1, 0.3)),

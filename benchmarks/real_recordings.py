@@ -21,9 +21,7 @@ against GPS as it is and against GPS 3.4 s later.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-import tempfile
 from typing import Any
 
 import numpy as np
@@ -34,11 +32,9 @@ from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.trackers.diver.births import locate
 from sonar_imm.trackers.diver.tracker import DiverConfig
-from sonar_imm_tools.recordings.convert import convert_autoferry
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
 
-DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
 LAG = 3.4
 
 TAG: dict[str, Any] = {
@@ -148,20 +144,6 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
             columns = {name: getattr(ping, name)[rows] for name in COLUMNS}
             out.append(Arrivals(stamp_ns=ping.stamp_ns, frame_id=ping.frame_id, **columns))
     return out
-
-
-def autoferry(sensor: str, time_offset_ns: int = 0) -> tuple[list, np.ndarray]:
-    """The scans of radar or lidar in Autoferry scenario 13, and the truth, as `load` has them."""
-    with tempfile.TemporaryDirectory() as scratch:
-        out = Path(scratch) / sensor
-        convert_autoferry(
-            DATA / 'autoferry/scenario13_detections.json',
-            out,
-            sensors=(sensor,),
-            truth=DATA / 'autoferry/scenario13_groundTruth.json',
-            time_offset_ns=time_offset_ns,
-        )
-        return load(out)
 
 
 def boat_scores(final: dict, truth: np.ndarray) -> list[float]:

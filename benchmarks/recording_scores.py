@@ -39,8 +39,6 @@ import numpy as np
 
 from benchmarks.real_boats import PlainKalman
 from benchmarks.real_recordings import (
-    autoferry,
-    DATA,
     HEADINGS,
     LAG,
     PACE,
@@ -50,6 +48,7 @@ from benchmarks.real_recordings import (
     thinned,
 )
 from benchmarks.real_recordings import load as load_bag
+from benchmarks.recordings import autoferry, DATA
 from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
@@ -63,16 +62,12 @@ BOATS = ('radar', 'lidar')
 WAYS, RECEIVERS = 8, (5, 4, 3)
 CUTOFF, NINETY_FIVE, LONGEST_GAP = 20.0, 5.991, 60.0
 SINGLE: dict[str, dict[str, Any]] = {
-    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (NOISE,)},
-    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
+    'CV Kalman': {'model_set': 'bench_cv', 'acceleration_noise': (NOISE,)},
+    'IMM CV+CV': {'model_set': 'bench_cv_cv', 'acceleration_noise': (0.01, 0.12)},
     'steady alone (heading_speed)': HEADINGS,
     'brisk alone': PACE,
-    'lively alone': {
-        'model_set': 'cv_cv',
-        'acceleration_noise': (0.05, 0.6),
-        'baseline_stay_probability': 0.85,
-    },
-    'quiet alone': {'model_set': 'cv', 'acceleration_noise': (0.03,)},
+    'lively alone': {'model_set': 'bench_cv_cv', 'acceleration_noise': (0.05, 0.6)},
+    'quiet alone': {'model_set': 'bench_cv', 'acceleration_noise': (0.03,)},
 }
 THINNED = ('CV Kalman', 'steady alone (heading_speed)', 'brisk alone')
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -86,10 +86,10 @@ def surveyed(runs: Path, out: Path, jobs: int, soundings: int) -> dict[str, obje
     options = Options(adjusted=True)
     sources = sources_of(runs)
     begun = time.perf_counter()
-    with folder_of(out, options), watch, workers(jobs) as run:
-        survey = make(sources, out, options, run, progress)
+    with folder_of(out, options, runs) as place, watch, workers(jobs) as run:
+        survey = make(sources, place, options, run, progress)
         watch.begin('products', 0)
-        write(survey, out)
+        write(survey, place)
         watch.begin('', 0)
     stages = {
         name: {'cpu_s': seconds, 'cpu_s_per_million': seconds / soundings * 1e6}

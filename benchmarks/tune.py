@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.real_recordings import DATA
+from benchmarks.recordings import DATA
 from benchmarks.study import Parts, study
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig
@@ -68,7 +68,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         'diver',
         'wandering',
         {'fixes': '400', 'noise': '0.1'},
-        {'covariance_scale': '0.1666667', 'model_set': 'cv', 'acceleration_noise': '0.3'},
+        {'covariance_scale': '0.1666667', 'model_set': 'bench_cv', 'acceleration_noise': '0.3'},
         'covariance_scale,acceleration_noise',
         (1.0, 0.1),
     ),

@@ -19,14 +19,15 @@
     python -m benchmarks.typical_seed obstacle movers --runs 31 --write bags/obstacle_movers
 
 A recording that is shipped is one draw of many, and a lucky one would promise too much. So the
-scene is simulated, tracked and scored under many seeds, as `sonar-imm sweep` does, and the seed is
-taken whose error is the median. With several metrics (``--metric``, dotted names of
+scene is simulated, tracked and scored under many seeds, and the seed is taken whose error is the
+median. With several metrics (``--metric``, dotted names of
 ``metrics.json``; by default the one that `check` compares) it is the seed whose rank is nearest to
 the middle in all of them; errors with a sign are ranked by their size. The limit of `check` is
 what nine in ten of these runs stay below, rounded up to two digits.
 
 ``--write`` makes the recording of that seed with its limit (``check.yaml``) and a README.md that
-says all this. ``--seed`` begins the runs, ``--set`` changes the scene.
+says all this. ``--out`` writes mean, deviation and standard error of all metrics as JSON.
+``--seed`` begins the runs, ``--set`` changes the scene.
 """
 
 from __future__ import annotations
@@ -43,12 +44,10 @@ import sys
 from attrs import frozen
 import numpy as np
 
-from benchmarks.study import markdown
+from benchmarks.study import markdown, Outcome, Plan, planned, record, run_seeds, write_json
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main as sonar_imm
-from sonar_imm_tools.cli.sweep import planned
 from sonar_imm_tools.evaluation.judging import Limit
-from sonar_imm_tools.evaluation.sweep import Outcome, run_here, run_on_processes
 from sonar_imm_tools.recordings.own_files import write_own_limit
 
 SHARE = 0.9
@@ -155,14 +154,11 @@ def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int)
     )
 
 
-def outcomes_of(given: argparse.Namespace) -> list[Outcome]:
-    overrides = dict(pair.split('=', 1) for pair in given.set)
-    sweep = planned(given.system, given.scene, overrides)
+def outcomes_of(given: argparse.Namespace, plan: Plan) -> list[Outcome]:
     seeds = range(given.seed, given.seed + given.runs)
     workers = min(given.workers or len(os.sched_getaffinity(0)), given.runs)
-    coming = run_here(sweep, seeds) if workers == 1 else run_on_processes(sweep, seeds, workers)
     found = []
-    for outcome in coming:
+    for outcome in run_seeds(plan, seeds, workers):
         found.append(outcome)
         text = outcome.failure or ', '.join(
             f'{name} {outcome.metrics.get(name, math.nan):.3f}' for name in given.metric
@@ -194,6 +190,7 @@ def main() -> None:
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE')
     parser.add_argument('--metric', action='append', default=[], help='the first has the limit')
     parser.add_argument('--workers', type=int, help='processes; by default one per core')
+    parser.add_argument('--out', type=Path, help='write the summary of all metrics here, as JSON')
     parser.add_argument('--write', type=Path, metavar='BAG', help='make the recording here')
     parser.add_argument(
         '--compress', action='store_const', const=['--compress'], default=[], help='the recording'
@@ -201,7 +198,10 @@ def main() -> None:
     given = parser.parse_args()
     limit = import_module(SYSTEMS[given.system].judge).LIMIT
     given.metric = given.metric or [limit.metric]
-    outcomes = outcomes_of(given)
+    overrides = dict(pair.split('=', 1) for pair in given.set)
+    plan = planned(given.system, given.scene, overrides)
+    outcomes = outcomes_of(given, plan)
+    write_json(given.out, record(plan, outcomes))
     failed = [outcome for outcome in outcomes if outcome.failure]
     try:
         found = typical(outcomes, given.metric)

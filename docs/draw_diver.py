@@ -44,7 +44,7 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
-from benchmarks.diver_accuracy import track, tuned  # noqa: E402
+from benchmarks.diver_paper import track, tuned  # noqa: E402
 from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker  # noqa: E402
@@ -90,7 +90,7 @@ def main() -> None:
         path = simulate(scenario(at), SEED).truth[0].position[:, :2]
         z, R = OBSERVE[at](path, count)
         trackers = {
-            'single direction (IMM CV+CV, tuned)': (RED, tuned('cv_cv', [at], count)),
+            'single direction (IMM CV+CV, tuned)': (RED, tuned('bench_cv_cv', [at], count)),
             '16 directions (heading_speed)': (BLUE, DiverConfig(model_set='heading_speed')),
         }
         tracks = {

@@ -16,13 +16,9 @@
 
 from __future__ import annotations
 
-from ipaddress import ip_address
-from socket import AddressFamily, AF_INET, AF_INET6
-
 from attrs import frozen
 
 from msg_adapters.inputs import inputs_of, InputTopic
-from msg_adapters.neighbours import GEO_POSE, TOPICS
 
 from .acoustics.geodesy import Origin
 from .parameters import Config, inherited, live, parameter, ParameterSpec
@@ -99,26 +95,7 @@ class TracksNodeConfig(PlacedNodeConfig):
 
     # fmt: off
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
-    also_publish: tuple[str, ...] = parameter((), '',
-        'further types for confirmed tracks', kind='str[]', choices=tuple(TOPICS))
-    targets_to: str = parameter('', '',
-        'address of NMEA 0183 targets, such as 192.168.1.20:10110; empty: none')
-    targets_as: str = parameter('tll', '',
-        'sentences of targets, of latitude and longitude: tll, or ais (virtual aids to '
-        'navigation, message 21; needs pyais)', choices=('tll', 'ais'))
-    targets_period: float = parameter(1.0, 's',
-        'time between rounds of targets', range=(0.1, 3600.0))
     # fmt: on
-
-    def check(self) -> list[str]:
-        try:
-            udp_address(self.targets_to or '127.0.0.1:1')
-        except ValueError:
-            return [
-                "parameter 'targets_to' must be the address of a machine in numbers and a port, "
-                f"such as 192.168.1.20:10110, got '{self.targets_to}'"
-            ]
-        return []
 
 
 @frozen(kw_only=True)
@@ -126,14 +103,9 @@ class ObstacleNodeConfig(TracksNodeConfig):
     """Besides, where the frame of the navigation lies on Earth."""
 
     # fmt: off
-    targets_as: str = inherited(TracksNodeConfig, 'targets_as', 'ttm',
-        description='sentences of targets: ttm (distance and bearing from the vehicle), or of '
-        'latitude and longitude, for which origin_latitude and origin_longitude are needed: tll, '
-        'or ais (virtual aids to navigation, message 21; needs pyais)',
-        choices=('ttm', 'tll', 'ais'))
     origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of nav, for targets and messages in latitude and '
-        'longitude; with both latitude and longitude 0: not known', range=(-90.0, 90.0))
+        'latitude of the origin of the frame of nav, for exports; with both latitude and '
+        'longitude 0: not known', range=(-90.0, 90.0))
     origin_longitude: float = parameter(0.0, 'deg',
         'longitude of the origin of the frame of nav, see origin_latitude',
         range=(-180.0, 180.0))
@@ -147,19 +119,6 @@ class ObstacleNodeConfig(TracksNodeConfig):
             return None
         return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
-    def check(self) -> list[str]:
-        problems = super().check()
-        form = self.targets_as
-        wanting = {f"'targets_as' {form}": self.targets_to and form != 'ttm'}
-        wanting[f"'also_publish' {GEO_POSE}"] = GEO_POSE in self.also_publish
-        if self.origin() is None:
-            problems += [
-                f'parameter {name} needs origin_latitude and origin_longitude'
-                for name, asked in wanting.items()
-                if asked
-            ]
-        return problems
-
 
 @frozen(kw_only=True)
 class DetectorNodeConfig(Config):
@@ -172,19 +131,6 @@ class DetectorNodeConfig(Config):
     diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
     stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
     # fmt: on
-
-
-def udp_address(text: str) -> tuple[str, int, AddressFamily]:
-    """Host in numbers, port and family of ``host:port``. Raises ValueError.
-
-    A name would have to be looked up, which can take seconds in which the node does nothing else.
-    """
-    host, _, port = text.rpartition(':')
-    host = '127.0.0.1' if host == 'localhost' else host.strip('[]')
-    version = ip_address(host).version
-    if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f'{port!r} is no port')
-    return host, int(port), AF_INET if version == 4 else AF_INET6
 
 
 def node_config_type(system: System) -> type[NodeConfig]:

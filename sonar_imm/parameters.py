@@ -40,7 +40,6 @@ import difflib
 from functools import lru_cache, partial
 from importlib.metadata import entry_points, EntryPoint
 import json
-import math
 from pathlib import Path
 import re
 import sys
@@ -122,7 +121,7 @@ class ParameterSpec:
         ):
             wanted = 'a whole number' if kind == 'int' else 'a number'
             return f'{name} must be {wanted}, got {value!r}'
-        if not math.isfinite(value):
+        if not abs(value) <= sys.float_info.max:  # whole numbers of JSON have no limit
             return f'{name} must be finite, got {value!r}'
         if (self.low is not None and value < self.low) or (
             self.high is not None and value > self.high

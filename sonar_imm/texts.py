@@ -18,14 +18,16 @@ from __future__ import annotations
 
 import re
 
-_CONTROLS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
+_CONTROLS = re.compile(
+    '[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]'
+)
 _LONGEST = 1000
 """Characters of a sentence; a name in a message may have millions."""
 
 
 def visible(text: str) -> str:
-    """`text` without what would steer a terminal: names in messages can hold anything. Lines and
-    tabs stay."""
+    """`text` without what would steer a terminal, or what no text file can hold: bytes of a file
+    name that are not UTF-8. Lines and tabs stay."""
     return _CONTROLS.sub(lambda found: ascii(found.group())[1:-1], text)
 
 

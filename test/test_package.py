@@ -73,24 +73,17 @@ WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly', 'tzdata'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Libraries that some commands need, each with an extra of its own.
 PEERS = {
-    'sonar_imm.nodes.tracks': {'pyais'},
     'sonar_imm_tools.offline.jobs': {'distributed'},
     'sonar_imm_tools.offline.run_folder': {'pyarrow'},
     'sonar_imm_tools.evaluation.rerun_file': {'rerun'},
-    'sonar_imm_tools.evaluation.sweep': {'distributed'},
     'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
     'sonar_imm_tools.recordings.convert.side_scan': {'PIL'},
-    'sonar_imm_tools.recordings.foreign': {
-        'ektools',
-        'pynmea2',
-        'pyxtf',
-        'themachinethatgoesping',
-    },
     'sonar_imm_tools.recordings.export.horizons': {'rasterio', 'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},
     'sonar_imm_tools.recordings.export.tracks': {'pyarrow'},
+    'sonar_imm_tools.recordings.xtf': {'pyxtf'},
     'sonar_imm_tools.survey.chart': {'rasterio'},
     'sonar_imm_tools.survey.products': {'pyarrow', 'rasterio'},
 }
@@ -195,8 +188,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
     without_key = {
-        *('laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio'),
-        *('ektools', 'soundfile'),
+        *('laspy', 'pyais', 'pyarrow', 'pynmea2', 'pyogrio', 'pyxtf', 'segyio', 'soundfile'),
     }
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
@@ -448,6 +440,21 @@ sys.exit(main())
     )
     assert done.returncode == 2
     assert done.stderr.splitlines() == [f'diver_node: {missing} is not here. {advice}']
+
+
+def test_the_program_of_several_nodes_says_that_it_was_removed() -> None:
+    program = """
+import sys
+from sonar_imm.nodes.commands import main
+
+sys.argv = ['/opt/lib/sonar_imm/composed_node', '/auv1/diver', '/auv2/diver']
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr == 'composed_node was removed: start one process per node\n'
 
 
 def test_the_page_of_commands_names_every_subcommand() -> None:

@@ -179,9 +179,7 @@ def _scan(
     x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
     x, P, _ = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
     expected = np.ascontiguousarray(x[:, :, :2])
-    fit = imm_kernels.gate(
-        expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2)
-    )
+    fit = imm.gate(expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2))
     target, detection = imm.pairs_inside(fit)
     cost = association_cost(fit[target, detection], 0.95, 1e-4)
     chosen = assign(target, detection, cost, targets, len(z))

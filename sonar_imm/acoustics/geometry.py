@@ -73,6 +73,11 @@ def flip_world(vector: ArrayLike) -> FloatArray:
     return np.asarray(vector, np.float64) @ _WORLD
 
 
+def flip_covariance(covariance: ArrayLike) -> FloatArray:
+    """NED of a covariance (..., 3, 3) in ENU, and the other way round."""
+    return np.asarray(_WORLD @ np.asarray(covariance, np.float64) @ _WORLD)
+
+
 def flip_body(vector: ArrayLike) -> FloatArray:
     """FRD of a vector (..., 3) in FLU, and the other way round."""
     return np.asarray(vector, np.float64) * _BODY

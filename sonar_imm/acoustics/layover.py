@@ -188,7 +188,7 @@ class Table(NamedTuple):
 def table_of(staves: int) -> Table:
     """The table of a number of staves, or of the next smaller number that has one: fewer staves
     say less."""
-    with np.load(TABLES) as tables:
+    with np.load(TABLES, allow_pickle=False) as tables:
         of = max(P for P in map(int, tables['staves']) if P <= staves)
         return Table(tables['edges'], tables['decibels'], tables[f'value_{of}'].astype(float))
 

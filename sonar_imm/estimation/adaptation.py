@@ -18,17 +18,12 @@ Learning does not change the chain. It gives a *correction*, a factor for each t
 applied to the matrix of the next step: ``P(dt) = rownorm(P0(dt) * correction)``. So it works at
 irregular steps too.
 
-Four forms (`AdaptiveChain`):
+Two forms (`AdaptiveChain`):
 
 counts
     Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
     transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``, the mean of the
     posterior. The default of the diver tracker.
-paper
-    Eq. (1) of the diver paper read as a product, ``P_ij <- P_ij mu_j / sum``, guarded by
-    ``P <- (1 - guard) P + guard P0``. The equation is lost in the source.
-ratio
-    The same equation read as a ratio, ``P_ij <- P_ij mu_j(k) / mu_j(k-1) / sum``, guarded alike.
 fixed
     The chain as it is.
 
@@ -44,14 +39,11 @@ import numpy as np
 from .arrays import FloatArray, IndexArray, IntArray
 from .jit import kernel
 
-Form = Literal['counts', 'paper', 'ratio', 'fixed']
-
-LEAST = 1e-12
-"""A model less probable than this before a step counts as this probable in a ratio."""
+Form = Literal['counts', 'fixed']
 
 
 class Chain(Protocol):
-    """A Markov chain over models: `markov.RateChain`, `markov.EventChain`."""
+    """A Markov chain over models, such as `markov.RateChain`."""
 
     matrix: FloatArray
     step: float
@@ -65,25 +57,21 @@ class AdaptiveChain:
     """A chain and the way the data of T targets correct it. What was learnt is a value that the
     caller keeps: `fresh` makes it, `learn` updates it.
 
-    weight: counts only, how many transitions per row the prior is worth; guard: paper and ratio,
-    share of the prior that is kept at each step.
+    weight: of counts, how many transitions per row the prior is worth.
     """
 
-    def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0, guard: float = 0.7):
+    def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0):
         if form not in get_args(Form):
             raise ValueError(f"the form of adaptation is one of {get_args(Form)}, not '{form}'")
         self.chain = chain
         self.form = form
         self.weight = weight
-        self.guard = guard
 
     def fresh(self, targets: int) -> FloatArray:
-        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 1 for paper
-        and ratio, 0 for fixed."""
+        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 0 for
+        fixed."""
         M = len(self.chain.matrix)
-        if self.form == 'counts':
-            return np.zeros((targets, 2, M, M))
-        return np.ones((targets, 0 if self.form == 'fixed' else 1, M, M))
+        return np.zeros((targets, 2 if self.form == 'counts' else 0, M, M))
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
         """The matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing can be
@@ -91,9 +79,7 @@ class AdaptiveChain:
         nominal = self.chain.transition(dt)
         if self.form == 'fixed':
             return np.array(nominal[None])
-        if self.form == 'counts':
-            return counts_transition(nominal, learnt, self.chain.matrix, self.weight)
-        return corrected(nominal, learnt[:, 0])
+        return counts_transition(nominal, learnt, self.chain.matrix, self.weight)
 
     def learn(
         self,
@@ -111,45 +97,16 @@ class AdaptiveChain:
         if self.form == 'fixed':
             return learnt
         hit = np.arange(len(learnt)) if hit is None else hit
-        if self.form == 'counts':
-            nominal = self.chain.transition(dt)
-            return learn_counts(learnt, hit, transition, mu_before, mu_after, nominal)
-        learnt, factor = learnt.copy(), mu_after[hit]
-        if self.form == 'ratio':
-            factor = factor / np.maximum(mu_before[hit], LEAST)
-        learnt[hit, 0] = adapt_product(learnt[hit, 0], factor, self.chain.matrix, self.guard)
-        return learnt
-
-
-def adapt_product(
-    correction: FloatArray, factor: FloatArray, prior: FloatArray, guard: float
-) -> FloatArray:
-    """Eq. (1) of the diver paper as a factor on P0: P_ij <- P_ij f_j / sum, then the guard
-    P <- (1 - guard) P + guard P0; f (..., M) is mu(k), or mu(k) / mu(k-1).
-
-    Without the guard the exponent of f = mu doubles at each step, and rows become one-hot within
-    five; ratios telescope to mu(k) / mu(0), whatever the chain.
-    """
-    P = corrected(prior, correction) * factor[..., None, :]
-    total = P.sum(axis=-1, keepdims=True)
-    P = np.where(total > 0.0, P / np.where(total > 0.0, total, 1.0), prior)
-    P = (1.0 - guard) * P + guard * prior
-    return np.asarray(np.where(prior > 0.0, P / np.where(prior > 0.0, prior, 1.0), 1.0))
-
-
-def corrected(P: FloatArray, correction: FloatArray) -> FloatArray:
-    """Apply a learnt factor to the matrix of any step and renormalise the rows. (..., M, M)."""
-    out = P * correction
-    total = out.sum(axis=-1, keepdims=True)
-    return np.asarray(np.where(total > 0.0, out / np.where(total > 0.0, total, 1.0), P))
+        nominal = self.chain.transition(dt)
+        return learn_counts(learnt, hit, transition, mu_before, mu_after, nominal)
 
 
 @kernel
 def counts_transition(
     nominal: FloatArray, learnt: FloatArray, prior: FloatArray, weight: float
 ) -> FloatArray:
-    """`corrected` by the counts (n + N0 P0) / (e + N0 P0): the matrices (T, M, M) of a step whose
-    nominal one is `nominal` (M, M), after what was `learnt` (T, 2, M, M)."""
+    """Multiply by (n + N0 P0) / (e + N0 P0) and renormalise the rows: the matrices (T, M, M) of a
+    step whose nominal one is `nominal` (M, M), after what was `learnt` (T, 2, M, M)."""
     T, _, M, _ = learnt.shape
     out = np.empty((T, M, M))
     for t in range(T):

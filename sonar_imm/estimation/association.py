@@ -47,7 +47,6 @@ from numpy.typing import NDArray
 
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray, with_rows
 from .imm import pairs_inside
-from .jit import kernel
 
 Pair = tuple[int, int, float]
 """A target, a detection, and the cost of taking them together."""
@@ -299,22 +298,25 @@ class Tracks:
         Returns the tracks that live on and the mask ``kept`` (T,) of those, to select the states
         that the caller keeps beside them.
         """
-        looked = np.ones(len(self), np.bool_) if looked is None else looked
-        status, age, seen, misses, last_hit_ns, kept = count(
-            self.age,
-            _window(self.seen, rules.confirm_window),
-            self.misses,
-            self.last_hit_ns,
-            self.status,
-            hit,
-            looked,
-            stamp_ns,
-            rules.confirm_hits,
-            rules.delete_misses,
-            rules.max_coast_ns,
+        there = np.ones(len(self), np.bool_) if looked is None else looked | hit
+        seen = _window(self.seen, rules.confirm_window)
+        newest = np.concatenate([seen[:, 1:], hit[:, None]], axis=1)
+        seen = np.where(there[:, None], newest, seen)
+        hits, age = seen.sum(axis=1), self.age + there
+        misses = np.where(hit, 0, self.misses + there)
+        last_hit_ns = np.where(hit, stamp_ns, self.last_hit_ns)
+        firm = (self.status != TENTATIVE) | (hits >= rules.confirm_hits)
+        now = np.where(hit, CONFIRMED, np.where(there, COASTING, self.status))
+        status = np.where(firm, now, TENTATIVE).astype(np.uint8)
+        too_few = np.minimum(age, rules.confirm_window) - hits
+        ended = np.where(
+            firm,
+            misses >= rules.delete_misses,
+            too_few > rules.confirm_window - rules.confirm_hits,
         )
-        track_id = self.track_id[kept]
-        return Tracks(track_id, status, age, seen, misses, last_hit_ns, self.next_id), kept
+        kept = ~ended & (stamp_ns - last_hit_ns <= rules.max_coast_ns)
+        after = Tracks(self.track_id, status, age, seen, misses, last_hit_ns, self.next_id)
+        return after.only(kept), kept
 
     def none_left(self) -> Tracks:
         """No tracks any more; identities go on."""
@@ -346,7 +348,6 @@ def _window(seen: BoolArray, length: int) -> BoolArray:
     return np.pad(seen[:, seen.shape[1] - length + missing :], ((0, 0), (missing, 0)))
 
 
-@kernel
 def choose(
     fit: FloatArray, tentative: BoolArray, missed: float, log_clutter: float
 ) -> tuple[IntArray, bool]:
@@ -358,66 +359,12 @@ def choose(
     could go to two targets of the same rank: then the choice has to be weighed.
     """
     T, D = fit.shape
-    chosen, taken_by = np.empty(T, dtype=np.int64), np.empty(D, dtype=np.int64)
-    for t in range(T):
-        chosen[t] = -1
-    for d in range(D):
-        taken_by[d] = -1
-    for turn in range(2):
-        for t in range(T):
-            if tentative[t] != (turn == 1):
-                continue
-            for d in range(D):
-                if not fit[t, d] > -np.inf or not missed - fit[t, d] + log_clutter < 0.0:
-                    continue
-                holder = taken_by[d]
-                if holder >= 0 and tentative[holder] != tentative[t]:
-                    continue
-                if holder >= 0 or chosen[t] >= 0:
-                    return chosen, False
-                chosen[t], taken_by[d] = d, t
+    chosen, free = np.full(T, -1, np.int64), np.ones(D, np.bool_)
+    worthwhile = (fit > -np.inf) & (missed - fit + log_clutter < 0.0)
+    for turn in (False, True):
+        open_ = worthwhile & (tentative == turn)[:, None] & free
+        if (open_.sum(axis=0) > 1).any() or (open_.sum(axis=1) > 1).any():
+            return chosen, False
+        t, d = np.nonzero(open_)
+        chosen[t], free[d] = d, False
     return chosen, True
-
-
-@kernel
-def count(
-    age: IntArray,
-    seen: BoolArray,
-    misses: IntArray,
-    last_hit_ns: IntArray,
-    status: np.ndarray,
-    hit: BoolArray,
-    looked: BoolArray,
-    stamp_ns: int,
-    confirm_hits: int,
-    delete_misses: int,
-    max_coast_ns: int,
-) -> tuple[np.ndarray, IntArray, BoolArray, IntArray, IntArray, BoolArray]:
-    """See `Tracks.scan`: status, age, seen, misses and last_hit_ns of the tracks that
-    live on, and the mask kept (T,) of those."""
-    T, window = seen.shape
-    kept, out = np.empty(T, dtype=np.bool_), 0
-    status_1, age_1 = np.empty(T, dtype=np.uint8), np.empty(T, dtype=np.int64)
-    seen_1 = np.empty((T, window), dtype=np.bool_)
-    misses_1, last_1 = np.empty(T, dtype=np.int64), np.empty(T, dtype=np.int64)
-    for t in range(T):
-        there = looked[t] or hit[t]
-        hits = 0
-        for k in range(window):
-            was_hit = seen[t, k]
-            if there:
-                was_hit = seen[t, k + 1] if k + 1 < window else hit[t]
-            seen_1[out, k] = was_hit
-            hits += was_hit
-        age_1[out] = age[t] + there
-        misses_1[out] = 0 if hit[t] else misses[t] + there
-        last_1[out] = stamp_ns if hit[t] else last_hit_ns[t]
-        if status[t] != TENTATIVE or hits >= confirm_hits:
-            status_1[out] = CONFIRMED if hit[t] else (COASTING if there else status[t])
-            ended = misses_1[out] >= delete_misses
-        else:
-            status_1[out] = TENTATIVE
-            ended = min(age_1[out], window) - hits > window - confirm_hits
-        kept[t] = not ended and stamp_ns - last_1[out] <= max_coast_ns
-        out += kept[t]
-    return status_1[:out], age_1[:out], seen_1[:out], misses_1[:out], last_1[:out], kept

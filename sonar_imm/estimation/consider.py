@@ -38,8 +38,8 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
+from .covariance import JITTER, LIMIT
 from .jit import kernel
-from .small_matrices import JITTER, LIMIT
 
 
 def consider_update(

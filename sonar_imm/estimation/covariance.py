@@ -34,21 +34,26 @@ The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measur
 than `LIMIT` of it as its own noise: there R is raised by `JITTER` of S's diagonal, so that a
 perfect measurement leaves a variance, and can be repeated.
 
-The rules and repairs are compiled in `small_matrices`. Reference: Bierman, *Factorization Methods
+`small_matrices` has the rules and repairs compiled. Reference: Bierman, *Factorization Methods
 for Discrete Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation*
 (2000), ch. 12.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from . import small_matrices
 from .arrays import BoolArray, FloatArray
-from .small_matrices import LIMIT
+
+LIMIT = 1e-14
+"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
+n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a covariance within the limit
+has a factor."""
+
+JITTER = 1e-13
+"""What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
 
 
 class CovarianceError(ValueError):
@@ -98,7 +103,7 @@ def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
 
 def is_psd(P: FloatArray) -> BoolArray:
     """Whether each P (..., n, n) keeps to the limit, (...,). False where it is not finite."""
-    return small_matrices.are_psd(_batch(P)).reshape(P.shape[:-2])
+    return are_sound(np.moveaxis(np.asarray(P, np.float64), (-2, -1), (0, 1)))
 
 
 def add_jitter(P: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -107,15 +112,10 @@ def add_jitter(P: FloatArray) -> tuple[FloatArray, BoolArray]:
 
     What no jitter makes positive definite, because it is no covariance at all, stays as it is.
     """
-    out = np.array(_batch(P))
-    repaired = small_matrices.add_jitter_each(out)
-    return out.reshape(P.shape), repaired.reshape(P.shape[:-2])
-
-
-def _batch(P: FloatArray) -> FloatArray:
-    """P (..., n, n) as (B, n, n), the form that kernels take."""
-    count = math.prod(P.shape[:-2])
-    return np.ascontiguousarray(P, np.float64).reshape(count, *P.shape[-2:])
+    n = P.shape[-1]
+    batch = np.moveaxis(np.asarray(P, np.float64).reshape(-1, n, n), 0, -1)
+    out, repaired = with_jitter(batch)
+    return np.moveaxis(out, -1, 0).reshape(P.shape).copy(), repaired.reshape(P.shape[:-2])
 
 
 def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -123,12 +123,9 @@ def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, 
     moved = symmetrise(F @ P @ transpose(F) + Q)
     bad = np.asarray(~is_psd(moved) & np.isfinite(moved).all(axis=(-1, -2)))
     if bad.any():
-        cases = zip(*(np.broadcast_to(each, moved.shape)[bad] for each in (P, F, Q)))
-        again = np.empty_like(moved[bad])
-        for case, out in zip(cases, again):
-            root_P, root_F, root_Q = map(np.ascontiguousarray, case)
-            small_matrices.square_root_predict(root_P, root_F, root_Q, out)
-        moved[bad] = again
+        P, F, Q = (np.broadcast_to(each, moved.shape)[bad] for each in (P, F, Q))
+        turned = F @ _roots(P)
+        moved[bad] = add_jitter(turned @ transpose(turned) + symmetrise(Q))[0]
     return moved, bad
 
 
@@ -159,7 +156,88 @@ def _square_root_correct(
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """P, gain, factor and usable of one case: P (n, n), H (m, n), R (m, m)."""
     m, n = H.shape
-    out, gain, factor = np.empty((n, n)), np.empty((n, m)), np.empty((m, m))
-    if small_matrices.square_root_update(P, H, R, factor, gain, out):
-        return out, gain, factor, True
-    return P, np.zeros((n, m)), np.eye(m), False
+    unusable = P, np.zeros((n, m)), np.eye(m), False
+    if not all(np.isfinite(each).all() for each in (P, H, R)):
+        return unusable
+    root, noise = _roots(P), _roots(R)
+    seen = H @ root
+    own = (seen * seen).sum(axis=1) + (noise * noise).sum(axis=1)
+    if not ((own > 0.0) & (own < np.inf)).all():
+        return unusable
+    raised = ~(np.diag(R) > LIMIT * own)
+    for extra in (raised, np.ones(m, np.bool_)):
+        more = np.diag(np.sqrt(np.where(extra, JITTER * own, 0.0)))
+        blocks = [[noise, seen, more], [np.zeros((n, m)), root, np.zeros((n, m))]]
+        A = _triangular(np.block(blocks))
+        if (np.square(np.diag(A)[:m]) > LIMIT * own).all():
+            break
+    factor, cross, rest = A[:m, :m], A[m:, :m], A[m:, m:]
+    gain = transpose(solve(transpose(factor), transpose(cross)))
+    return add_jitter(rest @ transpose(rest))[0], gain, factor, True
+
+
+def _roots(P: FloatArray) -> FloatArray:
+    """Lower roots (..., n, n) of covariances that may be singular."""
+    return np.moveaxis(semidefinite_roots(np.moveaxis(P, (-2, -1), (0, 1))), (0, 1), (-2, -1))
+
+
+def _triangular(A: FloatArray) -> FloatArray:
+    """The lower triangle (r, r) with a diagonal that is not negative and the same ``A A'`` as A
+    (r, c)."""
+    lower = transpose(np.asarray(np.linalg.qr(transpose(A), mode='r')))
+    return np.asarray(lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0))
+
+
+# -- many small covariances at once, (n, n, ...): numpy runs along the last axes ------------------
+
+
+def semidefinite_roots(S: FloatArray) -> FloatArray:
+    """Return lower roots (n, n, ...), ``S = L L'``, of covariances S (n, n, ...) that may be
+    singular: a column without variance is zero. Only lower triangles are read."""
+    L = np.zeros(S.shape)
+    for b in range(len(S)):
+        pivot = S[b, b] - (L[b, :b] * L[b, :b]).sum(axis=0)
+        known = (pivot <= LIMIT * S[b, b]) | ~(pivot > 0.0)
+        root = np.sqrt(np.where(known, 0.0, pivot))
+        L[b, b] = root
+        inverse = np.where(known, 0.0, 1.0 / np.where(known, 1.0, root))
+        for a in range(b + 1, len(S)):
+            L[a, b] = (S[a, b] - (L[a, :b] * L[b, :b]).sum(axis=0)) * inverse
+    return L
+
+
+def are_sound(S: FloatArray) -> BoolArray:
+    """Return whether each covariance S (n, n, ...) keeps to the limit (...): `is_psd`, by pivots
+    without square roots. Only lower triangles are read."""
+    n = len(S)
+    L, D = np.zeros(S.shape), np.zeros(S.shape[1:])
+    good = np.ones(S.shape[2:], np.bool_)
+    with np.errstate(invalid='ignore', over='ignore'):  # what is not finite is not sound
+        for a in range(n):
+            rest = S[a, a] - LIMIT * S[a, a]
+            for b in range(a):
+                value = S[a, b] - (L[a, :b] * L[b, :b] * D[:b]).sum(axis=0)
+                good &= ~((D[b] == 0.0) & (value != 0.0))
+                L[a, b] = np.divide(value, D[b], out=np.zeros_like(value), where=D[b] != 0.0)
+                rest = rest - value * L[a, b]
+            positive = (rest > 0.0) & (rest < np.inf)
+            good &= positive | ((S[a, a] == 0.0) & (rest == 0.0))
+            D[a] = np.where(positive, rest, 0.0)
+    return good
+
+
+def with_jitter(S: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return covariances S (n, n, L), with larger diagonals where they did not keep to the limit,
+    and which (L,) these are: `add_jitter`. What no jitter cures stays as it is."""
+    bad = ~are_sound(S)
+    if not bad.any():
+        return S, bad
+    out, lanes, n = S.copy(), np.flatnonzero(bad), len(S)
+    share = JITTER
+    while len(lanes) and share < 2.0 * n:
+        trial = S[..., lanes].copy()
+        trial[range(n), range(n)] *= 1.0 + share
+        cured = are_sound(trial)
+        out[..., lanes[cured]] = trial[..., cured]
+        lanes, share = lanes[~cured], 10.0 * share
+    return out, bad

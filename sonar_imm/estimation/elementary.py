@@ -46,16 +46,6 @@ def _even_polynomial(function: str) -> tuple[float, ...]:
     )
 
 
-# Chebyshev interpolation, at 23 points, of what `gaussians` says; the first two units higher, so
-# that it is 1 / 2 at 0.
-_T = (
-    0.46151582985003786, -0.09155228183401122, 0.031030368425963, 0.010002352385420084,
-    -0.02640104296627982, 0.02453696323875023, -0.015170415402960762, 0.006522000726622294,
-    -0.0016760723409777719, 7.791206884373869e-06, 0.0001823341283884788, -5.360599672837992e-05,
-    -9.896049006398792e-06, 9.055694907386791e-06, -7.04376663890156e-08, -1.3003901927413688e-06,
-    1.2798783282871204e-07, 1.8841037002080884e-07, -2.636797167357404e-08,
-    -2.5444050458032668e-08, 3.661836535863277e-09, 2.2027448318350712e-09, -2.884794724105449e-10,
-)  # fmt: skip
 _S = _even_polynomial('sin')
 _C = _even_polynomial('cos')
 
@@ -81,33 +71,6 @@ def exponentials(values: FloatArray, scratch: FloatArray, out: FloatArray) -> No
         bits[i] = (bits[i] + 1023) << 52
     for i in range(values.shape[0]):
         out[i] = out[i] * scratch[i] if values[i] > _LEAST else 0.0
-
-
-@kernel
-def gaussians(
-    values: FloatArray, scratch: FloatArray, density: FloatArray, below: FloatArray
-) -> None:
-    """exp(-v^2 / 2) of values (n,) into density (n,), and the probability of a standard normal
-    number below v into below (n,).
-
-    The probability of more than a = abs(v) is exp(-a^2 / 2) / (1 + a) times a smooth function of
-    (a - 5) / (a + 5), a polynomial to 4e-16 (Shepherd and Laframboise, *Chebyshev approximation of
-    (1 + 2x) exp(x^2) erfc x in 0 <= x < infinity*, Math. Comp. 36, 1981).
-    """
-    for i in range(values.shape[0]):
-        below[i] = -0.5 * (values[i] * values[i])
-    exponentials(below, scratch, density)
-    for i in range(values.shape[0]):
-        a = abs(values[i])
-        a = 40.0 if a > 40.0 else a
-        t = (a - 5.0) / (a + 5.0)
-        p = _T[20] + t * (_T[21] + t * _T[22])
-        p = _T[15] + t * (_T[16] + t * (_T[17] + t * (_T[18] + t * (_T[19] + t * p))))
-        p = _T[10] + t * (_T[11] + t * (_T[12] + t * (_T[13] + t * (_T[14] + t * p))))
-        p = _T[5] + t * (_T[6] + t * (_T[7] + t * (_T[8] + t * (_T[9] + t * p))))
-        p = _T[0] + t * (_T[1] + t * (_T[2] + t * (_T[3] + t * (_T[4] + t * p))))
-        tail = density[i] * p / (1.0 + a)
-        below[i] = tail if values[i] < 0.0 else 1.0 - tail
 
 
 @kernel

@@ -43,7 +43,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import BoolArray, FloatArray
-from .covariance import add_jitter, correct, is_psd, propagate, symmetrise
+from .covariance import (
+    add_jitter,
+    correct,
+    is_psd,
+    propagate,
+    semidefinite_roots,
+    symmetrise,
+    with_jitter,
+)
 from .kalman import log_density
 
 DEAD = 1e-200
@@ -185,15 +193,58 @@ def gate(
     not impossible: the moment-matched gate of the mixture is too small for a sharp turn seen by a
     sensor that is accurate in one direction, and loses the track there.
     """
+    fit = np.full((len(h), len(z)), -np.inf)
+    if not fit.size:
+        return fit
     possible = c >= MIN_GATE_PROBABILITY
-    S, _ = add_jitter((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
-    v = z[None, :, None] - h[:, None]
-    nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
-    log_density = -0.5 * (nis + h.shape[-1] * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])
-    inside = ((nis <= threshold) & possible[:, None]).any(axis=-1)
-    weight = np.where(possible, c, 0.0)[:, None]
+    S = H @ P @ np.swapaxes(H, -1, -2)
+    t, d = _near(h, S, possible, z, R, threshold)
+    total = np.moveaxis(S[t] + R[d, None], (-2, -1), (0, 1))  # (m, m, pairs, M)
+    shape = total.shape[2:]
+    total, _ = with_jitter(total.reshape(*total.shape[:2], -1))
+    v = np.moveaxis(z[d, None] - h[t], -1, 0).reshape(h.shape[-1], -1)
+    log, nis = (part.reshape(shape) for part in _log_density(v, total))
+    inside = ((nis <= threshold) & possible[t]).any(axis=-1)
+    density = (np.where(possible, c, 0.0)[t] * np.exp(log)).sum(axis=-1)
     with np.errstate(divide='ignore'):
-        return np.where(inside, np.log(np.sum(weight * np.exp(log_density), axis=-1)), -np.inf)
+        fit[t[inside], d[inside]] = np.log(density[inside])
+    return fit
+
+
+def _near(
+    h: FloatArray,
+    S: FloatArray,
+    possible: BoolArray,
+    z: FloatArray,
+    R: FloatArray,
+    threshold: float,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Targets and detections (pairs,) that lie in the box that the gates of all models reach: a
+    detection is far from most targets. S (T, M, m, m): without the errors of detections."""
+    widest = np.diagonal(R, axis1=-2, axis2=-1).max(axis=0)
+    reach = np.sqrt(threshold * np.maximum(np.diagonal(S, axis1=-2, axis2=-1) + widest, 0.0))
+    low = np.where(possible[..., None], h - reach, np.inf).min(axis=1)
+    high = np.where(possible[..., None], h + reach, -np.inf).max(axis=1)
+    inside = (z[None] >= low[:, None]) & (z[None] <= high[:, None])
+    t, d = np.nonzero(inside.all(axis=-1))
+    return t, d
+
+
+def _log_density(v: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """ln N(v; 0, S) and the normalised squares (L,) of v (m, L) under S (m, m, L); -inf and
+    infinity where S is singular."""
+    root = semidefinite_roots(S)
+    white = np.zeros_like(v)
+    singular = np.zeros(v.shape[1], np.bool_)
+    log = np.full(v.shape[1], -0.5 * len(v) * np.log(2.0 * np.pi))
+    for a in range(len(v)):
+        pivot = root[a, a]
+        singular |= ~(pivot > 0.0)
+        safe = np.where(pivot > 0.0, pivot, 1.0)
+        white[a] = (v[a] - (root[a, :a] * white[:a]).sum(axis=0)) / safe
+        log -= np.log(safe)
+    nis = np.where(singular, np.inf, (white * white).sum(axis=0))
+    return np.where(singular, -np.inf, log - 0.5 * nis), nis
 
 
 def pairs_inside(fit: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
-from .imm import DEAD, MIN_GATE_PROBABILITY
+from .imm import DEAD
 from .jit import kernel
 from .small_matrices import (
     all_finite,
@@ -411,65 +411,6 @@ def _weigh(
     for j in range(M):
         mu[j] /= total
     return best + math.log(total)
-
-
-@kernel
-def gate(
-    h: FloatArray,
-    H: FloatArray,
-    P: FloatArray,
-    c: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    threshold: float,
-) -> FloatArray:
-    """See `imm.gate`."""
-    T, M, m = h.shape
-    D, n = len(z), P.shape[2]
-    out = np.empty((T, D))
-    if T == 0 or D == 0:
-        return out  # what follows takes memory by the size of a measurement squared
-    S0, PHt, nothing = np.empty((M, m, m)), np.empty((n, m)), np.zeros((m, m))
-    S, L = np.empty((m, m)), np.zeros((m, m))
-    v, w, low, high, widest = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.zeros(m)
-    for d in range(D):
-        for r in range(m):
-            widest[r] = max(widest[r], R[d, r, r])
-    for t in range(T):
-        for r in range(m):
-            low[r], high[r] = np.inf, -np.inf
-        for j in range(M):
-            if c[t, j] >= MIN_GATE_PROBABILITY:
-                innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
-                for r in range(m):
-                    reach = math.sqrt(threshold * max(S0[j, r, r] + widest[r], 0.0))
-                    low[r] = min(low[r], h[t, j, r] - reach)
-                    high[r] = max(high[r], h[t, j, r] + reach)
-        for d in range(D):
-            out[t, d] = -np.inf
-            r = 0
-            while r < m and low[r] <= z[d, r] <= high[r]:
-                r += 1
-            if r < m:
-                continue
-            total, inside = 0.0, False
-            for j in range(M):
-                if c[t, j] < MIN_GATE_PROBABILITY:
-                    continue
-                for r in range(m):
-                    v[r] = z[d, r] - h[t, j, r]
-                    for s in range(m):
-                        S[r, s] = S0[j, r, s] + R[d, r, s]
-                if cholesky_with_jitter(S, L):
-                    nis = whitened_square(L, v, w)
-                    inside = inside or nis <= threshold
-                    value = -0.5 * (nis + m * LOG_2PI)
-                    for r in range(m):
-                        value -= math.log(L[r, r])
-                    total += c[t, j] * math.exp(value)
-            if inside:
-                out[t, d] = math.log(total)
-    return out
 
 
 @kernel

@@ -28,8 +28,7 @@ detections and new targets together. The sums over the events are
     missed_t        it exists and was not detected: Pr(no detection) r (1 - P_D) / (1 - r P_D),
     r_t             the new probability of existence: beta summed, plus missed.
 
-Tracks that share no detection do not influence each other, so the events are enumerated cluster
-by cluster (`associate`); a cluster with more than `MOST_EVENTS` gets a smaller gate. Within a
+`associate` computes these sums exactly, without visiting the events (`marginals`). Within a
 track, model j shares detection i in proportion to N_ji (`update`), ``beta_i|j ~ beta_i N_ji /
 f_i`` and ``mu_j ~ c_j (beta_0 + sum_i beta_i N_ji / f_i)``, moment-matched in each model.
 
@@ -44,6 +43,7 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
+from .marginals import marginals
 from .small_matrices import (
     add_jitter_each,
     cholesky_with_jitter,
@@ -53,15 +53,6 @@ from .small_matrices import (
     joseph,
     whitened_square,
 )
-
-MOST_EVENTS = 20_000
-"""Joint events of a cluster beyond which its gate shrinks."""
-
-SMALLER = 0.7
-"""By what the gate of too large a cluster is multiplied until it fits."""
-
-LEAST_GATE = 1e-6
-"""A gate as small as this holds nothing: the cluster is given up."""
 
 OPENS_GATE = 0.01
 """A model less probable than this opens no gate for a shared detection."""
@@ -118,7 +109,6 @@ def likelihoods(
     return mixture, least
 
 
-@kernel
 def associate(
     ratio: FloatArray,
     nis: FloatArray,
@@ -126,127 +116,18 @@ def associate(
     detection_probability: FloatArray,
     threshold: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `jipda.associate`: beta (T, D), missed (T,), existence (T,)."""
-    T, D = ratio.shape
-    beta, missed, after = np.zeros((T, D)), np.empty(T), np.empty(T)
-    inside = np.empty((T, D), dtype=np.bool_)
-    for t in range(T):
-        detected = existence[t] * detection_probability[t]
-        missed[t] = existence[t] * (1.0 - detection_probability[t]) / (1.0 - detected)
-        for d in range(D):
-            inside[t, d] = nis[t, d] <= threshold
-    label = _labels(inside)
-    members, shares, alone = np.empty(T, dtype=np.int64), np.empty((T, D)), np.empty(T)
-    for first in range(T):
-        if label[first] != first:
-            continue
-        size = 0
-        for t in range(first, T):
-            if label[t] == first:
-                members[size] = t
-                size += 1
-        own = members[:size]
-        gate = threshold
-        while _enumerate(own, inside, ratio, existence, detection_probability, shares, alone) < 0:
-            gate = gate * SMALLER if gate > LEAST_GATE else -1.0
-            for t in own:
-                for d in range(D):
-                    inside[t, d] = nis[t, d] <= gate
-        for t in own:
-            missed[t] *= alone[t]
-            for d in range(D):
-                beta[t, d] = shares[t, d]
-    for t in range(T):
-        after[t] = missed[t]
-        for d in range(D):
-            after[t] += beta[t, d]
-        after[t] = min(after[t], 1.0)  # what is rounded adds up to a little more
-    return beta, missed, after
+    """Return beta (T, D), missed (T,) and the new existence (T,) of the joint events above.
 
-
-@kernel
-def _labels(inside: BoolArray) -> IntArray:
-    """For each track the first track of its cluster; -1 for one without a detection."""
-    T, D = inside.shape
-    label = np.full(T, -1, dtype=np.int64)
-    for t in range(T):
-        for d in range(D):
-            if inside[t, d]:
-                label[t] = t
-                break
-    changed = True
-    while changed:
-        changed = False
-        for d in range(D):
-            least = T
-            for t in range(T):
-                if inside[t, d]:
-                    least = min(least, label[t])
-            for t in range(T):
-                if inside[t, d] and label[t] > least:
-                    label[t] = least
-                    changed = True
-    return label
-
-
-@kernel
-def _enumerate(
-    tracks: IntArray,
-    inside: BoolArray,
-    ratio: FloatArray,
-    existence: FloatArray,
-    detection_probability: FloatArray,
-    shares: FloatArray,
-    alone: FloatArray,
-) -> int:
-    """Visit the joint events of a cluster: the probability of each pair into `shares` (T, D), of
-    no detection into `alone` (T,). Gives their number, -1 where there are too many."""
-    size, D = len(tracks), inside.shape[1]
-    for t in tracks:
-        alone[t] = 0.0
-        for d in range(D):
-            shares[t, d] = 0.0
-    used = np.zeros(D, dtype=np.bool_)
-    chosen = np.full(size, -2, dtype=np.int64)
-    weight = np.ones(size + 1)
-    count, total, place = 0, 0.0, 0
-    while place >= 0:
-        if place == size:
-            count += 1
-            if count > MOST_EVENTS:
-                return -1
-            total += weight[size]
-            for k in range(size):
-                if chosen[k] < 0:
-                    alone[tracks[k]] += weight[size]
-                else:
-                    shares[tracks[k], chosen[k]] += weight[size]
-            place -= 1
-            continue
-        t = tracks[place]
-        if chosen[place] >= 0:
-            used[chosen[place]] = False
-        chosen[place] += 1
-        while chosen[place] >= 0 and chosen[place] < D:
-            if inside[t, chosen[place]] and not used[chosen[place]]:
-                break
-            chosen[place] += 1
-        if chosen[place] >= D:
-            chosen[place] = -2
-            place -= 1
-            continue
-        detected = existence[t] * detection_probability[t]
-        if chosen[place] < 0:
-            weight[place + 1] = weight[place] * (1.0 - detected)
-        else:
-            used[chosen[place]] = True
-            weight[place + 1] = weight[place] * detected * ratio[t, chosen[place]]
-        place += 1
-    for t in tracks:
-        alone[t] /= total
-        for d in range(D):
-            shares[t, d] /= total
-    return count
+    :param ratio: (T, D) f / lambda.
+    :param nis: (T, D) normalised innovation squared; pairs above `threshold` are impossible.
+    :param existence: (T,) before the scan.
+    :param detection_probability: (T,) of a target that exists.
+    """
+    detected = existence * detection_probability
+    beta, none = marginals(detected[:, None] * ratio, 1.0 - detected, nis <= threshold)
+    missed = none * existence * (1.0 - detection_probability) / (1.0 - detected)
+    # What is rounded adds up to a little more than 1.
+    return beta, missed, np.minimum(missed + beta.sum(axis=1), 1.0)
 
 
 def update(

@@ -194,31 +194,3 @@ def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
     out[M, :M] = (1.0 - stay) / M
     out[M, M] = stay
     return out
-
-
-class EventChain:
-    """Models that are events rather than states: each step draws from the same distribution,
-    whatever came before.
-
-    law (M,): probabilities in one reference step. Its first model is 'nothing happens', which gets
-    likelier as the step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have
-    identical rows (the filter is then a GPB1).
-    """
-
-    def __init__(self, law: ArrayLike, step: float):
-        row = check_transition_matrix(np.tile(np.asarray(law, np.float64), (np.size(law), 1)))[0]
-        if not step > 0.0:
-            raise ValueError(f'the reference step must be positive, got {step}')
-        self.step = float(step)
-        self.matrix = np.tile(row, (len(row), 1))
-
-    def transition(self, dt: float) -> FloatArray:
-        """P(dt), (M, M)."""
-        if not dt >= 0.0:
-            raise ValueError(f'a time step cannot be negative, got {dt}')
-        row = self.matrix[0].copy()
-        nothing = row[0] ** (dt / self.step)
-        happens = row[1:].sum()
-        row[1:] *= (1.0 - nothing) / happens if happens > 0.0 else 0.0
-        row[0] = 1.0 - row[1:].sum()
-        return np.tile(row, (len(row), 1))

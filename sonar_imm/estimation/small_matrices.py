@@ -18,12 +18,6 @@ For matrices of a few rows the call of a library costs more than the arithmetic.
 writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets;
 only the repairs, which are rare, allocate. `is_psd`, `add_jitter` and the ``square_root_``
 functions are the rules that `covariance` explains.
-
-`semidefinite_roots` and `not_psd` work on many matrices side by side, each in a *lane*: an array
-(.., lanes) has one number of every matrix in a row, and the last loop of everything runs along
-such a row, with few arrays in each loop, so that it is compiled to vector instructions: one small
-matrix hardly fills a processor that does several additions at a time. What is done to a lane does
-not depend on its neighbours, so a matrix gives the same bits in any company.
 """
 
 from __future__ import annotations
@@ -32,16 +26,9 @@ import math
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import BoolArray, FloatArray
+from .covariance import JITTER, LIMIT
 from .jit import kernel
-
-LIMIT = 1e-14
-"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
-n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a covariance within the limit
-has a factor."""
-
-JITTER = 1e-13
-"""What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
 
 
 @kernel
@@ -406,77 +393,3 @@ def whitened_square(L: FloatArray, v: FloatArray, w: FloatArray) -> float:
         w[r] = value / L[r, r]
         total += w[r] * w[r]
     return total
-
-
-MOST_LANES = 48
-"""With more, the numbers of all lanes do not fit into the fastest memory."""
-
-
-@kernel
-def lanes_for(count: int) -> int:
-    """How many lanes `count` > 0 components are worked on with, in as few turns as can be."""
-    turns = (count + MOST_LANES - 1) // MOST_LANES
-    return (count + turns - 1) // turns
-
-
-@kernel
-def turn_of(first: int, count: int, lanes: int) -> int:
-    """Where the turn that would begin with component `first` does begin, so that it ends with the
-    last of `count`; some are then done twice, which changes nothing."""
-    return min(first, count - lanes)
-
-
-@kernel
-def semidefinite_roots(S: FloatArray, L: FloatArray, scratch: FloatArray) -> None:
-    """`semidefinite_root` of the matrices S (n, n, lanes), into L; only lower
-    triangles are read and written. scratch: (lanes,)."""
-    n, _, lanes = S.shape
-    for b in range(n):
-        for a in range(b, n):
-            for k in range(lanes):
-                L[a, b, k] = S[a, b, k]
-            for c in range(b):
-                for k in range(lanes):
-                    L[a, b, k] -= L[a, c, k] * L[b, c, k]
-        for k in range(lanes):
-            pivot = L[b, b, k]
-            known = pivot <= LIMIT * S[b, b, k] or not pivot > 0.0
-            root = math.sqrt(pivot)
-            L[b, b, k] = 0.0 if known else root
-            scratch[k] = 0.0 if known else 1.0 / root
-        for a in range(b + 1, n):
-            for k in range(lanes):
-                L[a, b, k] *= scratch[k]
-
-
-@kernel
-def not_psd(S: FloatArray, L: FloatArray, scratch: FloatArray, bad: IntArray) -> None:
-    """bad (lanes,): 1 where `is_psd` would refuse the matrix of S (n, n, lanes), 0
-    elsewhere. The lower triangle is read; L (n, n, lanes) and scratch (lanes,) are written."""
-    n, _, lanes = S.shape
-    for k in range(lanes):
-        bad[k] = 0
-    for a in range(n):
-        # L D L' without square roots: L below the diagonal, L D above it, 1 / D on it.
-        for k in range(lanes):
-            scratch[k] = S[a, a, k] - LIMIT * S[a, a, k]
-        for b in range(a):
-            for k in range(lanes):
-                L[b, a, k] = S[a, b, k]
-            for c in range(b):
-                for k in range(lanes):
-                    L[b, a, k] -= L[c, a, k] * L[b, c, k]
-            for k in range(lanes):
-                L[a, b, k] = L[b, a, k] * L[b, b, k]
-            for k in range(lanes):
-                lost = (L[b, b, k] == 0.0) & (L[b, a, k] != 0.0)
-                bad[k] = 1 if lost else bad[k]
-            for k in range(lanes):
-                scratch[k] -= L[b, a, k] * L[a, b, k]
-        for k in range(lanes):
-            rest = scratch[k]
-            positive = (rest > 0.0) & (rest < math.inf)
-            L[a, a, k] = 1.0 / rest if positive else 0.0
-        for k in range(lanes):
-            nothing = (S[a, a, k] == 0.0) & (scratch[k] == 0.0)
-            bad[k] = bad[k] if (L[a, a, k] > 0.0) | nothing else 1

@@ -21,6 +21,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 
+from ..gone import GONE
 from ..threads import one_blas_thread
 from . import NO_ROS
 from .stopping import stopper
@@ -31,10 +32,13 @@ OF_ROS, MESSAGES = ('rclpy', 'std_srvs'), ('_msgs', '_interfaces')
 
 def main() -> int:
     """Start the node that this program is called after, e.g. ``diver_node``. Gives its exit code,
-    2 where a module is not installed."""
+    2 where a module is not installed or the program was removed."""
+    program = Path(sys.argv[0]).stem
+    if gone := GONE.get(f'executable {program}'):
+        print(f'{program} {gone}', file=sys.stderr)
+        return 2
     stopper.listen()
     one_blas_thread()  # before the node's module imports numpy
-    program = Path(sys.argv[0]).stem
     try:
         node = import_module(f'{__package__}.{program.removesuffix("_node")}')
     except ModuleNotFoundError as error:

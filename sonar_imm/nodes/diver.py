@@ -40,12 +40,12 @@ from msg_adapters.fixes import write_geo
 
 from ..acoustics.geodesy import Origin
 from ..estimates import Estimate
+from .base import TrackerNode
 from .messages import make
 from .running import run
-from .tracks import TracksNode
 
 
-class DiverNode(TracksNode):
+class DiverNode(TrackerNode):
     """Tracks divers from position fixes or raw arrival times."""
 
     def __init__(self, **options: Any):
@@ -55,7 +55,10 @@ class DiverNode(TracksNode):
         self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
 
     def origin(self) -> Origin | None:
-        """That of the parameters, or the first position in latitude and longitude."""
+        """Return the origin of the frame of the tracks, None while it is not known.
+
+        It is set by the parameters or by the first position in latitude and longitude.
+        """
         known: Origin | None = self.tracker.origin
         return known
 

@@ -38,15 +38,14 @@ from typing import Any
 
 from msg_adapters.displays.obstacle import write_places
 
-from ..acoustics.geodesy import Origin
 from ..estimates import Estimate
+from .base import TrackerNode
 from .messages import make, message_class
 from .qos import latched_qos
 from .running import run
-from .tracks import TracksNode
 
 
-class ObstacleNode(TracksNode):
+class ObstacleNode(TrackerNode):
     """Tracks obstacles ahead and how far above or below the sonar they lie."""
 
     def __init__(self, **options: Any):
@@ -57,11 +56,6 @@ class ObstacleNode(TracksNode):
         self._map = self._endpoints.advertise(
             message_class('geometry_msgs/msg/PoseArray'), '~/map', latched_qos()
         )
-
-    def origin(self) -> Origin | None:
-        """That of the parameters."""
-        known: Origin | None = self._node_config.origin()
-        return known
 
     def activated(self) -> None:
         """Hear the inputs, and show what is remembered."""

@@ -22,7 +22,7 @@ and nothing waits for them, so `MessagesFirst` looks at them a few times a secon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 import contextlib
 from pathlib import Path
 import sys
@@ -58,33 +58,23 @@ Its parameters: docs/parameters, or ros2 param list and ros2 param describe whil
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin a node until SIGINT, SIGTERM or SIGHUP. Gives the exit code: 0 done, 2 unusable
-    parameters."""
-    return run_all(lambda: [make_node()], args)
-
-
-def run_all(
-    make_nodes: Callable[[], Iterable[Node]],
-    args: list[str] | None = None,
-    explain: Callable[[Sequence[str] | None], str | None] | None = None,
-) -> int:
-    """Spin several nodes in one executor, as `run` does one; `explain` is in place of `help_text`.
+    parameters.
 
     The order of things matters: the textbook version fails on every tenth signal, because the
     context can vanish inside any call, the constructor included.
     """
     first = stopper.listen()
-    nodes: list[Node] = []
+    node: Node | None = None
     try:
         _init(args)
-        if text := (explain or help_text)(args):
+        if text := help_text(args):
             print(text)
             return 0
         stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
         executor = MessagesFirst()
-        for node in make_nodes():
-            nodes.append(node)
-            executor.add_node(node)
-        warn_of_foreign_files(nodes, args)
+        node = make_node()
+        executor.add_node(node)
+        warn_of_foreign_files(node, args)
         stopper.on_stop(rclpy.try_shutdown)
         executor.spin()
     except ExternalShutdownException:
@@ -97,7 +87,7 @@ def run_all(
             raise
     finally:
         with contextlib.suppress(*([Exception] if stopper.asked else [])):
-            for node in nodes:
+            if node is not None:
                 node.destroy_node()
         rclpy.try_shutdown()
         stopper.release() if first else stopper.ignore()
@@ -127,19 +117,18 @@ def help_text(args: Sequence[str] | None) -> str | None:
     raise ConfigError(f"'{words[0]}' is no argument of this node; see --help")
 
 
-def warn_of_foreign_files(nodes: Sequence[Node], args: Sequence[str] | None) -> None:
+def warn_of_foreign_files(node: Node, args: Sequence[str] | None) -> None:
     """Warn of each parameter file that is for other nodes only: ROS ignores it in silence."""
     words = list(sys.argv if args is None else args)
     for before, word in zip(words, words[1:]):
         if before != '--params-file':
             continue
         names = sections_of(small_text(Path(word)))
-        full = [node.get_fully_qualified_name() for node in nodes]
-        own = {*full, *(f'/{node.get_name()}' for node in nodes)}
+        full = node.get_fully_qualified_name()
+        own = {full, f'/{node.get_name()}'}
         if names and not any('*' in name or _full(name) in own for name in names):
-            nodes[0].get_logger().warning(
-                f'{word} has no effect: it is for {", ".join(names)}, and this is '
-                f"'{', '.join(full)}'"
+            node.get_logger().warning(
+                f"{word} has no effect: it is for {', '.join(names)}, and this is '{full}'"
             )
 
 

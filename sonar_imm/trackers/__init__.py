@@ -65,7 +65,7 @@ class System:
     smoother: '' when the tracker cannot look back. node_config: a class of
     `sonar_imm.node_config`. kernels: about how many kernels each of the tracker's `warm_steps`
     needs in the default configuration, and how many lines of source they have, shared ones
-    included; all_kernels: the same of all steps.
+    included, none where all is numpy; all_kernels: the same of all steps.
     """
 
     name: str
@@ -184,8 +184,6 @@ SYSTEMS = {
             config='config.ObstacleConfig',
             tracker='tracker.ObstacleTracker',
             node_config='ObstacleNodeConfig',
-            kernels={'pings': (41, 1179), 'avoidance': (8, 226)},
-            all_kernels=(49, 1405),
         ),
     )
 }

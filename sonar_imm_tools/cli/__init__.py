@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import functools
 from importlib import import_module
+import io
 import os
 import signal
 import sys
@@ -46,22 +47,19 @@ PROGRAM = 'sonar-imm'
 COMMANDS = {
     'simulate': 'Write a bag of simulated measurements with truth.',
     'convert': 'Turn other formats (CSV, JSON, ...) into a bag.',
-    'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
+    'info': 'Show what is in a bag, which tracker fits, what is wrong with it.',
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
-    'fuse': 'Fuse the diver tracks of two nodes into one run.',
-    'export': 'Write soundings, horizons, tracks or obstacles of a run for other programs.',
+    'export': 'Write soundings, horizons, tracks or obstacles for other programs.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
     'view': 'Open the HTML report of a run; a bag is tracked and scored first.',
     'play': 'Publish a bag to live nodes.',
     'echo': 'Show the estimates of running nodes as a live table.',
-    'chart': 'Make a chart of the soundings of running nodes, for RViz.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
-    'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
-    'tune': 'Fit parameters to your own recordings, or say what they cannot tell.',
+    'tune': 'Fit parameters to your recordings, list the undetermined ones.',
     'bench': 'Measure speed against other libraries, in one run.',
     'warm': 'Compile the kernels of the trackers now, not at the first start.',
-    'demo': 'Live node, offline tracker, scores and one report on the shipped bags.',
+    'demo': 'Play the shipped bags to live nodes, track, score, write a report.',
 }
 
 
@@ -103,8 +101,12 @@ class LazyGroup(click.Group):
         except BrokenPipeError:
             raise click.exceptions.Exit(READER_GONE) from None
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands only: the usage names both options, and the page fits one screen."""
+        self.format_commands(ctx, formatter)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The help page from the summaries; importing every module would take seconds."""
+        """Write the commands from the summaries; importing every module would take seconds."""
         with formatter.section('Commands'):
             formatter.write_dl(list(self._summaries.items()))
 
@@ -115,6 +117,8 @@ class LazyGroup(click.Group):
     package=__name__,
     summaries=COMMANDS,
     invoke_without_command=True,
+    options_metavar='[--help | --version]',
+    subcommand_metavar='COMMAND [ARGS]...',
     context_settings={'help_option_names': ['-h', '--help'], 'max_content_width': 100},
     epilog=f'`{PROGRAM} COMMAND --help` shows the options of a command and an example.',
 )
@@ -129,6 +133,10 @@ def command(ctx: click.Context) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that prints errors."""
     one_blas_thread()
+    # What the terminal cannot show is written as an escape, instead of an error.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
     with _signals_unwind():
         return _run(arguments)
 
@@ -210,6 +218,9 @@ def _user_error(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, ModuleNotFoundError) and error.name:
         return missing_package(error.name.split('.')[0])
+    if isinstance(error, UnicodeEncodeError) and not error.object.isascii():
+        name = error.object.encode('utf-8', 'backslashreplace').decode()
+        return f'{name} is not UTF-8, which a library that is needed here cannot name; rename it'
     if isinstance(error, OSError):
         known = error.filename and error.strerror
         return f'{error.filename}: {error.strerror}' if known else str(error)
@@ -222,7 +233,7 @@ def missing_package(name: str) -> str | None:
 
     remedies = {
         'distributed': 'dask.distributed, which distributes the runs, is not installed: pip '
-        "install 'sonar_imm[sweep]', or use --workers 1",
+        "install 'sonar_imm[cluster]', or use --jobs",
         'rclpy': NO_ROS,
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",

@@ -292,8 +292,9 @@ def say(text: str = '', *, quiet: bool = False) -> None:
 
 
 def warn(text: str) -> None:
-    """Print a line on standard error."""
-    click.echo(visible(text), err=True)
+    """Print one line on standard error. Names in it may hold anything, so only this and `say`
+    print sentences."""
+    click.echo(visible(' '.join(text.split())), err=True)
 
 
 @contextlib.contextmanager

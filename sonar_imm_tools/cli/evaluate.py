@@ -105,14 +105,19 @@ def command(
     they cross; only the figure of that is written, where --report names a file.
     """
     from ..offline.batch import run_folders
+    from ..offline.run_folder import REPORT, RunFolder
 
     if crossing != (other is not None):
         raise click.UsageError('--crossing compares two runs: OUT_DIR and OTHER')
     if other is not None:
         _compare_crossing(out_dir, other, position_std, report, as_json)
         return
+    folders = run_folders(out_dir)
+    for folder in folders:
+        if report is not None:
+            RunFolder(folder).keep_from(report, but=REPORT)
     options = JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
-    judgements = {folder: evaluate_run(folder, options) for folder in run_folders(out_dir)}
+    judgements = {folder: evaluate_run(folder, options) for folder in folders}
     page = None if no_report else report or out_dir / 'report.html'
     if page is not None:
         from ..evaluation.report import write_report
@@ -141,10 +146,17 @@ def _compare_crossing(
     from ..evaluation.plotting import plain_content
     from ..offline.run_folder import RunFolder
 
+    for folder in (a, b):
+        if report is not None:
+            RunFolder(folder).keep_from(report)
     metrics = crossing_metrics(RunFolder(a), RunFolder(b), position_std)
     if report is not None:
+        from ..evaluation.report import write_page
+
         figure = go.Figure(plain_content(mistie_figure(metrics)))
-        figure.write_html(report, include_plotlyjs=True)
+        head = '<head><meta name="generator" content="sonar_imm">'
+        text = figure.to_html(include_plotlyjs=True).replace('<head>', head, 1)
+        write_page(report, f'<!DOCTYPE html>\n{text}')
     if as_json:
         print_json(metrics)
         return

@@ -102,6 +102,9 @@ def command(
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     folder = RunFolder(run)
+    folder.keep_from(out)
+    if original is not None and out.exists() and out.samefile(original):
+        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
         result, text = _export_map(asked)
@@ -172,8 +175,13 @@ def _export_map(asked: _Asked) -> Told:
         raise click.UsageError(
             'places are in metres: say with --epsg and --origin where their origin lies'
         )
-    with whole(asked.out) as unfinished:
-        write_obstacles(unfinished, landmarks, asked.epsg, asked.origin)
+    try:
+        with whole(asked.out) as unfinished:
+            write_obstacles(unfinished, landmarks, asked.epsg, asked.origin)
+    except (KeyError, TypeError, ValueError):
+        raise BagError(
+            f"'landmarks' in the run.json of {asked.run} cannot be understood"
+        ) from None
     return {'obstacles': len(landmarks)}, f'{len(landmarks)} obstacles'
 
 
@@ -193,10 +201,16 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
 def _export_tracks(asked: _Asked) -> Told:
     """Tracks of a run of divers or obstacles."""
     from ..recordings.export.tracks import tracks_of, write_tracks
+    from ..recordings.sources import BagError
 
     degrees = _to_degrees(asked)
     if degrees is None and (stated := asked.record.get('origin')):
-        degrees = Origin(**stated).degrees
+        try:
+            numbers = {name: float(value) for name, value in stated.items()}
+            degrees = Origin(**numbers).degrees
+        except (AttributeError, TypeError, ValueError, OverflowError):
+            sentence = f"'origin' in the run.json of {asked.run} cannot be understood"
+            raise BagError(sentence) from None
     tracks = tracks_of(asked.folder.read_estimates(), degrees)
     with whole(asked.out) as unfinished:
         left_out = write_tracks(unfinished, tracks, asked.kind, asked.run.name)
@@ -223,8 +237,6 @@ def _export_horizons(asked: _Asked, original: Path | None) -> Told:
         raise click.UsageError(
             'SEG-Y needs --segy, the file that the recording was converted from'
         )
-    if segy and original is not None and out.exists() and out.samefile(original):
-        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     positions, notes, degrees = None, {}, _to_degrees(asked)
     if Path(record['bag']).exists():
         with BagReader(record['bag']) as bag:
@@ -238,8 +250,10 @@ def _export_horizons(asked: _Asked, original: Path | None) -> Told:
                 )
     elif segy or kind == 'geojson':
         raise BagError(f'{record["bag"]}, the recording of {run}, is gone')
-    speed = float(record['parameters'].get('sound_speed', 1500.0))
-    picks = picks_of(asked.folder.read_estimates(), speed, positions)
+    speed = record['parameters'].get('sound_speed', 1500.0)
+    if isinstance(speed, bool) or not isinstance(speed, (int, float)) or not 0.0 < speed < 1e5:
+        raise BagError(f'the sound_speed in the run.json of {run} is no speed')
+    picks = picks_of(asked.folder.read_estimates(), float(speed), positions)
     left_out = 0
     with whole(out) as unfinished:
         if kind == 'csv':

@@ -90,4 +90,5 @@ def track_line(bag: str, system: str, named: dict[str, str]) -> str:
     from ..recordings.sources import quoted
 
     topics = [f' --topic {quoted(f"{name}={topic}")}' for name, topic in named.items()]
-    return f'sonar-imm track {quoted(bag)} OUT_DIR --system {system}{"".join(topics)}'
+    path = f'./{bag}' if bag.startswith('-') else bag
+    return f'sonar-imm track {quoted(path)} OUT_DIR --system {system}{"".join(topics)}'

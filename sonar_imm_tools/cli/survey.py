@@ -22,6 +22,7 @@ from pathlib import Path
 
 import click
 
+from ..evaluation.numbers import counted
 from .common import example, json_option, place_options, print_json, progress, say, warn
 
 
@@ -109,7 +110,7 @@ def command(
     options = Options(
         resolution=resolution, adjusted=adjusted, fixed=fixed, epsg=number, origin=origin
     )
-    with folder_of(out, options, resume=resume, overwrite=overwrite):
+    with folder_of(out, options, runs, resume=resume, overwrite=overwrite) as place:
         with (
             contextlib.ExitStack() as stack,
             workers(jobs, scheduler, warn) as run,
@@ -124,13 +125,14 @@ def command(
                 say=lambda text: say(text, quiet=as_json),
                 warn=warn,
             )
-            survey = make(sources, out, options, run, hooks)
-        content = write(survey, out)
+            survey = make(sources, place, options, run, hooks)
+        content = write(survey, place)
     failed = [line for line in content['lines'] if line['failure']]
     if as_json:
         print_json(content)
     else:
         lines = len(content['lines']) - len(failed)
-        say(f'{out}: {lines} lines in {len(content["tiles"])} tiles')
+        left = f', {counted(len(failed), "line")} left out' if failed else ''
+        say(f'{out}: {counted(lines, "line")} in {counted(len(content["tiles"]), "tile")}{left}')
     if failed:
         raise click.exceptions.Exit(1)

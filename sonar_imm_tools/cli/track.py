@@ -65,7 +65,7 @@ def _shard(
 @click.command(
     epilog=example(
         'sonar-imm track dive.bag out',
-        'sonar-imm track dive.bag out --set model_set=cv_cv',
+        'sonar-imm track dive.bag out --set model_set=heading_speed',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
         'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
         'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
@@ -270,12 +270,13 @@ def _track_all(
     as_json: bool,
 ) -> None:
     """Do all runs, write and print their summary; ends with 1 when one failed."""
-    from ..offline.batch import run_jobs, summary_of, write_summary
+    from ..offline.batch import check_summary, run_jobs, summary_of, write_summary
     from ..offline.run_folder import RUN
     from ..recordings.reader import BagError
 
     if (out_dir / RUN).exists() and runs and runs[0].folder != out_dir:
         raise BagError(f'{out_dir} holds a run itself; choose another folder for several')
+    check_summary(out_dir, summary)
     outcomes = list(failures)
     for outcome in failures:
         warn(f'{outcome.bag}: {outcome.failure}')

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 import time
 from typing import Any
@@ -91,10 +92,13 @@ def command(
     --set or the recording's own parameters.yaml), so that `track --params` needs no other.
     """
     from ..evaluation.tuning import most_evaluations, prepared, tune
-    from ..recordings.own_files import write_ros_parameters
+    from ..recordings.own_files import PARAMETERS, write_ros_parameters
 
     plan = Plan(**options)
     for bag in bags:
+        place = Path(os.path.realpath(out)) if out is not None and out.exists() else None
+        if place and place.is_relative_to(os.path.realpath(bag)) and place.name != PARAMETERS:
+            raise click.UsageError(f'{out} is in the recording {bag}, which stays as it is')
         say_parameters(bag, plan, quiet=as_json)
     runs = [job for bag in sorted(bags) for job in plan.jobs(bag, Path())]
     if len({job.system for job in runs}) > 1:

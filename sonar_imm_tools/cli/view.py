@@ -65,7 +65,9 @@ def command(source: Path, rerun_file: Path | None) -> None:
         _open_report(source)
         return
     from ..evaluation.rerun_file import write_rerun
+    from ..offline.run_folder import RunFolder
 
+    RunFolder(source).keep_from(rerun_file)
     count = write_rerun(source, rerun_file)
     say(f'{count} estimates written to {rerun_file}; show them with: rerun {rerun_file}')
 

@@ -21,6 +21,5 @@ __all__ = [
     'plotting',
     'report',
     'rerun_file',
-    'sweep',
     'tuning',
 ]

@@ -43,6 +43,7 @@ from sonar_imm import __version__
 from sonar_imm.files import whole
 from sonar_imm.texts import visible
 
+from ..recordings.sources import BagError
 from .numbers import Card, Check, counted, flatten, front
 from .plotting import plain_content
 
@@ -51,6 +52,8 @@ MOST_GL_FIGURES = 4
 """A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
 only the largest figures of a page are drawn by WebGL."""
 PLOTLYJS = 'plotly.packed.js'
+LONGEST_HEAD = 65536
+"""Bytes in which a page says who made it."""
 
 
 @frozen
@@ -135,16 +138,16 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
     ``report_runs`` for ``report.html``.
     """
     if len(parts) == 1:
-        _write(path, report_html(parts[0]))
+        write_page(path, report_html(parts[0]))
         return
     folder = path.with_name(f'{path.stem}_runs')
     folder.mkdir(parents=True, exist_ok=True)
     plotlyjs = packed(_plotlyjs())
-    _write(folder / PLOTLYJS, f"const packedPlotlyJs = '{plotlyjs}';\n")
+    write_page(folder / PLOTLYJS, f"const packedPlotlyJs = '{plotlyjs}';\n")
     names = page_names(parts)
     for part, name in zip(parts, names):
-        _write(folder / name, report_html(part, front_page=f'../{path.name}'))
-    _write(path, front_html(parts, [f'{folder.name}/{name}' for name in names]))
+        write_page(folder / name, report_html(part, front_page=f'../{path.name}'))
+    write_page(path, front_html(parts, [f'{folder.name}/{name}' for name in names]))
 
 
 def page_names(parts: Sequence[Part]) -> list[str]:
@@ -196,9 +199,19 @@ def _visible(value: object) -> object:
     return visible(value) if isinstance(value, str) and not is_html else value
 
 
-def _write(path: Path, text: str) -> None:
+def write_page(path: Path, text: str) -> None:
+    """Write a page or script of a report; bytes of file names that are not UTF-8 become visible
+    escapes. Raises `BagError` where another file is there that this package did not make."""
+    if path.is_file():
+        with path.open('rb') as file:
+            start = file.read(LONGEST_HEAD)
+        if start and not _OURS.match(start):
+            raise BagError(f'{path} is there already and is no report; choose another name')
     with whole(path) as unfinished:
-        unfinished.write_text(text, encoding='utf-8')
+        unfinished.write_bytes(text.encode('utf-8', 'backslashreplace'))
+
+
+_OURS = re.compile(rb'\s*<!doctype html>.*sonar_imm|const packedPlotlyJs = ', re.DOTALL | re.I)
 
 
 def _plotlyjs() -> str:
@@ -212,7 +225,9 @@ def _plotlyjs() -> str:
 
 def packed(text: str) -> str:
     """A text as the page has it: gzip as base64."""
-    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode('ascii')
+    return base64.b64encode(
+        gzip.compress(text.encode('utf-8', 'backslashreplace'), mtime=0)
+    ).decode('ascii')
 
 
 def _accelerated(figures: Sequence[go.Figure]) -> list[go.Figure]:

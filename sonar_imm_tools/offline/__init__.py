@@ -15,4 +15,4 @@
 """Trackers run over recordings without ROS: a run and its folder, many runs, and what is in a
 recording."""
 
-__all__ = ['batch', 'fusing', 'inspection', 'jobs', 'run_folder', 'tracking']
+__all__ = ['batch', 'inspection', 'jobs', 'run_folder', 'tracking']

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,16 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.reader import BagError, BagReader
 from .jobs import as_they_end, cluster, processes, sentence_of
-from .run_folder import finite, PARQUET, RUN, run_record, RunFolder, summaries, SUMMARY
+from .run_folder import (
+    finite,
+    PARQUET,
+    read_json,
+    RUN,
+    run_record,
+    RunFolder,
+    summaries,
+    SUMMARY,
+)
 from .tracking import InputOptions, OfflineRun, write_run
 
 TRACKED, KEPT, FAILED = 'tracked', 'kept', 'failed'
@@ -95,7 +105,7 @@ def track(job: Job, advance: Callable[[int], Advance] | None = None) -> Outcome:
                 remove_leftovers(job.folder)
                 return _outcome(job, KEPT, run)
             overwrite = True  # it is not finished, or the same without Parquet
-        with folder.fresh(overwrite=overwrite) as unfinished:
+        with folder.fresh(overwrite=overwrite, inputs=[job.bag]) as unfinished:
             advanced = advance(offline.total) if advance else lambda count: None
             run = write_run(unfinished, offline, advanced, parquet=job.parquet)
         return _outcome(job, TRACKED, run)
@@ -245,11 +255,22 @@ def run_folders(out: Path) -> list[Path]:
     return found
 
 
+def check_summary(out: Path, name: str = SUMMARY) -> None:
+    """Raise `BagError` where a file that is no summary has its name in the folder `out`."""
+    if os.path.lexists(out / name):
+        _entries(out / name)
+
+
 def _entries(path: Path) -> list[dict[str, Any]]:
+    content = read_json(path)
     try:
-        entries = json.loads(path.read_text(encoding='utf-8'))['runs']
+        entries = content['runs']
         if not all(isinstance(entry['folder'], str) for entry in entries):
             raise ValueError('a folder is no text')
+        for entry in entries:
+            below = Path(entry['folder'])
+            if below.is_absolute() or '..' in below.parts:
+                raise ValueError(f'{below} is not below its folder')
         return list(entries)
     except (ValueError, TypeError, KeyError) as error:
         raise BagError(f'{path} cannot be understood: {sentence_of(error)}') from None

@@ -20,6 +20,7 @@ soundings.csv  what of them goes into a chart, when a sonar with navigation was 
 estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
 run.json       input, parameters, versions; a folder without it is unfinished
 metrics.json   and report.html, once evaluated
+.sonar_imm     shows that sonar_imm made the folder; only then `--overwrite` replaces it
 
 With ``--parquet`` there are estimate.parquet and soundings.parquet beside the CSV. A run is
 written elsewhere and moved to its folder when it is finished, see `sonar_imm.files`.
@@ -30,15 +31,15 @@ same bytes. Times and versions are in run.json.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 import hashlib
 from importlib.metadata import version
 import json
 import math
+import os
 from pathlib import Path
 import platform
-import shutil
 from typing import Any, Protocol
 
 import numba
@@ -49,7 +50,17 @@ from msg_adapters.estimates import read_estimate, write_estimate
 from msg_adapters.soundings import write_soundings
 from sonar_imm import __version__
 from sonar_imm.estimates import Estimate
-from sonar_imm.files import beside, on_disk, sync_folder, whole
+from sonar_imm.files import (
+    beside,
+    hindrance,
+    mark,
+    MARKER,
+    on_disk,
+    remove_leftovers,
+    replaced,
+    sync_folder,
+    whole,
+)
 from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
@@ -74,6 +85,10 @@ SUMMARY, SHARD_SUMMARY = 'summary.json', 'summary-{}-of-{}.json'
 """In a folder of several runs, which are below it: where they are, see `batch`."""
 _RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
 """All that belongs to a run; without the first one there is no finished run."""
+KIND = 'results'
+"""What the marker of a run says."""
+MOST_JSON = 1 << 26
+"""Characters of a run.json or summary.json."""
 
 
 ROWS_IN_A_GROUP = 65536
@@ -148,6 +163,7 @@ class ParquetTable:
         self._path = path
         self._notes = dict(notes or {})
         self._writer: Any = None
+        self._file: Any = None
         self._held: list[dict[str, np.ndarray]] = []
         self._rows_held = 0
         self._types: dict[str, np.dtype] = {}
@@ -161,6 +177,7 @@ class ParquetTable:
                 self._write_group()
             if self._writer is not None:
                 self._writer.close()
+                self._file.close()
 
     def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
         """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
@@ -182,7 +199,9 @@ class ParquetTable:
         if self._writer is None:
             fields = [(name, arrow.from_numpy_dtype(dtype)) for name, dtype in types.items()]
             schema = arrow.schema(fields, metadata=self._notes)
-            self._writer = arrow.parquet.ParquetWriter(str(self._path), schema)
+            # The library names only files whose names are UTF-8.
+            self._file = self._path.open('wb')
+            self._writer = arrow.parquet.ParquetWriter(self._file, schema)
         if not self._held:
             return
         columns = [
@@ -200,35 +219,76 @@ class RunFolder:
         self.path = path
 
     @contextlib.contextmanager
-    def fresh(self, *, overwrite: bool = False) -> Iterator[RunFolder]:
+    def fresh(
+        self, *, overwrite: bool = False, inputs: Sequence[Path] = ()
+    ) -> Iterator[RunFolder]:
         """Yields a folder elsewhere to write a run into; at the end of the block the run is moved
-        here, as a whole where there is no folder yet. An exception leaves everything as it was.
+        here as a whole. An exception leaves everything as it was.
 
-        Raises `BagError` when a run is here and may not be overwritten. Other files are left
-        alone.
+        inputs: what is read meanwhile. Files that do not belong to a run are left alone, and come
+        along where an earlier run is replaced. Raises `BagError` when a run is here and may not be
+        overwritten, or when nothing shows that this package made it.
         """
+        remove_leftovers(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise BagError(f'{self.path} is a file; a folder is needed')
-        old = [self.path / name for name in _RUN_FILES if (self.path / name).exists()]
+        if (self.path / 'metadata.yaml').exists() or _is_any(self.path, inputs):
+            raise BagError(f'{self.path} is a recording; choose another folder for the run')
+        old = [name for name in _RUN_FILES if os.path.lexists(self.path / name)]
         if old and not overwrite:
             raise BagError(
-                f'{self.path} holds a run already ({old[0].name}); choose another '
+                f'{self.path} holds a run already ({old[0]}); choose another '
                 'folder or say --overwrite'
             )
-        if not self.path.exists():
+        if old:
+            if why := self._hindrance(inputs):
+                raise BagError(why)
+            with replaced(self.path, (*_RUN_FILES, MARKER)) as place:
+                mark(place, KIND)
+                yield RunFolder(place)
+        elif not self.path.exists():
             with whole(self.path) as place:
                 place.mkdir()
+                mark(place, KIND)
                 yield RunFolder(place)
-            return
-        with beside(self.path / 'run') as place:
-            yield RunFolder(place)
-            on_disk(place)
-            for path in old:  # run.json is the first of them
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-            made = [name for name in _RUN_FILES if (place / name).exists()]
-            for name in reversed(made):  # and the last one here
-                (place / name).rename(self.path / name)
+        else:
+            with beside(self.path / 'run') as place:
+                yield RunFolder(place)
+                on_disk(place)
+                self._take_in(place)
+
+    def _hindrance(self, inputs: Sequence[Path]) -> str:
+        """Return why the run here is not replaced; empty when it may be."""
+        try:  # versions without markers wrote these
+            known = 'sonar_imm' in self.read_run().get('versions', {})
+        except BagError:
+            known = False
+        if why := hindrance(self.path, KIND, inputs, known=known):
+            return why
+        bag = self.path / BAG
+        others = [
+            item.name
+            for item in (bag.iterdir() if bag.is_dir() and not bag.is_symlink() else ())
+            if item.suffix not in ('.mcap', '.db3') and item.name != 'metadata.yaml'
+        ]
+        return f'{bag} holds {others[0]}, which is of no run; move it away' if others else ''
+
+    def _take_in(self, place: Path) -> None:
+        """Move a run from `place` to this folder, run.json as the last; all of it or nothing."""
+        moved = []
+        try:
+            if not os.path.lexists(self.path / MARKER):
+                mark(self.path, KIND)
+                moved.append(MARKER)
+            for name in reversed(_RUN_FILES):
+                if (place / name).exists():
+                    os.rename(place / name, self.path / name)
+                    moved.append(name)
             sync_folder(self.path)
+        except BaseException:
+            for name in reversed(moved):
+                os.rename(self.path / name, place / name)
+            raise
 
     def write_estimates(
         self,
@@ -276,7 +336,7 @@ class RunFolder:
     def write_json(self, name: str, content: Any) -> Path:
         """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
         path = self.path / name
-        with whole(path) as unfinished:
+        with whole(path, follow=False) as unfinished:
             text = json.dumps(finite(content), indent=2) + '\n'
             unfinished.write_text(text, encoding='utf-8')
         return path
@@ -284,26 +344,64 @@ class RunFolder:
     def read_run(self) -> dict[str, Any]:
         """The content of run.json. Raises `BagError` when the folder holds no finished run."""
         path = self.path / RUN
-        if not path.is_file() and (lists := summaries(self.path)):
+        if not self.path.exists():
+            remove_leftovers(self.path)  # a killed command may have moved it aside
+        if not os.path.lexists(path) and (lists := summaries(self.path)):
             raise BagError(
                 f'{self.path} holds several runs, which {lists[0].name} lists; name the folder of '
                 'one'
             )
-        if not path.is_file():
+        if not os.path.lexists(path):
             raise BagError(
                 f'{self.path} holds no finished run: {RUN} is missing; '
                 'make one with sonar-imm track'
             )
+        run = read_json(path)
         try:
-            run = json.loads(path.read_text(encoding='utf-8'))
             _check_run(run)
         except (ValueError, AttributeError, TypeError) as error:
             raise BagError(f'{path} cannot be understood: {error}') from None
-        return run
+        return dict(run)
+
+    def keep_from(self, out: Path, *, but: str = '') -> None:
+        """Raise `BagError` where the file `out` would take the place of a file of this run, except
+        the one called `but`, or of a file of its recording."""
+        place = Path(os.path.realpath(out))
+        here = Path(os.path.realpath(self.path))
+        own = [Path(os.path.realpath(here / name)) for name in (*_RUN_FILES, MARKER)]
+        own += [here / name for name in (*_RUN_FILES, MARKER)]
+        if place != here / but and any(place.is_relative_to(item) for item in own):
+            raise BagError(f'{out} is a file of the run {self.path}; choose another name')
+        bag = self.read_run()['bag']
+        if bag and place.is_relative_to(os.path.realpath(bag)):
+            raise BagError(f'{out} is in the recording of {self.path}; choose another name')
 
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
         return _read_estimates(self.path / BAG)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file. Raises `BagError` for what is none: also for a pipe, which may
+    never end, and for one larger than `MOST_JSON`."""
+    try:
+        if not path.is_file():
+            raise ValueError('it is no regular file')
+        with path.open(encoding='utf-8') as file:
+            text = file.read(MOST_JSON + 1)
+        if len(text) > MOST_JSON:
+            raise ValueError(f'it has more than {MOST_JSON} characters')
+        return json.loads(text)
+    except RecursionError:
+        raise BagError(f'{path} cannot be understood: it is nested too deeply') from None
+    except ValueError as error:
+        raise BagError(f'{path} cannot be understood: {error}') from None
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+
+
+def _is_any(path: Path, others: Iterable[Path]) -> bool:
+    return os.path.realpath(path) in map(os.path.realpath, others)
 
 
 def summaries(folder: Path) -> list[Path]:
@@ -396,7 +494,7 @@ def fingerprint(path: Path) -> dict[str, Any]:
     digest, size = hashlib.sha256(), 0
     for file in files:
         if path.is_dir():
-            digest.update(str(file.relative_to(path).as_posix()).encode())
+            digest.update(os.fsencode(file.relative_to(path).as_posix()))
         with file.open('rb') as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 from attrs import frozen, NOTHING
 
 from .csv_table import CsvOptions
-from .options import group, nanoseconds, option
+from .options import group, option
 from .places import BEARINGS
 
 
@@ -36,14 +36,6 @@ def _origin(text: str) -> tuple[float, ...]:
     if len(numbers) not in (2, 3):
         raise ValueError(f"'{text}' is not of the form LAT,LON or LAT,LON,HEIGHT")
     return numbers
-
-
-def _sensor_offsets(text: str) -> int | dict[str, int]:
-    """``-1.5`` for all sensors, or ``radar=-1.5,lidar=0.1``."""
-    if '=' not in text:
-        return nanoseconds(text)
-    pairs = dict(part.partition('=')[::2] for part in text.split(','))
-    return {name.strip(): nanoseconds(seconds) for name, seconds in pairs.items()}
 
 
 def _whole_numbers(text: str) -> list[int]:
@@ -235,24 +227,6 @@ class TruthOptions(_Places):
 
 
 @frozen(kw_only=True)
-class AutoferryOptions(_Options):
-    """Detections of boats of the Autoferry data set to /fixes."""
-
-    EXAMPLES: ClassVar = (
-        'scenario13.json boats.bag --truth scenario13_groundTruth.json --sensor radar --std 5',
-    )
-    truth: Path | str | None = option(None, '', 'Ground truth of the scenario, JSON.', kind='file')
-    sensors: Sequence[str] = option(('radar',), '',
-        'radar or lidar; may be given twice.', flag='sensor', many=True)
-    std: float | None = option(None, 'METRES',
-        'Standard deviation to state on each axis.', kind='float', above=0.0)
-    time_offset_ns: int | Mapping[str, int] = option(0, 'SECONDS',
-        'Added to the stamps of the detections, of all sensors or as radar=-1.5,lidar=0.1.',
-        flag='time-offset', parse=_sensor_offsets)
-    frame_id: str = option('map', '', 'Frame of the positions, east-north-up.')
-
-
-@frozen(kw_only=True)
 class SnapshotsOptions(_OfSonar):
     """Array snapshots in a numpy archive (npz) to /snapshot.
 
@@ -413,34 +387,6 @@ class XtfOptions(_Detecting):
 
 
 @frozen(kw_only=True)
-class Ek80Options(_OfSonar):
-    """Raw file of a Simrad EK80 to /snapshot and /nav. Needs themachinethatgoesping; one of an
-    EK60 or ES60 needs ektools.
-
-    The sectors of a split beam are summed to its starboard and its port half; --staves says other
-    sums. Power and angles make the same two halves. Chirps are compressed. Of several channels the
-    first is taken, or the one that --channel names.
-    """
-
-    EXAMPLES: ClassVar = ('D20221108.raw line.bag', 'D20221108.raw line.bag --channel ES70')
-    channel: str = option('', 'TEXT', 'Part of the name of the channel.')
-    staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
-        'Sectors, from 0, of each stave; those joined by + are summed.', parse=_staves)
-    element_spacing: float | None = _element_spacing()
-
-
-@frozen(kw_only=True)
-class KongsbergOptions(_Options):
-    """Soundings of a Kongsberg KMALL or .all file to /ground. Needs themachinethatgoesping.
-
-    They are a reference, or the ground of the obstacle tracker: no tracker takes them alone. The
-    last profile of sound speed is kept in parameters.yaml beside the bag.
-    """
-
-    EXAMPLES: ClassVar = ('0077.kmall reference.bag', '0077.all reference.bag')
-
-
-@frozen(kw_only=True)
 class PicturesOptions(_Detecting):
     """Folder of pictures of a sonar to /detections. Needs Pillow.
 
@@ -467,9 +413,8 @@ OPTIONS: dict[str, type] = {
     options.__name__.removesuffix('Options').lower(): options
     for options in (
         *(FixesOptions, RelativeOptions, NmeaOptions, ArrivalsOptions, DetectionsOptions),
-        *(TruthOptions, AutoferryOptions, SnapshotsOptions, ImagesOptions, InterferometerOptions),
-        *(SegyOptions, XtfOptions, Ek80Options, KongsbergOptions, PicturesOptions),
-        *(HydrophonesOptions, TracesOptions),
+        *(TruthOptions, SnapshotsOptions, ImagesOptions, InterferometerOptions),
+        *(SegyOptions, XtfOptions, PicturesOptions, HydrophonesOptions, TracesOptions),
     )
 }
 """The options by the kind of conversion."""

@@ -33,13 +33,15 @@ from .sources import BagError, is_recording, quoted, start_of, SUFFIXES
 from .topics import made_topics
 from .track_files import kind_of_text
 
-SONAR_FILES = {
-    'ek80': 'a raw file of a Simrad EK60 or EK80',
-    'kongsberg': 'a KMALL or .all file of a Kongsberg multibeam',
-    'xtf': 'side scan or soundings in XTF',
-}
-"""Binary files of sonars, by the kind of conversion."""
 STATE_IT = 'where you know what it is, sonar-imm convert KIND IN OUT_BAG states it'
+RAW_FILE = (
+    'is a raw file of an echo sounder, which is not read any more: convert it to npz (kind '
+    'snapshots) or XTF'
+)
+SCANS = (
+    'is JSON and no GeoJSON: scans in JSON are not read any more, write the positions as CSV '
+    '(kind fixes)'
+)
 PICTURES = ('.png', '.jpg', '.jpeg')
 
 
@@ -69,11 +71,13 @@ def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
         return _of_archive(path)
     if _is_segy(start):
         return Guess('segy', 'traces in SEG-Y')
-    if kind := _of_sonar(start):
-        return Guess(kind, SONAR_FILES[kind])
+    if _is_raw(start):
+        raise BagError(f'{path} {RAW_FILE}')
+    if start[0] == 123 and b'\0' in start[1:200]:
+        return Guess('xtf', 'side scan or soundings in XTF')
     if kind := kind_of_text(path):
         if kind == 'json':
-            return Guess('autoferry', 'scans in JSON')
+            raise BagError(f'{path} {SCANS}')
         return Guess('fixes', f'a {kind.upper()} file of positions')
     if _is_nmea(start):
         return Guess('nmea', 'NMEA 0183 or AIS sentences')
@@ -155,15 +159,12 @@ def _is_segy(start: bytes) -> bool:
     return 1 <= code <= 16 and any(start[3220:3222])
 
 
-def _of_sonar(start: bytes) -> str:
-    """The kind of a binary file of a sonar; empty for another."""
-    if start[4:8] in (b'XML0', b'CON0', b'FIL1'):
-        return 'ek80'
-    if start[4:5] == b'#' and start[5:8].isalpha() and start[5:8].isupper():
-        return 'kongsberg'
-    if start[4:6] in (b'\x02I', b'\x02i'):
-        return 'kongsberg'
-    return 'xtf' if start[0] == 123 and b'\0' in start[1:200] else ''
+def _is_raw(start: bytes) -> bool:
+    """Whether a file is one of a Simrad EK60 or EK80, or a KMALL or .all of a Kongsberg."""
+    name = start[5:8]
+    simrad = start[4:8] in (b'XML0', b'CON0', b'FIL1')
+    kmall = start[4:5] == b'#' and name.isalpha() and name.isupper()
+    return b'\0' in start[:64] and (simrad or kmall or start[4:6] in (b'\x02I', b'\x02i'))
 
 
 def _is_nmea(start: bytes) -> bool:

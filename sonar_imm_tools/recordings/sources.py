@@ -461,8 +461,17 @@ def start_of(path: Path, size: int = 4096) -> bytes:
 
 
 def quoted(word: object, windows: bool = os.name == 'nt') -> str:
-    """A word of a command as the shell of this machine takes it."""
-    return subprocess.list2cmdline([str(word)]) if windows else shlex.quote(str(word))
+    """A word of a command as the shell of this machine takes it; bytes of a name that cannot be
+    printed as escapes, which bash and zsh read."""
+    text = str(word)
+    if windows:
+        return subprocess.list2cmdline([text])
+    if text.isprintable():
+        return shlex.quote(text)
+    plain = (
+        chr(b) if 32 <= b < 127 and b not in b"'\\" else f'\\x{b:02x}' for b in os.fsencode(text)
+    )
+    return f"$'{''.join(plain)}'"
 
 
 def packed_hint(files: Iterable[Path]) -> str:

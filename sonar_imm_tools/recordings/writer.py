@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
+import os
 from pathlib import Path
 import sqlite3
 from typing import Any
@@ -35,6 +36,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.rosbag2.storage_mcap import McapWriter
 
 from sonar_imm.files import whole
+from sonar_imm.texts import visible
 
 from .mcap_records import seal
 from .messages import cdr_of, ros_message, typestore
@@ -50,6 +52,9 @@ CHUNK_NS = 10 * 10**9
 CHUNK_LEAST = 1 << 12
 """A chunk of an MCAP file is closed when it holds so many bytes of messages, or so much time and
 not too little: a bit that turns costs the chunk that it is in."""
+
+PLAIN = 'recording'
+"""Name of the storage file in a folder whose own name metadata.yaml cannot hold."""
 
 _RELIABLE = Qos(
     QosHistory.KEEP_LAST,
@@ -75,6 +80,11 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
     except sqlite3.OperationalError as error:
         raise BagError(f'{path} cannot be written: {error}') from None
+
+
+def _is_plain(name: str) -> bool:
+    """Whether the storage file may have the name of its folder, as `ros2 bag record` does it."""
+    return name.isprintable() and len(os.fsencode(name)) < 240
 
 
 class BagWriter:
@@ -108,17 +118,21 @@ class BagWriter:
             raise BagError(f'{path} exists already; remove it or choose another name')
         try:
             self._unfinished = self._place.enter_context(whole(self.path))
+            self._made = self._unfinished
+            if not _is_plain(self._made.name):
+                self._made = self._made.with_name(PLAIN)
             self._writer = Writer(
-                self._unfinished, version=8, storage_plugin=StoragePlugin[storage.upper()]
+                self._made, version=8, storage_plugin=StoragePlugin[storage.upper()]
             )
             for key, note in sorted((custom_data or {}).items()):
-                self._writer.set_custom_data(key, str(note))
+                self._writer.set_custom_data(visible(key), visible(str(note)))
             if compressed:
                 mode = CompressionMode.STORAGE if storage == 'mcap' else CompressionMode.MESSAGE
                 self._writer.set_compression(mode, CompressionFormat.ZSTD)
             self._writer.open()
         except OSError as error:
-            self._place.close()
+            with contextlib.suppress(OSError):  # thrown away, not moved to its place
+                self._place.__exit__(type(error), error, error.__traceback__)
             raise BagError(f'{path} cannot be written: {error.strerror}') from None
 
     def __enter__(self) -> BagWriter:
@@ -136,9 +150,10 @@ class BagWriter:
         """Finish the bag: index, metadata, checksums and parameters; then move it to its place."""
         with naming(self.path), self._place:
             self._writer.close()
-            for file in self._unfinished.glob('*.mcap'):
+            for file in self._made.glob('*.mcap'):
                 seal(file)
-            write_own_parameters(self._unfinished, self._parameters)
+            write_own_parameters(self._made, self._parameters)
+            self._made.replace(self._unfinished)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""

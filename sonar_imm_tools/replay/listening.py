@@ -51,12 +51,10 @@ class ReceivedTable:
 
 
 class TableListener:
-    """Hears `topics`, or, when there are none, every topic that ends in ``/estimate``, or in
-    another `last` part."""
+    """Hears `topics`, or, when there are none, every topic that ends in ``/estimate``."""
 
-    def __init__(self, link: Link, topics: tuple[str, ...] = (), last: str = 'estimate'):
+    def __init__(self, link: Link, topics: tuple[str, ...] = ()):
         self._link = link
-        self._last = last
         self._wanted = tuple(f'/{name.lstrip("/")}' for name in topics)
         self._received: deque[ReceivedTable] = deque()
         self._subscriptions: dict[str, object] = {}
@@ -125,7 +123,7 @@ class TableListener:
             hint = ''.join(did_you_mean(name, names) for name in self._wanted[:1])
             return f'nobody publishes {missing} {waited}{hint}; is ROS_DOMAIN_ID the same?'
         return (
-            f'no topic that ends in /{self._last} was found {waited}; is a node running, and '
+            f'no topic that ends in /estimate was found {waited}; is a node running, and '
             'ROS_DOMAIN_ID the same?'
         )
 
@@ -134,4 +132,4 @@ class TableListener:
 
     def _is_meant(self, name: str, types: list[str]) -> bool:
         parts = name.split('/')
-        return parts[-1] == self._last and 'truth' not in parts and TABLE in types
+        return parts[-1] == 'estimate' and 'truth' not in parts and TABLE in types

@@ -20,7 +20,6 @@ __all__ = [
     'grid',
     'jobs',
     'line',
-    'live',
     'looks',
     'making',
     'products',

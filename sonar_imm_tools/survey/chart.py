@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 from pathlib import Path
+from typing import Any
 
 from attrs import frozen
 import numpy as np
@@ -120,20 +121,30 @@ def write_geotiff(
     from rasterio.transform import from_origin
 
     rows, columns = chart.shape
-    with rasterio.open(
-        path,
-        'w',
-        driver='COG',
-        height=rows,
-        width=columns,
-        count=len(names),
-        dtype='float32',
-        nodata=math.nan,
-        crs=None if epsg is None else wkt_of(epsg),
-        transform=from_origin(chart.west, chart.north, chart.cell, chart.cell),
-        compress='deflate',
-        overview_resampling='nearest',
-    ) as file:
+    options: dict[str, Any] = {
+        'driver': 'COG',
+        'height': rows,
+        'width': columns,
+        'count': len(names),
+        'dtype': 'float32',
+        'nodata': math.nan,
+        'crs': None if epsg is None else wkt_of(epsg),
+        'transform': from_origin(chart.west, chart.north, chart.cell, chart.cell),
+        'compress': 'deflate',
+        'overview_resampling': 'nearest',
+    }
+
+    def fill(file: Any) -> None:
         for number, name in enumerate(names, start=1):
             file.write(chart.bands[name].astype(np.float32), number)
             file.set_band_description(number, name)
+
+    if str(path).isprintable():
+        with rasterio.open(path, 'w', **options) as file:
+            fill(file)
+        return
+    # The library names only files whose names are UTF-8.
+    with rasterio.MemoryFile() as memory:
+        with memory.open(**options) as file:
+            fill(file)
+        path.write_bytes(memory.read())

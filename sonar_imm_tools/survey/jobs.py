@@ -63,12 +63,17 @@ class Options:
 
 @frozen(kw_only=True)
 class Source:
-    """The table of a line, or its recording. name: as the products say; folder: where it is."""
+    """The table of a line, or its recording.
+
+    name: as the products say. folder: where it is. run: the content of its run.json; None for a
+    table or recording without one. failure: why the line is left out; empty when it is not.
+    """
 
     name: str
     folder: Path
     table: Path
-    run: Mapping[str, Any]
+    run: Mapping[str, Any] | None
+    failure: str = ''
 
 
 @frozen(kw_only=True)
@@ -117,7 +122,7 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
         'origin': list(options.origin),
         'budget': [*asdict(budget).values(), sound_speed],
     }
-    known = kept(place.with_suffix('.json'))
+    known = _known_line(place)
     info: dict[str, Any] = {'size': size, 'mtime_ns': mtime_ns}
     if known is not None and known['wanted'] == wanted and known['info']['size'] == info['size']:
         if known['info']['mtime_ns'] == info['mtime_ns']:
@@ -149,6 +154,14 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     return info
 
 
+def _known_line(place: Path) -> dict[str, Any] | None:
+    """Return what an earlier command kept of a line, None where nothing can be used."""
+    known = kept(place.with_suffix('.json'))
+    info = known.get('info') if isinstance(known, dict) else None
+    whole = {'size', 'mtime_ns', 'sha256', 'soundings', 'pieces', 'depth', 'bounds'}
+    return known if isinstance(info, dict) and whole <= info.keys() and 'wanted' in known else None
+
+
 def line_statistics(unit: Unit, corrections: FloatArray, cell: float, place: Path) -> None:
     """Keep the looks of a unit at corrected places."""
     signature = signed(unit.signature, corrections, cell)
@@ -166,7 +179,7 @@ def tile_line(
     """Keep the corrected soundings of a unit sorted by tile: first row and end of each tile's."""
     signature = signed(unit.signature, corrections, [tile.name for tile in tiles])
     known = kept(place.with_suffix('.json'))
-    if known is not None and known['signature'] == signature:
+    if isinstance(known, dict) and known.get('signature') == signature:
         return {name: (a, b) for name, (a, b) in known['rows'].items()}
     line = _load(unit.file).corrected(corrections)
     of_tile = np.full(len(line), len(tiles))
@@ -214,7 +227,7 @@ def make_tile(job: TileJob) -> None:
     low = (np.array(job.tile.box[:2]) - HALO) * job.tile.cell
     high = (np.array(job.tile.box[:2]) + TILE + HALO) * job.tile.cell
     for k, (_, source, ranges) in enumerate(job.parts):
-        table = np.load(source, mmap_mode='r')
+        table = np.load(source, mmap_mode='r', allow_pickle=False)
         rows = np.concatenate([np.array(table[a:b]) for a, b in ranges])
         rows = rows[np.all((rows['xy'] >= low) & (rows['xy'] < high), axis=1)]
         rows = rows[np.lexsort((rows['xy'][:, 1], rows['xy'][:, 0], rows['stamp_ns']))]
@@ -244,7 +257,7 @@ def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    with whole(path) as unfinished, unfinished.open('wb') as file:
+    with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.save(file, _table(columns))
 
 
@@ -276,12 +289,12 @@ def _stat(path: Path) -> tuple[int, int]:
 
 
 def _save(path: Path, arrays: Mapping[str, Any]) -> None:
-    with whole(path) as unfinished, unfinished.open('wb') as file:
+    with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.savez(file, **arrays)
 
 
 def _load(path: Path) -> Line:
-    with np.load(path) as kept:
+    with np.load(path, allow_pickle=False) as kept:
         return _line(kept['table'], float(kept['sound_speed']))
 
 
@@ -295,7 +308,7 @@ class KeptLooks(Sequence[Looks]):
         return len(self._places)
 
     def __getitem__(self, k: Any) -> Any:
-        table = np.load(self._places[k])
+        table = np.load(self._places[k], allow_pickle=False)
         columns = {name: np.ascontiguousarray(table[name]) for name in table.dtype.names}
         return Looks(self._cell, **columns)
 
@@ -313,10 +326,10 @@ def kept(path: Path) -> Any:
     """What a JSON file says, None where there is none that can be read."""
     try:
         return json.loads(path.read_text(encoding='utf-8'))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
 def write_json(path: Path, content: Any) -> None:
-    with whole(path) as unfinished:
+    with whole(path, follow=False) as unfinished:
         unfinished.write_text(json.dumps(finite(content), indent=1) + '\n', encoding='utf-8')

@@ -39,6 +39,7 @@ import numpy as np
 
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 
 from ..recordings.export.points import Points
@@ -50,6 +51,15 @@ BASIS = 9
 DIRECTION_SECONDS, SPEED_SECONDS = 1.0, 5.0
 """Pings this near share their direction, and their speed: a keel point moves by D times pitch."""
 LEAST_NOISE = 0.01**2
+STATED = (
+    'attitude_std_deg',
+    'heading_std_deg',
+    'heave_std',
+    'position_std',
+    'sound_speed_std',
+    'sound_speed',
+)
+"""Parameters of a run that a survey needs."""
 
 
 @frozen(eq=False)
@@ -148,19 +158,29 @@ def joined_lines(parts: Sequence[Line]) -> Line:
     return evolve(parts[0], **whole)
 
 
-def budget_of(run: Mapping[str, Any]) -> tuple[ErrorBudget, float]:
-    """The error budget and the sound speed that a run.json was tracked with, else the defaults.
+def budget_of(run: Mapping[str, Any] | None) -> tuple[ErrorBudget, float]:
+    """Return the error budget and the sound speed, m/s, of a run; the defaults where there is no
+    run.json (None).
 
-    Raises `ConfigError` where its parameters are not what they must be.
+    Raises `ConfigError` where its parameters are missing or are not what they must be.
     """
-    names = ('attitude_std_deg', 'heading_std_deg', 'heave_std', 'position_std', 'sound_speed_std')
+    if run is None:
+        return BathymetryConfig().budget(), BathymetryConfig().sound_speed
     stated = run.get('parameters')
-    known = stated if isinstance(stated, Mapping) else {}
-    config = BathymetryConfig.from_mapping({k: known[k] for k in names if k in known})
-    speed = known.get('sound_speed')
-    if isinstance(speed, (int, float)) and 300.0 < speed < 3000.0:
-        return config.budget(), float(speed)
-    return config.budget(), 1500.0
+    if not isinstance(stated, Mapping):
+        raise ConfigError('it has no parameters')
+    if missing := [name for name in STATED if name not in stated]:
+        raise ConfigError(f'its parameters lack {", ".join(missing)}; track the recording again')
+    config = BathymetryConfig.from_mapping({name: _number(name, stated[name]) for name in STATED})
+    return config.budget(), config.sound_speed
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a parameter of run.json as a float. Raises `ConfigError`."""
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (plain and abs(value) < 1e9):
+        raise ConfigError(f'its parameter {name} is not a finite number')
+    return float(value)
 
 
 def partials(basis: FloatArray, g: FloatArray, sound_speed: float) -> FloatArray:

@@ -23,8 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import hashlib
-import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,13 @@ import numpy as np
 from sonar_imm import __version__
 from sonar_imm.acoustics.sounding import ErrorBudget
 from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.files import marked
+from sonar_imm.parameters import ConfigError
 
+from ..evaluation.numbers import counted
 from ..offline.jobs import Run
-from ..offline.run_folder import PARQUET, RUN, SOUNDINGS
+from ..offline.run_folder import BAG, CSV, PARQUET, RUN, RunFolder, SOUNDINGS
+from ..offline.run_folder import KIND as RESULTS
 from ..recordings.export.points import TOPIC, topics_of_soundings
 from ..recordings.reader import BagReader
 from ..recordings.sources import BagError, is_recording
@@ -81,8 +85,12 @@ def sources_of(runs: Path) -> list[Source]:
     for name in (SOUNDINGS, PARQUET[SOUNDINGS]):  # the later one is read
         found |= {path.parent: path for path in sorted(runs.rglob(name)) if WORK not in path.parts}
     for place in _recordings(runs):
-        if place not in found and place.parent not in found and _has_soundings(place):
-            found[place] = place
+        # The bag of a run whose table is gone stands for it.
+        bag = place if place.is_dir() else place.parent
+        folder = bag.parent if bag.name == BAG and _is_results(bag.parent) else place
+        known = {folder, place.parent, bag.parent} & found.keys()
+        if not known and _has_soundings(place):
+            found[folder] = place
     if not found:
         raise BagError(
             f'{runs} holds no line: there is no {SOUNDINGS} or {PARQUET[SOUNDINGS]}, and no '
@@ -94,7 +102,8 @@ def sources_of(runs: Path) -> list[Source]:
         below = folder.relative_to(runs).as_posix()
         unique = names.count(last) == 1 and below != '.'
         name = last if unique else runs.resolve().name if below == '.' else below
-        sources.append(Source(name=name, folder=folder, table=table, run=_run_of(folder)))
+        run, failure = _run_of(folder)
+        sources.append(Source(name=name, folder=folder, table=table, run=run, failure=failure))
     return sorted(sources, key=lambda source: source.name)
 
 
@@ -115,19 +124,36 @@ def _has_soundings(recording: Path) -> bool:
         return True
 
 
-def _run_of(folder: Path) -> dict[str, Any]:
-    """What run.json says, which may be absent."""
+def _is_results(folder: Path) -> bool:
+    """Whether `track` made a folder, which has a run.json then."""
+    there = any(os.path.lexists(folder / name) for name in (RUN, CSV))
+    return there or marked(folder).get('kind') == RESULTS
+
+
+def _run_of(folder: Path) -> tuple[dict[str, Any] | None, str]:
+    """Return the content of run.json, and why the line has to be left out. A table or a recording
+    that `track` did not make has none."""
+    if not _is_results(folder):
+        return None, ''
     try:
-        run = json.loads((folder / RUN).read_text(encoding='utf-8'))
-    except (OSError, ValueError):
-        return {}
-    return run if isinstance(run, dict) else {}
+        run = RunFolder(folder).read_run()
+        if run['system'] != 'bathymetry':
+            raise BagError(f'{folder / RUN} is of {run["system"]}, which has no soundings')
+        epsg = run.get('epsg') or 0
+        if isinstance(epsg, bool) or not isinstance(epsg, int) or not 0 <= epsg < 10**6:
+            raise BagError(f"{folder / RUN} cannot be understood: 'epsg' is no number of one")
+        budget_of(run)
+    except ConfigError as error:
+        return None, f'{folder / RUN} cannot be used: {error}'
+    except BagError as error:
+        return None, str(error)
+    return run, ''
 
 
 def epsg_of(sources: Sequence[Source], given: int) -> int:
     """The coordinate system of all, 0 for none. Raises `BagError` where two disagree."""
     known = [(given, 'the command')] if given else []
-    known += [(int(s.run['epsg']), s.name) for s in sources if s.run.get('epsg')]
+    known += [(int(s.run['epsg']), s.name) for s in sources if s.run and s.run.get('epsg')]
     for number, name in known[1:]:
         if number != known[0][0]:
             raise BagError(
@@ -247,7 +273,7 @@ class Survey:
     def nodes(self) -> Iterator[tuple[Tile, Nodes]]:
         """The tiles with their nodes, in order; those without any are left out."""
         for tile, file in self.tiles.items():
-            with np.load(file) as kept:
+            with np.load(file, allow_pickle=False) as kept:
                 nodes = Nodes(**{name: kept[name] for name in kept.files})
             if len(nodes.z):
                 yield tile, nodes
@@ -259,7 +285,7 @@ def make(
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
     work = out / WORK
     units, lines, budget = _imported(sources, work, options, run, progress)
-    warnings: list[str] = []
+    warnings = _unstated(sources, lines)
     depth = float(np.median([unit.depth for unit in units]))
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
@@ -319,23 +345,23 @@ def _imported(
     sources: Sequence[Source], work: Path, options: Options, run: Run, progress: Progress
 ) -> tuple[list[Unit], list[dict[str, Any]], ErrorBudget]:
     places = [
-        work / 'lines' / hashlib.sha256(source.name.encode()).hexdigest()[:16]
+        work / 'lines' / hashlib.sha256(os.fsencode(source.name)).hexdigest()[:16]
         for source in sources
     ]
     for folder in ('lines', 'looks', 'soundings', 'tiles'):
         (work / folder).mkdir(parents=True, exist_ok=True)
-    calls = [(source, place, options) for source, place in zip(sources, places)]
     infos: list[dict[str, Any]] = [{} for _ in sources]
-    failures = [''] * len(sources)
-    advance = progress.begin('lines', len(sources))
-    for k, info, failure in run(import_line, calls):
-        infos[k], failures[k] = info or {}, failure
+    failures = [source.failure for source in sources]
+    todo = [k for k, failure in enumerate(failures) if not failure]
+    advance = progress.begin('lines', len(todo))
+    for n, info, failure in run(import_line, [(sources[k], places[k], options) for k in todo]):
+        infos[todo[n]], failures[todo[n]] = info or {}, failure
         advance(1)
     units: list[Unit] = []
     lines, budgets = [], []
     for source, place, info, failure in zip(sources, places, infos, failures):
         if failure:
-            progress.warn(f'{source.name}: {failure}')
+            progress.warn(f'left out: {source.name}: {failure}')
         lines.append(
             {
                 'name': source.name,
@@ -439,6 +465,16 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
         meets = np.all((low < low[k] + side[k] + halo) & (low + side > low[k] - halo), axis=1)
         found[tile.name] = [names[n] for n in np.flatnonzero(meets)]
     return found
+
+
+def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a warning that names the lines whose error budget is assumed."""
+    used = [source for source, line in zip(sources, lines) if not line['failure']]
+    names = [source.name for source in used if source.run is None]
+    if not names:
+        return []
+    named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
+    return [f'{counted(len(names), "line")} without {RUN} ({named}): default error budget']
 
 
 def _warnings_of(found: Adjustment) -> list[str]:

@@ -22,18 +22,19 @@ import contextlib
 import html
 import json
 import math
+import os
 from pathlib import Path
 import shutil
 from typing import Any
 
-from attrs import asdict
+from attrs import asdict, fields
 import numpy as np
 import plotly.graph_objects as go
 import plotly.offline
 
 from sonar_imm import __version__
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.files import whole
+from sonar_imm.files import hindrance, mark, MARKER, remove_leftovers, replaced, whole
 from sonar_imm.parameters import ConfigError
 from sonar_imm.texts import visible
 
@@ -44,7 +45,7 @@ from ..recordings.sources import BagError
 from .adjustment import described, Mistie
 from .chart import BANDS, Chart, values_of, write_geotiff
 from .grid import Nodes
-from .jobs import Options, TILE, Tile, write_json
+from .jobs import kept, Options, TILE, Tile, write_json
 from .making import extent_of, SURVEY, Survey, WORK
 
 CHART, TILES, PROVENANCE, COVERAGE, ADJUSTMENT, CROSSINGS = (
@@ -55,58 +56,95 @@ CHART, TILES, PROVENANCE, COVERAGE, ADJUSTMENT, CROSSINGS = (
     'adjustment.json',
     'crossings.csv',
 )
+KIND = 'survey'
+"""What the marker of a survey says."""
+OPTIONS = 'options.json'
+OWN = (WORK, TILES, SURVEY, CHART, PROVENANCE, COVERAGE, ADJUSTMENT, CROSSINGS, REPORT, MARKER)
+"""All that belongs to a survey."""
 OF_A_SURVEY = (*BANDS, 'cell')
 """Bands of survey.tif and of the tiles."""
 
 
 @contextlib.contextmanager
 def folder_of(
-    out: Path, options: Options, *, resume: bool = False, overwrite: bool = False
-) -> Iterator[None]:
-    """The folder of a survey, made or taken up again. Where nothing was there and what is asked
-    for cannot be done, nothing stays.
+    out: Path,
+    options: Options,
+    runs: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Iterator[Path]:
+    """Yield the folder to make a survey of `runs` in: `out` itself, or, where an earlier survey is
+    replaced, a new one that takes its place at the end. Where nothing was there and the survey
+    cannot be made, nothing stays.
 
-    Raises `BagError` when something is there and neither may be said of it, or when it was made
-    with other options.
+    Raises `BagError` when something is there and neither `resume` nor `overwrite` is said, when
+    nothing shows that this package made it, or when it was made with other options.
     """
+    remove_leftovers(out)
     wanted = json.loads(json.dumps(asdict(options)))
-    file = out / WORK / 'options.json'
     if out.exists() and not out.is_dir():
         raise BagError(f'{out} is a file; a folder is needed')
+    if out.is_dir() and out.samefile(runs):
+        raise BagError(f'{out} holds the lines; choose another folder for the survey')
     there = out.is_dir() and any(out.iterdir())
-    if there and resume:
-        try:
-            known = json.loads(file.read_text(encoding='utf-8'))
-        except (OSError, ValueError):
-            raise BagError(f'{out} holds no survey that could be taken up again') from None
-        if other := [name for name in wanted if known.get(name) != wanted[name]]:
-            raise BagError(
-                f'{out} was made with another {", ".join(other)}; choose another folder or say '
-                '--overwrite'
-            )
-    elif there and not overwrite:
+    if there and not (resume or overwrite):
         raise BagError(
             f'{out} is there already; choose another folder, or say --resume or --overwrite'
         )
-    elif there:
-        _remove(out)
-    write_json(file, wanted)
+    if overwrite and any(os.path.lexists(out / name) for name in OWN):
+        if why := hindrance(out, KIND, [runs], known=_is_survey(out)):
+            raise BagError(why)
+        with replaced(out, OWN) as place:
+            mark(place, KIND)
+            write_json(place / WORK / OPTIONS, wanted)
+            yield place
+        return
+    if there and resume:
+        _check_options(out, wanted)
+        yield out
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    mark(out, KIND)
     try:
-        yield
+        write_json(out / WORK / OPTIONS, wanted)
+        yield out
     except (BagError, ConfigError):
-        if not (there and resume):
-            _remove(out)
-            with contextlib.suppress(OSError):
-                out.rmdir()
+        _remove(out)
         raise
 
 
-def _remove(out: Path) -> None:
-    """Remove what a survey consists of; other files stay."""
+def _check_options(out: Path, wanted: Mapping[str, Any]) -> None:
+    """Raise `BagError` where no survey with these options can be taken up again at `out`."""
+    known = kept(out / WORK / OPTIONS)
+    if not isinstance(known, dict):
+        raise BagError(f'{out} holds no survey that could be taken up again')
     for name in (WORK, TILES):
-        shutil.rmtree(out / name, ignore_errors=True)
-    for name in (SURVEY, CHART, PROVENANCE, COVERAGE, ADJUSTMENT, CROSSINGS, REPORT):
-        (out / name).unlink(missing_ok=True)
+        if (out / name).is_symlink():
+            raise BagError(f'{out / name} is a link, through which nothing is written; remove it')
+    if other := [name for name in wanted if known.get(name) != wanted[name]]:
+        raise BagError(
+            f'{out} was made with another {", ".join(other)}; choose another folder or say '
+            '--overwrite'
+        )
+
+
+def _remove(out: Path) -> None:
+    """Remove what a survey consists of from a folder that this command made; other files stay."""
+    for name in OWN:
+        if (out / name).is_dir() and not (out / name).is_symlink():
+            shutil.rmtree(out / name, ignore_errors=True)
+        else:
+            (out / name).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        out.rmdir()
+
+
+def _is_survey(out: Path) -> bool:
+    """Whether a folder has what versions without markers wrote into that of a survey."""
+    found = [kept(out / SURVEY), kept(out / WORK / OPTIONS)]
+    wanted = [{'version', 'lines', 'tiles'}, {field.name for field in fields(Options)}]
+    return any(isinstance(a, dict) and b <= a.keys() for a, b in zip(found, wanted))
 
 
 def write(survey: Survey, out: Path) -> dict[str, Any]:
@@ -117,7 +155,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
     bands = {name: np.full((rows, columns), np.nan, np.float32) for name in OF_A_SURVEY}
     auto = survey.options.resolution == 0.0
     names_of_tiles = {f'{tile.name}.tif' for tile in counts}
-    for stale in sorted((out / TILES).glob('*.tif')):
+    for stale in sorted((out / TILES).glob('L*_*_*.tif')):
         if stale.name not in names_of_tiles:
             stale.unlink()
     epsg = survey.epsg or None
@@ -127,7 +165,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
             place = out / TILES / f'{tile.name}.tif'
             side = TILE * tile.cell
             chart = Chart(tile.i * side, (tile.j + 1) * side, tile.cell, own)
-            with whole(place) as unfinished:
+            with whole(place, follow=False) as unfinished:
                 write_geotiff(unfinished, chart, epsg, OF_A_SURVEY)
         times = round(tile.cell / cell)
         top = round((north - (tile.j + 1) * TILE * tile.cell) / cell)
@@ -136,7 +174,7 @@ def write(survey: Survey, out: Path) -> dict[str, Any]:
         for name, values in own.items():
             bands[name][where] = np.repeat(np.repeat(values, times, axis=0), times, axis=1)
     chart = Chart(west, north, cell, bands)
-    with whole(out / CHART) as unfinished:
+    with whole(out / CHART, follow=False) as unfinished:
         write_geotiff(unfinished, chart, epsg, OF_A_SURVEY)
     _write_provenance(out / PROVENANCE, survey)
     write_json(out / COVERAGE, _coverage(chart, survey.epsg))
@@ -199,10 +237,11 @@ def _write_provenance(path: Path, survey: Survey) -> None:
             ('residual', pyarrow.float32()),
         ]
     )
-    names = np.array([unit.line for unit in survey.units])
+    names = np.array([visible(unit.line) for unit in survey.units])
     with (
-        whole(path) as unfinished,
-        pyarrow.parquet.ParquetWriter(str(unfinished), schema) as writer,
+        whole(path, follow=False) as unfinished,
+        unfinished.open('wb') as file,
+        pyarrow.parquet.ParquetWriter(file, schema) as writer,
     ):
         for tile, nodes in survey.nodes():
             node = nodes.seen_node
@@ -244,7 +283,10 @@ def _write_crossings(path: Path, survey: Survey) -> None:
     def summary(of_pair: Mistie | None) -> list[str]:
         return [f'{of_pair.median:.4f}', f'{of_pair.rms:.4f}'] if of_pair else ['', '']
 
-    with whole(path) as unfinished, unfinished.open('w', encoding='utf-8', newline='') as file:
+    with (
+        whole(path, follow=False) as unfinished,
+        unfinished.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file,
+    ):
         writer = CsvWriter(file)
         kinds = ('median_before', 'rms_before', 'median_after', 'rms_after')
         writer.write(['line_a', 'line_b', 'cells', *kinds])
@@ -271,8 +313,9 @@ STYLE = (
 
 def write_report(out: Path, survey: Survey, chart: Chart, content: Mapping[str, Any]) -> None:
     """Write report.html. content: that of adjustment.json."""
-    with whole(out / REPORT) as unfinished:
-        unfinished.write_text(page(survey, chart, content), encoding='utf-8')
+    text = page(survey, chart, content)
+    with whole(out / REPORT, follow=False) as unfinished:
+        unfinished.write_bytes(text.encode('utf-8', 'backslashreplace'))
 
 
 def page(survey: Survey, chart: Chart, content: Mapping[str, Any]) -> str:

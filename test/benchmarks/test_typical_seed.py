@@ -20,9 +20,9 @@ from argparse import Namespace
 import numpy as np
 import pytest
 
+from benchmarks.study import Outcome
 from benchmarks.typical_seed import readme, rounded_up, typical
 from sonar_imm_tools.evaluation.judging import Limit
-from sonar_imm_tools.evaluation.sweep import Outcome
 
 
 def outcomes(**metrics):

@@ -50,6 +50,14 @@ def test_help_lists_every_command(arguments, capsys):
     assert all(f'  {name} ' in printed for name in COMMANDS)
 
 
+def test_help_fits_a_screen_of_24_lines_and_80_columns(monkeypatch, capsys):
+    monkeypatch.setenv('COLUMNS', '80')
+    assert main(['--help']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 24 and max(map(len, lines)) <= 80  # the prompt takes one line
+    assert '--version' in lines[0]
+
+
 @pytest.mark.parametrize('name', list(COMMANDS))
 def test_every_command_has_help(name, capsys):
     assert main([name, '--help']) == 0
@@ -59,7 +67,7 @@ def test_every_command_has_help(name, capsys):
         assert f'Example:\n    sonar-imm {name}' in printed
 
 
-@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'autoferry'])
+@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'xtf'])
 def test_every_kind_of_conversion_has_help(kind, capsys):
     assert main(['convert', kind, '--help']) == 0
     assert f'Example:\n    sonar-imm convert {kind}' in capsys.readouterr().out

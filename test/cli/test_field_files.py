@@ -21,7 +21,6 @@ import re
 
 from helpers.dive_scenes import legs
 from helpers.field_files import FORMATS, line, shipped_sound
-from helpers.sonar_files import kmall
 import numpy as np
 import pytest
 
@@ -109,10 +108,9 @@ def test_from_a_file_to_a_picture_in_two_commands(tmp_path, name, capsys, monkey
 def test_soundings_of_a_multibeam_are_a_reference_and_no_tracker_takes_them_alone(
     tmp_path, capsys
 ):
-    pytest.importorskip('themachinethatgoesping')
-    kmall(tmp_path / 'line.kmall')
+    MADE['swath.xtf'].make(tmp_path / 'swath.xtf', line(5, 0.2))
     bag, run = tmp_path / 'bag', tmp_path / 'run'
-    assert main(['convert', str(tmp_path / 'line.kmall'), str(bag)]) == 0
+    assert main(['convert', str(tmp_path / 'swath.xtf'), str(bag)]) == 0
     assert 'to track it' not in capsys.readouterr().out
     assert main(['info', str(bag)]) == 1
     printed = capsys.readouterr().out

@@ -71,7 +71,7 @@ def test_track_twice_writes_the_same_bytes_and_accounts_for_every_message(
     assert main(['track', str(dive), str(tmp_path / 'out')]) == 2
     assert '--overwrite' in capsys.readouterr().err
     call('track', dive, tmp_path / 'out', '--overwrite')
-    assert contents(tmp_path / 'out') == first and len(first) == 3
+    assert contents(tmp_path / 'out') == first and len(first) == 4
 
 
 def test_evaluate_scores_and_reports(call, tmp_path):
@@ -99,21 +99,21 @@ def test_evaluate_takes_truth_from_another_bag_and_says_when_that_has_none(call,
 def test_parameters_come_from_file_and_command(call, dive, tmp_path):
     params = tmp_path / 'diver.yaml'
     params.write_text(
-        '/**:\n  ros__parameters:\n    model_set: cv_cv\n    confirm_hits: 2\n'
+        '/**:\n  ros__parameters:\n    model_set: heading_speed\n    confirm_hits: 2\n'
         '    use_sim_time: true\n'
     )
     given = ('confirm_hits=1', 'acceleration_noise=0.1, 1.5', 'hover=false')
     words = [word for setting in given for word in ('--set', setting)]
     run = call('track', dive, tmp_path / 'out', '--params', params, *words)
     parameters = run['parameters']
-    assert parameters['model_set'] == 'cv_cv' and parameters['confirm_hits'] == 1
+    assert parameters['model_set'] == 'heading_speed' and parameters['confirm_hits'] == 1
     assert parameters['acceleration_noise'] == [0.1, 1.5] and parameters['hover'] is False
 
 
 @pytest.mark.parametrize(
     'text, words',
     [
-        ('/**:\n  ros__parameters:\n    model_sett: cv', "did you mean 'model_set'?"),
+        ('/**:\n  ros__parameters:\n    model_sett: families', "did you mean 'model_set'?"),
         ('model_set: vc', 'must be one of'),
         ('{', 'not a YAML file'),
         ('- 1', 'must hold a mapping'),

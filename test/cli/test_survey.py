@@ -26,6 +26,7 @@ import pytest
 
 from msg_adapters.soundings import write_soundings
 from sonar_imm.soundings import COLUMNS, Soundings
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
@@ -44,6 +45,14 @@ PRODUCTS = (
     'crossings.csv',
     'report.html',
 )
+
+
+RECORD = {
+    'system': 'bathymetry',
+    'bag': 'a.bag',
+    'topics': {},
+    'parameters': BathymetryConfig().as_dict(),
+}
 
 
 def run(*arguments):
@@ -96,8 +105,7 @@ def test_export_of_one_run_is_the_same_grid(lines, tmp_path):
     """Node by node, also across the seams of tiles; a survey keeps what it reads in float32."""
     runs = tmp_path / 'runs'
     shutil.copytree(lines / 'line_001', runs / 'line_001')
-    record = {'system': 'bathymetry', 'bag': 'a.bag', 'topics': {}, 'parameters': {}}
-    (runs / 'line_001' / 'run.json').write_text(json.dumps(record))
+    (runs / 'line_001' / 'run.json').write_text(json.dumps(RECORD))
     assert run('survey', runs, tmp_path / 'out', '--resolution', 1) == 0
     assert run('export', runs / 'line_001', tmp_path / 'one.tif', '--cell', 1) == 0
     survey, there, _ = read(tmp_path / 'out' / 'survey.tif')
@@ -300,8 +308,8 @@ def test_groups_that_do_not_overlap_are_adjusted_with_a_warning(lines, tmp_path,
         write_table(folder / 'soundings.csv', points.moved((east, 0.0, 0.0)))
     out = tmp_path / 'out'
     assert run('survey', tmp_path / 'runs', out, '--adjust', '--resolution', 4) == 0
-    (sentence,) = json.loads((out / 'survey.json').read_text())['warnings']
-    assert sentence in capsys.readouterr().err
+    assumed, sentence = json.loads((out / 'survey.json').read_text())['warnings']
+    assert 'without run.json' in assumed and sentence in capsys.readouterr().err
     assert '2 groups that do not overlap' in sentence and 'priors alone' in sentence
 
 
@@ -314,7 +322,7 @@ def test_parquet_and_a_coordinate_system(lines, tmp_path):
     folder.mkdir(parents=True)
     table = pyarrow.csv.read_csv(lines / 'line_000' / 'soundings.csv')
     pyarrow.parquet.write_table(table, folder / 'soundings.parquet')
-    (folder / 'run.json').write_text(json.dumps({'epsg': 32632}))
+    (folder / 'run.json').write_text(json.dumps({**RECORD, 'epsg': 32632}))
     place = ('--origin', '500000,6000000,1.5', '--resolution', 2)
     assert run('survey', tmp_path / 'runs', tmp_path / 'out', *place) == 0
     bands, transform, file = read(tmp_path / 'out' / 'survey.tif')
@@ -391,7 +399,7 @@ def test_what_cannot_be_done_is_one_sentence_and_writes_nothing(
         for k in (0, 1):
             shutil.copytree(lines / f'line_{k:03d}', runs / f'line_{k:03d}')
             if change == 'crs':
-                run_json = json.dumps({'epsg': 32632 + k})
+                run_json = json.dumps({**RECORD, 'epsg': 32632 + k})
                 (runs / f'line_{k:03d}' / 'run.json').write_text(run_json)
     if change == 'broken':
         for k in (0, 1):

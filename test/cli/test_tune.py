@@ -38,7 +38,7 @@ from sonar_imm_tools.evaluation.obstacle import predictive as obstacles
 from sonar_imm_tools.evaluation.tuning import errors, maximise, Tunable, values_of
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'regret_free'
-QUICK = ['--system', 'diver', '--set', 'model_set=cv', '--parameters', 'covariance_scale']
+QUICK = ['--system', 'diver', '--set', 'model_set=linear', '--parameters', 'covariance_scale']
 
 
 def dive(folder: Path, duration: int) -> Path:
@@ -54,7 +54,7 @@ def test_covariances_that_are_too_small_are_found_and_written(tmp_path: Path) ->
         main(['tune', str(bag), *QUICK, '--set', 'covariance_scale=0.1', '--out', str(out)]) == 0
     )
     written = yaml.safe_load(out.read_text())['/**']['ros__parameters']
-    assert written['model_set'] == 'cv' and 0.5 < written['covariance_scale'] <= 1.0
+    assert written['model_set'] == 'linear' and 0.5 < written['covariance_scale'] <= 1.0
     assert main(['track', str(bag), str(tmp_path / 'run'), '--params', str(out)]) == 0
 
 
@@ -83,7 +83,7 @@ def test_bad_input_is_named(
     sentence: str,
 ) -> None:
     bag = dive(tmp_path, duration)
-    options = ['--system', 'diver', '--set', 'model_set=cv']
+    options = ['--system', 'diver', '--set', 'model_set=linear']
     assert main(['tune', str(bag), *options, '--parameters', name]) == 2
     assert sentence in capsys.readouterr().err
 
@@ -228,7 +228,7 @@ def score_of(
 ) -> float:
     """The log likelihood that the tracker gives fixes z (n, 2) with R (n, 2, 2)."""
     config = DiverConfig(
-        model_set='cv',
+        model_set='linear',
         acceleration_noise=(noise,),
         covariance_scale=scale,
         max_tracks=1,

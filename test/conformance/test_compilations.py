@@ -103,7 +103,7 @@ def found():
 @pytest.mark.parametrize('name', RUNS)
 def test_nothing_is_left_to_compile_after_warm_and_a_kernel_has_one_kind_of_arguments(found, name):
     before, after = found[name]
-    assert any(before.values())
+    assert any(before.values()) or name.startswith('obstacle')  # which has no kernel
     late = {name for name in after if after[name] != before.get(name, [])}
     late = {name for name in late if '.surface_kernels.' not in name}  # flat floors do without
     assert {name for name in late if name.rpartition('.')[2] not in COLD} == set()
@@ -117,6 +117,8 @@ def test_a_system_knows_about_how_many_kernels_its_steps_need(found, name):
     figures = found[name]
     system = SYSTEMS[name]
     assert set(figures) == set(system.kernels)
+    if not figures:
+        return
     first = next(iter(figures))
     for known, right in zip(system.kernels[first], figures[first]):
         assert 0.8 * right < known < 1.25 * right, figures

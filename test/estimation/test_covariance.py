@@ -24,17 +24,18 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.estimation import imm, imm_kernels, kalman, small_matrices
-from sonar_imm.estimation.covariance import add_jitter, correct, is_psd, propagate
-from sonar_imm.estimation.small_matrices import (
+from sonar_imm.estimation.covariance import (
+    add_jitter,
+    are_sound,
+    correct,
+    is_psd,
     JITTER,
-    lanes_for,
     LIMIT,
-    MOST_LANES,
-    not_psd,
+    propagate,
     semidefinite_roots,
-    turn_of,
+    with_jitter,
 )
-from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
+from sonar_imm.trackers.obstacle import mixtures
 
 ROUNDING = 1e-14
 
@@ -277,7 +278,7 @@ def test_the_obstacle_update_stays_positive_definite():
     h, z = np.zeros((500, 4, 2)), np.zeros((500, 2))
     repairs = 0
     for _ in range(5):
-        x, P, mu, _, repaired = obstacle_kernels.jipda_update(x, P, mu, h, z, R, 0.05, 1e-3)
+        x, P, mu, _, repaired = mixtures.update(x, P, mu, h, z, R, 0.05, 1e-3)
         assert is_covariance(P)
         assert np.isfinite(x).all() and (mu >= 0.0).all()
         np.testing.assert_allclose(mu.sum(axis=1), 1.0, rtol=1e-12)
@@ -290,7 +291,7 @@ def test_a_probability_below_zero_depth_stays_in_its_interval():
     rng = np.random.default_rng(9)
     mu = rng.dirichlet(np.full(16, 0.3), 4000)
     mean, std = -10.0 * np.ones((4000, 16)), 0.1 * np.ones((4000, 16))
-    *_, negative = obstacle_kernels.bands(mean, std, mu, 0.05)
+    *_, negative = mixtures.bands(mean, std, mu, 0.05)
     assert (mu.sum(axis=1) > 1.0).any()
     assert (negative <= 1.0).all() and (negative > 1.0 - 1e-9).all()
 
@@ -324,13 +325,8 @@ def covariances(rng, n, lanes):
 def test_roots_and_soundness_are_those_of_single_matrices(n):
     lanes = 40
     P = covariances(np.random.default_rng(n), n, lanes)
-    S, L, scratch = (
-        np.ascontiguousarray(np.moveaxis(P, 0, -1)),
-        np.zeros((n, n, lanes)),
-        np.empty(lanes),
-    )
-    bad = np.empty(lanes, np.int64)
-    semidefinite_roots(S, L, scratch)
+    S = np.moveaxis(P, 0, -1)
+    L = semidefinite_roots(S)
     for k in range(lanes):
         root = np.zeros((n, n))
         small_matrices.semidefinite_root(P[k], root)
@@ -339,15 +335,16 @@ def test_roots_and_soundness_are_those_of_single_matrices(n):
         size = np.sqrt(np.abs(np.diag(P[k])))
         close = np.abs(mine @ mine.T - root @ root.T) <= 1e-13 * np.outer(size, size)
         assert close.all() or not np.isfinite(P[k]).all(), k
-    not_psd(S, L, scratch, bad)
-    alone = [not small_matrices.is_psd(P[k], np.zeros((n, n))) for k in range(lanes)]
-    assert bad.tolist() == [int(each) for each in alone]
-    assert {0, 1} == set(bad.tolist())
+    alone = [small_matrices.is_psd(P[k], np.zeros((n, n))) for k in range(lanes)]
+    assert are_sound(S).tolist() == alone
+    assert {False, True} == set(alone)
 
 
-@pytest.mark.parametrize('count', [1, 9, MOST_LANES, MOST_LANES + 1, 180, 560])
-def test_turns_cover_all_components(count):
-    lanes = lanes_for(count)
-    done = [turn_of(first, count, lanes) + np.arange(lanes) for first in range(0, count, lanes)]
-    assert lanes <= MOST_LANES
-    assert set(np.concatenate(done).tolist()) == set(range(count))
+@pytest.mark.parametrize('n', [3, 4, 6])
+def test_jitter_is_that_of_single_matrices(n):
+    P = covariances(np.random.default_rng(n), n, 40)
+    mended, repaired = with_jitter(np.moveaxis(P, 0, -1))
+    for k in range(len(P)):
+        alone = P[k].copy()
+        assert small_matrices.add_jitter(alone, np.zeros((n, n))) == repaired[k]
+        assert_allclose(mended[..., k], alone, rtol=1e-12)

@@ -15,9 +15,8 @@
 """exp of a row."""
 
 import numpy as np
-from scipy import special
 
-from sonar_imm.estimation.elementary import exponentials, gaussians, phasors
+from sonar_imm.estimation.elementary import exponentials, phasors
 
 
 def row(values):
@@ -42,29 +41,6 @@ def test_a_row_gives_the_same_bits_however_it_is_cut():
     values = -np.random.default_rng(1).exponential(30.0, 101)
     whole = row(values)
     assert all(row([value])[0] == expected for value, expected in zip(values, whole))
-
-
-def bell(values):
-    values = np.array(values, float)
-    rows = np.empty((3, len(values)))
-    gaussians(values, *rows)
-    return rows[1:]
-
-
-def test_gaussians_are_those_of_the_library():
-    values = np.concatenate([np.linspace(-37.0, 37.0, 40_001), np.logspace(-18, 0, 101)])
-    density, below = bell(values)
-    # The square of a value is rounded before it stands in an exponent.
-    near = 1e-15 + 3e-16 * np.square(values)
-    assert (np.abs(density / np.exp(-0.5 * np.square(values)) - 1.0) <= near).all()
-    assert (np.abs(below / special.ndtr(values) - 1.0) <= near).all()
-    assert bell([0.0])[:, 0].tolist() == [1.0, 0.5]
-
-
-def test_what_is_certain_is_one_and_what_is_unknown_stays_so():
-    density, below = bell([-np.inf, np.inf, -50.0, 50.0, np.nan])
-    assert below[:4].tolist() == [0.0, 1.0, 0.0, 1.0] and np.isnan(below[4])
-    assert not density.any()
 
 
 def test_phasors_are_cosines_and_sines():

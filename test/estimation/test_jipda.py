@@ -76,7 +76,7 @@ def test_the_sums_over_events_are_those_of_the_prototype(case, form):
 @pytest.mark.parametrize('case', CASES)
 def test_the_events_are_those_of_the_prototype(case):
     possible = VECTORS[f'{case}/ratio'] > 0.0
-    events = oracle._events(possible, list(range(len(possible))))
+    events = oracle.events(possible)
     assert np.array_equal(np.reshape(events, (-1, len(possible))), VECTORS[f'{case}/out_events'])
 
 
@@ -98,30 +98,6 @@ def test_one_track_in_a_scan_with_nothing_is_the_bayes_rule_of_a_miss():
     none = np.empty((1, 0))
     _, _, after = jipda.associate(none, none, np.array([0.5]), np.array([0.7]), 9.0)
     np.testing.assert_allclose(after, 0.5 * 0.3 / (0.5 * 0.3 + 0.5))
-
-
-def test_a_cluster_with_too_many_events_gets_a_smaller_gate():
-    """Eight tracks and eight detections all within the gate: 1441729 events."""
-    rng = np.random.default_rng(3)
-    ratio, nis = rng.gamma(2.0, 3.0, (8, 8)), rng.uniform(0.0, 13.0, (8, 8))
-    existence, pd = np.full(8, 0.9), np.full(8, 0.9)
-    first, second = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
-    for ours, theirs in zip(first, second):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-14)
-    kept = nis[first[0] > 0.0].max()
-    gates = 13.8 * 0.7 ** np.arange(30)
-    assert 0.0 < kept < 13.8
-    gate = gates[gates >= kept].min()
-    assert len(oracle._events(nis <= gate, list(range(8)))) <= oracle.MOST_EVENTS
-    assert oracle._count(nis <= gate / 0.7, list(range(8))) > oracle.MOST_EVENTS
-
-
-def test_a_cluster_of_equal_pairs_that_no_gate_divides_ends():
-    for form in FORMS[1:]:
-        beta, _, after = form(
-            np.ones((9, 9)), np.zeros((9, 9)), np.full(9, 0.9), np.full(9, 0.9), 13.8
-        )
-        assert not beta.any() and np.isfinite(after).all()
 
 
 def problem(seed, T=3, D=4, M=3, n=3, m=2):

@@ -161,12 +161,3 @@ def test_persistent_headings_match_the_reference(diver_reference):
     )
     hover = markov.with_hover(markov.persistent_headings(16, 0.88, 2.0), 0.02, 0.9)
     np.testing.assert_allclose(hover, diver_reference('A12_speedstate16_hover', 'Pi'), atol=1e-14)
-
-
-def test_events_get_rarer_with_shorter_steps():
-    chain = markov.EventChain([0.9, 0.07, 0.03], step=1.0)
-    np.testing.assert_allclose(chain.transition(1.0), np.tile([0.9, 0.07, 0.03], (3, 1)))
-    tenth = chain.transition(0.1)
-    np.testing.assert_allclose(tenth[0, 0] ** 10, 0.9, atol=1e-14)
-    np.testing.assert_allclose(tenth[:, 1] / tenth[:, 2], 7.0 / 3.0)
-    np.testing.assert_allclose(chain.transition(0.0), np.tile([1.0, 0.0, 0.0], (3, 1)))

@@ -30,10 +30,6 @@ from helpers import marine
 from helpers.dive_scenes import legs
 from helpers.sonar_files import (
     BEGIN,
-    ek60,
-    ek80,
-    kmall,
-    kongsberg_all,
     line_east,
     place_of,
     side_scan,
@@ -264,16 +260,16 @@ def traces_npz(path, spots):
     np.savez(path, depth=depth, amplitude=echoes(len(spots)), stamp=stamp)
 
 
-def floor(count, staves, wavelengths=0.5, spacing=0.06):
-    """Samples (count, bins, staves) of an array 15 m above a level floor, and their ranges;
-    wavelengths: from stave to stave."""
+def floor(count, staves):
+    """Samples (count, bins, staves) of an array 15 m above a level floor, half a wavelength from
+    stave to stave, and their ranges."""
     rng = np.random.default_rng(4)
-    distance = spacing * np.arange(round(50.0 / spacing))
+    distance = 0.06 * np.arange(833)
     shape = (count, len(distance))
     noise = 0.05 * (rng.normal(size=(*shape, staves)) + 1j * rng.normal(size=(*shape, staves)))
     echo = (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * (distance > 15.0)
     angle = np.arccos(np.clip(15.0 / np.maximum(distance, 15.0), 0.0, 1.0))
-    place = wavelengths * (np.arange(staves) - 0.5 * (staves - 1))
+    place = 0.5 * (np.arange(staves) - 0.5 * (staves - 1))
     turn = np.exp(2j * np.pi * np.outer(np.sin(angle), place))
     return (noise + echo[..., None] * turn).astype(np.complex64), distance
 
@@ -283,19 +279,6 @@ def snapshots_npz(path, spots):
     stamp = np.array([FIRST + each.seconds for each in spots])
     facts = {'sound_speed': 1500.0, 'frequency': 300e3, 'spacing_wavelengths': 0.5}
     np.savez(path, iq=iq[:, 140:], range=distance[140:], stamp=stamp, **facts)
-
-
-def boats_json(path, spots):
-    records = [
-        {
-            'sensorID': 2,
-            'time': FIRST + each.seconds,
-            'measurement': [[(each.place or (0.0, 0.0))[1]], [(each.place or (0.0, 0.0))[0]]],
-            'ownshipPosition': [0.0, 0.0],
-        }
-        for each in spots
-    ]
-    path.write_text(json.dumps(records, indent=1))
 
 
 def bag_of(path, spots, messages, types):
@@ -427,31 +410,6 @@ def soundings_xtf(path, spots):
     path.write_bytes(b''.join(parts))
 
 
-def split_beam(path, spots):
-    pytest.importorskip('themachinethatgoesping')
-    iq, _ = floor(len(spots), 2, 23 / (2 * np.pi), 0.0298)
-    ek80(path, iq[..., [1, 0, 0, 1]], spots=[(each.seconds, each.degrees) for each in spots])
-
-
-def old_split_beam(path, spots):
-    pytest.importorskip('ektools')
-    iq, _ = floor(len(spots), 2, 21.9 / (2 * np.pi), 0.5 * 1490.0 * 2.56e-4)
-    power = np.round(20.0 * np.log10(np.abs(iq[..., 0]) + 1e-3) * 256 / 3.0103).astype(int)
-    turn = np.angle(iq[..., 1] * iq[..., 0].conj()) * 128 / np.pi
-    angles = np.stack([turn, 0.0 * turn], axis=-1).clip(-128, 127).astype(int)
-    ek60(path, power, angles, spots=[(each.seconds, each.degrees) for each in spots])
-
-
-def kmall_line(path, spots):
-    pytest.importorskip('themachinethatgoesping')
-    kmall(path, spots=[(each.seconds, each.degrees) for each in spots])
-
-
-def all_line(path, spots):
-    pytest.importorskip('themachinethatgoesping')
-    kongsberg_all(path, spots=[(each.seconds, each.degrees) for each in spots])
-
-
 def pictures(path, spots):
     """An echo on the bow that comes nearer as the vehicle goes east."""
     image = pytest.importorskip('PIL.Image')
@@ -513,7 +471,6 @@ FORMATS = [
     Format('numpy archive', 'pings.npz', snapshots_npz, 'bathymetry'),
     Format('numpy archive', 'traces.npz', traces_npz, 'fathometer'),
     Format('CSV of traces', 'traces.csv', traces_csv, 'fathometer'),
-    Format('JSON of the Autoferry data set', 'boats.json', boats_json, 'diver', ('--std', '2')),
     Format('bag with sonar images, or amplitude and phase', 'survey.bag', images_bag, 'obstacle'),
     Format(
         'bag with sonar images, or amplitude and phase',
@@ -526,22 +483,6 @@ FORMATS = [
     Format('bag with `sensor_msgs/PointCloud`', 'micron.bag', cloud_bag, 'obstacle', kind='none'),
     Format('XTF: side scan, processed soundings', 'line.xtf', side_scan_xtf, 'obstacle', step=0.2),
     Format('XTF: side scan, processed soundings', 'swath.xtf', soundings_xtf, '', step=0.2),
-    Format(
-        'Simrad EK80 raw: complex samples, chirps (compressed), power with angles',
-        'wbt.raw',
-        split_beam,
-        'bathymetry',
-        step=0.2,
-    ),
-    Format(
-        'Simrad EK60, ES60 raw: power with angles',
-        'gpt.raw',
-        old_split_beam,
-        'bathymetry',
-        step=0.2,
-    ),
-    Format('Kongsberg KMALL, .all', 'line.kmall', kmall_line, '', step=0.2),
-    Format('Kongsberg KMALL, .all', 'line.all', all_line, '', step=0.2),
     Format(
         'folder of PNG, JPEG with a CSV of stamps',
         'frames',

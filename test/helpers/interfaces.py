@@ -49,7 +49,7 @@ ORDER = (
     'sensors',
     'dave_interfaces',
 )
-USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs', 'diagnostic_msgs')
+USES = ('builtin_interfaces', 'std_msgs', 'geometry_msgs')
 PACKAGE = """<?xml version="1.0"?>
 <package format="3">
   <name>{name}</name>
@@ -104,19 +104,16 @@ def write_sources(folder, definitions):
             for name, text in definitions.items()
             if name.startswith(f'{package}/')
         }
-        uses = [*USES]
-        if any('geographic_msgs/' in text for text in own.values()) and package != ORDER[0]:
-            uses.append(ORDER[0])
         place = folder / 'src' / package
         (place / 'msg').mkdir(parents=True)
         for name, text in own.items():
             (place / 'msg' / f'{name}.msg').write_text(text)
-        depends = ''.join(f'<depend>{used}</depend>' for used in uses)
+        depends = ''.join(f'<depend>{used}</depend>' for used in USES)
         (place / 'package.xml').write_text(PACKAGE.format(name=package, depends=depends))
-        finds = '\n'.join(f'find_package({used} REQUIRED)' for used in uses)
+        finds = '\n'.join(f'find_package({used} REQUIRED)' for used in USES)
         files = ' '.join(f'msg/{name}.msg' for name in own)
         (place / 'CMakeLists.txt').write_text(
-            CMAKE.format(name=package, finds=finds, uses=' '.join(uses), files=files)
+            CMAKE.format(name=package, finds=finds, uses=' '.join(USES), files=files)
         )
 
 

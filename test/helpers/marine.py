@@ -93,24 +93,6 @@ OTHERS = {
     'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
         'std_msgs/Header header\ngeographic_msgs/GeoPoseWithCovariance pose\n'
     ),
-    'marine_interfaces/msg/Classification': 'string class_id\nfloat32 probability\n',
-    'marine_interfaces/msg/Kinematics': (
-        'geometry_msgs/PoseWithCovariance pose\nuint8 orientation_availability\n'
-        'geometry_msgs/TwistWithCovariance twist\n'
-    ),
-    'marine_interfaces/msg/Shape': (
-        'uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n'
-    ),
-    'marine_interfaces/msg/Contact': (
-        'std_msgs/Header header\nstring id\nfloat32 existence_probability\n'
-        'marine_interfaces/Classification[] classification\n'
-        'marine_interfaces/Kinematics kinematics\nmarine_interfaces/Shape shape\n'
-        'geographic_msgs/GeoPose geo_pose\nstring source\nuint8 origin_kind\nuint8 status\n'
-        'string note\nstring[] observation_ids\ndiagnostic_msgs/KeyValue[] attributes\n'
-    ),
-    'marine_interfaces/msg/ContactArray': (
-        'std_msgs/Header header\nmarine_interfaces/Contact[] contacts\n'
-    ),
     'marine_interfaces/msg/SonarInfo': (
         'std_msgs/Header header\nstring sonar_model\nfloat32[] pulse_lengths\n'
         'float32[] bandwidths\nuint8[] tx_signal_types\nuint8 intensity_quantity\n'

@@ -15,11 +15,14 @@
 """Processes that share work, where they cannot."""
 
 from multiprocessing import synchronize
+import socket
 
 from helpers.dying import work
 import pytest
 
-from sonar_imm_tools.offline.jobs import processes, workers
+from sonar_imm.parameters import ConfigError
+from sonar_imm_tools.offline import jobs
+from sonar_imm_tools.offline.jobs import cluster, processes, workers
 
 
 @pytest.mark.parametrize('error', [FileNotFoundError(2, 'No such file'), OSError(38, 'Not there')])
@@ -50,3 +53,16 @@ def test_one_process_does_calls_in_turn(tmp_path):
     with workers() as run:
         found = list(run(work, [(tmp_path, 1), (tmp_path, 4)]))
     assert found == [(0, 1, ''), (1, None, 'ValueError: not this one')]
+
+
+def test_a_missing_scheduler_is_one_sentence(monkeypatch):
+    pytest.importorskip('distributed')
+    monkeypatch.setattr(jobs, 'CONNECT_SECONDS', 0.5)
+    with socket.create_server(('127.0.0.1', 0)) as silent:
+        address = f'127.0.0.1:{silent.getsockname()[1]}'
+        with pytest.raises(ConfigError, match=f'no dask scheduler answers at {address} '):
+            cluster(address).__enter__()
+    with pytest.raises(ConfigError, match='no dask scheduler'):  # the port is closed now
+        cluster(address).__enter__()
+    with pytest.raises(ConfigError, match='no dask scheduler at nonsense: .*port'):
+        cluster('nonsense').__enter__()

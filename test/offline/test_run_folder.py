@@ -87,19 +87,26 @@ def test_no_estimates_leave_a_readable_run(folder):
 
 
 def test_an_earlier_run_is_kept_unless_told_otherwise(folder):
-    folder.write_json('run.json', {})
+    folder.path.rmdir()
+    with folder.fresh() as unfinished:
+        unfinished.write_json('run.json', {})
     (folder.path / 'notes.txt').write_text('mine')
+    marker = (folder.path / '.sonar_imm').read_bytes()
     with pytest.raises(BagError, match='--overwrite'), folder.fresh():
         pytest.fail('the folder was given out')
     with pytest.raises(KeyError), folder.fresh(overwrite=True) as unfinished:
         unfinished.write_json('run.json', {'new': 1})
         raise KeyError
-    assert contents(folder.path) == {'notes.txt': b'mine', 'run.json': b'{}\n'}
+    assert contents(folder.path) == {
+        '.sonar_imm': marker,
+        'notes.txt': b'mine',
+        'run.json': b'{}\n',
+    }
     with folder.fresh(overwrite=True) as unfinished:
         unfinished.write_json('run.json', {'new': 1})
         assert contents(folder.path)['run.json'] == b'{}\n'
     assert json.loads((folder.path / 'run.json').read_text()) == {'new': 1}
-    assert sorted(contents(folder.path)) == ['notes.txt', 'run.json']
+    assert sorted(contents(folder.path)) == ['.sonar_imm', 'notes.txt', 'run.json']
 
 
 def test_a_file_is_no_folder(tmp_path):

@@ -53,3 +53,10 @@ def counts_correction(
     return np.asarray(
         np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0)
     )
+
+
+def corrected(P: FloatArray, correction: FloatArray) -> FloatArray:
+    """Apply a learnt factor to the matrix of any step and renormalise the rows. (..., M, M)."""
+    out = P * correction
+    total = out.sum(axis=-1, keepdims=True)
+    return np.asarray(np.where(total > 0.0, out / np.where(total > 0.0, total, 1.0), P))

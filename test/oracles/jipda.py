@@ -20,7 +20,7 @@ import numpy as np
 
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.estimation.covariance import add_jitter
-from sonar_imm.estimation.jipda import LEAST_GATE, MOST_EVENTS, OPENS_GATE, SMALLER
+from sonar_imm.estimation.jipda import OPENS_GATE
 
 
 class Likelihoods(NamedTuple):
@@ -71,84 +71,39 @@ def associate(
 ) -> Association:
     """The sums over all joint events.
 
-    ratio (T, D): f / lambda; nis (T, D): a pair is possible where it is below `threshold`, and
-    below less in a cluster that is too large; existence, detection_probability (T,).
+    ratio (T, D): f / lambda; nis (T, D): a pair is possible where it is below `threshold`;
+    existence, detection_probability (T,).
     """
     T, D = ratio.shape
-    beta = np.zeros((T, D))
-    missed = existence * (1.0 - detection_probability)
-    missed = missed / (1.0 - existence * detection_probability)
-    for tracks, inside in _clusters(nis, threshold):
-        total, alone = 0.0, np.zeros(T)
-        shares = np.zeros((T, D))
-        for event in _events(inside, tracks):
-            weight = 1.0
-            for t, d in zip(tracks, event):
-                detected = existence[t] * detection_probability[t]
-                weight *= 1.0 - detected if d < 0 else detected * ratio[t, d]
-            total += weight
-            for t, d in zip(tracks, event):
-                if d < 0:
-                    alone[t] += weight
-                else:
-                    shares[t, d] += weight
-        beta[tracks] = shares[tracks] / total
-        missed[tracks] *= alone[tracks] / total
+    detected = existence * detection_probability
+    beta, none, total = np.zeros((T, D)), np.zeros(T), 0.0
+    for event in events(nis <= threshold):
+        weight = 1.0
+        for t, d in enumerate(event):
+            weight *= 1.0 - detected[t] if d < 0 else detected[t] * ratio[t, d]
+        total += weight
+        for t, d in enumerate(event):
+            if d < 0:
+                none[t] += weight
+            else:
+                beta[t, d] += weight
+    beta, none = beta / total, none / total
+    missed = none * existence * (1.0 - detection_probability) / (1.0 - detected)
     return Association(beta, missed, beta.sum(axis=1) + missed)
 
 
-def _clusters(nis: FloatArray, threshold: float) -> list[tuple[list[int], BoolArray]]:
-    """Tracks that share detections, and which pairs of them are possible (T, D)."""
-    inside = nis <= threshold
-    waiting = [t for t in range(len(nis)) if inside[t].any()]
-    clusters = []
-    while waiting:
-        tracks, detections = {waiting[0]}, inside[waiting[0]]
-        while new := {t for t in waiting if t not in tracks and (inside[t] & detections).any()}:
-            tracks |= new
-            detections = inside[sorted(tracks)].any(axis=0)
-        members = sorted(tracks)
-        waiting = [t for t in waiting if t not in tracks]
-        own, gate = inside, threshold
-        while _count(own, members) > MOST_EVENTS:
-            gate = gate * SMALLER if gate > LEAST_GATE else -1.0
-            own = nis <= gate
-        clusters.append((members, own))
-    return clusters
-
-
-def _events(inside: BoolArray, tracks: list[int]) -> list[tuple[int, ...]]:
-    """All ways in which each of `tracks` takes a detection or none (-1), none taken twice; in
-    rising order."""
-    events: list[tuple[int, ...]] = [()]
-    for t in tracks:
-        events = [
+def events(possible: BoolArray) -> list[tuple[int, ...]]:
+    """List all ways in which each track takes a detection or none (-1), none taken twice, in
+    rising order; possible (T, D)."""
+    found: list[tuple[int, ...]] = [()]
+    for row in possible:
+        found = [
             (*event, d)
-            for event in events
-            for d in (-1, *np.flatnonzero(inside[t]).tolist())
+            for event in found
+            for d in (-1, *np.flatnonzero(row).tolist())
             if d < 0 or d not in event
         ]
-    return events
-
-
-def _count(inside: BoolArray, tracks: list[int]) -> int:
-    """The number of joint events, or a number above `MOST_EVENTS`."""
-    used: set[int] = set()
-
-    def below(place: int, limit: int) -> int:
-        if place == len(tracks):
-            return 1
-        found = below(place + 1, limit)
-        for d in np.flatnonzero(inside[tracks[place]]).tolist():
-            if found > limit:
-                break
-            if d not in used:
-                used.add(d)
-                found += below(place + 1, limit - found)
-                used.remove(d)
-        return found
-
-    return below(0, MOST_EVENTS)
+    return found
 
 
 def update(

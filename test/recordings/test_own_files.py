@@ -112,30 +112,6 @@ def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):
     assert "unknown parameter 'levr'" in capsys.readouterr().err
 
 
-def test_a_sweep_knows_the_instruments_of_its_scene(tmp_path):
-    assert (
-        main(
-            [
-                'sweep',
-                'obstacle',
-                '--runs',
-                '1',
-                '--workers',
-                '1',
-                '--set',
-                'last_range=80',
-                '--set',
-                'sonar_lever=2,0,-0.3',
-                '--out',
-                str(tmp_path),
-            ]
-        )
-        == 0
-    )
-    given = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
-    assert given['sonar_lever'] == [2.0, 0.0, -0.3]
-
-
 # -- the limit ------------------------------------------------------------------------------------
 
 

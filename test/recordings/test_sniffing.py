@@ -14,8 +14,6 @@
 
 """What a file is taken for, by its content alone."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -43,17 +41,14 @@ FILES = {
     'traces': b'stamp,depth,amplitude\n',
     'nmea': b'$GPHDT,45.0,T*04\r\n!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24\r\n',
     'nmea ': b'half a line\r\n1717199990.1 $GPHDT,45.0,T*04\r\n',
-    'autoferry': json.dumps([{'measurement': []}]).encode(),
     'segy': segy(),
     'segy ': segy(b'C'),
     'hydrophones': b'RIFF\0\0\0\0WAVEfmt ',
     'hydrophones ': b'fLaC\0',
-    'ek80': b'\0\0\0\x10XML0' + bytes(100),
-    'ek80 ': b'\0\0\0\x10CON0' + bytes(100),
-    'kongsberg': b'\0\0\0\x10#IIP' + bytes(100),
-    'kongsberg ': b'\0\0\0\x10\x02I' + bytes(100),
     'xtf': b'\x7b\x01' + bytes(1100),
 }
+RAW = (b'XML0', b'CON0', b'FIL1', b'#IIP', b'\x02I', b'\x02i')
+"""What stands behind the first four bytes of EK80, EK60, KMALL and .all."""
 
 
 @pytest.mark.parametrize('kind', FILES)
@@ -80,12 +75,30 @@ def test_archives(tmp_path):
         (b'stamp,Rechts,Hoch\n', '--column x=HEADER'),
         (bytes(range(256)) * 4, 'no text'),
         (b'PK\x03\x04 and nothing', 'damaged archive'),
+        *((b'\0\0\0\x10' + name + bytes(100), 'raw file of an echo sounder') for name in RAW),
+        (b'[{"measurement": []}]', r'JSON and no GeoJSON.* as CSV \(kind fixes\)'),
     ],
 )
 def test_what_is_not_known_is_said_with_what_would_help(tmp_path, content, wanted):
     (tmp_path / 'file.dat').write_bytes(content)
     with pytest.raises(BagError, match=wanted):
         sniff(tmp_path / 'file.dat')
+
+
+@pytest.mark.parametrize('words', [(), ('ek80',), ('kongsberg',)])
+def test_a_raw_file_of_an_echo_sounder_says_what_to_do(tmp_path, capsys, words):
+    path = tmp_path / 'D20221108.raw'
+    path.write_bytes((100).to_bytes(4, 'little') + b'XML0' + bytes(100))
+    assert main(['convert', *words, str(path), str(tmp_path / 'bag')]) == 2
+    (sentence,) = (
+        line for line in capsys.readouterr().err.splitlines() if 'kind snapshots' in line
+    )
+    assert 'XTF' in sentence and not (tmp_path / 'bag').exists()
+
+
+def test_a_table_is_not_taken_for_one(tmp_path):
+    (tmp_path / 'usbl.csv').write_text('time#UTC,x,y\n1,2,3\n')
+    assert sniff(tmp_path / 'usbl.csv').kind == 'fixes'
 
 
 def test_columns_that_are_named_settle_it_without_the_kind(tmp_path, capsys):

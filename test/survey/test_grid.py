@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.soundings import COLUMNS
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm_tools.recordings.export.points import Points
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.simulation.survey import budget, scenario, simulate
@@ -218,9 +219,9 @@ def test_two_sigma_hold_the_truth_of_one_run(terrain, slope, cell):
 
 
 def test_the_budget_is_that_of_the_run():
-    assert budget_of({}) == (BUDGET, 1500.0)
-    values = {'parameters': {'heave_std': 0.2, 'sound_speed': 1480.0, 'system': 'other'}}
-    found, speed = budget_of(values)
+    assert budget_of(None) == (BUDGET, 1500.0)
+    parameters = BathymetryConfig().as_dict() | {'heave_std': 0.2, 'sound_speed': 1480.0}
+    found, speed = budget_of({'parameters': parameters})
     assert found.heave == 0.2 and found.attitude == BUDGET.attitude and speed == 1480.0
 
 

@@ -114,11 +114,12 @@ def test_live_lockstep_equals_offline_byte_for_byte(bag):
 def test_the_parameter_file_reaches_the_live_node(bag, tmp_path):
     file = tmp_path / 'diver.yaml'
     file.write_text(
-        '/**:\n  ros__parameters:\n    model_set: cv_cv\n    max_tracks: 3\n'
-        '    transition_matrix: []\n'
+        '/**:\n  ros__parameters:\n    model_set: heading_speed\n    max_tracks: 3\n'
+        '    directions: 4\n    transition_matrix: []\n'
     )
     result = run_lockstep(bag, 'diver', params_file=file)
-    assert_same_tables(result.estimates, offline(bag, model_set='cv_cv', max_tracks=3))
+    known = {'model_set': 'heading_speed', 'directions': 4, 'max_tracks': 3}
+    assert_same_tables(result.estimates, offline(bag, **known))
 
 
 def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):

@@ -474,6 +474,6 @@ def test_single_fixes_far_from_the_origin_keep_their_digits():
             )
             for k in range(10)
         ]
-        last = run('diver', fixes, model_set='cv')[-1]
+        last = run('diver', fixes, model_set='linear')[-1]
         assert abs(last.state[0, 0] - shift[0] - 9e-3) < 1e-4
         assert abs(last.state[0, 2] - 1e-3) < 2e-4

@@ -26,7 +26,8 @@ from helpers.source import ROOT
 import numpy as np
 import pytest
 
-from sonar_imm.parameters import ConfigError
+from sonar_imm import IMM, position
+from sonar_imm.parameters import ConfigError, MODELS, registered
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverTracker
@@ -42,15 +43,13 @@ CODE = '''
 
 
     class Turns:
-        """cv_ct of the diver tracker again, by numerical integration."""
+        """Straight on and turning, by numerical integration."""
 
-        transition = np.full((3, 3), 0.05) + 0.85 * np.eye(3)
+        transition = np.full((3, 3), 0.075) + 0.775 * np.eye(3)
 
         def __init__(self, config):
-            rate = np.radians(config.turn_rate_deg)
+            rate = np.radians(20.0)
             self.start = {'vx': (0.0, config.velocity_std), 'vy': (0.0, config.velocity_std)}
-            self.transition = np.full((3, 3), (1.0 - config.baseline_stay_probability) / 2.0)
-            np.fill_diagonal(self.transition, config.baseline_stay_probability)
             self.models = [
                 turn('straight', 0.0, 0.1), turn('left', rate, 0.3), turn('right', -rate, 0.3)
             ]
@@ -89,7 +88,8 @@ CODE = '''
         from attrs import evolve
         from sonar_imm.trackers.diver.models import build_models
 
-        return build_models(evolve(config, model_set='heading_speed'))
+        plain = {'model_set': 'heading_speed', 'dimensions': 2, 'fix_bias_std': 0.0}
+        return build_models(evolve(config, **plain))
 
 
     def swim(built_in, j):
@@ -171,19 +171,33 @@ def fixes():
     return [fix(t, x, y, 0.25 * np.eye(2)) for t, (x, y) in zip(stamps, at)]
 
 
+def test_a_set_gives_the_estimates_of_the_same_filter_alone(installed):
+    config = DiverConfig(model_set='tiny_turns', adaptation='fixed', max_tracks=1)
+    first, *others = fixes()
+    made = run(DiverTracker(config), [first, *others])
+    own = registered(MODELS, 'tiny_turns').load()(config)
+    imm = IMM(
+        own.models,
+        own.transition,
+        [*first.position[:2], 0.0, 0.0],
+        np.diag([0.25, 0.25, *[config.velocity_std**2] * 2]),
+        position(0.5),
+        stamp=first.stamp_ns / 1e9,
+    )
+    for item, mine in zip(others, made[1:], strict=True):
+        imm.step(item.position[:2], stamp=item.stamp_ns / 1e9)
+        assert mine.state[0] == pytest.approx(imm.estimate.mean, rel=1e-9, abs=1e-9)
+        assert mine.covariance[0] == pytest.approx(imm.estimate.covariance, rel=1e-9, abs=1e-9)
+        assert mine.probabilities[0] == pytest.approx(imm.model_probabilities, abs=1e-9)
+
+
 @pytest.mark.parametrize(
-    'own, built_in, values',
-    [
-        ('tiny_turns', 'cv_ct', {}),
-        ('tiny_turns', 'cv_ct', {'fix_bias_std': 0.5, 'association': 'jipda'}),
-        ('tiny_turns', 'cv_ct', {'dimensions': 3}),
-        ('tiny_headings', 'heading_speed', {}),
-    ],
+    'values', [{}, {'fix_bias_std': 0.5, 'association': 'jipda'}, {'dimensions': 3}]
 )
-def test_a_diver_model_written_again_gives_the_same_estimates(installed, own, built_in, values):
+def test_a_diver_model_written_again_gives_the_same_estimates(installed, values):
     ours, theirs = (
         run(DiverTracker(DiverConfig(model_set=name, **values)), fixes())
-        for name in (own, built_in)
+        for name in ('tiny_headings', 'heading_speed')
     )
     assert len(ours) == len(theirs) == 60
     for mine, reference in zip(ours, theirs):
@@ -278,14 +292,15 @@ def test_the_command_tracks_with_it(folder, tmp_path):
     command = [sys.executable, '-m', 'sonar_imm_tools.cli', 'track', bag]
     out = tmp_path / 'own'
     done = subprocess.run(
-        [*command, str(out), '--set', 'model_set=tiny_turns'],
+        [*command, str(out), '--set', 'model_set=tiny_headings'],
         env=env,
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads((out / 'run.json').read_text())['parameters']['model_set'] == 'tiny_turns'
-    assert main(['track', bag, str(tmp_path / 'built_in'), '--set', 'model_set=cv_ct']) == 0
+    assert json.loads((out / 'run.json').read_text())['parameters']['model_set'] == 'tiny_headings'
+    named = ['--set', 'model_set=heading_speed']
+    assert main(['track', bag, str(tmp_path / 'built_in'), *named]) == 0
     ours, theirs = (
         np.genfromtxt(path, delimiter=',', names=True)
         for each in (out, tmp_path / 'built_in')
@@ -293,7 +308,7 @@ def test_the_command_tracks_with_it(folder, tmp_path):
     )
     for name in ('px', 'py', 'vx', 'vy', 'cov_px_px'):
         assert ours[name] == pytest.approx(theirs[name], rel=1e-9, abs=1e-9)
-    assert ours['prob_left'] == pytest.approx(theirs['prob_ct_left'], abs=1e-9)
+    assert ours['prob_hover'] == pytest.approx(theirs['prob_hover'], abs=1e-9)
     done = subprocess.run(
         [*command, str(tmp_path / 'no'), '--set', 'model_set=tiny_broken'],
         env=env,

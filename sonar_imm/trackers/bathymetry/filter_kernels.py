@@ -73,7 +73,7 @@ TURNS = 0.5 / math.pi
 
 PER_LN2 = 1.0 / math.log(2.0)
 # ln 2 in two parts: products of the first with whole numbers up to 1075 are exact.
-LN2, LN2_REST = 6.93147180369123816490e-01, 1.90821492927057970002e-10
+LN2, LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 LEAST_EXPONENT = -700.0
 E = tuple(1.0 / math.factorial(k) for k in range(13))
 # Taylor series in f^2 of sin(pi f) / f and cos(pi f), for abs(f) <= 1/2.

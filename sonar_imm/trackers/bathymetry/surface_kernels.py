@@ -31,7 +31,7 @@ from ...estimation.jit import kernel
 # As in `filter_kernels`: exp, cos and sin of many numbers at a time.
 ROUND = 1.5 * 2.0**52
 PER_LN2 = 1.0 / math.log(2.0)
-LN2, LN2_REST = 6.93147180369123816490e-01, 1.90821492927057970002e-10
+LN2, LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 LEAST_EXPONENT = -700.0
 E = tuple(1.0 / math.factorial(k) for k in range(13))
 SINE = tuple((-1.0) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(11))

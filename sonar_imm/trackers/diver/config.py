@@ -27,18 +27,7 @@ from ..model_checks import chain_problems
 from ..own_models import diver_models
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
 
-MODEL_SETS = (
-    'families',
-    'heading_speed',
-    'heading_speed_lateral',
-    'world_headings',
-    'relative_headings',
-    'cv',
-    'cv_cv',
-    'cv_ct',
-)
-BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
-"""The single-direction sets and how many models they have."""
+MODEL_SETS = ('families', 'heading_speed')
 
 TARGETS: dict[str, dict[str, Any]] = {
     'diver': {},
@@ -86,7 +75,7 @@ AFLOAT = 2.0
 """Standard deviation on each axis of the velocity of what a fix shows, m/s, where nothing is said
 of it. A boat is tracked no other way, and it costs a diver nothing."""
 
-ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
+ADAPTATIONS = ('counts', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate', 'exact')
 ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
 NAMED_TRACKS = ('share', 'alone')
@@ -119,9 +108,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'of families wherever a parameter is at its default',
         choices=tuple(TARGETS))
     directions: int = parameter(16, '',
-        'number of headings of the multi-direction sets', range=(4, 64))
+        'number of headings (heading_speed, families)', range=(4, 64))
     hover: bool = parameter(True, '',
-        'add a model for standing still (heading_speed sets, families)')
+        'add a model for standing still (heading_speed, families)')
     reference_step: float = parameter(1.0, 's',
         'time step for which the probabilities and noises of the models are stated; values for '
         'other steps are derived from them', range=(1e-3, 3600.0))
@@ -139,8 +128,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'probability of staying stopped over a reference step', range=(0.0, 1.0))
     transition_matrix: tuple[float, ...] = parameter((), '',
         'whole transition matrix over a reference step, row-major, row = from; empty: built from '
-        'stay_probability, heading_concentration, hover_enter and hover_stay, or '
-        'baseline_stay_probability', range=(0.0, 1.0), kind='float[]')
+        'stay_probability, heading_concentration, hover_enter and hover_stay', range=(0.0, 1.0),
+        kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
     family_switch_rate: float = parameter(0.001, '1/s',
@@ -153,56 +142,34 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families: copies with a lower scale say where the diver is, but not how well that is '
         'known; lower it only where errors are known not to last', range=(0.01, 1.0))
     adaptation: str = parameter('counts', '',
-        'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
-        'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',
+        'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
         choices=ADAPTATIONS)
     adaptation_prior: float = parameter(2.0, '',
         'adaptation counts: weight of the prior matrix, in transitions per row', range=(1e-3, 1e6))
-    adaptation_guard: float = parameter(0.7, '',
-        'adaptation paper and ratio: share of the prior matrix kept at each step; below 0.3 they '
-        'degenerate', range=(0.0, 1.0))
 
     # -- how divers move -------------------------------------------------------------------------
     speed_mean: float = parameter(0.75, 'm/s',
-        'speed expected of a new track (heading_speed sets, families)', range=(0.0, 20.0))
+        'speed expected of a new track (heading_speed, families)', range=(0.0, 20.0))
     speed_std: float = parameter(0.4, 'm/s',
-        'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
+        'standard deviation of the speed of a new track around speed_mean (heading_speed, '
         'families)', range=(1e-3, 20.0))
     velocity_std: float = parameter(0.7, 'm/s',
-        'standard deviation on each axis of the velocity of a new track, around zero (sets with '
-        'a velocity state; families: 2 at a fix of a diver)',
-        range=(1e-3, 20.0))
+        'families: standard deviation on each axis of the velocity of a new track, around zero; '
+        '2 at a fix of a diver', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
-        'random walk of the speed over a reference step (heading_speed sets, families)',
+        'random walk of the speed over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
     brisk_speed_noise: float = parameter(0.07, 'm/s',
         'families: random walk of the speed over a reference step in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
     lateral_noise: float = parameter(0.24, 'm',
-        'random walk sideways over a reference step (heading_speed sets, families)',
+        'random walk sideways over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
-    lateral_speed_std: float = parameter(0.2, 'm/s',
-        'heading_speed_lateral: standard deviation of the lateral velocity', range=(0.0, 10.0))
-    lateral_speed_time: float = parameter(10.0, 's',
-        'heading_speed_lateral: time over which the lateral velocity is correlated',
-        range=(1e-2, 1e5))
     hover_noise: float = parameter(0.05, 'm',
         'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
-    fixed_speed: float = parameter(1.0, 'm/s',
-        'world_headings: speed of every heading', range=(0.0, 20.0))
-    velocity_noise: float = parameter(0.19, 'm/s',
-        'world_headings and relative_headings: velocity noise over a reference step',
-        range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
-        'cv, cv_cv and cv_ct: acceleration noise of each model over a reference step; families: '
-        'of lively_calm, lively_sharp and quiet; empty: values tuned for divers',
-        range=(0.0, 100.0), kind='float[]')
-    turn_rate_deg: float = parameter(20.0, 'deg/s',
-        'cv_ct: turn rate of the two CT models', range=(0.0, 180.0))
-
-    baseline_stay_probability: float = parameter(0.85, '',
-        'cv_cv and cv_ct: probability of keeping the model over a reference step',
-        range=(0.0, 1.0))
+        'families: acceleration noise of lively_calm, lively_sharp and quiet over a reference '
+        'step; empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
 
     # -- measurements ----------------------------------------------------------------------------
     fix_std: float = live(1.0, 'm',
@@ -417,19 +384,16 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                 f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'
             )
         models = self.model_count()
-        noises = BASELINES.get(self.model_set, 3)
-        if self._accelerates() and len(self.acceleration_noise) not in (0, noises):
+        noises = len(self.acceleration_noise)
+        if self.model_set == 'families' and noises not in (0, 3):
             problems.append(
-                f'acceleration_noise needs one value for each of the {noises} models of '
-                f'{self.model_set}, got {len(self.acceleration_noise)}'
+                'acceleration_noise of families needs three values, of lively_calm, lively_sharp '
+                f'and quiet, got {noises}'
             )
         problems += chain_problems(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
         )
         return problems
-
-    def _accelerates(self) -> bool:
-        return self.model_set in BASELINES or self.model_set == 'families'
 
     def for_target(self) -> DiverConfig:
         """These parameters with those of the kind of target where they are at their defaults."""
@@ -526,8 +490,5 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         """Number of models in the set these parameters describe."""
         if self.model_set not in MODEL_SETS:
             return len(diver_models(self.model_set, self).joint.names)
-        if self.model_set in BASELINES:
-            return BASELINES[self.model_set]
-        hovering = self.model_set.startswith(('heading_speed', 'families'))
-        count = self.directions + int(self.hover and hovering)
+        count = self.directions + int(self.hover)
         return 2 * count + 3 if self.model_set == 'families' else count

@@ -42,7 +42,7 @@ from typing import NamedTuple
 from attrs import evolve
 import numpy as np
 
-from ...estimation import imm_kernels, jipda, markov
+from ...estimation import imm, imm_kernels, jipda, markov
 from ...estimation.adaptation import AdaptiveChain, Chain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import gate_threshold, TENTATIVE
@@ -71,6 +71,9 @@ FAMILIES = ('steady', 'brisk', 'lively', 'quiet')
 
 LIVELY, QUIET = (0.05, 0.6), (0.03,)
 """Acceleration noise of the constant velocities, m/s^2 over a reference step."""
+
+LIVELY_STAY = 0.85
+"""Probability of keeping the model of the lively family over a reference step."""
 
 PACE_TIME = 60.0
 """Time within which a diver who stands forgets his pace, s, as `brisk` does: else who stands for
@@ -149,7 +152,7 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         chain = rate_chain(config, np.eye(M))
     else:
         both, plain = (steady, brisk), evolve(config, transition_matrix=())
-        rates = markov.persistent(len(LIVELY), config.baseline_stay_probability)
+        rates = markov.persistent(len(LIVELY), LIVELY_STAY)
         generators = [rate_chain(plain, models.chain.matrix).generator for models in both]
         generators += [markov.RateChain(rates, T).generator, np.zeros((len(QUIET), len(QUIET)))]
         generator = _between(family, generators, config.family_switch_rate)
@@ -312,7 +315,7 @@ def fit(
         fit = found.whole + ratio
         return np.where(fit > bound(fixes), fit, -np.inf)
     threshold = gate_threshold(fixes.config.gate_probability, 2)
-    return imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
+    return imm.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold) + ratio
 
 
 def update(

@@ -82,7 +82,6 @@ class DiverTracker:
             self.models.chain,
             cast(Form, config.adaptation),
             weight=config.adaptation_prior,
-            guard=config.adaptation_guard,
         )
         self._settle(config)
         self.reset()

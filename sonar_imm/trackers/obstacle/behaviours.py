@@ -23,7 +23,7 @@ seabed    fixed, and as deep as the sea floor below the vehicle when it was seen
           its own
 
 The depth of an obstacle never changes, so slices do not interact. What it does may: within a slice
-the behaviours are mixed (`behaviour_kernels.mix`) before each step. The cycle is mix, predict,
+the behaviours are mixed (`mixtures.mix`) before each step. The cycle is mix, predict,
 update, combine. The probability of a behaviour is its weight summed over the slices.
 
 Source: docs/obstacle.md, section Behaviours.
@@ -37,10 +37,10 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ..own_models import obstacle_behaviour
-from . import behaviour_kernels, kernels
-from .behaviour_kernels import COMMON, Motion
+from . import mixtures
 from .config import BEHAVIOURS, ObstacleConfig
 from .filters import depth_slices, depth_span, DepthSlices, Hints, Mixture, Sonar, View
+from .unscented import COMMON, Motion, STATES
 
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
@@ -64,7 +64,7 @@ deviation."""
 class BehaviourSlices(DepthSlices):
     """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
 
-    n = behaviour_kernels.STATES
+    n = STATES
 
     def __init__(self, config: ObstacleConfig):
         super().__init__(config)
@@ -141,9 +141,7 @@ class BehaviourSlices(DepthSlices):
     def advance(
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
-        mixed = behaviour_kernels.mix(
-            *mixture, self._prior, self.slices, self._transition(dt), DROPPED
-        )
+        mixed = mixtures.mix(*mixture, self._prior, self.slices, self._transition(dt), DROPPED)
         return self.carried(Mixture(*mixed), before.pose, after.pose, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
@@ -212,7 +210,7 @@ def _velocity(mixture: Mixture, moves: BoolArray) -> tuple[FloatArray, FloatArra
     spread."""
     x, P = mixture.x[..., COMMON:].copy(), mixture.P[..., COMMON:, COMMON:].copy()
     x[:, ~moves], P[:, ~moves] = 0.0, 0.0
-    return kernels.matched(x, P, mixture.mu, 2)
+    return mixtures.moment_match(x, P, mixture.mu, 2)
 
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:

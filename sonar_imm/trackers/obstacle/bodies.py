@@ -43,7 +43,6 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from .filters import put, Sonar, View
-from .ping_kernels import widen
 
 CENTRE = 0.1
 """That of ten glints of equal strength."""
@@ -94,14 +93,20 @@ class Bodies(NamedTuple):
 
 def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> View:
     """The view with the errors that are the same in every ping."""
-    position, centre = sonar.pose.position, CENTRE * np.square(bodies.std)
-    covariance, place_covariance = widen(
-        view.covariance,
-        view.place_covariance,
-        view.state,
-        view.place,
-        position,
-        scale_std**2,
-        centre,
-    )
+    centre = CENTRE * np.square(bodies.std)
+    reach, away = view.state * [1.0, 0.0, 1.0], view.place - sonar.pose.position
+    covariance = view.covariance + scale_std**2 * _outer(reach)
+    covariance[:, 0, 0] += centre[:, 0]
+    covariance[:, 1, 1] += centre[:, 1] / np.square(view.state[:, 0])
+    place_covariance = view.place_covariance + scale_std**2 * _outer(away)
+    along = away[:, :2] / np.maximum(np.hypot(*away[:, :2].T), 1e-9)[:, None]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    for axis, variance in zip((along, across), centre.T):
+        place_covariance[:, :2, :2] += variance[:, None, None] * _outer(axis)
     return view._replace(covariance=covariance, place_covariance=place_covariance)
+
+
+def _outer(vector: FloatArray) -> FloatArray:
+    """Return the outer products (T, n, n) of vectors (T, n), equal to the last bit on both
+    sides."""
+    return np.asarray(vector[:, :, None] * vector[:, None])

@@ -36,12 +36,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics.geometry import Pose
-from ...estimation import imm_kernels
+from ...estimation import imm
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
-from . import kernels
 from .config import ObstacleConfig
 from .filters import Mixture
+from .unscented import points
 
 REACH = 4.0
 """Standard deviations of an elevation over which a new obstacle has its slices."""
@@ -91,7 +91,7 @@ def expected(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, Floa
     x = mixture.x
     d, cosine, sine = x[..., 0], np.cos(x[..., 1]), np.sin(x[..., 1])
     a, b, c = pose.R[2]
-    m = kernels.points(x, *pose, cone)
+    m = points(x, *pose, cone)
     level = np.sqrt(m[..., 0] * m[..., 0] + m[..., 1] * m[..., 1])
     H = np.empty((*d.shape, 3))
     if not cone:
@@ -144,7 +144,7 @@ def fits(
     R3[:, 2, 2] = np.where(known, seen.variance, fov**2 / 12.0)  # anywhere in the beam
     h3 = np.concatenate([h, angle[..., None]], axis=-1)
     threshold = gate_threshold(config.gate_probability, 3)
-    fit = imm_kernels.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
+    fit = imm.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
     return np.asarray(fit + np.log(fov))
 
 
@@ -157,7 +157,7 @@ def outliers(
     density: float,
 ) -> FloatArray:
     """Probability (T, K) that detections z (T, 2), R (T, 2, 2) of which h (T, K, 2) was expected
-    are outliers, as `kernels.jipda_update` has it."""
+    are outliers, as `mixtures.update` has it."""
     s00 = mixture.P[..., 0, 0] + R[:, None, 0, 0]
     s01 = mixture.P[..., 0, 1] + R[:, None, 0, 1]
     s11 = mixture.P[..., 1, 1] + R[:, None, 1, 1]

@@ -37,11 +37,11 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold
-from . import avoidance_kernels, behaviour_kernels, kernels
-from .behaviour_kernels import Motion, Step
+from . import mixtures, unscented
 from .config import ObstacleConfig
+from .unscented import Motion, RELATIVE, Step
 
 BAND = 0.9
 """Probability of the interval `low` to `high`."""
@@ -107,6 +107,11 @@ class Mixture(NamedTuple):
     def rows(self, which: np.ndarray) -> Mixture:
         return Mixture(self.x[which], self.P[which], self.mu[which])
 
+    def is_finite(self) -> BoolArray:
+        """Return which targets (T,) have finite numbers throughout."""
+        means, covariances = np.isfinite(self.x), np.isfinite(self.P)
+        return np.asarray(means.all(axis=(1, 2)) & covariances.all(axis=(1, 2, 3)))
+
     def joined(self, other: Mixture) -> Mixture:
         return Mixture(*(np.concatenate(both) for both in zip(self, other)))
 
@@ -120,7 +125,7 @@ class View(NamedTuple):
     covariance; the interval of the offset; probability that the obstacle is above; its place in
     the world with covariance; the probability of each behaviour (T, B) of the filter's; north and
     east velocity (T, 2), m/s, with covariance; near: mean (T, K, 5) and covariance (T, K, 5, 5) of
-    each component's place and velocity as `avoidance_kernels` has them."""
+    each component's place and velocity, see `unscented.relative`."""
 
     state: FloatArray
     covariance: FloatArray
@@ -205,7 +210,7 @@ class DepthSlices:
     ) -> tuple[Mixture, int]:
         """`advance` of targets that go on with what they do."""
         step = Step(*before, *after, np.array(self._noise) * dt, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixture, self._motion(dt), step)
+        x, P, repaired = unscented.advance(*mixture, self._motion(dt), step)
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
     def _motion(self, dt: float) -> Motion:
@@ -223,46 +228,46 @@ class DepthSlices:
         """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,), and how
         many covariances had to be repaired."""
         outlier = self.config.outlier_probability
-        *after, nis, repaired = kernels.jipda_update(
-            *mixture, h, z, R, outlier, self.outlier_density
-        )
+        *after, nis, repaired = mixtures.update(*mixture, h, z, R, outlier, self.outlier_density)
         return Mixture(*after), nis, int(np.count_nonzero(repaired))
 
     def seen(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
         """With what an echo in this ping says of the height, or one in the ping before, of the
         sonar `last` (`looks`)."""
-        m = kernels.points(mixture.x, *sonar.pose, self.cone)
+        m = unscented.points(mixture.x, *sonar.pose, self.cone)
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
         other = np.full(len(m), self.config.outlier_probability)
         vertical, *others = self._beam
         edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
-        return Mixture(*kernels.looked(*mixture, m, other, 1.0 - other, edge, soft, *others)[:3])
+        beam = edge, soft, *others
+        return Mixture(*mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, *beam)[:3])
 
     def missed(self, mixture: Mixture, p: FloatArray, sonar: Sonar) -> tuple[Mixture, FloatArray]:
         """After a ping without an echo of the targets, which each give one with the probability
         p (T,) inside the beam; and the probability (T,) beforehand that the beam held them."""
-        m = kernels.points(mixture.x, *sonar.pose, self.cone)
+        m = unscented.points(mixture.x, *sonar.pose, self.cone)
         vertical, *others = self._beam
         edge, soft = (1.0 - EDGE) * vertical, SOFT * vertical
-        *after, inside = kernels.looked(*mixture, m, np.ones(len(p)), -p, edge, soft, *others)
+        beam = edge, soft, *others
+        *after, inside = mixtures.weight_by_beam(*mixture, m, np.ones(len(p)), -p, *beam)
         return Mixture(*after), inside
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
         x, P, mu = mixture
         position, depth = sonar.pose.position, sonar.pose.position[2]
-        state, own = kernels.matched(x, P, mu, 3)
+        state, own = mixtures.moment_match(x, P, mu, 3)
         state[:, 2] -= depth
-        band = kernels.bands(x[:, :, 2] - depth, np.sqrt(P[:, :, 2, 2]), mu, 0.5 * (1.0 - BAND))
-        near = avoidance_kernels.relative(x, P, mu, self.moves, *sonar.pose, self.cone)
-        together, both = kernels.matched(*near, mu, avoidance_kernels.SIZE)
+        band = mixtures.bands(x[:, :, 2] - depth, np.sqrt(P[:, :, 2, 2]), mu, 0.5 * (1.0 - BAND))
+        near = unscented.relative(x, P, mu, self.moves, *sonar.pose, self.cone)
+        together, both = mixtures.moment_match(*near, mu, RELATIVE)
         return View(
             state,
             own,
             *band,
             position + together[:, :3],
-            np.ascontiguousarray(both[:, :3, :3]),  # also what there is none of is so
+            both[:, :3, :3],
             self.behaviour(mu),
             together[:, 3:],
             both[:, 3:, 3:],
@@ -278,8 +283,8 @@ class DepthSlices:
         whether (T,) it lies ahead."""
         x, P, mu = mixture
         spread = np.sqrt(P[:, :, 2, 2]) / x[:, :, 0]
-        return kernels.outlook(
-            kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._surely
+        return mixtures.beam_probability(
+            unscented.points(x, *sonar.pose, self.cone), spread, mu, *self._surely
         )
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
@@ -287,7 +292,7 @@ class DepthSlices:
         arrives, and the mean of the ranges out and back."""
         if sonar.late is None:
             return np.ascontiguousarray(mixture.x[..., :2])
-        out = kernels.points(mixture.x, *sonar.pose, self.cone)
+        out = unscented.points(mixture.x, *sonar.pose, self.cone)
         return two_way_echo(out, sonar, self.config)
 
     def _clamp_to_seafloor(self, mixture: Mixture, sonar: Sonar) -> Mixture:

@@ -22,7 +22,6 @@ from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from .config import ObstacleConfig
-from .ping_kernels import mounted, turned_round
 
 
 class Mount:
@@ -39,11 +38,10 @@ class Mount:
 
     def sonar(self, vehicle: Pose) -> Pose:
         """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
-        # Copies: a kernel is compiled anew for arrays that cannot be written.
-        position, R = (part.copy() for part in vehicle)
-        return Pose(*mounted(position, R, self.lever, R @ self.R))
+        there = geometry.mounted(vehicle, self.lever, self.R)
+        return Pose(geometry.flip_world(there.position), geometry.flip_rotation(there.R))
 
     @staticmethod
     def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
         """Points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
-        return turned_round(points, covariance)
+        return geometry.flip_world(points), geometry.flip_covariance(covariance)

@@ -32,12 +32,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
 from ...estimates import Estimate, places
-from ...estimation import imm_kernels
+from ...estimation import imm
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...intake import KnownFrames
@@ -46,7 +45,6 @@ from ...measurements import Altitude, Detections, Ground, Measurement, nanosecon
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..protocol import WarmStep
-from . import ping_kernels
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
@@ -67,6 +65,9 @@ IN_BEAM = 0.9
 """A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
 echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
 approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
+SMALLEST, WIDEST = 1e-12, 0.25
+"""Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
+nothing."""
 _SIDE = np.array([1.0, -1.0, 1.0])
 """ROS counts bearings to port."""
 _SIDES = np.outer(_SIDE, _SIDE)
@@ -121,33 +122,10 @@ class ObstacleTracker:
         self.config, self.mount = config, Mount(config)
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
-        for _, compile_step in self.warm_steps(inputs):
-            compile_step()
+        """Do nothing: no kernel has to be compiled."""
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        if inputs is not None and Detections not in inputs:
-            return []
-        return [('pings', self._warm_pings), ('avoidance', self._warm_avoidance)]
-
-    def _warm_pings(self) -> None:
-        # Pings in which everything happens once: births, contested hits, a pose to wait for.
-        nearby = min(self.config.max_range, 100.0)
-        tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0, max_range=nearby))
-        for step in range(1, 5):
-            # All within less time than it takes to know a course: avoidance is a step of its own.
-            stamp = step * 200_000_000
-            east = Navigation(
-                stamp_ns=stamp, position=[0.2 * step, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
-            )
-            echoes = np.array([50.0, 50.1]) - 0.2 * step
-            tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
-            tracker.process(east)
-            tracker.process(Detections(stamp_ns=stamp, range=echoes, bearing=[0.0, 0.001]))
-
-    def _warm_avoidance(self) -> None:
-        ping_kernels.slope(np.arange(2.0), np.zeros((2, 3)))
-        mean, covariance = np.zeros((1, 1, 5)), np.eye(5)[None, None]
-        closest_approach(mean, covariance, np.ones((1, 1)), np.ones(3), self.config)
+        return []
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
@@ -174,9 +152,11 @@ class ObstacleTracker:
         return self._stream.state.innovations.warnings('detections', advice)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
-        revised = self._stream.revise(measurement)
-        pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
-        return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
+        # Nonsense overflows: what is not finite then is dropped and counted.
+        with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
+            revised = self._stream.revise(measurement)
+            pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
+            return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
 
     @property
     def landmarks(self) -> Memory:
@@ -306,7 +286,7 @@ class ObstacleTracker:
             looks=before.looks.advanced(self.filter, before.sonar, sonar, dt),
             repairs=before.repairs + repairs,
         )
-        is_finite = ping_kernels.is_finite(mixture.x, mixture.P)
+        is_finite = mixture.is_finite()
         broken = len(is_finite) - int(np.count_nonzero(is_finite))
         return (now.only(is_finite) if broken else now), broken
 
@@ -314,12 +294,16 @@ class ObstacleTracker:
         """z (D, 2), R (D, 2, 2), whether an extent is stated (D,), elevation and its variance
         (D,), of the rows that are echoes, azimuth positive to starboard. A row that is as
         uncertain as it is far says nothing and is left out."""
-        *echoes, real = ping_kernels.echoes(
-            ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
-        )
+        z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
+        variance = np.column_stack([ping.var_range, ping.var_bearing])
+        stated = np.isfinite(variance) & (variance > SMALLEST)
+        variance = np.where(stated, variance, self._own_variance)
+        R = variance[:, :, None] * np.eye(2)
+        real = np.isfinite(z[:, 0]) & (np.abs(z[:, 1]) < 0.5 * np.pi)
+        real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
         extended = np.isfinite(ping.extent_range)
-        columns = *echoes, extended, ping.elevation, ping.var_elevation
-        if np.count_nonzero(real) == len(real):
+        columns = z, R, extended, ping.elevation, ping.var_elevation
+        if real.all():
             return columns
         return tuple(column[real] for column in columns)
 
@@ -336,7 +320,7 @@ class ObstacleTracker:
             fit = fits(now.mixture, h, now.sonar.pose, z, R, seen, config)
         else:
             threshold = gate_threshold(config.gate_probability, 2)
-            fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
+            fit = imm.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
         tentative = now.life.status == TENTATIVE
         usual = config.detection_probability
         weighed = fit
@@ -460,7 +444,7 @@ class ObstacleTracker:
             mixture, repairs = self.filter.carried(
                 each.mixture(self.filter.K), each.sonar, now.sonar.pose, dt
             )
-            if not ping_kernels.is_finite(mixture.x, mixture.P)[0]:
+            if not mixture.is_finite()[0]:
                 continue
             number, std = each.body
             now = self._joined(

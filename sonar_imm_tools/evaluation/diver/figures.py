@@ -55,15 +55,14 @@ MOST_TRACKS_NAMED = 12
 
 
 def sections(
-    run: Mapping[str, Any],
     metrics: Mapping[str, Any],
     series: Series,
     truth: Truth | None = None,
     fixes: Series | None = None,
     origin: Origin | None = None,
 ) -> Iterator[Section]:
-    """The sections of one run. run: content of ``run.json``; metrics: of ``metrics.json``; origin:
-    where the frame of the tracks lies on Earth, None when nobody said."""
+    """The sections of one run. metrics: content of ``metrics.json``; origin: where the frame of
+    the tracks lies on Earth, None when nobody said."""
     series = series.confirmed()
     in_metres = map_figure(series, truth, fixes)
     yield Section(
@@ -93,11 +92,10 @@ def sections(
             sigma_figure(series, track_id),
         )
     if series.model_names:
-        relative = run.get('parameters', {}).get('model_set') == 'relative_headings'
         yield Section(
             'Which motion model held',
             f'Dark: the model is probable. Headings are counter-clockwise from +x.{which}',
-            models_figure(series, track_id, None if relative else true_course(matching, track_id)),
+            models_figure(series, track_id, true_course(matching, track_id)),
         )
     hits = series.hits()
     if len(hits):

@@ -34,11 +34,10 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from sonar_imm.estimation import imm_kernels
+from sonar_imm.estimation import imm
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver.config import BASELINES, DiverConfig, MODEL_SETS
-from sonar_imm.trackers.diver.models import BASELINE_NOISE
+from sonar_imm.trackers.diver.config import DiverConfig, MODEL_SETS
 from sonar_imm.trackers.diver.scan import Positions
 from sonar_imm.trackers.diver.state import DiverState
 from sonar_imm.trackers.diver.tracker import Association, DiverTracker
@@ -65,27 +64,22 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
         )
     scale, least = config.covariance_scale, min(1.0, config.covariance_scale)
     found = [Tunable(name='covariance_scale', start=scale, least=least)]
-    if config.model_set in BASELINES:
-        noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
+    if config.model_set not in MODEL_SETS:
+        # A set of another package may read these where they are stated; if not, they are flat.
+        noise = config.acceleration_noise
         for place, value in enumerate(noise):
             found.append(
                 Tunable(name='acceleration_noise', start=value, place=place, whole=tuple(noise))
             )
-        if len(noise) > 1:
-            stay = config.baseline_stay_probability
-            found.append(Tunable(name='baseline_stay_probability', start=stay, kind='logit'))
         found.append(_of(config, 'velocity_std', usual=False))
-    elif config.model_set in MODEL_SETS:
+    else:
         found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
-        if config.model_set.startswith(('families', 'heading_speed')):
-            found.append(_of(config, 'speed_mean', std=0.7))
-            found.append(_of(config, 'speed_std', std=0.7, usual=False))
-            found.append(_of(config, 'speed_noise', usual=False))
-            found.append(_of(config, 'lateral_noise', std=1.0, usual=False))
-            for name in ('hover_enter', 'hover_stay'):
-                found.append(_of(config, name, kind='logit', usual=False))
-        else:
-            found.append(_of(config, 'velocity_noise'))
+        found.append(_of(config, 'speed_mean', std=0.7))
+        found.append(_of(config, 'speed_std', std=0.7, usual=False))
+        found.append(_of(config, 'speed_noise', usual=False))
+        found.append(_of(config, 'lateral_noise', std=1.0, usual=False))
+        for name in ('hover_enter', 'hover_stay'):
+            found.append(_of(config, name, kind='logit', usual=False))
         if config.model_set == 'families':
             found.append(_of(config, 'brisk_speed_noise', usual=False))
             found.append(_of(config, 'family_switch_rate', usual=False))
@@ -136,7 +130,7 @@ class Scored(DiverTracker):
             else:
                 H = self._layout(now.instruments).H
                 expected = found.expected
-                whole = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
+                whole = imm.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
             log_f[found.tracks] = whole[found.tracks, found.detection]
         score = m * math.log(density)
         nameless = fixes.whole and fixes.target_id is None

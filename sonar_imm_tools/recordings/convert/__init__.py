@@ -29,10 +29,8 @@ from ..csv_table import CsvOptions
 from ..truth import convert_truth
 from .archives import convert_snapshots, convert_traces
 from .arrivals import convert_arrivals
-from .autoferry import convert_autoferry
 from .bag_images import convert_images, convert_interferometer
 from .detections import convert_detections
-from .echo_sounders import convert_ek80, convert_kongsberg
 from .fixes import convert_fixes
 from .hydrophones import convert_hydrophones
 from .nmea import convert_nmea
@@ -42,14 +40,11 @@ from .side_scan import convert_pictures, convert_xtf
 
 __all__ = [
     'convert_arrivals',
-    'convert_autoferry',
     'convert_detections',
-    'convert_ek80',
     'convert_fixes',
     'convert_hydrophones',
     'convert_images',
     'convert_interferometer',
-    'convert_kongsberg',
     'convert_nmea',
     'convert_pictures',
     'convert_relative',

@@ -29,17 +29,17 @@ import numpy as np
 
 from msg_adapters.detections import write_detections
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Rejection, Snapshot, SonarImage
+from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, Snapshot, SonarImage
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
 from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
 from ..csv_table import BadRow, CsvTable, Row
-from ..foreign import Record
 from ..messages import ros_message
 from ..sources import BagError
+from ..xtf import pings_of
 from .bag_images import SYSTEM
-from .sonar_files import ground_message, Message, speed_of, write_pings, write_records
+from .sonar_files import ground_message, Message, Record, speed_of, write_records
 
 LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""
@@ -77,7 +77,7 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
                 phases = True
                 yield Message(f'/{side}/snapshot', write_snapshot(snapshot, ros_message))
 
-    write_pings(path, 'xtf', report, how, messages, {SYSTEM: mount})
+    write_records(path, pings_of(path, report), report, how, messages, {SYSTEM: mount})
     if set(report.messages) <= {'/nav', '/altitude', '/ground'}:
         return
     other = next(side for side in LOOKS if side != how.side)
@@ -121,6 +121,8 @@ def _sides(ping: Record, port_samples: str) -> dict[str, list[Record]]:
     for channel in ping['channels']:
         if channel['side'] in LOOKS and len(channel['samples']):
             samples = channel['samples']
+            if len(samples) > MAX_IMAGE_CELLS:  # before each takes eight bytes and more
+                raise Rejection('too_large', f'a channel has {len(samples)} samples')
             if channel['side'] == 'port' and port_samples == 'far':
                 samples = samples[::-1]
             found.setdefault(channel['side'], []).append({**channel, 'samples': samples})
@@ -237,7 +239,10 @@ def _picture(folder: Path, record: Record, frame_id: str) -> SonarImage:
     if folder.resolve() not in path.resolve().parents:
         raise BadRow(f"'{record['file']}' lies outside of the folder", 'no picture')
     try:
-        with Image.open(path) as picture:
+        # By these names alone: other formats are read by programs that Pillow starts.
+        with Image.open(path, formats=('PNG', 'JPEG')) as picture:
+            if picture.width * picture.height > MAX_IMAGE_CELLS:
+                raise BadRow(f"'{record['file']}' has too many pixels", 'no picture')
             pixels = np.asarray(picture.convert('F'), np.float64)
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError) as error:
         raise BadRow(f"'{record['file']}' cannot be read: {error}", 'no picture') from None

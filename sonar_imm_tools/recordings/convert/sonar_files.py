@@ -11,18 +11,17 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What conversions of sonars' own files share: the way from the pings of a reader into a bag.
+"""What XTF and folders of pictures share: the way from the pings of a reader into a bag.
 
-Libraries of others read the binary formats, each in a process of its own (see `foreign`), ping by
-ping, so that the length of a file does not matter. Where the ship was is ``/nav``, in metres from
-the first position; soundings are ``/ground``.
+They come ping by ping, so that the length of a file does not matter. Where the ship was is
+``/nav``, in metres from the first position; soundings are ``/ground``.
 
 A ping whose clock is off for itself is left out; a clock that was set is followed, and said.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,21 +34,18 @@ from msg_adapters.navigation import write_navigation, write_range
 from msg_adapters.soundings import write_ground
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import quaternion
-from sonar_imm.acoustics.rays import profile_problem
 from sonar_imm.measurements import Altitude, Ground, Navigation, Rejection
 
 from ... import SECOND
 from ..conversion import ConversionReport, JUMP, Leaps, provenance
 from ..csv_table import BadRow
-from ..foreign import LIBRARIES, read_apart, Record
 from ..messages import ros_message
 from ..places import origin_of_detections
-from ..sources import BagError
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
-EXTRAS = {'pyxtf': 'xtf', 'themachinethatgoesping': 'echosounders', 'ektools': 'echosounders'}
-"""The extra of the package that installs a library."""
+Record = dict[str, Any]
+"""What a reader says of a ping or a picture; see `xtf.pings_of`."""
 
 
 class Message(NamedTuple):
@@ -106,25 +102,6 @@ def _orientation(heading: float, pitch: float, roll: float) -> tuple[float, floa
     return quaternion(math.radians(roll), math.radians(-pitch), math.radians(90.0 - heading))
 
 
-def write_pings(
-    path: Path,
-    reader: str,
-    report: ConversionReport,
-    how: Any,
-    messages: Any,
-    parameters: dict[str, dict[str, Any]] | None = None,
-) -> None:
-    """Write what a reader of binary files gives."""
-    try:
-        records = _named(read_apart(reader, path), path, report, parameters)
-        write_records(path, records, report, how, messages, parameters)
-    except ImportError:
-        library = LIBRARIES[reader]
-        raise BagError(
-            f"{path.name} needs {library}: pip install 'sonar_imm[{EXTRAS[library]}]'"
-        ) from None
-
-
 def ground_message(ping: Record, offset: np.ndarray) -> Message:
     """The soundings of a ping; offset (n, 3): metres east, north and up of where the ship is.
     Raises `Rejection`."""
@@ -138,29 +115,6 @@ def ground_message(ping: Record, offset: np.ndarray) -> Message:
         frame_id=nav.frame_id,
     )
     return Message('/ground', write_ground(ground, ros_message))
-
-
-def _named(
-    records: Iterable[Record],
-    path: Path,
-    report: ConversionReport,
-    parameters: dict[str, dict[str, Any]] | None,
-) -> Iterator[Record]:
-    """Pings with the word for their place; what is wrong with the file goes to the report, a
-    profile of sound speed to the parameters of the bathymetry tracker."""
-    for record in records:
-        if record['kind'] == 'problem':
-            report.problems.append(f'{path.name}: {record["text"]}; what came before it is kept')
-        elif record['kind'] == 'profile':
-            if problem := profile_problem(record['values']):
-                report.problems.append(f'{path.name}: a profile of sound speed {problem}')
-            elif parameters is not None:
-                parameters['bathymetry']['sound_speed_profile'] = record['values']
-        elif record['kind'] == 'note':
-            report.notes[record['name']] = record['text']
-        else:
-            report.rows += 1
-            yield {**record, 'where': f'ping {report.rows}'}
 
 
 def write_records(
@@ -186,7 +140,8 @@ def write_records(
             stamp_ns = record['stamp_ns']
             try:
                 nav = frame.navigation(record)
-                made = list(messages({**record, 'nav': nav}))
+                with np.errstate(invalid='ignore'):  # of NaN, which the measurements reject
+                    made = list(messages({**record, 'nav': nav}))
             except (Rejection, BadRow) as error:
                 report.bad_row(path, record['where'], error)
                 continue

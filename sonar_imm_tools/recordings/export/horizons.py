@@ -135,7 +135,7 @@ def _along(longitude: FloatArray, latitude: FloatArray) -> FloatArray:
 def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> None:
     """The CSV. line: its name; epsg: of the columns x and y, which are empty without it."""
     x, y = _projected(picks, epsg)
-    with path.open('w', encoding='utf-8', newline='') as file:
+    with path.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file:
         writer = CsvWriter(file)
         writer.write(
             (

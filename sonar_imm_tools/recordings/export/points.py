@@ -88,6 +88,8 @@ def read_points(path: Path) -> Points:
             rows = list(reader)
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BagError(f'{path} is no CSV: {error}') from None
     try:
         stamps = np.array([int(row[header.index('stamp_ns')]) for row in rows], np.int64)
         columns = {
@@ -95,7 +97,7 @@ def read_points(path: Path) -> Points:
             for name in COLUMNS
             if name in header
         }
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise BagError(f'{path} has a row that is not numbers throughout') from None
     return _exact(stamps, columns)
 
@@ -105,18 +107,23 @@ def _read_parquet(path: Path, wanted: list[str]) -> Points:
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(path)
+        with path.open('rb') as file:  # the library names only files whose names are UTF-8
+            table = pyarrow.parquet.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         sentence = ' '.join(str(error).split())
         raise BagError(f'{path} cannot be read: {sentence}') from None
     if missing := [name for name in wanted if name not in table.column_names]:
         raise BagError(f'{path} has no column {" and ".join(missing)}')
-    columns = {
-        name: table[name].to_numpy().astype(np.float64)
-        for name in COLUMNS
-        if name in table.column_names
-    }
-    return _exact(table['stamp_ns'].to_numpy().astype(np.int64), columns)
+    try:
+        stamps = table['stamp_ns'].to_numpy().astype(np.int64)
+        columns = {
+            name: table[name].to_numpy().astype(np.float64)
+            for name in COLUMNS
+            if name in table.column_names
+        }
+    except (ValueError, TypeError, OverflowError, pyarrow.ArrowException):
+        raise BagError(f'{path} has a column that is not numbers throughout') from None
+    return _exact(stamps, columns)
 
 
 def topics_of_soundings(reader: BagReader) -> list[str]:

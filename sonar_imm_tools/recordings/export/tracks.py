@@ -184,7 +184,7 @@ def write_tracks(path: Path, tracks: Tracks, kind: str, name: str) -> int:
 
 
 def _write_csv(path: Path, tracks: Tracks) -> None:
-    with path.open('w', encoding='utf-8', newline='') as file:
+    with path.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file:
         writer = CsvWriter(file)
         writer.write(tracks.columns)
         for k in range(len(tracks)):
@@ -196,7 +196,8 @@ def _write_parquet(path: Path, tracks: Tracks) -> None:
     import pyarrow.parquet
 
     table = pyarrow.table({name: column.tolist() for name, column in tracks.columns.items()})
-    pyarrow.parquet.write_table(table, str(path))
+    with path.open('wb') as file:  # the library names only files whose names are UTF-8
+        pyarrow.parquet.write_table(table, file)
 
 
 def _write_geojson(path: Path, tracks: Tracks, name: str) -> None:

@@ -18,6 +18,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm_tools.evaluation.bathymetry import figures, METRICS, summary_sentence
 from sonar_imm_tools.evaluation.bathymetry.figures import (
     chart_figure,
@@ -86,7 +87,8 @@ def test_the_chart_puts_the_middle_of_each_cell_in_its_place_north_up():
 def test_the_chart_has_cells_as_small_as_fit(extent, cell, monkeypatch):
     made = []
     monkeypatch.setattr(figures, 'chart_of', lambda points, size, *_: made.append(size))
-    finest_chart({'x': np.array([0.0, extent]), 'y': np.zeros(2)}, {'parameters': {}})
+    record = {'parameters': BathymetryConfig().as_dict()}
+    finest_chart({'x': np.array([0.0, extent]), 'y': np.zeros(2)}, record)
     assert made == [cell]
 
 

@@ -309,7 +309,7 @@ def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
 STD = np.radians(2.0)
 EVERYWHERE = (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)
 """A coverage that says no more than that the sensor stands at the origin."""
-SINGLE = {'max_tracks': 1, 'model_set': 'cv', 'coverage_sector': EVERYWHERE}
+SINGLE = {'max_tracks': 1, 'model_set': 'linear', 'coverage_sector': EVERYWHERE}
 
 
 def path(count=40):
@@ -331,7 +331,7 @@ def layout_of(config):
 
 
 def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
-    layout = layout_of(DiverConfig(model_set='cv', bearing_bias_std_deg=2.0))
+    layout = layout_of(DiverConfig(model_set='linear', bearing_bias_std_deg=2.0))
     rng, place = np.random.default_rng(1), np.array([5.0, -3.0])
     x = rng.normal(size=(2, 3, 5)) * [20.0, 20.0, 1.0, 1.0, 0.05]
     root = rng.normal(size=(2, 3, 5, 5))
@@ -371,7 +371,7 @@ def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(as
 
 
 def test_where_nobody_knows_where_a_sensor_stands_nothing_is_added():
-    config = {'max_tracks': 1, 'model_set': 'cv'}
+    config = {'max_tracks': 1, 'model_set': 'linear'}
     plain, _ = last(config, path())
     same, _ = last({**config, 'bearing_bias_std_deg': 2.0}, path())
     np.testing.assert_array_equal(same.covariance, plain.covariance)
@@ -404,7 +404,7 @@ def around_a_diver(off):
 def test_a_vessel_that_moves_tells_how_its_transceiver_is_turned():
     off = np.radians(4.0)
     measured, where = around_a_diver(off)
-    config = {'max_tracks': 1, 'model_set': 'cv', 'acceleration_noise': (0.02,)}
+    config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
     ignored, _ = last(config, measured)
     stated = {'bearing_bias_std_deg': 3.0, 'systematic_errors': 'estimate'}
     found, state = last({**config, **stated}, measured)
@@ -442,7 +442,7 @@ def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():
         )
         for k in range(1, 30)
     ]
-    config = {'max_tracks': 1, 'model_set': 'cv', 'acceleration_noise': (0.02,)}
+    config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
     plain, _ = last(config, pings)
     wide, state = last({**config, 'bearing_bias_std_deg': 2.0}, pings)
     across = np.array([-0.8, 0.6])
@@ -453,7 +453,7 @@ def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():
 
 
 def test_instruments_beyond_the_most_are_taken_as_they_are():
-    config = DiverConfig(model_set='cv', bearing_bias_std_deg=2.0)
+    config = DiverConfig(model_set='linear', bearing_bias_std_deg=2.0)
     known = Instruments()
     for k in range(MOST_RECEIVERS + 2):
         known = known.with_sensor(f'sensor_{k}')

@@ -90,7 +90,8 @@ def test_each_sensor_has_its_own():
     tracker = DiverTracker(
         DiverConfig(
             association='jipda',
-            model_set='cv',
+            model_set='heading_speed',
+            directions=4,
             sensors=('left', 'right'),
             sensor_clutter_density=(0.0, 3e-5),
         )
@@ -145,7 +146,8 @@ def test_densities_are_bounded():
     ],
 )
 def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
-    tracker = DiverTracker(DiverConfig(model_set='cv', **{'association': 'gnn', **settings}))
+    known = {'model_set': 'heading_speed', 'directions': 4, 'association': 'gnn'}
+    tracker = DiverTracker(DiverConfig(**{**known, **settings}))
     for item in scans(40, false, half):
         tracker.process(item)
     (about,) = [text for text in tracker.warnings() if 'clutter_density' in text] or ['']

@@ -62,7 +62,7 @@ def out_and_back(away=15):
 
 
 @pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
-@pytest.mark.parametrize('model_set', ['families', 'heading_speed', 'cv'])
+@pytest.mark.parametrize('model_set', ['families', 'heading_speed', 'linear'])
 def test_who_leaves_the_sector_keeps_his_track(association, model_set):
     plain = DiverConfig(association=association, model_set=model_set)
     for config, tracks in ((plain, 2), (evolve(plain, coverage_sector=AHEAD), 1)):
@@ -125,7 +125,7 @@ def test_existence_at_the_edge_is_that_of_particles_told_the_true_probability():
     """A diver who swims out of the sector, and is not seen any more: 40,000 particles with the
     motion of the tracker, weighed by 1 - p(x) with each empty scan."""
     config = DiverConfig(
-        association='jipda', model_set='cv', acceleration_noise=(0.1,), coverage_sector=AHEAD
+        association='jipda', model_set='linear', acceleration_noise=(0.1,), coverage_sector=AHEAD
     )
     tracker, rng, p = DiverTracker(config), np.random.default_rng(3), 0.9
     for second in range(1, 16):
@@ -152,7 +152,7 @@ def test_existence_at_the_edge_is_that_of_particles_told_the_true_probability():
 @pytest.mark.parametrize('edge', [-1.5, -0.4, 0.3, 1.2])
 def test_what_is_left_of_a_track_by_a_half_plane_is_the_truncated_normal(edge):
     config = DiverConfig(
-        model_set='cv', coverage_sector=(-1e6, 0.0, 0.0, 360.0, 0.0, 1e6 + edge), max_tracks=1
+        model_set='linear', coverage_sector=(-1e6, 0.0, 0.0, 360.0, 0.0, 1e6 + edge), max_tracks=1
     )
     tracker = DiverTracker(config)
     tracker.process(scan(1, (0.0, 0.0)))

@@ -541,7 +541,7 @@ def test_what_is_stated_is_kept():
 def test_a_kind_that_is_unknown_is_refused():
     with pytest.raises(ConfigError, match='did you mean|must be one of'):
         DiverConfig(target='bot')
-    with pytest.raises(ConfigError, match='acceleration_noise needs one value for each of the 3'):
+    with pytest.raises(ConfigError, match='acceleration_noise of families needs three'):
         DiverConfig(acceleration_noise=(1.0,))
 
 

@@ -32,7 +32,7 @@ from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 CV = {
-    'model_set': 'cv',
+    'model_set': 'linear',
     'association': 'gnn',
     'max_tracks': 1,
     'dimensions': 3,

@@ -54,7 +54,7 @@ def scan(second, *places, std=0.5):
 # -- exact ----------------------------------------------------------------------------------------
 
 LINEAR = DiverConfig(
-    model_set='cv',
+    model_set='linear',
     association='kbest',
     adaptation='fixed',
     acceleration_noise=(0.2,),
@@ -172,7 +172,7 @@ def test_weights_are_those_of_all_histories(monkeypatch):
 def test_few_hypotheses_are_the_likeliest_of_many():
     trackers = {}
     for count in (3, 300):
-        config = DiverConfig(model_set='cv', association='kbest', hypotheses=count)
+        config = DiverConfig(model_set='linear', association='kbest', hypotheses=count)
         trackers[count] = DiverTracker(config)
         for second in range(1, 6):
             trackers[count].process(scan(second, (0.0, 0.4 * second), (1.0, 0.4 * second)))
@@ -228,7 +228,7 @@ def test_the_name_of_one_of_two_buddies_makes_no_third_track(seed):
 
 
 def test_names_that_are_alone_take_no_nameless_fix():
-    config = DiverConfig(model_set='cv', association='kbest', named_tracks='alone')
+    config = DiverConfig(model_set='linear', association='kbest', named_tracks='alone')
     made = buddies(config, 0, 60)
     named = made[-1].extras['target_id'] == 7
     assert named.sum() == 1 and (~named).sum() >= 2
@@ -319,7 +319,7 @@ def knot(second, rng, count):
 
 
 def test_a_knot_of_fixes_costs_bounded_memory():
-    config = DiverConfig(model_set='cv', association='kbest', max_tracks=4)
+    config = DiverConfig(model_set='linear', association='kbest', max_tracks=4)
     tracker, rng = DiverTracker(config), np.random.default_rng(2)
     most = kbest.most_tracks(config)
     for second in range(1, 9):

@@ -20,7 +20,8 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.trackers.obstacle import behaviour_kernels as behave
+from sonar_imm.trackers.obstacle import mixtures
+from sonar_imm.trackers.obstacle import unscented as behave
 from sonar_imm.trackers.obstacle.behaviours import BehaviourSlices
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar
@@ -92,7 +93,7 @@ def test_mixing_equals_numpy():
     before, _ = poses(rng)
     x, P, mu = targets(rng, before)
     prior = motion().prior
-    got = behave.mix(x, P, mu, prior, 2, CHAIN, 0.0)
+    got = mixtures.mix(x, P, mu, prior, 2, CHAIN, 0.0)
     for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, CHAIN)):
         assert_allclose(mine, plain, rtol=1e-12, atol=1e-15)
     assert_allclose(got[2].sum(axis=1), 1.0)
@@ -105,7 +106,7 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
     x, P, mu = targets(rng, before)
     mu[:, 4:8] *= 1e-9
     mu /= mu.sum(axis=1, keepdims=True)
-    x1, P1, mu1 = behave.mix(x, P, mu, motion().prior, 2, CHAIN, 1e-6)
+    x1, P1, mu1 = mixtures.mix(x, P, mu, motion().prior, 2, CHAIN, 1e-6)
     assert np.all(mu1[:, 4:8] == 0.0)
     assert_allclose(mu1[:, :4].sum(axis=1) / mu1[:, 8], mu[:, :4].sum(axis=1) / mu[:, 8])
     assert np.all(x1[:, 8] == x[:, 8]) and np.all(P1[:, 8] == P[:, 8])

@@ -1,0 +1,188 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Exact probabilities of association, without visiting the joint events.
+
+In a joint event each track takes at most one detection and each detection goes to at most one
+track. Its weight is a product over tracks,
+
+    w(event) = prod_assigned a[t, d] * prod_missed m[t],
+
+and the probability of a pair is the sum over the events that hold it. There are too many events to
+visit: 12 tracks and 12 detections have 8e11. Their sum needs only the *set* of detections that the
+first k tracks have used (a permanent by dynamic programming over sets):
+
+    forward[k + 1][U] = m[k] forward[k][U] + sum_{d in U} a[k, d] forward[k][U - d]
+
+`backward` is the same from the last track on, and the sum over all events that hold the pair
+(k, d) is ``sum_U forward[k][U] a[k, d] backward[k + 1][U + d]``. Each step is one vector operation
+of 2^d elements. Where a cluster has fewer tracks than detections the two change roles, so that the
+cost is 2^min(tracks, detections).
+
+Tracks that share no detection do not influence each other: `clusters` splits the problem. A
+cluster of a single track has a closed form. One that is larger than `LARGEST` on both sides loses
+its least probable pairs and is split anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+
+from .arrays import BoolArray, FloatArray, IndexArray, IntArray
+
+__all__ = ['clusters', 'marginals']
+
+LARGEST = 12
+"""Tracks, or detections, of a cluster that is computed exactly."""
+
+DROPPED = 0.3
+"""Share of the pairs that a larger cluster loses at a time, the least probable first."""
+
+
+def marginals(
+    assigned: FloatArray, missed: FloatArray, possible: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the probability of each pair (T, D), and of no detection (T,): each row sums to one.
+
+    :param assigned: (T, D) weight of track t with detection d, at least 0.
+    :param missed: (T,) weight of track t without a detection, above 0.
+    :param possible: (T, D) False for pairs that are no part of any event.
+
+    >>> import numpy as np
+    >>> pair, none = marginals(np.array([[3.0, 0.0]]), np.array([1.0]), np.array([[True, False]]))
+    >>> pair.tolist(), none.tolist()
+    ([[0.75, 0.0]], [0.25])
+    """
+    weight = np.where(possible, assigned, 0.0)
+    # A row may be scaled at will: its factor is in every event.
+    largest = np.maximum(weight.max(axis=1, initial=0.0), missed)
+    weight, alone = weight / largest[:, None], missed / largest
+    together = list(_small_clusters(weight, alone))
+    pair, none = _each_alone(weight, alone)
+    for tracks, detections in together:
+        cell = np.ix_(tracks, detections)
+        pair[cell], none[tracks] = _exact(weight[cell], alone[tracks])
+    return pair, none
+
+
+def clusters(possible: BoolArray) -> IntArray:
+    """Return for each track the first track of its cluster (T,): tracks that share a detection,
+    directly or by others between them. A track without a detection is alone.
+
+    >>> import numpy as np
+    >>> clusters(np.array([[True, False], [False, True], [True, False]])).tolist()
+    [0, 1, 0]
+    """
+    T = len(possible)
+    label = np.arange(T)
+    if not possible.size:
+        return label
+    while True:
+        of_detection = np.where(possible, label[:, None], T).min(axis=0)
+        least = np.where(possible, of_detection, T).min(axis=1)
+        after = np.minimum(label, least)
+        after = after[after]
+        if np.array_equal(after, label):
+            return label
+        label = after
+
+
+def _each_alone(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the marginals (T, D) and (T,) of tracks that share no detection."""
+    total = alone + weight.sum(axis=1)
+    return weight / total[:, None], alone / total
+
+
+def _small_clusters(
+    weight: FloatArray, alone: FloatArray
+) -> Iterator[tuple[IndexArray, IndexArray]]:
+    """Yield tracks and detections of each cluster of several tracks that can be computed exactly.
+    Pairs that a larger cluster loses are set to 0 in `weight`, in place.
+    """
+    waiting = [np.arange(len(weight))]
+    while waiting:
+        among = waiting.pop()
+        label = clusters(weight[among] > 0.0)
+        shared = np.bincount(label, minlength=len(among)) > 1
+        for first in np.flatnonzero(shared):
+            tracks = among[label == first]
+            detections = np.flatnonzero(weight[tracks].any(axis=0))
+            if min(len(tracks), len(detections)) <= LARGEST:
+                yield tracks, detections
+                continue
+            t, d = np.nonzero(weight[tracks])
+            probable = _each_alone(weight[tracks], alone[tracks])[0][t, d]
+            least = np.argsort(probable, kind='stable')[: max(1, int(DROPPED * len(t)))]
+            weight[tracks[t[least]], d[least]] = 0.0
+            waiting.append(tracks)
+
+
+def _exact(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the marginals (t, d) and (t,) of one cluster: weight (t, d), alone (t,)."""
+    t, d = weight.shape
+    if d <= t:
+        return _over_sets(weight, alone)
+    # Detections in turn, sets of tracks. A detection that is nobody's weighs 1; a track without
+    # one is a track that is in no set at the end, with its weight taken out of all others.
+    pair, _, unused = _steps((weight / alone[:, None]).T, np.ones(d))
+    return pair.T, unused
+
+
+def _over_sets(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
+    pair, none, _ = _steps(weight, alone)
+    return pair, none
+
+
+def _steps(a: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the marginals of a recursion over `steps` rows and sets of `k` columns.
+
+    :param a: (steps, k) weight of each row with each column.
+    :param m: (steps,) weight of each row without a column.
+    :returns: pair (steps, k), none (steps,), and unused (k,): that a column is in no pair.
+    """
+    steps, k = a.shape
+    without, with_it = _subsets(k)
+    forward = np.zeros((steps + 1, 1 << k))
+    forward[0, 0] = 1.0
+    for row in range(steps):
+        forward[row + 1] = m[row] * forward[row]
+        for column in range(k):
+            if a[row, column]:
+                forward[row + 1, with_it[column]] += a[row, column] * forward[row, without[column]]
+    total = forward[steps].sum()
+    backward = np.ones(1 << k)
+    pair, none = np.zeros((steps, k)), np.empty(steps)
+    for row in reversed(range(steps)):
+        none[row] = m[row] * (forward[row] @ backward)
+        before = m[row] * backward
+        for column in range(k):
+            if a[row, column]:
+                later = backward[with_it[column]]
+                pair[row, column] = a[row, column] * (forward[row, without[column]] @ later)
+                before[without[column]] += a[row, column] * later
+        backward = before
+    unused = np.array([forward[steps, without[column]].sum() for column in range(k)])
+    return pair / total, none / total, unused / total
+
+
+@lru_cache(maxsize=LARGEST + 1)
+def _subsets(k: int) -> tuple[tuple[IndexArray, ...], tuple[IndexArray, ...]]:
+    """Return for each of k elements the sets without it, and the same sets with it: sets are the
+    bits of a number."""
+    numbers = np.arange(1 << k)
+    without = tuple(numbers[(numbers >> bit) & 1 == 0] for bit in range(k))
+    return without, tuple(sets | (1 << bit) for bit, sets in enumerate(without))

@@ -1,0 +1,257 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A survey names damaged lines and leaves them out; it assumes no error budget in silence."""
+
+import json
+import os
+import shutil
+
+import pytest
+
+from sonar_imm.files import mark
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.survey.making import sources_of
+
+pytest.importorskip('rasterio')
+pytest.importorskip('pyarrow')
+
+RECORD = {
+    'system': 'bathymetry',
+    'bag': 'a.bag',
+    'topics': {},
+    'parameters': BathymetryConfig().as_dict(),
+}
+SMALL = ('lines=2', 'cross_lines=1', 'spacing=25', 'length=60', 'ping_interval=0.7', 'ghost=false')
+
+
+def changed(**parameters):
+    return json.dumps({**RECORD, 'parameters': {**RECORD['parameters'], **parameters}})
+
+
+HOSTILE = {
+    'empty': '',
+    'cut': json.dumps(RECORD)[:-20],
+    'list': '[]',
+    'number': '3',
+    'null': 'null',
+    'deep': '[' * 100_000,
+    'no_parameters': json.dumps({k: v for k, v in RECORD.items() if k != 'parameters'}),
+    'empty_parameters': json.dumps({**RECORD, 'parameters': {}}),
+    'list_of_parameters': json.dumps({**RECORD, 'parameters': [1]}),
+    'other_system': json.dumps({**RECORD, 'system': 'diver'}),
+    'text': changed(heave_std='0.05'),
+    'bool': changed(heave_std=True),
+    'none': changed(heave_std=None),
+    'nan': changed(heave_std=float('nan')),
+    'infinite': changed(heave_std=float('inf')),
+    'negative': changed(heave_std=-1.0),
+    'huge': changed(heave_std=10**400),
+    'longer_number': changed(heave_std=0).replace('"heave_std": 0', '"heave_std": ' + '9' * 5000),
+    'nested': changed(heave_std={'a': [1]}),
+    'sound_speed': changed(sound_speed=1e300),
+    'epsg_text': json.dumps({**RECORD, 'epsg': 'x'}),
+    'epsg_list': json.dumps({**RECORD, 'epsg': [32632]}),
+    'epsg_negative': json.dumps({**RECORD, 'epsg': -3}),
+}
+TABLES = {
+    'table_empty': b'',
+    'table_binary': bytes(range(256)) * 100,
+    'table_header': b'stamp_ns,x\n1,2\n',
+    'table_nul': b'stamp_ns\0',
+}
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope='module')
+def good(tmp_path_factory):
+    """Lines with their run.json."""
+    out = tmp_path_factory.mktemp('good') / 'runs'
+    settings = [word for setting in SMALL for word in ('--set', setting)]
+    assert run('simulate', 'survey', out, '--soundings', *settings) == 0
+    for line in out.glob('line_*'):
+        (line / 'run.json').write_text(json.dumps(RECORD))
+    return out
+
+
+def damage(runs):
+    """Add a damaged line of each kind."""
+    line = runs / 'line_000'
+    table = (line / 'soundings.csv').read_bytes()
+    for name, text in HOSTILE.items():
+        shutil.copytree(line, runs / name)
+        (runs / name / 'run.json').write_text(text)
+    for name, content in TABLES.items():
+        shutil.copytree(line, runs / name)
+        (runs / name / 'soundings.csv').write_bytes(content)
+    head, rest = table.split(b'\n', 1)
+    first = rest.split(b'\n')[0].split(b',')
+    first[head.split(b',').index(b'range')] = b'nan'
+    odd = {
+        'table_cut': table[: len(table) * 2 // 3 - 5],
+        'table_nan': b'\n'.join([head, b','.join(first), rest]),
+        'table_big_stamp': head + b'\n' + b'9' * 30 + rest[19:],
+        'table_only_header': head + b'\n',
+    }
+    for name, content in odd.items():
+        shutil.copytree(line, runs / name)
+        (runs / name / 'soundings.csv').write_bytes(content)
+    for name in ('bytes', 'directory', 'pipe', 'dangling', 'missing', 'parquet'):
+        shutil.copytree(line, runs / name)
+        if name != 'parquet':
+            (runs / name / 'run.json').unlink()
+    (runs / 'bytes' / 'run.json').write_bytes(b'\xff\xfe{}')
+    (runs / 'directory' / 'run.json').mkdir()
+    os.mkfifo(runs / 'pipe' / 'run.json')
+    (runs / 'dangling' / 'run.json').symlink_to('nowhere')
+    mark(runs / 'missing', 'results')
+    (runs / 'parquet' / 'soundings.parquet').write_bytes(b'PAR1' + bytes(100) + b'PAR1')
+    return {path.name for path in runs.iterdir() if path.is_dir()} - {
+        path.name for path in runs.glob('line_*')
+    }
+
+
+@pytest.mark.parametrize('jobs', [1, 2])
+def test_each_damaged_line_is_named_and_left_out_and_the_chart_is_that_of_the_others(
+    good, tmp_path, capsys, jobs
+):
+    assert run('survey', good, tmp_path / 'wanted', '--resolution', 2) == 0
+    wanted = capsys.readouterr()
+    assert wanted.err == '' and '3 lines in' in wanted.out and 'left out' not in wanted.out
+    runs = tmp_path / 'runs'
+    shutil.copytree(good, runs)
+    names = damage(runs)
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 2, '--jobs', jobs) == 1
+    said = capsys.readouterr()
+    left_out = [line for line in said.err.splitlines() if line.startswith('left out: ')]
+    assert {line.split(': ')[1] for line in left_out} == names and len(left_out) == len(names)
+    assert 'Traceback' not in said.err and 'Error:' not in said.err
+    assert f'{len(names)} lines left out' in said.out and '3 lines in' in said.out
+    survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
+    assert {line['name'] for line in survey['lines'] if line['failure']} == names
+    assert survey['warnings'] == []
+    for name in ('survey.tif', 'provenance.parquet', 'crossings.csv'):
+        there, here = tmp_path / 'wanted' / name, tmp_path / 'out' / name
+        assert there.read_bytes() == here.read_bytes(), name
+
+
+def test_lines_that_were_not_tracked_here_are_named_where_a_budget_is_assumed(
+    good, tmp_path, capsys
+):
+    runs = tmp_path / 'runs'
+    shutil.copytree(good, runs)
+    (runs / 'line_001' / 'run.json').unlink()
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 2) == 0
+    sentence = '1 line without run.json (line_001): default error budget'
+    assert sentence in capsys.readouterr().err
+    assert json.loads((tmp_path / 'out' / 'survey.json').read_text())['warnings'] == [sentence]
+    assert sentence in (tmp_path / 'out' / 'report.html').read_text()
+
+
+def test_a_run_whose_table_is_gone_keeps_its_own_budget(good, tmp_path):
+    """Its bag holds the soundings too; its run.json lies beside the bag."""
+    folder = tmp_path / 'runs' / 'line'
+    (folder / 'estimate').mkdir(parents=True)
+    (folder / 'estimate' / 'estimate.mcap').write_bytes(b'')
+    for text, failure in ((changed(heave_std=0.5), ''), ('{', 'cannot be understood')):
+        (folder / 'run.json').write_text(text)
+        (source,) = sources_of(tmp_path / 'runs')
+        assert source.name == 'line' and source.table == folder / 'estimate' / 'estimate.mcap'
+        assert failure in source.failure and bool(failure) == bool(source.failure)
+        assert failure or source.run['parameters']['heave_std'] == 0.5
+
+
+def test_what_an_earlier_command_kept_may_be_damaged(good, tmp_path):
+    out = tmp_path / 'out'
+    assert run('survey', good, out, '--resolution', 2) == 0
+    wanted = (out / 'survey.tif').read_bytes()
+    for text in ('', '[]', '{}', '{"info": 3, "wanted": []}', '[' * 100_000):
+        for path in sorted((out / '.work' / 'lines').glob('*.json')):
+            path.write_text(text)
+        for path in sorted((out / '.work' / 'soundings').glob('*.json')):
+            path.write_text(text)
+        assert run('survey', good, out, '--resolution', 2, '--resume') == 0
+        assert (out / 'survey.tif').read_bytes() == wanted
+
+
+def test_an_export_assumes_no_budget_either(good, tmp_path, capsys):
+    shutil.copytree(good / 'line_000', tmp_path / 'run')
+    (tmp_path / 'run' / 'run.json').write_text(HOSTILE['empty_parameters'])
+    assert run('export', tmp_path / 'run', tmp_path / 'out.tif') == 2
+    assert 'its parameters lack' in capsys.readouterr().err
+    assert not (tmp_path / 'out.tif').exists()
+
+
+@pytest.mark.parametrize('marker', [True, False])
+def test_an_earlier_survey_is_replaced_as_a_whole(good, tmp_path, capsys, monkeypatch, marker):
+    out = tmp_path / 'out'
+    assert run('survey', good, out, '--resolution', 2) == 0
+    (out / 'mine.txt').write_text('mine')
+    if not marker:  # of an older version
+        (out / '.sonar_imm').unlink()
+    before = contents(out)
+
+    def broken(*_):
+        raise OSError(28, 'No space left on device')
+
+    with monkeypatch.context() as patches:
+        patches.setattr('sonar_imm_tools.survey.products.write_report', broken)
+        assert run('survey', good, out, '--resolution', 4, '--overwrite') == 2
+    assert contents(out) == before and os.listdir(tmp_path) == ['out']
+    assert run('survey', good, out, '--resolution', 4, '--overwrite') == 0
+    assert run('survey', good, tmp_path / 'fresh', '--resolution', 4) == 0
+    fresh = contents(tmp_path / 'fresh')
+    assert contents(out).keys() == {*fresh, 'mine.txt'}
+    assert contents(out)['survey.tif'] == fresh['survey.tif'] != before['survey.tif']
+    capsys.readouterr()
+
+
+def test_a_folder_that_no_survey_made_is_not_replaced(good, tmp_path, capsys):
+    out = tmp_path / 'out'
+    (out / 'tiles').mkdir(parents=True)
+    (out / '.work').mkdir()
+    for name in ('tiles/L1_0_0.tif', '.work/thesis.tex', 'report.html', 'survey.json'):
+        (out / name).write_text('mine')
+    before = contents(out)
+    assert run('survey', good, out, '--overwrite') == 2
+    assert 'is no survey folder that sonar-imm made' in capsys.readouterr().err
+    assert run('survey', good, good, '--overwrite') == 2
+    assert run('survey', good, out, '--resume') == 2
+    assert contents(out) == before
+
+
+def test_tiles_that_lie_behind_a_link_stay(good, tmp_path, capsys):
+    out, charts = tmp_path / 'out', tmp_path / 'charts'
+    assert run('survey', good, out) == 0
+    shutil.rmtree(out / 'tiles')
+    charts.mkdir()
+    (charts / 'L9_9_9.tif').write_text('mine')
+    (out / 'tiles').symlink_to(charts)
+    assert run('survey', good, out, '--resume') == 2
+    assert 'tiles is a link' in capsys.readouterr().err
+    assert run('survey', good, out, '--overwrite') == 0
+    assert [path.name for path in charts.iterdir()] == ['L9_9_9.tif']
+    assert (out / 'tiles').is_dir() and not (out / 'tiles').is_symlink()
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob('*')
+        if path.is_file()
+    }

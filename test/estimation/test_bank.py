@@ -1,0 +1,366 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bank of models and the table of rows against an independent prototype, the readable IMM and
+Monte Carlo."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from sonar_imm.estimation import bank as verbs
+from sonar_imm.estimation import imm
+from sonar_imm.estimation.bank import Bank, Gaussians, Moves
+from sonar_imm.estimation.rows import Rows
+
+FOLDER = Path(__file__).parents[1] / 'vectors' / 'regret_free'
+MIXING = np.load(FOLDER / 'mixing.npz', allow_pickle=False)
+RUN = np.load(FOLDER / 'run.npz', allow_pickle=False)
+ORDER = np.argsort(MIXING['kind'] == 1, kind='stable')
+"""Velocities come last in a bank."""
+A = int((MIXING['kind'] != 1).sum())
+HOVER = MIXING['kind'][ORDER][:A] == 2
+UNITS = np.where(HOVER, 0.0, MIXING['heading'][ORDER][:A].T)
+BANK = Bank(
+    UNITS,
+    velocities=3,
+    speed=float(MIXING['speed_mean']),
+    speed_variance=float(MIXING['speed_variance']),
+    sector=float(MIXING['sector_variance']),
+)
+
+
+def blocks_of(x, P):
+    """Blocks of one row from the prototype's x (37, 4) and P (37, 4, 4)."""
+    return [
+        Gaussians(x[:A, :3].T[None], np.moveaxis(P[:A, :3, :3], 0, -1)[None]),
+        Gaussians(x[A:].T[None], np.moveaxis(P[A:], 0, -1)[None]),
+    ]
+
+
+def given_blocks():
+    return blocks_of(MIXING['x'][ORDER], MIXING['P'][ORDER])
+
+
+def transition(name='transition_1s'):
+    return MIXING[name][np.ix_(ORDER, ORDER)][None]
+
+
+def test_mixing_is_that_of_the_prototype():
+    mixed, c = verbs.mix(BANK, given_blocks(), MIXING['mu'][ORDER][None], transition())
+    due = blocks_of(MIXING['out_x'][ORDER], MIXING['out_P'][ORDER])
+    np.testing.assert_allclose(c[0], MIXING['out_c'][ORDER], rtol=1e-12)
+    for found, right in zip(mixed, due):
+        np.testing.assert_allclose(found.x, right.x, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(found.P, right.P, rtol=1e-12, atol=1e-12)
+
+
+def test_rows_do_not_influence_each_other():
+    rng = np.random.default_rng(1)
+    blocks, mu = given_blocks(), MIXING['mu'][ORDER]
+    many = [Gaussians(np.repeat(b.x, 5, 0), np.repeat(b.P, 5, 0)) for b in blocks]
+    for block in many:
+        block.x[:] += rng.normal(size=(5, 1, 1))
+    weights = rng.dirichlet(mu * 40.0 + 0.1, 5)
+    together, c = verbs.mix(BANK, many, weights, transition())
+    for row in range(5):
+        alone, c_alone = verbs.mix(
+            BANK, [b.rows([row]) for b in many], weights[[row]], transition()
+        )
+        np.testing.assert_allclose(c[row], c_alone[0], rtol=1e-12)
+        for found, right in zip(together, alone):
+            np.testing.assert_allclose(found.x[row], right.x[0], rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found.P[row], right.P[0], rtol=1e-12, atol=1e-12)
+
+
+def test_moments_are_about_the_row_and_not_about_the_origin():
+    mu = MIXING['mu'][ORDER][None]
+    here, _ = verbs.mix(BANK, given_blocks(), mu, transition())
+    away = given_blocks()
+    for block in away:
+        block.x[:, :2] += 1e6
+    there, _ = verbs.mix(BANK, away, mu, transition())
+    for found, right in zip(there, here):
+        np.testing.assert_allclose(found.x[:, :2] - 1e6, right.x[:, :2], atol=1e-8)
+        np.testing.assert_allclose(found.P, right.P, atol=1e-8)
+
+
+def test_states_behind_the_motion_are_mixed_by_identity():
+    """A constant that is the same in all models stays as it is; its correlation with the position
+    is the mean of those of the models."""
+    rng = np.random.default_rng(2)
+    more = []
+    for block in given_blocks():
+        n = block.x.shape[1]
+        x = np.insert(block.x, n, 0.7, axis=1)
+        P = np.zeros((1, n + 1, n + 1, block.x.shape[2]))
+        P[:, :n, :n] = block.P
+        P[:, n, n] = 4.0
+        P[:, :2, n] = P[:, n, :2] = rng.normal(size=(1, 2, 1))
+        more.append(Gaussians(x, P))
+    mixed, _ = verbs.mix(BANK, more, MIXING['mu'][ORDER][None], transition())
+    plain, _ = verbs.mix(BANK, given_blocks(), MIXING['mu'][ORDER][None], transition())
+    for found, right in zip(mixed, plain):
+        n = right.x.shape[1]
+        np.testing.assert_allclose(found.x[:, n], 0.7)
+        np.testing.assert_allclose(found.P[:, n, n], 4.0)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_velocity_given_its_heading_is_what_samples_say(seed):
+    """Of velocities near a heading, those inside the sector: mean speed and position."""
+    rng = np.random.default_rng(seed)
+    x = np.array([3.0, -2.0, 0.8, 0.1])
+    root = rng.normal(size=(4, 4)) * [0.5, 0.5, 0.2, 0.2]
+    P = root.T @ root + 0.02 * np.eye(4)
+    alone = Bank(np.array([[1.0], [0.0]]), velocities=1, sector=BANK.sector)
+    block = Gaussians(x[None, :, None], P[None, :, :, None])
+    moments, _ = verbs._as_headings(alone, block, np.zeros((1, 3)))
+    samples = rng.multivariate_normal(x, P, 200_000)
+    variance = BANK.sector * (x[2] ** 2 + P[2, 2]) + verbs.LEAST_ACROSS
+    weight = np.exp(-0.5 * samples[:, 3] ** 2 / variance)
+    mean = weight @ samples[:, :3] / weight.sum()
+    np.testing.assert_allclose(moments[0, :3, 0, 0], mean, atol=0.02)
+
+
+def one_block(seed, N=4, n=3, m=5):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(N, m, n, n))
+    P = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(n)
+    x, mu = rng.normal(size=(N, m, n)), rng.dirichlet(np.ones(m), N)
+    matrix = rng.dirichlet(np.ones(m), m)
+    F = np.eye(n) + np.triu(rng.normal(size=(m, n, n)), 1)
+    Q, B = np.tile(0.3 * np.eye(n), (m, 1, 1)), rng.normal(size=(m, n))
+    return x, P, mu, matrix[None], F, Q, B, rng
+
+
+def model_last(x, P):
+    return Gaussians(np.moveaxis(x, 1, -1), np.moveaxis(P, 1, -1))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_one_cycle_of_equal_models_is_the_readable_imm(seed):
+    x, P, mu, matrix, F, Q, B, rng = one_block(seed)
+    plain = Bank(np.zeros((2, x.shape[1])))
+    mixed = imm.mix(x, P, mu, matrix)
+    moved = imm.predict(mixed.x, mixed.P, F, Q, B)
+    z, R = rng.normal(size=(len(x), 2)), 0.4 * np.eye(2) + 0.1
+    H = np.broadcast_to(np.eye(2, x.shape[2]), (1, x.shape[1], 2, x.shape[2]))
+    due = imm.update(moved.x, moved.P, mixed.c, z[:, None] - moved.x[..., :2], H, R[None])
+
+    (block,), c = verbs.mix(plain, [model_last(x, P)], mu, matrix)
+    steps = Moves(np.moveaxis(F, 0, -1), np.moveaxis(Q, 0, -1), B.T)
+    block, row = verbs.predict(block, steps), np.arange(len(x))
+    pairs = verbs.weigh(block, row, z, np.tile(R, (len(x), 1, 1)))
+    likelihood = (c * np.exp(pairs.log)).sum(axis=1)
+    ratio = np.exp(pairs.log) / likelihood[:, None]
+    block, weight = verbs.update(block, pairs, row, ratio, np.zeros(len(x)))
+    right = model_last(due.x, due.P)
+    np.testing.assert_allclose(block.x, right.x, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(block.P, right.P, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(c * weight, due.mu, rtol=1e-10)
+    np.testing.assert_allclose(np.log(likelihood), due.log_likelihood, rtol=1e-10)
+
+
+@pytest.mark.parametrize('considered', [False, True])
+def test_several_measurements_are_moment_matched(considered):
+    """Against one Kalman update for each measurement, and their mixture with none of them."""
+    from oracles import jipda as oracle
+
+    x, P, mu, _, _, _, _, rng = one_block(7, N=2)
+    z, R = rng.normal(size=(3, 2)), np.tile(0.5 * np.eye(2) + 0.1, (3, 1, 1))
+    beta, missed = np.array([0.2, 0.5, 0.1]), 0.2
+    H = np.broadcast_to(np.eye(2, 3), (5, 2, 3))
+    estimated = np.array([True, True, not considered])
+    block, row = model_last(x, P), np.repeat([0, 1], 3)
+    pairs = verbs.weigh(block, row, np.tile(z, (2, 1)), np.tile(R, (2, 1, 1)))
+    f = (mu[row] * np.exp(pairs.log)).sum(axis=1)
+    ratio = np.tile(beta, 2)[:, None] * np.exp(pairs.log) / f[:, None]
+    after, weight = verbs.update(block, pairs, row, ratio, np.full(2, missed), estimated=estimated)
+    for k in range(2):
+        innovation = z[:, None] - x[k, :, :2]
+        due = oracle.update(x[k], P[k], mu[k], innovation, H, R, beta, missed, ~estimated)
+        np.testing.assert_allclose(after.x[k].T, due[0], rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(np.moveaxis(after.P[k], -1, 0), due[1], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(mu[k] * weight[k], due[2], rtol=1e-10)
+
+
+def test_a_measured_value_may_be_a_sum_of_components():
+    """Position and a lasting error of the fix, against H as a matrix."""
+    x, P, *_, rng = one_block(8, N=1, n=5)
+    z, R = rng.normal(size=(1, 2)), np.tile(np.eye(2), (1, 1, 1))
+    H = np.array([[1.0, 0, 0, 1.0, 0], [0, 1.0, 0, 0, 1.0]])
+    block, row = model_last(x, P), np.zeros(1, int)
+    measured = ((0, 3), (1, 4))
+    pairs = verbs.weigh(block, row, z, R, measured)
+    after, _ = verbs.update(block, pairs, row, np.ones((1, 5)), np.zeros(1), measured)
+    for j in range(5):
+        S = H @ P[0, j] @ H.T + R[0]
+        K = P[0, j] @ H.T @ np.linalg.inv(S)
+        np.testing.assert_allclose(after.x[0, :, j], x[0, j] + K @ (z[0] - H @ x[0, j]))
+        np.testing.assert_allclose(after.P[0, ..., j], P[0, j] - K @ S @ K.T, rtol=1e-9)
+
+
+def test_without_a_measurement_nothing_changes():
+    x, P, *_ = one_block(9)
+    block, none = model_last(x, P), np.empty(0, int)
+    pairs = verbs.weigh(block, none, np.empty((0, 2)), np.empty((0, 2, 2)))
+    after, weight = verbs.update(block, pairs, none, np.empty((0, 5)), np.full(4, 0.3))
+    assert after is block
+    np.testing.assert_array_equal(weight, 0.3)
+
+
+# -- the table of rows ---------------------------------------------------------------------------
+
+
+def started(scales):
+    """Rows of one target that begins at the first fix, one for each scale."""
+    K, z, R = len(scales), RUN['z'][0], RUN['R'][0]
+    P0, P1 = np.zeros((K, 3, 3, A)), np.zeros((K, 4, 4, 3))
+    x0, x1 = np.zeros((K, 3, A)), np.zeros((K, 4, 3))
+    x0[:, :2], x1[:, :2], x0[:, 2] = z[:, None], z[:, None], float(MIXING['speed_mean'])
+    for k, scale in enumerate(scales):
+        P0[k, :2, :2] = P1[k, :2, :2] = scale * R[..., None]
+    P0[:, 2, 2], P1[:, 2, 2], P1[:, 3, 3] = float(MIXING['speed_variance']), 0.49, 0.49
+    return Rows(
+        (Gaussians(x0, P0), Gaussians(x1, P1)),
+        np.tile(RUN['start_mu'][ORDER], (K, 1)),
+        np.full(K, -math.log(K)),
+        np.zeros(K, np.int64),
+        np.full(K, -1),
+        {'scale': scales},
+    )
+
+
+def test_a_run_of_scaled_filters_is_that_of_the_prototype():
+    """Sixty fixes whose covariances are stated six times too small."""
+    from sonar_imm.trackers.diver.config import DiverConfig
+    from sonar_imm.trackers.diver.models import build_models
+
+    models = build_models(DiverConfig())
+    generator = MIXING['generator'][np.ix_(ORDER, ORDER)]
+    outputs = np.zeros((4, 3, A)), np.zeros((4, 4, 3))
+    outputs[0][0, 0], outputs[0][1, 1], outputs[0][2, 2], outputs[0][3, 2] = 1.0, 1.0, *UNITS
+    outputs[1][range(4), range(4)] = 1.0
+    scales = RUN['scales']
+    rows, every = started(scales), np.arange(len(scales))
+    for k in range(1, len(RUN['t'])):
+        dt = RUN['t'][k] - RUN['t'][k - 1]
+        F, Q, B = (np.moveaxis(part, 0, -1) for part in models.motion(dt))
+        rows = rows.spread(float(RUN['share']))
+        blocks, c = verbs.mix(BANK, rows.blocks, rows.mu, expm(generator * dt)[None])
+        blocks = [
+            verbs.predict(blocks[0], Moves(F[:3, :3, :A], Q[:3, :3, :A], B[:3, :A])),
+            verbs.predict(blocks[1], Moves(F[..., A:], Q[..., A:], B[:, A:])),
+        ]
+        z = np.tile(RUN['z'][k], (len(scales), 1))
+        R = RUN['R'][k] * scales[:, None, None]
+        pairs = [verbs.weigh(block, every, z, R) for block in blocks]
+        log = np.concatenate([each.log for each in pairs], axis=1)
+        f = np.log((c * np.exp(log)).sum(axis=1))
+        whole = rows.log_sum(rows.logw + f)
+        ratio = np.split(np.exp(log - whole), [A], axis=1)
+        updated = [
+            verbs.update(block, each, every, part, np.zeros(len(scales)))
+            for block, each, part in zip(blocks, pairs, ratio)
+        ]
+        mu = c * np.concatenate([weight for _, weight in updated], axis=1)
+        total = mu.sum(axis=1)
+        rows = rows.replace(
+            blocks=tuple(block for block, _ in updated), mu=mu / total[:, None]
+        ).reweighed(np.log(total))[0]
+        mean, covariance = rows.combine(*verbs.combine(rows.blocks, rows.mu, outputs))
+        # The prototype rounds its steps to a microsecond.
+        np.testing.assert_allclose(mean[0], RUN['out_x'][k], atol=1e-5)
+        np.testing.assert_allclose(covariance[0], RUN['out_P'][k], atol=1e-5)
+        np.testing.assert_allclose(rows.weight, RUN['out_scale_probability'][k], atol=1e-5)
+        np.testing.assert_allclose(whole[0], RUN['out_log_likelihood'][k], atol=1e-5)
+
+
+def table(seed=0):
+    """Rows of three targets, two, one and three of them."""
+    rng = np.random.default_rng(seed)
+    x, P, mu, *_ = one_block(seed, N=6)
+    target = np.array([0, 0, 1, 2, 2, 2])
+    logw = rng.normal(size=6)
+    rows = Rows((model_last(x, P),), mu, logw, target, np.full(6, -1), {'scale': np.arange(6.0)})
+    return rows.pruned(0.0)
+
+
+def test_weights_of_the_rows_of_a_target_sum_to_one():
+    rows = table()
+    np.testing.assert_allclose(np.add.reduceat(rows.weight, rows.first), 1.0)
+    after, total = rows.reweighed(np.log([0.1, 0.2, 0.5, 1.0, 2.0, 4.0]))
+    np.testing.assert_allclose(np.add.reduceat(after.weight, after.first), 1.0)
+    np.testing.assert_allclose(total[1], np.log(0.5))
+    np.testing.assert_allclose(np.exp(total[0]), rows.weight[:2] @ [0.1, 0.2], rtol=1e-12)
+
+
+def test_a_target_that_no_row_explains_keeps_its_weights():
+    rows = table()
+    after, total = rows.reweighed(np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0]))
+    assert total[0] == -np.inf
+    np.testing.assert_allclose(after.weight, rows.weight)
+
+
+def test_the_heaviest_row_of_a_target_always_stays():
+    rows = table()
+    alone = rows.pruned(1.1)
+    assert alone.target.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(alone.weight, 1.0)
+    heaviest = [
+        rows.logw[rows.target == t].argmax() + np.argmax(rows.target == t) for t in range(3)
+    ]
+    assert alone.parent.tolist() == heaviest
+    assert np.array_equal(alone.key['scale'], rows.key['scale'][heaviest])
+    assert len(rows.pruned(0.0, most=2)) == 5
+
+
+def test_targets_that_go_are_numbered_anew_with_their_rows():
+    rows = table()
+    left = rows.of_targets(np.array([False, True, True]))
+    assert left.target.tolist() == [0, 1, 1, 1] and left.parent.tolist() == [2, 3, 4, 5]
+    assert np.array_equal(left.blocks[0].x, rows.blocks[0].x[2:])
+
+
+def test_new_rows_stand_beside_those_of_their_target():
+    rows = table()
+    both = rows.append(rows.take(np.array([2, 5])))
+    assert both.target.tolist() == [0, 0, 1, 1, 2, 2, 2, 2]
+    assert both.parent.tolist() == [-1, -1, -1, -1, -1, -1, -1, -1]
+    assert np.array_equal(both.key['scale'], [0, 1, 2, 2, 3, 4, 5, 5])
+    with pytest.raises(ValueError, match='rows with .* do not fit'):
+        rows.append(rows.take(np.array([0])).replace(key={}))
+
+
+def test_the_mixture_of_rows_is_that_of_all_their_models():
+    rows = table()
+    outputs = [np.repeat(np.eye(2, 3)[..., None], 5, axis=2)]
+    mean, covariance = rows.combine(*verbs.combine(rows.blocks, rows.mu, outputs))
+    x, P = rows.blocks[0]
+    for target in range(3):
+        own = np.flatnonzero(rows.target == target)
+        weight = (rows.weight[own, None] * rows.mu[own]).ravel()
+        points = np.moveaxis(x[own, :2], 1, -1).reshape(-1, 2)
+        spread = np.moveaxis(P[own, :2, :2], -1, 1).reshape(-1, 2, 2)
+        due = weight @ points
+        d = points - due
+        np.testing.assert_allclose(mean[target], due)
+        np.testing.assert_allclose(
+            covariance[target], np.einsum('k,kab->ab', weight, spread + d[:, :, None] * d[:, None])
+        )
+    np.testing.assert_allclose(rows.models().sum(axis=1), 1.0)

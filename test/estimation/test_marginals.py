@@ -1,0 +1,115 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Probabilities of association against all joint events, and against the problem turned round."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from oracles.jipda import events
+import pytest
+
+from sonar_imm.estimation import marginals as module
+from sonar_imm.estimation.marginals import clusters, marginals
+
+
+def problem(seed, T, D, share=0.7):
+    """Weights of all sizes, some pairs impossible."""
+    rng = np.random.default_rng(seed)
+    weight = rng.gamma(0.3, 4.0, (T, D)) * 10.0 ** rng.uniform(-6.0, 6.0, (T, 1))
+    return weight, 10.0 ** rng.uniform(-6.0, 0.0, T), rng.uniform(size=(T, D)) < share
+
+
+def enumerated(weight, missed, possible):
+    pair, none, total = np.zeros(weight.shape), np.zeros(len(missed)), 0.0
+    for event in events(possible):
+        w = np.prod([missed[t] if d < 0 else weight[t, d] for t, d in enumerate(event)])
+        total += w
+        for t, d in enumerate(event):
+            if d < 0:
+                none[t] += w
+            else:
+                pair[t, d] += w
+    return pair / total, none / total
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(0, 5))
+def test_they_are_the_sums_over_all_joint_events(seed, T, D):
+    case = problem(seed, T, D)
+    for found, due in zip(marginals(*case), enumerated(*case)):
+        np.testing.assert_allclose(found, due, rtol=1e-12, atol=1e-300)
+
+
+@pytest.mark.parametrize('T, D', [(5, 9), (9, 5), (8, 8)])
+def test_tracks_and_detections_may_change_roles(T, D):
+    """Where a false detection weighs 1, the problem turned round is the same one."""
+    weight, missed, possible = problem(T * D, T, D)
+    pair, none = marginals(weight, missed, possible)
+    turned, nobodys = marginals((weight / missed[:, None]).T, np.ones(D), possible.T)
+    np.testing.assert_allclose(pair, turned.T, rtol=1e-10)
+    np.testing.assert_allclose(none, 1.0 - turned.sum(axis=0), atol=1e-10)
+    np.testing.assert_allclose(nobodys, 1.0 - pair.sum(axis=0), atol=1e-10)
+
+
+@pytest.mark.parametrize('T, D', [(12, 12), (12, 40), (13, 13), (30, 25)])
+def test_rows_are_distributions_and_no_detection_is_given_away_twice(T, D):
+    pair, none = marginals(*problem(T + D, T, D, share=0.9))
+    np.testing.assert_allclose(pair.sum(axis=1) + none, 1.0, rtol=1e-12)
+    assert (pair >= 0.0).all() and (pair.sum(axis=0) <= 1.0 + 1e-12).all()
+
+
+def test_a_cluster_that_is_too_large_loses_its_least_probable_pairs(monkeypatch):
+    """Fourteen tracks side by side, each near its own detection: almost nothing is lost."""
+    at = np.arange(14.0)
+    distance = np.square(at[:, None] - at[None] - 0.2)
+    weight, missed = 90.0 * np.exp(-0.5 * distance / 0.2), np.full(14, 0.1)
+    possible = distance < 16.0
+    pair, none = marginals(weight, missed, possible)
+    monkeypatch.setattr(module, 'LARGEST', 14)
+    exact, alone = marginals(weight, missed, possible)
+    assert 0.0 < np.abs(pair - exact).max() < 0.03
+    assert np.abs(none - alone).max() < 0.03
+
+
+def test_equal_pairs_in_a_large_cluster_end():
+    pair, none = marginals(np.ones((40, 40)), np.full(40, 0.1), np.ones((40, 40), bool))
+    np.testing.assert_allclose(pair.sum(axis=1) + none, 1.0)
+
+
+def test_the_order_of_tracks_and_detections_does_not_matter():
+    weight, missed, possible = problem(3, 9, 11)
+    rng = np.random.default_rng(4)
+    rows, columns = rng.permutation(9), rng.permutation(11)
+    pair, none = marginals(weight, missed, possible)
+    cell = np.ix_(rows, columns)
+    other, alone = marginals(weight[cell], missed[rows], possible[cell])
+    np.testing.assert_allclose(other, pair[cell], rtol=1e-10)
+    np.testing.assert_allclose(alone, none[rows], rtol=1e-10)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_clusters_are_connected_components(seed):
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    rng = np.random.default_rng(seed)
+    T, D = rng.integers(1, 12), rng.integers(0, 12)
+    possible = rng.uniform(size=(T, D)) < 0.15
+    t, d = np.nonzero(possible)
+    graph = coo_array((np.ones(len(t)), (t, T + d)), shape=(T + D, T + D))
+    due = connected_components(graph, directed=False)[1][:T]
+    label = clusters(possible)
+    assert np.array_equal(label[:, None] == label[None], due[:, None] == due[None])
+    assert all(label[label == first].size and label[first] == first for first in set(label))
