@@ -50,7 +50,7 @@ FUZZ_JSON ?=
 # Damaged files of each format and damaged states of each system.
 FILES ?= 100
 # Tests that run the compiled kernels.
-KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm imm_particles \
+KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm \
     set_particles smoothing covariance kalman)) \
     $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
     test/trackers test/cli/test_bathymetry_vectors.py

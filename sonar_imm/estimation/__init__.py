@@ -34,7 +34,6 @@ __all__ = [
     'hypotheses',
     'imm',
     'imm_filter',
-    'imm_particles',
     'jipda',
     'jit',
     'kalman',

@@ -155,8 +155,8 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
-            kernels={'pings': (21, 632), 'surfaces': (14, 379)},
-            all_kernels=(29, 898),
+            kernels={'pings': (4, 545), 'surfaces': (3, 239)},
+            all_kernels=(7, 784),
         ),
         System(
             name='diver',
