@@ -26,13 +26,20 @@ import sys
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[2] / 'sonar_imm'
-FILES = ('estimation/set_kernels.py', 'estimation/set_shift_kernels.py')
+FILES = (
+    'acoustics/ray_kernels.py',
+    'acoustics/wave_kernels.py',
+    'estimation/set_kernels.py',
+    'estimation/set_shift_kernels.py',
+    'trackers/bathymetry/filter_kernels.py',
+    'trackers/bathymetry/surface_kernels.py',
+)
 ALLOWED = {
     'numpy': {'np'},
     'numpy.typing': {'NDArray'},
     'math': {'math'},
     'numba': {'numba'},
-    '.jit': {'kernel'},
+    **dict.fromkeys(('.jit', '..estimation.jit', '...estimation.jit'), {'kernel'}),
     '__future__': {'annotations'},
     '.arrays': {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'},
 }
