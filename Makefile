@@ -47,8 +47,9 @@ RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
 FUZZ_JSON ?=
-# Damaged files of each format and damaged states of each system.
+# Damaged files of each format, and damaged or forged states of each system.
 FILES ?= 100
+STATES ?= 25000
 # Tests that run the compiled kernels.
 KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm \
     set_particles smoothing covariance kalman)) \
@@ -109,8 +110,8 @@ test-bounds: venv ## run the tests of the compiled kernels with every index chec
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
 	    $(BIN)/python -m pytest -m 'not system' --statistics none -n $(JOBS) $(SHARED) $(or $(TESTS),$(KERNEL_TESTS))
 
-fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and states (CASES=... FILES=... FUZZ_JSON=...)
-	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) --files $(FILES) \
+fuzz: venv ## send 100,000 hostile messages to each tracker, damage files and 100,000 states (CASES=... FILES=... STATES=... FUZZ_JSON=...)
+	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) --files $(FILES) --states $(STATES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 # A node that compiles answers late: kernels first. The pages of tutorials take longest: they come before the rest, so that

@@ -96,19 +96,19 @@ class GateDecision(Generic[Item]):
 
 
 @frozen
-class _Held(Generic[Item]):
+class Held(Generic[Item]):
     stamp_ns: int
     item: Item
     late: bool
 
 
-class _Run(Generic[Item]):
+class Run(Generic[Item]):
     """Items in a row that do not belong to the stream. held: the newest `hold` of them; stamps:
     the distinct stamps of all, rising."""
 
     def __init__(self, hold: int):
         self.hold = hold
-        self.held: list[_Held[Item]] = []
+        self.held: list[Held[Item]] = []
         self.stamps: list[int] = []
 
     def __len__(self) -> int:
@@ -129,7 +129,7 @@ class _Run(Generic[Item]):
     def add(self, stamp_ns: int, item: Item, late: bool) -> int:
         """Append an item; gives how many ``doubtful`` ones had to go for it."""
         dropped = [self.held.pop(0)] if self.full else []
-        self.held.append(_Held(stamp_ns, item, late))
+        self.held.append(Held(stamp_ns, item, late))
         _insert_distinct(self.stamps, stamp_ns)
         return sum(not item.late for item in dropped)
 
@@ -164,7 +164,7 @@ class StampGate(Generic[Item]):
         self.hold = hold
         self._first: list[int] = []
         self._newest: list[int] = []
-        self._run = _Run[Item](hold)
+        self._run = Run[Item](hold)
 
     @property
     def newest_ns(self) -> int | None:
@@ -202,7 +202,7 @@ class StampGate(Generic[Item]):
     def _abandon(self) -> int:
         abandoned = self._run.doubtful
         if len(self._run):
-            self._run = _Run(self.hold)
+            self._run = Run(self.hold)
         return abandoned
 
     def _restarted(self) -> bool:
@@ -222,7 +222,7 @@ class StampGate(Generic[Item]):
         return long and (run.span_ns > self.window_ns or run.full)
 
     def _restart(self, abandoned: int) -> GateDecision[Item]:
-        held, self._run = self._run.held, _Run(self.hold)
+        held, self._run = self._run.held, Run(self.hold)
         self._first, self._newest = [], []
         for entry in held:
             self._accept(entry.stamp_ns)
@@ -256,7 +256,7 @@ class Inserted(Generic[State]):
 
 
 @frozen
-class _Scan(Generic[Item]):
+class Scan(Generic[Item]):
     keys: list[bytes]
     items: list[Item]
 
@@ -264,9 +264,9 @@ class _Scan(Generic[Item]):
         place = bisect_left(self.keys, key)
         return place < len(self.keys) and self.keys[place] == key
 
-    def with_item(self, key: bytes, item: Item) -> _Scan[Item]:
+    def with_item(self, key: bytes, item: Item) -> Scan[Item]:
         place = bisect_left(self.keys, key)
-        return _Scan(
+        return Scan(
             [*self.keys[:place], key, *self.keys[place:]],
             [*self.items[:place], item, *self.items[place:]],
         )
@@ -288,7 +288,7 @@ class ReplayHistory(Generic[State, Item]):
         self.scan_limit = scan_limit
         self._base = initial
         self._stamps: list[int] = []
-        self._scans: list[_Scan[Item]] = []
+        self._scans: list[Scan[Item]] = []
         self._states: list[State] = []
 
     def __len__(self) -> int:
@@ -304,6 +304,11 @@ class ReplayHistory(Generic[State, Item]):
     def state(self) -> State:
         """The state after the newest scan."""
         return self._states[-1] if self._states else self._base
+
+    @property
+    def base(self) -> State:
+        """The state before the first scan that is kept."""
+        return self._base
 
     @property
     def states(self) -> list[State]:
@@ -323,7 +328,7 @@ class ReplayHistory(Generic[State, Item]):
             return Inserted('too_late', [])
         place = bisect_left(self._stamps, stamp_ns)
         merged = place < len(self._stamps) and self._stamps[place] == stamp_ns
-        scan = self._scans[place] if merged else _Scan[Item]([], [])
+        scan = self._scans[place] if merged else Scan[Item]([], [])
         if scan.holds(key):
             return Inserted('duplicate', [])
         if len(scan.items) >= self.scan_limit:
@@ -340,7 +345,7 @@ class ReplayHistory(Generic[State, Item]):
 
     @staticmethod
     def _replay(
-        state: State, stamps: list[int], scans: list[_Scan[Item]], step: Step[State, Item]
+        state: State, stamps: list[int], scans: list[Scan[Item]], step: Step[State, Item]
     ) -> list[State]:
         states = []
         for stamp_ns, scan in zip(stamps, scans):

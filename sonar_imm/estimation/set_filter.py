@@ -66,7 +66,7 @@ member, in whichever hump.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 import math
 from typing import NamedTuple
@@ -287,6 +287,40 @@ class SetFilter:
         # The sets are draws from the prior in disguise: as many particles as if they were.
         return Weighted(sets, log_ratio)
 
+    def require(self, before: Weighted, steps: Iterable[SetStep] = ()) -> None:
+        """Raise ValueError for sets, or steps kept for smoothing, that are none of this model: of
+        sets that come from a file. Kernels take places for indices."""
+        self._require_sets(before)
+        for step in steps:
+            self._require_sets(step.after)
+            with np.errstate(divide='ignore'):
+                self._require_sets(Weighted(step.sets, np.log(step.w), step.path))
+            if not ((step.source >= 0) & (step.source < self.particles)).all():
+                raise ValueError('sets come from none')
+
+    def _require_sets(self, weighted: Weighted) -> None:
+        model, (sets, log_weight, path, _) = self.model, weighted
+        memory = model.order_max if model.amplitude_memory > 0.0 else 0
+        column = np.arange(model.order_max)
+        # The members of impossible sets mean nothing.
+        there = (column < sets.order[:, None]) & (log_weight > -np.inf)[:, None]
+        cell = np.where(there, sets.cell, model.cells - 1)
+        good = (
+            sets.cell.shape == (self.particles, model.order_max)
+            and sets.prior_mean.shape == (self.particles, memory)
+            and ((sets.order >= model.order_min) & (sets.order <= model.order_max)).all()
+            and ((sets.cell >= 0) & (sets.cell < model.cells)).all()
+            and (np.diff(cell, axis=1) >= 0).all()
+            and ((sets.shift >= 0) & (sets.shift <= 2 * model.pad)).all()
+            and np.isfinite(sets.prior_mean).all()
+            and np.isfinite(sets.prior_variance).all()
+            and (log_weight < np.inf).all()
+            and (model.shift is None or path is None or path.precision > 0.0)
+            and (path is None or np.isfinite(path.pull).all())
+        )
+        if not good:
+            raise ValueError('sets are none of this model')
+
     def propagate(self, before: Weighted, record: Record) -> Weighted:
         """Sets as they may have become by the time of the record: deaths, shift, walks, births."""
         passage, shift, path = record.passage, record.passage.shift, None
@@ -466,6 +500,11 @@ class LagSmoother:
     def __init__(self, lag: int):
         self.lag = lag
         self._steps: deque[SetStep] = deque(maxlen=lag + 1)
+
+    @property
+    def steps(self) -> list[SetStep]:
+        """The steps that are kept, oldest first."""
+        return list(self._steps)
 
     def push(self, step: SetStep) -> SetStep | None:
         """The step `lag` records before this one as the ancestors of its sets, each with the

@@ -125,7 +125,9 @@ class Intake:
         self.repeats.reset()
 
     def restored(self) -> None:
-        """Tell the tracker where the sonar is, after a state was put in."""
+        """Tell the tracker where the sonar is, after a state was put in. Raises ValueError for
+        transforms that are none."""
+        self.transforms.require()
         self._mount()
 
     def _in_frame(self, measurement: Any, target: str) -> Any:
@@ -254,6 +256,16 @@ class TransformTree:
             self._poses[frame] = step
         while len(self._poses) > MOST_FRAMES:
             self._poses.pop(next(iter(self._poses)))
+
+    def require(self) -> None:
+        """Raise ValueError where it holds something else than frames."""
+        for frame, step in self._poses.items():
+            parent, pose = step
+            if not (isinstance(frame, str) and isinstance(parent, str) and type(pose) is Pose):
+                raise ValueError('a frame is none')
+            turned = pose.R @ pose.R.T - np.eye(3)
+            if pose.position.shape != (3,) or not np.abs(turned).max() < 1e-6:
+                raise ValueError('a frame is turned in no way')
 
     def pose(self, target: str, source: str) -> Pose | None:
         """Where the frame `source` is in the frame `target`; None when it is not known."""
@@ -395,3 +407,7 @@ def _after(yaw: float, q: FloatArray) -> FloatArray:
     x, y, z, w = q
     s, c = np.sin(0.5 * yaw), np.cos(0.5 * yaw)
     return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+
+
+STATE_TYPES = (RepeatFilter, TransformTree, Pose)
+"""The classes that a saved state of the intake may hold, see `trackers.state_file`."""

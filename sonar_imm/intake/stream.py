@@ -40,7 +40,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from attrs import frozen
 
-from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
+from ..estimation.history import Held, MAX_LATE_NS, ReplayHistory, Run, Scan, StampGate, Step
 from ..measurements import nanoseconds, Rejection, VesselPose
 
 State = TypeVar('State')
@@ -229,6 +229,11 @@ class ReplayStream(Stream, Generic[State]):
         """The newest state."""
         return self._history.state
 
+    @property
+    def kept(self) -> list[State]:
+        """All states that are kept."""
+        return [self._history.base, *self._history.states]
+
     def revise(self, measurement: Any) -> list[tuple[int, State]]:
         """Take a measurement in: every stamp with a new or a changed state, and that state, oldest
         first."""
@@ -244,3 +249,9 @@ class ReplayStream(Stream, Generic[State]):
                 self.counts['late'] += 1
             revised.update(inserted.revised)
         return sorted(revised.items(), key=itemgetter(0))
+
+
+STREAM_TYPES = (Stream, OnceStream, StreamRules, KnownFrames, StampGate, Run, Held)
+REPLAY_TYPES = (*STREAM_TYPES, ReplayStream, ReplayHistory, Scan)
+"""The classes that the states of either stream may hold, see `trackers.state_file`; measurements
+besides."""

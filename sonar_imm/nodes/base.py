@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 import functools
+import sys
 import time
 import traceback
 from typing import Any
@@ -464,6 +465,20 @@ class TrackerNode(BaseNode):
         if estimates:
             self._publish(estimates)
 
+    def _recover(self, name: str) -> None:
+        if not self._gave_up_state():
+            super()._recover(name)
+
+    def _gave_up_state(self) -> bool:
+        """Whether a state that was loaded is to blame for the exception that is handled; the
+        tracker is a new one then."""
+        if not self._saved_state.gave_up(self._config, sys.exc_info()[1]):
+            return False
+        self._intake = self._saved_state.intake
+        self.tracker = self._intake.tracker
+        self._displays.clear()
+        return True
+
     def start_afresh(self) -> None:
         """Forget all measurements and take away what is drawn."""
         self._intake.reset()
@@ -475,6 +490,13 @@ class TrackerNode(BaseNode):
 
     def work_report(self) -> dict[str, Any]:
         """What the tracker says of itself."""
+        try:
+            health = self.tracker.health()
+            warnings = list(getattr(self.tracker, 'warnings', list)())
+        except Exception:
+            if not self._gave_up_state():
+                raise
+            health, warnings = self.tracker.health(), []
         counts = Counter(self.tracker.counts) + self._errors
         if self._withheld:
             counts['revisions_withheld'] = self._withheld
@@ -483,9 +505,9 @@ class TrackerNode(BaseNode):
         return {
             'enabled': self._enabled,
             'counts': counts,
-            'health': self.tracker.health(),
+            'health': health,
             'warnings': [
-                *getattr(self.tracker, 'warnings', list)(),
+                *warnings,
                 *filter(None, [self._saved_state.trouble]),
             ],
         }

@@ -48,6 +48,8 @@ from ..trackers.state_file import (
     write_state,
 )
 
+PROOF = 100
+"""Measurements after which a state that was loaded is taken for sound."""
 _ENOUGH = 3
 """First measurements that have to be far from a state before it is given up; one may be wrong."""
 
@@ -55,7 +57,8 @@ _ENOUGH = 3
 class SavedState:
     """Loads and saves the state of one tracker and of the `Intake` before it.
 
-    trouble: why states are not saved, in a sentence; empty while they are.
+    trouble: why states are not saved, in a sentence; empty while they are. intake: with the
+    tracker.
     """
 
     def __init__(self, node: Node, system: str, settings: NodeConfig):
@@ -78,6 +81,7 @@ class SavedState:
         self._loaded_ns: int | None = None
         self._newest_ns: int | None = None
         self._taken = self._saved = self._far = 0
+        self._unproven = 0
         self._thread: threading.Thread | None = None
         self._release: Callable[[], None] | None = None
         if self._path and not self._path.parent.is_dir():
@@ -85,10 +89,8 @@ class SavedState:
 
     def load(self, config: Config) -> Intake:
         """The intake of a tracker that goes on from the file, or of a new one."""
-        self._intake = self._from_file(config) or Intake(
-            self._system.build(config), self._frame_id
-        )
-        return self._intake
+        self.intake = self._from_file(config) or Intake(self._system.build(config), self._frame_id)
+        return self.intake
 
     def _from_file(self, config: Config) -> Intake | None:
         if self._path and self._hold(self._path):
@@ -116,6 +118,7 @@ class SavedState:
     def still_fits(self, stamp_ns: int) -> bool:
         """Note a measurement; False when it shows that the loaded state is of another time."""
         self._taken += 1
+        self._unproven = max(0, self._unproven - 1)
         self._newest_ns = stamp_ns
         loaded = self._loaded_ns
         if loaded is None:
@@ -130,6 +133,26 @@ class SavedState:
                 'one of the state that was loaded: the tracker starts afresh'
             )
         return not self._far
+
+    def gave_up(self, config: Config, error: BaseException | None) -> bool:
+        """Whether the state that was loaded is to blame for an error, and is given up: say so, and
+        replace the tracker of `intake` by a new one. What was measured since it was loaded has to
+        go with it for a while before an error is taken for one of this program."""
+        if not self._unproven or self._path is None:
+            return False
+        self._unproven = 0
+        self._refused = True
+        self._loaded_ns = None
+        self._node.get_logger().warning(
+            f"the state in '{self._path}' does not go with what is measured "
+            f'({type(error).__name__}): the tracker starts afresh; it is kept as '
+            f"'{_refused(self._path).name}' when the next one is saved"
+        )
+        fresh = Intake(self._system.build(config), self._frame_id)
+        fresh.transforms = self.intake.transforms
+        fresh.restored()
+        self.intake = fresh
+        return True
 
     def save(self, given: Config, *, wait: bool = False) -> None:
         """Write the state of now, if there is something new; `wait` until it is on the disk.
@@ -147,8 +170,8 @@ class SavedState:
             parameters=json_parameters(given),
             saved_ns=time.time_ns(),
             newest_ns=self._newest_ns,
-            state=frozen_state(self._intake.tracker),
-            extras={'conventions': self._conventions, 'intake': frozen_state(self._intake)},
+            state=frozen_state(self.intake.tracker),
+            extras={'conventions': self._conventions, 'intake': frozen_state(self.intake)},
         )
         if wait:
             self._write(self._path, saved)
@@ -185,10 +208,11 @@ class SavedState:
             when = f'{age:.0f} s ago' if age > 0 else f'{-age:.0f} s ahead of the clock'
             raise StateError(f'it was saved {when}, state_max_age is {self._max_age:g} s')
         intake = Intake(tracker_from(saved, self._system, config), self._frame_id)
-        if saved.extras['conventions'] != self._conventions:
+        if saved.extras.get('conventions') != self._conventions:
             raise StateError('it was saved with another frame_id or world_frame_convention')
-        restore(intake, saved.extras['intake'])
+        restore(intake, saved.extras.get('intake', {}))
         self._loaded_ns = self._newest_ns = saved.newest_ns
+        self._unproven = PROOF
         self._node.get_logger().info(f"goes on from the state in '{path}', {age:.1f} s old")
         return intake
 

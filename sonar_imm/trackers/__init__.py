@@ -140,6 +140,11 @@ class System:
         """Those of a tracker of its own, for another process: this can be pickled."""
         return self.build(config).warm_steps()
 
+    def state_types(self) -> tuple[type, ...]:
+        """The classes that a saved state of the tracker may hold: a literal table."""
+        types: tuple[type, ...] = self._own('state_types.STATE_TYPES')
+        return types
+
     def _own(self, dotted: str) -> Any:
         module, _, name = dotted.rpartition('.')
         return getattr(import_module(f'{__name__}.{self.name}.{module}'), name)

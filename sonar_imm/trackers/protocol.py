@@ -34,6 +34,7 @@ class Tracker(Protocol):
     counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``,
     ``too_late``, ...). STATE: the attributes that hold all it knows, see `state_file`; a tracker
     that keeps more, which follows from them, has a method ``restored`` that makes it again.
+    ``STATE_TYPES`` in `state_types` are the classes that they may hold.
     """
 
     config: Any

@@ -27,7 +27,7 @@ import click
 import sonar_imm
 from sonar_imm.trackers import SYSTEMS
 
-from .common import BAG, example, json_option, print_json, say
+from .common import BAG, example, json_option, node_file, print_json, say
 
 
 @click.command(epilog=example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
@@ -116,4 +116,5 @@ def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
     from ..resources import share_folder
 
     bag = bag or min((share_folder() / 'bags').glob(f'{system}_*'))
-    return run_lockstep(bag, system, params_file=own_parameters(bag)).latency_ms()
+    with node_file(SYSTEMS[system], own_parameters(bag)) as params:
+        return run_lockstep(bag, system, params_file=params).latency_ms()

@@ -40,7 +40,7 @@ from ..recordings.reader import BagReader
 from ..recordings.topics import instruments
 from ..replay.harness import LockstepResult, run_lockstep
 from ..resources import share_folder
-from .common import load_config, load_detector, progress
+from .common import load_config, load_detector, node_file, progress
 from .evaluate import evaluate_run
 from .track import track_one
 
@@ -151,16 +151,16 @@ def play_recording(
     else of the system. topics: input by topic name; None for those that fit.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
-    params = params or own_parameters(bag)
+    used = params or own_parameters(bag)
     limit = own_limit(bag) if limit is None else limit
-    config, node = load_config(SYSTEMS[system], params, {})
+    config, node = load_config(SYSTEMS[system], used, {})
     options = InputOptions(
         topics=topics,
         frame_id=node.frame_id,
         use_tf_static=hears_transforms(node),
         world_frame=node.world_frame_convention,
         origin=node.origin(),
-        detector=load_detector(SYSTEMS[system], params, {}),
+        detector=load_detector(SYSTEMS[system], used, {}),
     )
     run = track_one(
         Job(
@@ -176,11 +176,14 @@ def play_recording(
     )
     if not live:
         return PlayedRecording(system, bag, folder, limit, (), {})
-    with progress('playing to the node', run['messages'], quiet=quiet) as advance:
+    with (
+        progress('playing to the node', run['messages'], quiet=quiet) as advance,
+        node_file(SYSTEMS[system], used) as given,
+    ):
         played = run_lockstep(
             bag,
             system,
-            params_file=params,
+            params_file=given,
             settings={**config.as_dict(), 'use_tf_static': hears_transforms(node)},
             topics=topics,
             progress=advance,

@@ -21,13 +21,14 @@ import contextlib
 import json
 from pathlib import Path
 import sys
+import tempfile
 import time
 from typing import Any
 
 import click
 
 from msg_adapters.inputs import FEEDERS
-from sonar_imm.node_config import node_config_type, NodeConfig, type_specs
+from sonar_imm.node_config import DetectorNodeConfig, node_config_type, NodeConfig, type_specs
 from sonar_imm.parameters import (
     Config,
     ConfigError,
@@ -40,7 +41,7 @@ from sonar_imm.parameters import (
 from sonar_imm.texts import visible
 from sonar_imm.trackers import System, SYSTEMS
 
-from ..recordings.own_files import PARAMETERS as OWN_PARAMETERS
+from ..recordings.own_files import OF_FRAMES, OwnParameters, write_ros_parameters
 
 Advance = Callable[[int], None]
 
@@ -187,15 +188,16 @@ def _scalar(text: str, kind: str) -> Any:
 
 
 def load_config(
-    system: System, params: Path | None, overrides: dict[str, str]
+    system: System, params: Path | OwnParameters | None, overrides: dict[str, str]
 ) -> tuple[Config, NodeConfig]:
-    """The parameters of tracker and node: defaults, then the file, then ``--set``.
+    """The parameters of tracker and node: defaults, then the file, then ``--set``. A recording's
+    own file sets what it may, a line on stderr names the rest.
 
     Raises `ConfigError` with one sentence for each mistake.
     """
     tracker, node = system.config_type(), node_config_type(system)
     choices = {spec.name: spec for spec in type_specs(system.name)}
-    values = _parameters_of(params, system.name) if params else {}
+    values = _parameters_of(params, system, system.name, report=True) if params else {}
     specs = {spec.name: spec for config in (tracker, node) for spec in config.specs()} | choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
@@ -219,7 +221,7 @@ def load_config(
 
 
 def load_detector(
-    system: System, params: Path | None, overrides: dict[str, str]
+    system: System, params: Path | OwnParameters | None, overrides: dict[str, str]
 ) -> dict[str, Any]:
     """Parameters of the detector before the tracker that are not the default: of the section of
     its node in the file, then ``--set``. Empty for a system without one.
@@ -234,7 +236,8 @@ def load_detector(
     from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
     # A file for the tracker's node alone says nothing of the detector.
-    values = _parameters_of(params, FEEDERS[system.name], needed=False) if params else {}
+    feeder = FEEDERS[system.name]
+    values = _parameters_of(params, system, feeder, needed=False) if params else {}
     values.update(
         {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
     )
@@ -252,8 +255,54 @@ def _detector_specs(system: System) -> dict[str, ParameterSpec]:
     return {spec.name: spec for spec in DetectorConfig.specs()}
 
 
-def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[str, Any]:
-    """What a file says for a node; needed: it is a mistake when it is for others only."""
+@contextlib.contextmanager
+def node_file(system: System, params: Path | OwnParameters | None) -> Iterator[Path | None]:
+    """Yields a parameter file for real nodes: `params`, of a recording's own one a copy of what is
+    taken from it."""
+    if not isinstance(params, OwnParameters):
+        yield params
+        return
+    names = (system.name, *filter(None, [FEEDERS.get(system.name)]))
+    with tempfile.TemporaryDirectory(prefix='sonar_imm_') as folder:
+        path = Path(folder) / params.path.name
+        write_ros_parameters(path, {name: _parameters_of(params, system, name) for name in names})
+        yield path
+
+
+def parameters_taken(system: System, params: Path | OwnParameters | None) -> dict[str, Any]:
+    """What a parameter file says for the tracker, not checked. Raises `ConfigError`."""
+    return _parameters_of(params, system, system.name) if params else {}
+
+
+def _taken(own: OwnParameters, system: System, node_name: str, report: bool) -> dict[str, Any]:
+    """What is taken from a recording's own file for a node; report: say what is not."""
+    detector = set(_detector_specs(system))
+    node = {spec.name for spec in node_config_type(system).specs()}
+    if detector:
+        node |= {spec.name for spec in DetectorNodeConfig.specs()}
+    allowed = detector | {spec.name for spec in type_specs(node_name)}
+    if node_name == system.name:
+        allowed |= {spec.name for spec in system.config_type().specs()}
+        allowed |= node.intersection(OF_FRAMES)
+    values, sentences = own.taken(node_name, allowed, node)
+    for sentence in sentences if report else ():
+        click.echo(visible(sentence), err=True)
+    # What nobody knows `load_config` refuses, with what may be meant.
+    return values if node_name == system.name else {k: values[k] for k in values if k in allowed}
+
+
+def _parameters_of(
+    path: Path | OwnParameters,
+    system: System,
+    node_name: str,
+    *,
+    needed: bool = True,
+    report: bool = False,
+) -> dict[str, Any]:
+    """What a file says for a node of `system`; needed: it is a mistake when it is for others
+    only."""
+    if isinstance(path, OwnParameters):
+        return _without_common(_taken(path, system, node_name, report))
     try:
         text = small_text(path)
         values = parameters_from_yaml(text, node_name=node_name)
@@ -261,13 +310,15 @@ def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[s
         raise ConfigError(f'{path} is not a text file') from None
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
-    # Beside a recording the file describes the instruments for one tracker; others do without.
-    foreign = needed and not values and path.name != OWN_PARAMETERS
-    if foreign and (names := _others(text, node_name)):
+    if needed and not values and (names := _others(text, node_name)):
         raise ConfigError(
             f"{path} is for {', '.join(names)}, and not for '{node_name}': rename the section, or "
             "call it '/**' for any node"
         )
+    return _without_common(values)
+
+
+def _without_common(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
 
 

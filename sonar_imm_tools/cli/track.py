@@ -46,6 +46,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..offline.batch import Job, Outcome
+    from ..recordings.own_files import OwnParameters
     from ..recordings.reader import BagReader
 
 
@@ -175,7 +176,7 @@ class Plan:
     strict: bool = False
     parquet: bool = False
 
-    def parameters_of(self, bag: Path) -> Path | None:
+    def parameters_of(self, bag: Path) -> Path | OwnParameters | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
         from ..recordings.own_files import own_parameters
 

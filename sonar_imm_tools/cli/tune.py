@@ -151,12 +151,9 @@ def command(
 
 def _begun_with(plan: Plan, bag: Path, system: str) -> dict[str, Any]:
     """What --params, --set and the recording's own file state."""
-    from sonar_imm.parameters import parameters_from_yaml, small_text
     from sonar_imm.trackers import SYSTEMS
 
-    from .common import typed_overrides
+    from .common import parameters_taken, typed_overrides
 
-    path = plan.parameters_of(bag)
-    text = small_text(path) if path else ''
-    stated = parameters_from_yaml(text, node_name=system)
+    stated = parameters_taken(SYSTEMS[system], plan.parameters_of(bag))
     return {**stated, **typed_overrides(SYSTEMS[system].config_type(), plan.overrides)}

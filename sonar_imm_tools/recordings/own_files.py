@@ -18,6 +18,10 @@ Most recordings fit the defaults of a tracker. Where the sonar is mounted elsewh
 is another one, the tracker needs these parameters: without them its estimates are wrong or
 missing.
 
+A recording may come from anybody. Its parameters are data: `taken` gives those that describe what
+is tracked and how it was measured, and a file that they name has to lie beside the recording.
+Where a node keeps files, or what it listens to, only its user says.
+
 The limit is the largest error that `check` allows, with the arguments of `simulate` that make the
 recording again where an installation left it out. A simulated recording is one draw of many: what
 its error may be follows from the errors of the same scene under other seeds, and not from the
@@ -26,21 +30,34 @@ system.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 import math
 from pathlib import Path
 import shlex
+import stat
 from typing import Any
 
+from attrs import frozen
 import yaml
 
 from sonar_imm.files import whole
-from sonar_imm.parameters import Config, ConfigError, small_text, yaml_tree
+from sonar_imm.parameters import Config, ConfigError, parameters_from_yaml, small_text, yaml_tree
 
 from .sources import BagError
 
 PARAMETERS = 'parameters.yaml'
 LIMIT = 'check.yaml'
+MOST_BYTES = 1_000_000
+"""Bytes of a file that the parameters of a recording name."""
+OF_FRAMES = (
+    'frame_id',
+    'world_frame_convention',
+    'use_tf_static',
+    'origin_latitude',
+    'origin_longitude',
+    'origin_height',
+)
+"""Parameters of a node that a recording may state: in what frames it was measured."""
 _HEADS = {
     PARAMETERS: '# Parameters of the tracker that describe the instruments of this recording.\n',
     LIMIT: '# The largest error that `sonar-imm check` allows on this recording, and what makes\n'
@@ -48,10 +65,72 @@ _HEADS = {
 }
 
 
-def own_parameters(bag: Path) -> Path | None:
+@frozen
+class OwnParameters:
+    """The parameter file `path` in the folder of a recording."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def taken(
+        self, node: str, allowed: Collection[str], known: Collection[str]
+    ) -> tuple[dict[str, Any], list[str]]:
+        """What the file says for `node` but for the parameters that are `known` and not `allowed`,
+        and a sentence for each of these, and for each file that may not be read. Raises
+        `ConfigError`."""
+        try:
+            inside(self.path.parent, self.path.name)
+            stated = parameters_from_yaml(small_text(self.path), node_name=node)
+        except UnicodeDecodeError:
+            raise ConfigError(f'{self.path} is not a text file') from None
+        except ConfigError as error:
+            raise ConfigError(f'{self.path}: {error}') from None
+        found, sentences = {}, []
+        for name, value in stated.items():
+            if name in known and name not in allowed:
+                sentences.append(
+                    f"{self.path}: '{name}' is not used: it is a parameter of the node, which a "
+                    'recording does not set; give it with --params or --set'
+                )
+                continue
+            try:
+                found[name] = self._placed(value) if name.endswith('_file') else value
+            except ConfigError as error:
+                sentences.append(f"{self.path}: '{name}' is not used: {error}")
+        return found, sentences
+
+    def _placed(self, value: Any) -> Any:
+        """The file, or the files, that a parameter names, beside the recording."""
+        if isinstance(value, (list, tuple)):
+            return [self._placed(item) for item in value]
+        if not isinstance(value, str) or not value:
+            return value
+        return str(inside(self.path.parent, value))
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The file `name` in `folder`, without links. Raises `ConfigError` for one that is elsewhere,
+    is not a regular file, or is too large."""
+    try:
+        root, path = folder.resolve(strict=True), (folder / name).resolve(strict=True)
+        status = path.stat()
+    except (OSError, ValueError, RuntimeError):
+        raise ConfigError(f"there is no file '{name}' in the folder of the recording") from None
+    if not path.is_relative_to(root):
+        raise ConfigError(f"'{name}' lies outside of the folder of the recording")
+    if not stat.S_ISREG(status.st_mode):
+        raise ConfigError(f"'{name}' is no regular file")
+    if status.st_size > MOST_BYTES:
+        raise ConfigError(f"'{name}' has more than {MOST_BYTES} bytes")
+    return path
+
+
+def own_parameters(bag: Path) -> OwnParameters | None:
     """The parameter file in the folder of a recording; None when there is none."""
     path = bag / PARAMETERS
-    return path if path.is_file() else None
+    return OwnParameters(path) if path.is_file() else None
 
 
 def unusual(known: Mapping[str, Any], tracker: type[Config]) -> dict[str, Any]:
@@ -118,6 +197,7 @@ def own_recipe(bag: Path) -> list[str]:
 
 def _stated(path: Path) -> dict[str, Any]:
     try:
+        inside(path.parent, path.name)
         stated = yaml_tree(small_text(path))
     except (ConfigError, UnicodeDecodeError):
         raise BagError(f'{path} is not YAML') from None

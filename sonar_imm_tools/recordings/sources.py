@@ -109,6 +109,7 @@ class RosbagsSource:
 
     def __init__(self, path: Path):
         self._path = path
+        _require_regular(path)
         for file in self._mcaps():
             if oversized := oversized_chunk(file):
                 raise BagError(oversized)
@@ -374,6 +375,14 @@ def _unpacked(raw: bytes) -> bytes:
 def _split_order(file: Path) -> tuple[int, str]:
     """Order the files of a split bag: name_2 comes before name_10."""
     return len(file.name), file.name
+
+
+def _require_regular(path: Path) -> None:
+    """Raise `BagError` for a file, or one in a folder, that is a pipe or a device: to open a pipe
+    would wait for somebody who writes, and a device has no end."""
+    for file in [path, *path.iterdir()] if path.is_dir() else [path]:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise BagError(f'{file} is not YAML or messages: it is no regular file')
 
 
 @lru_cache(maxsize=8)

@@ -24,6 +24,7 @@ import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
 from sonar_imm.intake import KnownFrames
+from sonar_imm.measurements import Fix
 from sonar_imm.parameters import Config, live, parameter
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -113,6 +114,9 @@ class WalkerSystem(System):
 
     def build(self, config):
         return WalkerTracker(config)
+
+    def state_types(self):
+        return (Fix, KnownFrames)
 
 
 def register(set_item):

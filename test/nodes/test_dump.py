@@ -34,6 +34,7 @@ from sonar_imm.parameters import ConfigError, sections_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.own_files import own_parameters
 
 NODES = {name: lambda name=name, **more: TrackerNode(name, **more) for name in SYSTEMS}
 
@@ -97,8 +98,8 @@ def test_a_file_for_another_node_is_named(tmp_path):
     file.write_text('/obstacle:\n  ros__parameters:\n    frame_id: odom\n')
     with pytest.raises(ConfigError, match="is for /obstacle, and not for 'diver'"):
         load_config(SYSTEMS['diver'], file, {})
-    beside = tmp_path / 'parameters.yaml'  # of a recording that another tracker looks at
-    file.rename(beside)
+    file.rename(tmp_path / 'parameters.yaml')  # of a recording that another tracker looks at
+    beside = own_parameters(tmp_path)
     assert load_config(SYSTEMS['diver'], beside, {})[1].frame_id == ''
     assert load_config(SYSTEMS['obstacle'], beside, {})[1].frame_id == 'odom'
 

@@ -77,7 +77,7 @@ def estimate_of(system):
     """The first estimate with a row that the tracker makes of a shipped recording."""
     path = shared_file(f'bags/{BAGS[system]}')
     record = SYSTEMS[system]
-    values = yaml.safe_load(own.read_text()) if (own := own_parameters(path)) else {}
+    values = yaml.safe_load(own.path.read_text()) if (own := own_parameters(path)) else {}
     values = values.get('/**', {}).get('ros__parameters', values)
     with BagReader(path) as bag:
         config = record.config_type().from_mapping(values, ignore_unknown=True)

@@ -17,6 +17,7 @@
 import re
 import time
 
+from helpers.hostile.states import forge, parts_of
 from helpers.rig import a_fix, Rig
 import pytest
 from std_srvs.srv import Trigger
@@ -122,6 +123,26 @@ def test_files_that_cannot_be_used_are_named_and_kept(start, tmp_path, capfd):
     end(rig)
     assert (tmp_path / 'state.refused').read_text() == 'shopping list'
     assert read_state(tmp_path / 'state').system == 'walker'
+
+
+def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_path, capfd):
+    """It loads, and the tracker raises at the first measurement: the node goes on without it."""
+    rig = start()
+    rig.send(a_fix(1.0))
+    end(rig)
+    header, block = parts_of(tmp_path / 'state')
+    fixes = next(pair for pair in header['state'][1:] if pair[0] == 'fixes')
+    fixes[1] = ['dict', [1, 'a fix']]
+    forge(tmp_path / 'state', header, block)
+    again = start()
+    again.send(a_fix(2.0), a_fix(3.0, 3.0, 3.0), a_fix(4.0, 3.0, 3.0))
+    said = capfd.readouterr().err
+    assert said.count('does not go with what is measured (AttributeError)') == 1
+    assert 'Traceback' not in said and 'internal error' not in said
+    assert sorted(again.node.tracker.fixes) == [3 * 10**9, 4 * 10**9]
+    end(again)
+    assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
+    assert (tmp_path / 'state.refused').exists()
 
 
 def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, monkeypatch):

@@ -56,7 +56,7 @@ def test_the_file_is_one_of_ros(tmp_path):
     assert own_parameters(tmp_path) is None
     values = {'sonar_lever': (2.0, 0.0, -0.3), 'azimuth_model': 'cone', 'max_range': 50.0}
     path = write_own_parameters(tmp_path, {'obstacle': values, 'fls_detector': {}})
-    assert own_parameters(tmp_path) == path
+    assert own_parameters(tmp_path).path == path
     text = path.read_text()
     read = parameters_from_yaml(text, node_name='obstacle')
     assert SYSTEMS['obstacle'].config_type().from_mapping(read).sonar_lever == (2.0, 0.0, -0.3)

@@ -50,6 +50,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Sequence
+from functools import cached_property
 import math
 from typing import Any, NamedTuple
 
@@ -403,36 +404,42 @@ class PoseQueue:
         return max(usable, key=lambda altitude: altitude.stamp_ns).altitude if usable else None
 
 
-@frozen(eq=False)
+@frozen(eq=False, slots=False)
 class Alone:
-    """A ping estimated by itself, and its probability `rough` (n,) of rough floor by the distance
-    (n,) m from the array, increasing; bins whose place is not known are left out."""
+    """A ping estimated by itself. All else follows from the ping, and is computed when it is asked
+    for: a saved state has the ping alone."""
 
-    seen: Look
-    track: Track
-    distance: FloatArray
-    rough: FloatArray
+    ping: Ping
 
     @classmethod
     def of(cls, seen: Look, track: Track) -> Alone:
+        """The same of what was computed before."""
+        alone = cls(seen.ping)
+        vars(alone).update(seen=seen, track=track)
+        return alone
+
+    @cached_property
+    def seen(self) -> Look:
+        return look(self.ping)
+
+    @cached_property
+    def track(self) -> Track:
+        return run(self.seen)
+
+    @cached_property
+    def rough(self) -> tuple[FloatArray, FloatArray]:
+        """Distances (n,) m from the array, increasing, and the probability (n,) of rough floor
+        there; bins whose place is not known are left out."""
+        seen, track = self.seen, self.track
         distance = seen.swath.distance(floor_of(seen, track))
         known = np.flatnonzero(np.isfinite(distance))
         order = known[np.argsort(distance[known], kind='stable')]
         rough = track.probability[:, seen.models.rough].sum(axis=1)
-        return cls(seen, track, distance[order], np.clip(rough[order], 0.0, 1.0))
-
-    def kept(self) -> Ping:
-        """What a saved state has of it: the rest follows from the ping."""
-        return self.seen.ping
-
-    @classmethod
-    def from_kept(cls, ping: Ping) -> Alone:
-        seen = look(ping)
-        return cls.of(seen, run(seen))
+        return distance[order], np.clip(rough[order], 0.0, 1.0)
 
     @property
     def stamp_ns(self) -> int:
-        return self.seen.ping.snapshot.stamp_ns
+        return self.ping.snapshot.stamp_ns
 
 
 class Favoured(NamedTuple):
@@ -505,8 +512,9 @@ def favour_of(alone: Alone, neighbours: list[Alone], strength: float) -> FloatAr
     distance = np.nan_to_num(seen.swath.distance(floor_of(seen, track)), nan=-1.0)
     field = np.zeros(len(distance))
     for near in neighbours:
-        if len(near.rough):
-            p = np.interp(distance, near.distance, near.rough, left=0.5, right=0.5)
+        place, share = near.rough
+        if len(share):
+            p = np.interp(distance, place, share, left=0.5, right=0.5)
             field += _log_ratio(p, strength)
     rough = seen.models.rough
     favour = np.empty(track.probability.shape)

@@ -81,7 +81,7 @@ class _Vessel(NamedTuple):
     axes: FloatArray
 
 
-class _Samples:
+class Samples:
     """What one instrument says of the vessel: poses, of which only a part may be meant."""
 
     def __init__(self, kept_ns: int):
@@ -120,7 +120,7 @@ class Georeferencer:
         self._first: Origin | None = None
         self._metric = False
         kept = max(KEPT_NS, nanoseconds(config.history))
-        self._poses, self._places, self._headings = (_Samples(kept) for _ in range(3))
+        self._poses, self._places, self._headings = (Samples(kept) for _ in range(3))
         self._waiting: list[RelativeFix] = []
 
     def __len__(self) -> int:
@@ -247,7 +247,7 @@ class Georeferencer:
         """Whether the vessel is known by latitude and longitude, because there is no nav."""
         return self.config.vessel == 'moving' and not self._poses.buffer.stamps
 
-    def _after(self, samples: _Samples, pose: Navigation) -> list[Measurement]:
+    def _after(self, samples: Samples, pose: Navigation) -> list[Measurement]:
         """Take what an instrument says of the vessel; gives what is ready after it."""
         if samples.add(pose, self._counts):
             self._counts['vessel_pose_gap'] += len(self._waiting)

@@ -265,6 +265,16 @@ class DiverState(NamedTuple):
     not_started: int = 0
     repairs: int = 0
 
+    def require_like(self, other: DiverState, n: int) -> None:
+        """Raise ValueError where this is no state of the models of `other` with n states each."""
+        shapes = [
+            (state.x.shape[1], *map(np.shape, (state.learnt[:0], state.history[:0])))
+            for state in (self, other)
+        ]
+        seen = self.life.seen.shape[1:] == other.life.seen.shape[1:]
+        if shapes[0] != shapes[1] or (len(self.x) and self.x.shape[2] != n) or not seen:
+            raise ValueError('states are of other models')
+
     @classmethod
     def of_nobody(cls, life: Tracks, models: ModelSet, learnt: FloatArray) -> DiverState:
         """The state without a track; `life` and `learnt` have none, but the next identity."""

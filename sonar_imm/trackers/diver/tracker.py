@@ -110,6 +110,12 @@ class DiverTracker:
         nobody = DiverState.of_nobody(life, self.models, self._chain.fresh(0))
         return nobody._replace(history=np.empty((0, self._window), np.int64))
 
+    def restored(self) -> None:
+        """Raise ValueError for states, put in, that are none of these models."""
+        nobody = self._nobody(Tracks.none(self.rules))
+        for state in self._stream.kept:
+            state.require_like(nobody, self._layout(state.instruments).size)
+
     @property
     def _window(self) -> int:
         return kbest.WINDOW if self._keeps_hypotheses else 0

@@ -72,7 +72,7 @@ class Collected(NamedTuple):
     depth_std: float = 0.0
 
 
-class _BlockDepths:
+class BlockDepths:
     """Mean and standard deviation of the depths that come with blocks, each counted as often as it
     has samples."""
 
@@ -127,7 +127,7 @@ class PressureStream:
         self._shape: tuple[int, float] | None = None
         self._next_ns = 0
         self._alive: NDArray[np.bool_] = np.ones(0, np.bool_)
-        self._depths = _BlockDepths()
+        self._depths = BlockDepths()
 
     def push(self, block: Pressure, reach: float) -> tuple[list[Collected], list[Collected]]:
         """Records and previews that `block` completes, each with the stamp of the block. reach: m
@@ -147,7 +147,7 @@ class PressureStream:
             previews = [self._record(average, block) for average in sliding[-1:]] or previews
         if records:
             self._alive = block.alive.copy()
-            self._depths = _BlockDepths()
+            self._depths = BlockDepths()
         return records, [] if records else previews
 
     @property
@@ -201,7 +201,7 @@ class PressureStream:
         self._blocks = BlockAverage(count, straddling)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
         self._alive = np.ones(block.hydrophones, np.bool_)
-        self._depths = _BlockDepths()
+        self._depths = BlockDepths()
         self._shape = block.hydrophones, rate
 
     def _check_memory(self, phones: int, length: int, rows: int, kept: int) -> None:

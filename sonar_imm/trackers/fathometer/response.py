@@ -82,6 +82,12 @@ class Lattice:
     def depth(self) -> FloatArray:
         return self.first + self.step * np.arange(self.cells, dtype=np.float64)
 
+    def require(self, config: FathometerConfig) -> None:
+        """Raise ValueError where no lattice of `config` would have been made like that."""
+        last = self.first + self.step * (self.cells - 1)
+        if self.step <= 0.0 or _checked(self.first, self.step, last, config).cells != self.cells:
+            raise ValueError('no lattice is like that')
+
     def padded(self, cells: int) -> Lattice:
         """With so many more cells at either end."""
         return Lattice(self.first - cells * self.step, self.step, self.cells + 2 * cells)

@@ -115,7 +115,7 @@ _LEFT, _DEEP, _OF_STRONGEST = 0.5, 6.0, 0.25
 
 
 @frozen(eq=False)
-class _Taken:
+class Taken:
     """A record that was taken in: what was seen and how it was named."""
 
     response: Response
@@ -178,14 +178,20 @@ class FathometerTracker:
         self._filter: SetFilter | None = None
         self._before: Weighted | None = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
-        self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
+        self._taken: deque[Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
         self._fit = Fit()
 
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
-        if self._lattice is not None:
-            self._begin(self._lattice)
+        if self._lattice is None:
+            if self._before is not None:
+                raise ValueError('sets without a lattice')
+            return
+        self._lattice.require(self.config)
+        self._begin(self._lattice)
+        if self._before is not None and self._filter is not None:
+            self._filter.require(self._before, self._smoother.steps)
 
     @property
     def frames(self) -> KnownFrames:
@@ -443,7 +449,7 @@ class FathometerTracker:
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
         self._ids, ids = self._named(reflectors, records)
-        self._taken.append(_Taken(response, self._ids.reflectors))
+        self._taken.append(Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,

@@ -109,6 +109,18 @@ class ObstacleTracker:
         )
         self.counts = self._stream.counts
 
+    def restored(self) -> None:
+        """Raise ValueError for states, put in, that are none of these models."""
+        K, n = self.filter.K, self.filter.n
+        for state in self._stream.kept:
+            for ping in (*state.done, *filter(None, [state.last])):
+                if ping.mixture.x.shape[1:] != (K, n):
+                    raise ValueError('states are of another filter')
+                for landmark in ping.memory:
+                    which = landmark.which
+                    if landmark.x.shape[1:] != (n,) or not ((which >= 0) & (which < K)).all():
+                        raise ValueError('landmarks are of another filter')
+
     @property
     def frames(self) -> KnownFrames:
         return self._stream.frames

@@ -36,10 +36,12 @@ import numpy as np
 
 from sonar_imm.trackers import SYSTEMS
 
-from .files import file_results, FILES
+from .files import file_results, FILES, RECORDED, state_results
 from .runs import BATCH, batches, run, run_extreme, Tally
 
 ROOT = Path(__file__).parents[3]
+AT_ONCE = 1000
+"""Damaged states that one process tries before another one may."""
 MOST_EXAMPLES = 500
 """Batches of one search of hypothesis, which remembers those it has tried."""
 
@@ -122,6 +124,7 @@ def main():
     parser.add_argument('--cases', type=int, default=100_000, help='messages for each system')
     parser.add_argument('--draws', type=int, default=300, help='configurations for each system')
     parser.add_argument('--files', type=int, default=0, help='damaged files of each kind')
+    parser.add_argument('--states', type=int, default=0, help='damaged states of each system')
     parser.add_argument('--systems', nargs='*', default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument('--jobs', type=int, default=2)
     parser.add_argument('--json', type=Path, help='write the numbers here')
@@ -131,6 +134,12 @@ def main():
             system: pool.submit(_all, system, given.cases, given.draws) for system in given.systems
         }
         files = [pool.submit(file_results, name, given.files) for name in FILES if given.files]
+        shares = [
+            (name, min(AT_ONCE, given.states - first), first)
+            for first in range(0, given.states, AT_ONCE)
+            for name in RECORDED
+        ]
+        files += [pool.submit(state_results, *share) for share in shares]
         results = {system: item.result() for system, item in coming.items()}
         damaged = [item.result() for item in files]
     failed = False

@@ -21,7 +21,6 @@ of text are changed for odd ones. A state is also changed under a checksum that 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 from pathlib import Path
@@ -33,8 +32,8 @@ from time import process_time
 import numpy as np
 
 from helpers.field_files import FORMATS, line
+from helpers.hostile.states import forge, forged, parts_of
 from helpers.tracked import tracked
-from sonar_imm.trackers import state_file
 from sonar_imm.trackers.state_file import read_state, StateError, tracker_from, write_state
 from sonar_imm_tools.cli import main
 
@@ -46,6 +45,10 @@ WORDS = [
     b'', b'nan', b'-1', b'0', b'1e308', b'1e999', b'9' * 40, b'99999999999', b'-0.0', b'x', b'"',
     b'<', b'\xff', b',,,', b'\r', b'\0', b'2024-13-45T99:99:99Z', b'90.0001', b'{', b']',
 ]  # fmt: skip
+CUT, GOES_ON = 20, 4
+"""Measurements before a state is saved, and after it is loaded."""
+MOST_WORDS = 1100
+"""Characters of a sentence."""
 RECORDED = ('diver_table1', 'obstacle_tethers', 'bathymetry_ship', 'fathometer_drift')
 
 
@@ -117,26 +120,36 @@ def _called(words):
     return f'{seconds:.0f} s' if seconds > LONGEST else '', code
 
 
-def states_damaged(recording, draws):
-    """Read states of a run, damaged in `draws` ways: how many were read, and what was wrong."""
+def states_damaged(recording, draws, first=0):
+    """Read states of a run, damaged in `draws` ways, and go on from those that are taken: how many
+    were, and what was wrong. What a tracker raises then the node takes for a damaged state."""
     run = tracked(recording)
     system = run.system.name
     taken, failures = 0, []
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / 'state'
-        write_state(path, run.saved(run.until(30)))
+        write_state(path, run.saved(run.until(CUT)))
         good = path.read_bytes()
-        for k in range(draws):
+        header, block = parts_of(path)
+        text = json.dumps(header)
+        for k in range(first, first + draws):
             rng = np.random.default_rng(k)
-            path.write_bytes(_forged(good, rng) if k % 2 else damaged(good, rng))
+            if k % 4:
+                forge(path, *forged(text, block, rng))
+            else:
+                path.write_bytes(damaged(good, rng))
             start = process_time()
             try:
-                tracker_from(read_state(path), run.system, run.config)
+                tracker = tracker_from(read_state(path), run.system, run.config)
                 taken += 1
-                if not k % 2 and path.read_bytes() != good:
+                if not k % 4 and path.read_bytes() != good:
                     failures.append(f'state of {system}, draw {k}: damaged, and taken for good')
-            except StateError:
-                pass
+                with contextlib.suppress(Exception):
+                    for measurement in run.input[CUT : CUT + GOES_ON]:
+                        tracker.process(measurement)
+            except StateError as error:
+                if '\n' in str(error) or len(str(error)) > MOST_WORDS:
+                    failures.append(f'state of {system}, draw {k}: {str(error)[:100]!r}')
             except Exception as error:
                 failures.append(f'state of {system}, draw {k}: {type(error).__name__}: {error}')
             if process_time() - start > LONGEST:
@@ -144,44 +157,25 @@ def states_damaged(recording, draws):
     return taken, failures
 
 
-def _forged(content, rng):
-    """A state that says something else, under a checksum that is right."""
-    with np.load(io.BytesIO(content.partition(b'\n')[2])) as parts:
-        text, block = parts['header'].tobytes(), parts['block']
-    header, place = json.loads(text), None
-    for _ in range(40):  # down into a random place
-        branch = header if place is None else place[0][place[1]]
-        keys = (
-            list(branch)
-            if isinstance(branch, dict)
-            else range(len(branch))
-            if isinstance(branch, list)
-            else ()
-        )
-        if not len(keys) or (place and rng.random() < 0.1):
-            break
-        place = branch, keys[int(rng.integers(len(keys)))]
-    owner, key = place
-    odd = [None, -1, 0, 2**70, 1.5, '', 'os', [], {}, True, [owner[key]], header['values'][:3]]
-    owner[key] = odd[int(rng.integers(len(odd)))]
-    buffer = io.BytesIO()
-    np.savez(buffer, header=np.frombuffer(json.dumps(header).encode(), np.uint8), block=block)
-    body = buffer.getvalue()
-    head = f'sonar_imm state {state_file.FORMAT} {hashlib.sha256(body).hexdigest()}\n'
-    return head.encode() + body
-
-
-FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'} | {
-    f'state of {name.split("_")[0]}': (states_damaged, name) for name in RECORDED
-}
-"""What is damaged: each format that is taken in, and the state of each system."""
+FILES = {each.name: (convert_damaged, each) for each in FORMATS if each.kind != 'none'}
+"""What is damaged: each format that is taken in."""
 
 
 def file_results(name, draws):
     """What happened to `draws` damaged files, as plain values."""
     attempt, what = FILES[name]
     start = process_time()
-    used, failures = attempt(what, draws)
+    return _results(name, draws, start, *attempt(what, draws))
+
+
+def state_results(recording, draws, first):
+    """What happened to `draws` states of a run, from the number `first` on."""
+    start = process_time()
+    name = f'state of {recording.split("_")[0]}'
+    return _results(name, draws, start, *states_damaged(recording, draws, first))
+
+
+def _results(name, draws, start, used, failures):
     return {
         'name': name,
         'draws': draws,

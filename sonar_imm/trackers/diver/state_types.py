@@ -1,0 +1,51 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The classes that a saved state of this tracker may hold, see `state_file`."""
+
+from __future__ import annotations
+
+from ...acoustics.geodesy import Origin
+from ...estimation.association import Tracks
+from ...estimation.consistency import NisMemory
+from ...estimation.hypotheses import Hypotheses
+from ...intake.stream import REPLAY_TYPES
+from ...measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    Navigation,
+    RelativeFix,
+    Start,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
+from ..navigation import NavigationBuffer
+from . import clutter
+from .config import DiverConfig
+from .georeferencing import Georeferencer, Samples
+from .offsets import Offsets, RecentPairs
+from .state import DiverState, FixConsistency, HeightCounts
+from .state_space import Instruments
+
+STATE_TYPES = (
+    *REPLAY_TYPES,
+    *(Arrivals, Fix, Fixes, Start),
+    *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
+    *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
+    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments, Hypotheses),
+    *(Offsets, RecentPairs, clutter.Clutter),
+)

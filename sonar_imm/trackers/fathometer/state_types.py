@@ -1,0 +1,41 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The classes that a saved state of this tracker may hold, see `state_file`."""
+
+from __future__ import annotations
+
+from ...acoustics.geodesy import Origin
+from ...acoustics.pulse import SampledPulse
+from ...acoustics.spectra import BlockAverage, SlidingAverage, SnapshotStream
+from ...estimation.set_filter import LagSmoother, SetStep, Weighted
+from ...estimation.set_model import Sets
+from ...estimation.set_shifts import ShiftPath
+from ...intake.stream import STREAM_TYPES
+from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace
+from .config import FathometerConfig
+from .pressure import BlockDepths, CompanionDepths, CompanionPlaces, Pace, PressureStream
+from .reflectors import Identified, Identities, Multiples, Seen
+from .response import Lattice, Response
+from .slopes import Slope
+from .tracker import Fit, Taken
+
+STATE_TYPES = (
+    *STREAM_TYPES,
+    *(ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace, Origin, FathometerConfig),
+    *(PressureStream, BlockDepths, SnapshotStream, BlockAverage, SlidingAverage),
+    *(CompanionDepths, CompanionPlaces, Pace, Response, SampledPulse, Lattice, Taken, Fit),
+    *(LagSmoother, SetStep, Weighted, Sets, ShiftPath),
+    *(Identities, Identified, Slope, Multiples, Seen),
+)

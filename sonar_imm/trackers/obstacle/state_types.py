@@ -1,0 +1,37 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The classes that a saved state of this tracker may hold, see `state_file`."""
+
+from __future__ import annotations
+
+from ...acoustics import geometry
+from ...estimation.association import Tracks
+from ...estimation.consistency import NisMemory
+from ...intake.stream import REPLAY_TYPES
+from ...measurements import Altitude, Detections, Ground, Navigation
+from ..navigation import NavigationBuffer
+from .bodies import Bodies
+from .filters import Mixture, Sonar
+from .ground import Cells, GroundMap
+from .looks import Looks
+from .memory import Existence, Landmark
+from .state import ObstacleState, PingState
+
+STATE_TYPES = (
+    *REPLAY_TYPES,
+    *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
+    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Looks),
+    *(Existence, Landmark, GroundMap, Cells),
+)
