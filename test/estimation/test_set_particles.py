@@ -25,12 +25,12 @@ import pytest
 
 from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from sonar_imm.estimation.set_filter import (
-    find_members,
     LagSmoother,
     levelled,
     SetFilter,
     Weighted,
 )
+from sonar_imm.estimation.set_members import find_members
 from sonar_imm.estimation.set_model import (
     aged,
     banded_transition,
