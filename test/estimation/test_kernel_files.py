@@ -25,7 +25,9 @@ import sys
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[2] / 'sonar_imm'
+import sonar_imm
+
+PACKAGE = Path(sonar_imm.__file__).parent
 FILES = (
     'acoustics/ray_kernels.py',
     'acoustics/wave_kernels.py',
