@@ -283,7 +283,7 @@ class SetFilter:
         self._require_sets(before)
         for step in steps:
             self._require_sets(step.after)
-            with np.errstate(divide='ignore'):
+            with np.errstate(divide='ignore', invalid='ignore'):
                 self._require_sets(Weighted(step.sets, np.log(step.w), step.path))
             if not ((step.source >= 0) & (step.source < self.particles)).all():
                 raise ValueError('sets come from none')
@@ -291,16 +291,17 @@ class SetFilter:
     def _require_sets(self, weighted: Weighted) -> None:
         model, (sets, log_weight, path, _) = self.model, weighted
         memory = model.order_max if model.amplitude_memory > 0.0 else 0
-        column = np.arange(model.order_max)
-        # The members of impossible sets mean nothing.
-        there = (column < sets.order[:, None]) & (log_weight > -np.inf)[:, None]
+        there = np.arange(model.order_max) < sets.order[:, None]
+        if sets.cell.shape != (self.particles, model.order_max):
+            raise ValueError('sets are as many as no tracker has')
         cell = np.where(there, sets.cell, model.cells - 1)
+        # The members of impossible sets are in no order.
+        rising = (np.diff(cell, axis=1) >= 0) | ~(log_weight > -np.inf)[:, None]
         good = (
-            sets.cell.shape == (self.particles, model.order_max)
-            and sets.prior_mean.shape == (self.particles, memory)
+            sets.prior_mean.shape == (self.particles, memory)
             and ((sets.order >= model.order_min) & (sets.order <= model.order_max)).all()
-            and ((sets.cell >= 0) & (sets.cell < model.cells)).all()
-            and (np.diff(cell, axis=1) >= 0).all()
+            and ((cell >= 0) & (cell < model.cells)).all()
+            and rising.all()
             and ((sets.shift >= 0) & (sets.shift <= 2 * model.pad)).all()
             and np.isfinite(sets.prior_mean).all()
             and np.isfinite(sets.prior_variance).all()
