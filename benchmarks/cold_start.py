@@ -56,12 +56,6 @@ CASES = {
     'diver, a tag': Case('diver', ('Arrivals',), steps=('tags',)),
     'diver, a tag with depth': Case('diver', ('Arrivals',), {'dimensions': 3}, ('tags',)),
     'diver, everything': Case('diver', (), {'dimensions': 3}),
-    'obstacle, defaults': Case('obstacle', ('Detections', 'Navigation')),
-    'obstacle, fixed ones only': Case(
-        'obstacle', ('Detections', 'Navigation'), {'behaviours': ('fixed',)}
-    ),
-    'obstacle, paper': Case('obstacle', ('Detections', 'Navigation'), {'method': 'seafloor'}),
-    'obstacle, everything': Case('obstacle'),
     'bathymetry, defaults': Case('bathymetry', ('Snapshot',)),
     'bathymetry, with navigation': Case(
         'bathymetry', ('Snapshot', 'Navigation'), {'navigation': 'required'}

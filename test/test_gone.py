@@ -16,6 +16,7 @@
 
 from pathlib import Path
 import re
+import shutil
 import sys
 
 import pytest
@@ -106,6 +107,14 @@ def test_parameters_of_the_command(capsys, tmp_path, name):
     file.write_text(f'/**:\n  ros__parameters:\n    {name}: 1\n')
     assert due in answer(capsys, *track, '--params', file)
     assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize('line', ['targets_to: x', 'model_set: cv'])
+def test_a_recording_may_still_have_them(capsys, tmp_path, line):
+    """Its parameters.yaml is that of an earlier version."""
+    bag = shutil.copytree(ROOT / 'bags' / BAGS['diver'], tmp_path / 'bag')
+    (bag / 'parameters.yaml').write_text(f'diver:\n  ros__parameters:\n    {line}\n')
+    assert 'was removed' in answer(capsys, 'track', bag, tmp_path / 'out')
 
 
 @pytest.mark.parametrize('name', of_kind('choice'))

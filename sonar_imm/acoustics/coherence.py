@@ -44,8 +44,8 @@ from scipy.optimize import brentq
 from ..estimation.arrays import BoolArray, FloatArray
 from .array import direction_grid, phase_step
 from .laplace import autocorrelation
-from .likelihood_kernels import beam_peaks
 from .variances import moving_mean
+from .wave_kernels import beam_peaks
 
 GATE_BINS = 5
 FALSE_ALARM = 1e-3

@@ -34,13 +34,6 @@ ping.
 
 **No array is exact.** What of an echo is no plane wave acts as noise that grows with it, so that
 echoes of 30 dB would all seem to be two. Each ping measures that itself: `array_error`.
-
-In the coordinates of `_climb`, the middle c of both phase steps and half their distance d, the sum
-and the difference of both waves are orthogonal, and p is a sum of two squares without singularity:
-
-    p = |sum_q cos(d q) z_q|^2 / sum_q cos^2(d q)  +  the same with sin,   z_q = exp(-i c q) y_q
-
-with q counted from the middle of the array.
 """
 
 from __future__ import annotations
@@ -55,9 +48,8 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from ..estimation.arrays import BoolArray, ComplexArray, FloatArray
-from ..estimation.jit import kernel
-from .likelihood_kernels import horner
 from .loudness import VERY_LOUD
+from .wave_kernels import fit_waves
 
 BIRTH, END = 0.0005, 0.05
 """Probabilities that a second surface begins, and ends, from one bin to the next."""
@@ -76,9 +68,6 @@ TABLES = Path(__file__).with_name('layover_tables.npz')
 _POINTS = 32
 """Fewest directions of the grid from which the search for two begins: four for each stave, and of
 few staves more, whose beams are wide, but have many local maxima."""
-_BESIDE = 0.2
-_CLOSEST = 1e-4
-"""Half the smallest difference of both phase steps, rad; nearer the fit does not change."""
 
 
 class Layover(NamedTuple):
@@ -131,12 +120,14 @@ def residuals(iq: ArrayLike, spacing: float) -> tuple[FloatArray, FloatArray, Fl
     phase = step * np.arange(points) - widest
     half = 0.5 * (staves - 1)
     multiples = 1.0, half, 0.5, 0.5 * staves
-    found = np.zeros((n, 2))
-    _fit_waves(
+    found, (real, imaginary) = np.zeros((n, 2)), np.empty((2, points))
+    fit_waves(
         y,
         phase,
         np.concatenate([[np.cos(k * phase), np.sin(k * phase)] for k in multiples]),
         math.inf if circle else widest,
+        real,
+        imaginary,
         found,
     )
     power = np.square(np.abs(y)).sum(axis=1)
@@ -220,157 +211,16 @@ def log_ratio(level: FloatArray, snr: FloatArray, staves: int, fades: float) -> 
 def existence(evidence: FloatArray) -> FloatArray:
     """Probability (n,) of a second surface in each bin, given the whole ping and what each bin
     says by itself (n,), log ratios; forward-backward over a chain of two states."""
-    out = np.empty(len(evidence))
-    _smooth(np.exp(evidence), BIRTH, END, out)
-    return out
-
-
-@kernel
-def _smooth(ratio: FloatArray, birth: float, end: float, out: FloatArray) -> None:
-    n = ratio.shape[0]
-    p = birth / (birth + end)
-    for t in range(n):
+    ratios = np.exp(evidence).tolist()
+    p, filtered = BIRTH / (BIRTH + END), []
+    for t, ratio in enumerate(ratios):
         if t > 0:
-            p = p * (1.0 - end) + (1.0 - p) * birth
-        p = p * ratio[t] / (p * ratio[t] + 1.0 - p)
-        out[t] = p
-    later = 1.0
-    for t in range(n - 2, -1, -1):
-        r = later * ratio[t + 1]
-        later = (end + (1.0 - end) * r) / (1.0 - birth + birth * r)
-        out[t] = out[t] * later / (out[t] * later + 1.0 - out[t])
-
-
-@kernel
-def _fit_waves(
-    y: ComplexArray, phase: FloatArray, turn: FloatArray, widest: float, found: FloatArray
-) -> None:
-    """Power of the best wave and of the best two, into found (n, 2), for snapshots y (n, P).
-
-    phase (m,): grid of phase steps from stave to stave; turn (8, m): cosine and sine of it, of
-    its multiple that leads to the middle of the array, of its half, and of P times its half; no
-    phase step lies beyond `widest`. The search for two begins beside the best one, where a
-    second one explains most, and once more on either side of the best one.
-    """
-    (n, P), m = y.shape, phase.shape[0]
-    half, beside = 0.5 * (P - 1), 0.5 * (phase[1] - phase[0])
-    real, imaginary = np.empty(m), np.empty(m)
-    for t in range(n):
-        horner(y[t], turn[0], turn[1], real, imaginary)
-        top, place = 0.0, -1
-        for i in range(m):
-            x = real[i] * turn[2, i] - imaginary[i] * turn[3, i]
-            imaginary[i] = imaginary[i] * turn[2, i] + real[i] * turn[3, i]
-            real[i] = x
-            power = x * x + imaginary[i] * imaginary[i]
-            if power > top:
-                top, place = power, i
-        if place < 0:
-            continue
-        single, c, _ = _climb(y[t], phase[place], 0.0, widest)
-        found[t, 0] = single
-        if P == 2:
-            continue
-        # The wave that was found, at the middle of the array: its beam is b.
-        b = complex(0.0, 0.0)
-        for p in range(P):
-            b += complex(math.cos((half - p) * c), math.sin((half - p) * c)) * y[t, p]
-        cosine, sine = math.cos(0.5 * c), math.sin(0.5 * c)
-        far_cosine, far_sine = math.cos(0.5 * P * c), math.sin(0.5 * P * c)
-        top, place = -1.0, 0
-        for i in range(m):
-            between = P * (turn[5, i] * cosine - turn[4, i] * sine)
-            if abs(between) < _BESIDE:
-                continue
-            g = (turn[7, i] * far_cosine - turn[6, i] * far_sine) / between
-            rest = complex(real[i], imaginary[i]) - g * b
-            power = (rest.real * rest.real + rest.imag * rest.imag) / (1.0 - g * g)
-            if power > top:
-                top, place = power, i
-        middle = 0.5 * (phase[place] + c)
-        pair = _climb(y[t], middle, abs(phase[place] - middle), widest)[0]
-        for side in (-beside, beside):
-            pair = max(pair, _climb(y[t], c + side, beside, widest)[0])
-        found[t, 1] = pair
-
-
-@kernel
-def _climb(y: ComplexArray, c: float, d: float, widest: float) -> tuple[float, float, float]:
-    """The next maximum of the power of two waves, from the middle c of their phase steps and half
-    their distance d on; of one wave for d = 0. Newton's method, also where the power is
-    convex, with a shorter step where one loses; no phase step leaves `widest`."""
-    P, pair = y.shape[0], d > 0.0
-    if d > 0.5 * math.pi:
-        c, d = c + math.pi, math.pi - d  # the other middle of two points of a circle
-    half = 0.5 * (P - 1)
-    best, at_c, at_d = -1.0, c, d
-    c_step, d_step, share = 0.0, 0.0, 1.0
-    c_slope, d_slope, cc, cd, dd = 0.0, 0.0, 0.0, 0.0, 0.0
-    for _ in range(30):
-        wave = complex(math.cos(half * c), math.sin(half * c))
-        onward = complex(math.cos(c), -math.sin(c))
-        beat = complex(math.cos(half * d), -math.sin(half * d))
-        faster = complex(math.cos(d), math.sin(d))
-        C0 = C1 = C2 = S0 = S1 = S2 = 0j
-        n0, n1, n2 = 0.0, 0.0, 0.0
-        for p in range(P):
-            q, z = p - half, wave * y[p]
-            even, odd = beat.real, beat.imag
-            C0 += complex(even * z.real, even * z.imag)
-            S0 += complex(odd * z.real, odd * z.imag)
-            even, odd = q * even, q * odd
-            C1 += complex(even * z.real, even * z.imag)
-            S1 += complex(odd * z.real, odd * z.imag)
-            even, odd = q * even, q * odd
-            C2 += complex(even * z.real, even * z.imag)
-            S2 += complex(odd * z.real, odd * z.imag)
-            n0 += beat.imag * beat.imag
-            n1 += 2.0 * q * beat.imag * beat.real
-            n2 += 2.0 * q * q * (1.0 - 2.0 * beat.imag * beat.imag)
-            wave *= onward
-            beat *= faster
-        rest = P - n0
-        A = (C0 * C0.conjugate()).real / rest
-        B = (S0 * S0.conjugate()).real / n0 if pair else 0.0
-        gain = A + B - best
-        if gain > 0.0:
-            best, at_c, at_d = A + B, c, d
-            if gain < 1e-8 * best:
-                break
-            c_slope = 2.0 * (C0.conjugate() * C1).imag / rest
-            cc = 2.0 * (C1 * C1.conjugate() - C0.conjugate() * C2).real / rest
-            if pair:
-                A_d = (A * n1 - 2.0 * (C0.conjugate() * S1).real) / rest
-                B_c = 2.0 * (S0.conjugate() * S1).imag / n0
-                B_d = (2.0 * (S0.conjugate() * C1).real - B * n1) / n0
-                cd = (c_slope * n1 - 2.0 * (S1.conjugate() * C1 + C0.conjugate() * S2).imag) / rest
-                cd += (2.0 * (C1.conjugate() * S1 + S0.conjugate() * C2).imag - B_c * n1) / n0
-                dd = 2.0 * (S1 * S1.conjugate() - C0.conjugate() * C2).real
-                dd = (dd + 2.0 * A_d * n1 + A * n2) / rest
-                cc += 2.0 * (S1 * S1.conjugate() - S0.conjugate() * S2).real / n0
-                bend = 2.0 * (C1 * C1.conjugate() - S0.conjugate() * S2).real
-                dd += (bend - 2.0 * B_d * n1 - B * n2) / n0
-                c_slope, d_slope = c_slope + B_c, A_d + B_d
-            else:
-                dd = 0.5 * cc
-            # Newton's step with the size of the curvatures (eigenvalues), whatever their sign.
-            mean, apart = 0.5 * (cc + dd), math.sqrt(0.25 * (cc - dd) * (cc - dd) + cd * cd)
-            high, low = abs(mean + apart), abs(mean - apart)
-            tilt = 0.5 * (1.0 / high - 1.0 / low) / apart
-            level = 1.0 / high - tilt * (mean + apart)
-            c_step = level * c_slope + tilt * (cc * c_slope + cd * d_slope)
-            d_step = level * d_slope + tilt * (cd * c_slope + dd * d_slope)
-            share = min(1.0, 2.0 / (P * math.sqrt(c_step * c_step + d_step * d_step)))
-        elif gain > -1e-12 * best:
-            break
-        else:
-            share *= 0.25
-        c = at_c + share * c_step
-        if pair:
-            d = abs(at_d + share * d_step)
-            if d > 0.5 * math.pi:
-                c, d = c + math.pi, math.pi - d
-            d = max(d, _CLOSEST)
-        if not abs(c) + d <= widest:
-            break
-    return best, at_c, at_d
+            p = p * (1.0 - END) + (1.0 - p) * BIRTH
+        p = p * ratio / (p * ratio + 1.0 - p)
+        filtered.append(p)
+    later, out = 1.0, filtered[-1:]
+    for p, ratio in zip(filtered[-2::-1], ratios[:0:-1]):
+        r = later * ratio
+        later = (END + (1.0 - END) * r) / (1.0 - BIRTH + BIRTH * r)
+        out.append(p * later / (p * later + 1.0 - p))
+    return np.array(out[::-1])

@@ -160,34 +160,3 @@ def direction_sines(
     for i in range(depth.shape[0]):
         ratio = depth[i] / slant_range
         out[i] = ratio * cos_tilt - math.sqrt(1.0 - ratio * ratio) * sin_tilt
-
-
-@kernel
-def beam_peaks(
-    form: ComplexArray,
-    cosine: FloatArray,
-    sine: FloatArray,
-    beam: FloatArray,
-    scratch: FloatArray,
-    height: FloatArray,
-    place: FloatArray,
-) -> None:
-    """Largest value of Re sum_k form_k z^k over a grid of z = cosine - i sine (m,), for every bin
-    of form (n, P), and its place on the grid, between points by a parabola through the highest
-    and its neighbours; into height (n,) and place (n,). beam and scratch (m,)."""
-    last = cosine.shape[0] - 1
-    for t in range(form.shape[0]):
-        horner(form[t], cosine, sine, beam, scratch)
-        best = 1
-        for i in range(2, last):
-            best = i if beam[i] > beam[best] else best
-        if beam[0] > beam[best]:
-            best = 1
-        elif beam[last] > beam[best]:
-            best = last - 1
-        below, top, above = beam[best - 1], beam[best], beam[best + 1]
-        bend = below - 2.0 * top + above
-        shift = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
-        shift = min(max(shift, -1.0), 1.0)
-        height[t] = top + shift * (0.5 * (above - below) + 0.5 * shift * bend)
-        place[t] = best + shift

@@ -36,11 +36,6 @@ _PER_LN2 = 1.0 / math.log(2.0)
 _LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LEAST = -700.0
 _E = tuple(1.0 / math.factorial(k) for k in range(13))
-_ROOT2 = math.sqrt(2.0)
-_MANTISSA = (1 << 52) - 1
-_ONE = 1023 << 52
-# A double with these bits and a small whole number in its lowest ones is 2^52 plus that number.
-_WHOLE = 1075 << 52
 
 
 def _even_polynomial(function: str) -> tuple[float, ...]:
@@ -51,16 +46,6 @@ def _even_polynomial(function: str) -> tuple[float, ...]:
     )
 
 
-# Chebyshev interpolation, at 23 points, of what `gaussians` says; the first two units higher, so
-# that it is 1 / 2 at 0.
-_T = (
-    0.46151582985003786, -0.09155228183401122, 0.031030368425963, 0.010002352385420084,
-    -0.02640104296627982, 0.02453696323875023, -0.015170415402960762, 0.006522000726622294,
-    -0.0016760723409777719, 7.791206884373869e-06, 0.0001823341283884788, -5.360599672837992e-05,
-    -9.896049006398792e-06, 9.055694907386791e-06, -7.04376663890156e-08, -1.3003901927413688e-06,
-    1.2798783282871204e-07, 1.8841037002080884e-07, -2.636797167357404e-08,
-    -2.5444050458032668e-08, 3.661836535863277e-09, 2.2027448318350712e-09, -2.884794724105449e-10,
-)  # fmt: skip
 _S = _even_polynomial('sin')
 _C = _even_polynomial('cos')
 
@@ -89,33 +74,6 @@ def exponentials(values: FloatArray, scratch: FloatArray, out: FloatArray) -> No
 
 
 @kernel
-def gaussians(
-    values: FloatArray, scratch: FloatArray, density: FloatArray, below: FloatArray
-) -> None:
-    """exp(-v^2 / 2) of values (n,) into density (n,), and the probability of a standard normal
-    number below v into below (n,).
-
-    The probability of more than a = abs(v) is exp(-a^2 / 2) / (1 + a) times a smooth function of
-    (a - 5) / (a + 5), a polynomial to 4e-16 (Shepherd and Laframboise, *Chebyshev approximation of
-    (1 + 2x) exp(x^2) erfc x in 0 <= x < infinity*, Math. Comp. 36, 1981).
-    """
-    for i in range(values.shape[0]):
-        below[i] = -0.5 * (values[i] * values[i])
-    exponentials(below, scratch, density)
-    for i in range(values.shape[0]):
-        a = abs(values[i])
-        a = 40.0 if a > 40.0 else a
-        t = (a - 5.0) / (a + 5.0)
-        p = _T[20] + t * (_T[21] + t * _T[22])
-        p = _T[15] + t * (_T[16] + t * (_T[17] + t * (_T[18] + t * (_T[19] + t * p))))
-        p = _T[10] + t * (_T[11] + t * (_T[12] + t * (_T[13] + t * (_T[14] + t * p))))
-        p = _T[5] + t * (_T[6] + t * (_T[7] + t * (_T[8] + t * (_T[9] + t * p))))
-        p = _T[0] + t * (_T[1] + t * (_T[2] + t * (_T[3] + t * (_T[4] + t * p))))
-        tail = density[i] * p / (1.0 + a)
-        below[i] = tail if values[i] < 0.0 else 1.0 - tail
-
-
-@kernel
 def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatArray) -> None:
     """cos and sin of 2 pi factor values (n,); NaN stays NaN.
 
@@ -134,33 +92,3 @@ def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatAr
         c = _C[0] + t * (_C[1] + t * (_C[2] + t * (_C[3] + t * c)))
         cosine[i] = c * c - s * s
         sine[i] = 2.0 * s * c
-
-
-@kernel
-def normals(uniform: FloatArray, out: FloatArray) -> None:
-    """Standard normal numbers (n,) from uniform ones in [0, 1) (n,), n even; uniform is used up.
-
-    Box and Muller: sqrt(-2 ln v) times the cosine and the sine of a random angle. v = 2^e m, and
-    ln m is the series of the inverse hyperbolic tangent of (m - 1) / (m + 1).
-    """
-    half = uniform.shape[0] // 2
-    first, cosine, sine = uniform[:half], out[:half], out[half:]
-    bits, exponent = first.view(np.int64), cosine.view(np.int64)
-    for i in range(half):
-        first[i] = 1.0 - first[i]
-    for i in range(half):
-        exponent[i] = (bits[i] >> 52) | _WHOLE
-        bits[i] = (bits[i] & _MANTISSA) | _ONE
-    for i in range(half):
-        m, e = first[i], cosine[i] - (2.0**52 + 1023.0)
-        e = e + 1.0 if m > _ROOT2 else e
-        m = 0.5 * m if m > _ROOT2 else m
-        f = (m - 1.0) / (m + 1.0)
-        t = f * f
-        p = 1.0 / 11.0 + t * (1.0 / 13.0 + t * (1.0 / 15.0 + t * (1.0 / 17.0 + t / 19.0)))
-        p = 1.0 / 3.0 + t * (1.0 / 5.0 + t * (1.0 / 7.0 + t * (1.0 / 9.0 + t * p)))
-        first[i] = math.sqrt(max(-2.0 * (e * math.log(2.0) + 2.0 * f * (1.0 + t * p)), 0.0))
-    phasors(uniform[half:], 1.0, cosine, sine)
-    for i in range(half):
-        cosine[i] *= first[i]
-        sine[i] *= first[i]

@@ -300,11 +300,11 @@ class _Short(_Base):
 
 
 _NEEDLESS = (
-    'WithLifting InlineClosureLikes DeadBranchPrune MakeFunctionToJitFunction InlineInlinables '
+    'WithLifting InlineClosureLikes MakeFunctionToJitFunction InlineInlinables '
     'FindLiterallyCalls LiteralUnroll LiteralPropagationSubPipelinePass InlineOverloads '
     'AnnotateTypes'
 ).split()
-"""Passes over a kernel for closures, `with`, None, literals, which none has, and for listings."""
+"""Passes over a kernel for closures, `with`, literals, which none has, and for listings."""
 
 
 def fewer_passes() -> dict[str, Any]:

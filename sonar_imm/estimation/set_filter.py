@@ -19,7 +19,7 @@ importance sampler for sets of every size at once. A cycle takes in one record::
 
     record = filter.record(b, key)                 # tables of this record
     before = before or filter.start(record)        # sets before the first record
-    sets = filter.propagate(before, record)        # shift, deaths, walks, births
+    sets = filter.propagate(before, record)        # deaths, shift, walks, births
     step = filter.weigh(sets, record)              # each set meets the record
     step = filter.resample(step, record)           # where few of the sets count
     step = filter.move(step, record)               # copies of a set differ again
@@ -52,15 +52,6 @@ Random numbers are counter based: those of a record come from a Philox generator
 seed and the record's own name (its stamp), and each particle has its row of them, ``(1 + c + J)``
 for the order, the c members that can come and go at once, and the J that can walk. The result is
 therefore the same whatever was processed before, and on one thread or several.
-
-From weighted sets to a list of members (`find_members`): the **intensity** of the particles, how
-many members are expected on each cell, has a hill for each member. No set has two members closer
-than the separation, so the intensity summed over a window narrower than that is a probability:
-that there is a member in it. Members are taken one after the other, the window that holds most
-first; what lies within the separation of one is its own. Where the sets are of two minds about a
-member, its hill has two humps, and the mean lies where nothing is. With `modes` the moments are
-then those of the greater hump alone, a mode with its own spread; the existence is that of the
-member, in whichever hump.
 """
 
 from __future__ import annotations
@@ -77,40 +68,78 @@ import numpy as np
 from . import set_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise, systematic
-from .set_model import repeated_walk, SetModel, Sets, turnover, Walks
-from .set_proposals import begin, gains, levelled, Peaks, propose_births
+from .set_model import (
+    aged,
+    inherited,
+    leave,
+    Left,
+    remembered,
+    repeated_walk,
+    SetModel,
+    Sets,
+    turnover,
+    Walks,
+)
+from .set_proposals import (
+    begin,
+    Births,
+    fill_walks,
+    first_members,
+    gains,
+    levelled,
+    Peaks,
+    propose_births,
+    walked_from,
+    WalkTables,
+)
 from .set_scatter import fit_scatter, NO_SCATTER, ScatterFit
-from .set_shifts import Shift, shift_tables, ShiftPath, ShiftTables
+from .set_shifts import Shift, ShiftPath, ShiftTables
 
 _STEP, _START, _RESAMPLE, _MOVE = range(4)
-_VALLEY, _ASIDE = 0.05, 0.1
 _PASSAGES = 16
+_SUMS, _SHIFTED_SUMS = 5, 8
+"""Rows of what `moments` adds up, without a shift and with one."""
 
 
 class Passage(NamedTuple):
-    """How sets change while the time of so many `records` passes: walks; motion; shift, None
-    without one, and its tables."""
+    """How sets change while the time of so many `records` passes: walks; most_changes, how many
+    members can come and go at once; cumulative (orders, columns), the running sums of the rows of
+    the transition matrix, or of `set_model.turnover`; shift, None without one, and its tables."""
 
     records: int
     walks: Walks
-    motion: kernels.SetMotion
+    most_changes: int
+    cumulative: FloatArray
     shift: Shift | None
-    shifts: ShiftTables
+    shifts: ShiftTables | None
+
+
+class AmplitudeModel(NamedTuple):
+    """How members answer: gram (n,) by lag; ridge, added to its diagonal; penalty in log
+    likelihood for each member; marginal: amplitudes are integrated out; remembers: those of one
+    record say something of those of the next."""
+
+    gram: FloatArray
+    ridge: float
+    penalty: float
+    marginal: bool
+    remembers: bool
 
 
 class Record(NamedTuple):
     """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
     key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign that
     walks look at, see `gains`; amplitudes: how members answer in it; background: of its scatter;
-    proposals: its tables, walks not filled in; passage: since the record before; found: gains
-    (S, n) by sign before they were levelled, and what stands out."""
+    births; walks: as far as nothing of the record is known; passage: since the record before;
+    found: gains (S, n) by sign before they were levelled, and what stands out."""
 
     b: FloatArray
     key: tuple[int, int]
     gains: FloatArray
-    amplitudes: kernels.AmplitudeModel
+    amplitudes: AmplitudeModel
     background: ScatterFit
-    proposals: kernels.Proposals
+    births: Births
+    walks: Walks
     passage: Passage
     found: tuple[FloatArray, Peaks]
 
@@ -165,17 +194,15 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        self._tables: tuple[FloatArray, FloatArray] = (np.empty((0, 0)), np.empty((0, 0)))
-        self._log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
+        self._tables = WalkTables.empty(0, 0)
         self._passages: dict[int, Passage] = {}
         self._passage(1)
-        self._amplitudes = kernels.AmplitudeModel(
+        self._amplitudes = AmplitudeModel(
             gram=model.gram,
             ridge=float(model.ridge),
             penalty=float(model.penalty),
             marginal=model.amplitude_prior == 'marginal',
-            memory=float(model.amplitude_memory),
-            variance=float(model.amplitude_std**2),
+            remembers=model.amplitude_memory > 0.0,
         )
         self._charge = np.array(
             [
@@ -196,15 +223,9 @@ class SetFilter:
             walk = repeated_walk(walk, records)
             chances, changes = turnover(chances, model.order_min, records), 2 * model.order_max
             shift = shift and evolve(shift, memory=shift.memory**records)
-        motion = kernels.SetMotion(
-            order_min=model.order_min,
-            separation=model.separation,
-            most_changes=changes,
-            cumulative=np.cumsum(chances, axis=1),
-        )
-        tables = shift_tables(shift, self._log_sum, model.walk_share)
         walks = Walks.alike(walk, model.record_cells, wide=records > 1)
-        found = Passage(records, walks, motion, shift, tables)
+        tables = ShiftTables.of(shift) if shift else None
+        found = Passage(records, walks, changes, np.cumsum(chances, axis=1), shift, tables)
         if len(self._passages) > _PASSAGES:
             self._passages = {1: self._passages[1]}
         self._passages[records] = found
@@ -227,31 +248,30 @@ class SetFilter:
         background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
         g, peaks = gains(model, b, background, amplitudes.gram)
         walked = levelled(model, g) if walks.wide else g
-        shape = model.record_cells * len(model.signs), walks.probability.shape[1]
-        if self._tables[0].shape != shape:
-            self._tables = np.empty(shape), np.empty(shape)
         births = propose_births(
             model, walked if records > 1 else g, model.birth_share, model.birth_cap
         )
-        driven = np.exp(walked) if walks.wide else np.empty((len(walked), 0))
-        proposals = kernels.Proposals(*self._tables, *births, passage.shifts, walks, driven)
-        return Record(b, key, walked, amplitudes, background, proposals, passage, (g, peaks))
+        found = g, peaks
+        return Record(b, key, walked, amplitudes, background, births, walks, passage, found)
 
     def start(self, record: Record) -> Weighted:
         """Sets before the first record, drawn where it will want them."""
-        model, sets = self.model, Sets.empty(self.model, self.particles)
+        model, shift = self.model, np.full(self.particles, self.model.pad, np.int64)
         beginning, births = begin(model, *record.found)
-        proposals = record.proposals._replace(
-            birth=births[0], birth_ratio=births[1], birth_positive=births[2]
-        )
         needed = 1 + model.order_max + (model.shift is not None) + len(beginning.sure)
         uniform = _generator(record.key, _START).random((self.particles, needed))
-        log_ratio, motion = np.zeros(self.particles), self._passage(1).motion
-        self._split(
-            lambda first, last: kernels.start(
-                first, last, motion, self._charge, proposals, beginning, uniform, sets, log_ratio
-            )
-        )
+        if model.shift:
+            start = ShiftTables.of(model.shift).start
+            shift = np.searchsorted(start, uniform[:, 1 + model.order_max], 'right')
+            shift = model.shift.step * np.minimum(shift, len(start) - 1)
+        found, order, log_ratio = first_members(model, beginning, births, uniform, shift)
+        sets = Sets.empty(model, self.particles)._replace(order=order, shift=shift)
+        elsewhere = births._replace(running=beginning.elsewhere)
+        # Those that were found stay where they are.
+        one, centre = np.ones((births.ratio.size, 1)), np.zeros(model.record_cells, np.int64)
+        walks = centre, WalkTables(one, one, one[:, 0])
+        self._draw(Left.all_of(found), walks, elsewhere, (1, uniform), sets, log_ratio)
+        log_ratio -= self._charge[order - model.order_min]
         # An impossible set has members that mean nothing; it must not walk.
         sets.cell[~np.isfinite(log_ratio)] = 0
         # The sets are draws from the prior in disguise: as many particles as if they were.
@@ -293,13 +313,12 @@ class SetFilter:
             raise ValueError('sets are none of this model')
 
     def propagate(self, before: Weighted, record: Record) -> Weighted:
-        """Sets as they may have become by the time of the record: shift, deaths, walks, births."""
-        path, shift = None, record.passage.shift
-        more = record.passage.motion.most_changes - self.model.most_changes
-        uniform = _generator(record.key, _STEP).random(
-            (self.particles, self.model.uniforms + more)
-        )
-        sets, log_ratio = self._drawn(self._aged(before.sets, record), record, uniform)
+        """Sets as they may have become by the time of the record: deaths, shift, walks, births."""
+        passage, shift, path = record.passage, record.passage.shift, None
+        needed = self.model.uniforms + passage.most_changes - self.model.most_changes
+        uniform = _generator(record.key, _STEP).random((self.particles, needed))
+        old = aged(self.model, before.sets, passage.records - 1)
+        sets, log_ratio = self._drawn(old, record, uniform)
         if shift is not None:
             path = ShiftPath.begin(shift, sets.shift)
             if before.path is not None:
@@ -311,12 +330,15 @@ class SetFilter:
         """Each set meets the record."""
         sets, log_weight = propagated.sets, propagated.log_weight.copy()
         amplitude = np.zeros(sets.cell.shape)
-        answer, background = record.amplitudes, record.background
-        self._split(
-            lambda first, last: kernels.weigh(
-                first, last, record.b, answer, background, sets, log_weight, amplitude
-            )
-        )
+
+        def work(first: int, last: int) -> None:
+            J, slots = self.model.order_max, kernels.SLOTS
+            owner, kept = np.full(slots, -1, np.int64), np.empty(slots)
+            scratch = np.empty((J, J)), np.empty((3, J)), owner, kept
+            seen = record.b, *record.amplitudes, *record.background
+            kernels.weigh(first, last, *seen, *sets, *scratch, log_weight, amplitude)
+
+        self._split(work)
         w, log_sum = normalise(log_weight)
         ok = bool(np.isfinite(log_sum))
         return SetStep(
@@ -341,10 +363,8 @@ class SetFilter:
             path = step.path.take(source) if step.path else None
             after = Weighted(step.sets.take(source), np.zeros(self.particles), path)
         if self.model.amplitude_memory > 0.0:
-            sets = after.sets if resampled else after.sets.take(source)
-            amplitude, answer = step.amplitude[source], record.amplitudes
-            self._split(lambda first, last: kernels.remember(first, last, answer, amplitude, sets))
-            after = after._replace(sets=sets)
+            gram, amplitude = record.amplitudes.gram, step.amplitude[source]
+            after = after._replace(sets=remembered(self.model, gram, after.sets, amplitude))
         return evolve(step, after=after, source=source, resampled=resampled)
 
     def move(self, step: SetStep, record: Record) -> SetStep:
@@ -360,13 +380,15 @@ class SetFilter:
         low = np.where(sets.order > 0, lowest - last, -last - 1)
         high = np.where(sets.order > 0, sets.cell[:, 0], last + 1)
         d, path = path.draw(shift, sets.shift, (low, high), u)
-        moved = sets._replace(cell=sets.cell - d[:, None], shift=sets.shift + d)
+        # No member is moved below 0; what is no member must stay an index.
+        cell = np.maximum(sets.cell - d[:, None], 0)
+        moved = sets._replace(cell=cell, shift=sets.shift + d)
         return evolve(step, after=step.after._replace(sets=moved, path=path))
 
     def summarise(self, step: SetStep) -> Summary:
         """What the sets say together."""
         pmf = np.zeros(len(self.model.transition))
-        rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
+        rows = _SHIFTED_SUMS if self.model.shift else _SUMS
         sums = np.zeros((rows, self.model.record_cells))
         # Of the shift, what is still to be drawn: its mean (N,) and variance, cells.
         offset, variance, shift = np.empty(0), 0.0, None
@@ -376,40 +398,82 @@ class SetFilter:
             mean = float(step.w @ place)
             spread = math.sqrt(float(step.w @ np.square(place - mean)) + variance)
             shift = mean - self.model.pad, spread
-        prior, least = self._amplitudes.variance, self.model.order_min
+        order, cell, _, prior_variance, _, shifted = step.sets
         kernels.moments(
-            step.w, step.sets, step.amplitude, offset, variance, prior, least, pmf, sums
+            step.w,
+            self.model.order_min,
+            order,
+            cell,
+            prior_variance,
+            shifted,
+            step.amplitude,
+            float(self.model.amplitude_std**2),
+            offset,
+            float(variance),
+            pmf,
+            sums,
         )
         # Weights add up to one but for rounding: no probability may pass it for that.
         return Summary(np.minimum(pmf, 1.0), sums, shift)
 
-    def _aged(self, sets: Sets, record: Record) -> Sets:
-        """Sets whose amplitudes, expected for the next record, are those for this one."""
-        more = record.passage.records - 1
-        if more < 1 or not self.model.amplitude_memory:
-            return sets
-        phi = self.model.amplitude_memory**more
-        fresh = (1.0 - phi**2) * self.model.amplitude_std**2
-        return sets._replace(
-            prior_mean=phi * sets.prior_mean, prior_variance=phi**2 * sets.prior_variance + fresh
-        )
-
     def _drawn(self, old: Sets, record: Record, uniform: FloatArray) -> tuple[Sets, FloatArray]:
         """Sets drawn from the proposals by uniform (N, uniforms), and log of model to proposal."""
-        model, new = self.model, Sets.empty(self.model, self.particles)
-        log_ratio, proposals = np.empty(self.particles), record.proposals
-        motion, amplitudes = record.passage.motion, self._amplitudes
-        if model.shift:
-            kernels.fill_all_walks(old, record.gains, model.walk_share, proposals)
-        else:
-            filled = np.zeros(len(proposals.walk), np.bool_)
-            kernels.fill_walks(old, record.gains, model.walk_share, filled, proposals)
-        self._split(
-            lambda first, last: kernels.propagate(
-                first, last, motion, amplitudes, proposals, uniform, old, new, log_ratio
-            )
-        )
+        model, passage, walks = self.model, record.passage, record.walks
+        new, log_ratio = Sets.empty(model, self.particles), np.zeros(self.particles)
+        left, new.order[:] = leave(model.order_min, passage.cumulative, old, uniform)
+        shape = len(model.signs) * model.record_cells, walks.probability.shape[1]
+        if self._tables.running.shape != shape:
+            self._tables = WalkTables.empty(*shape)
+        wanted, shifted = walked_from(model, old), model.shift is not None
+        fill_walks(walks, record.gains, model.walk_share, wanted, self._tables, all_sums=shifted)
+        if shifted:
+            new.shift[:] = self._draw_shifts(left, old.shift, record, uniform, log_ratio)
+        drawn = 1 + passage.most_changes, uniform
+        tables = walks.centre[walks.kind], self._tables
+        self._draw(left, tables, record.births, drawn, new, log_ratio)
+        if model.amplitude_memory:
+            new = inherited(model, old, left.parent, new)
         return new, log_ratio
+
+    def _draw_shifts(
+        self, left: Left, old: IntArray, record: Record, drawn: FloatArray, log_ratio: FloatArray
+    ) -> IntArray:
+        """The shifts (N,) plus pad of those that are left, in a record whose walks are known; old
+        (N,): of the record before. log_ratio (N,) is written."""
+        from . import set_shift_kernels as shift_kernels  # compiled where it is needed only
+
+        shift, tables = record.passage.shift, record.passage.shifts
+        assert shift and tables
+        log_sum = self._tables.log_sum.reshape(len(self.model.signs), -1)
+        known = shift.step, *tables[1:], log_sum, self.model.walk_share, drawn
+        found, slots, G = np.empty_like(old), shift_kernels.SLOTS, shift.count
+
+        def work(first: int, last: int) -> None:
+            key = np.full((slots, left.cell.shape[1] + 2), -1, np.int64)
+            span = np.empty((slots, 2), np.int64)
+            scratch = key, np.empty((slots, G)), np.empty((slots, G)), span
+            shift_kernels.draw_shifts(first, last, *known, *left, old, *scratch, found, log_ratio)
+
+        self._split(work)
+        return found
+
+    def _draw(
+        self,
+        left: Left,
+        walks: tuple[IntArray, WalkTables],
+        births: Births,
+        drawn: tuple[int, FloatArray],
+        sets: Sets,
+        log_ratio: FloatArray,
+    ) -> None:
+        """Let those that are left walk, and others be born, into `sets`, whose order and shift are
+        known. walks: see `set_kernels.propagate`, as what else there is."""
+        model, (centre, tables) = self.model, walks
+        known = model.cells, model.separation, *drawn, *left, centre, *tables[:2], *births
+        sets_of = sets.shift, sets.order, sets.cell, sets.sign
+        self._split(
+            lambda first, last: kernels.propagate(first, last, *known, *sets_of, log_ratio)
+        )
 
     def _split(self, work: Callable[[int, int], None]) -> None:
         """Run work(first, last) over all particles, a share for each thread."""
@@ -460,99 +524,6 @@ class LagSmoother:
         return evolve(
             first, sets=first.sets.take(line), w=step.w, amplitude=first.amplitude[line], path=path
         )
-
-
-class Members(NamedTuple):
-    """K members by place: place (K,) in cells, mean over the hill or its greatest hump; amplitude
-    (K,) mean in units of the noise; covariance (K, 2, 2) of both, the spread of the particles;
-    prior_variance (K,) of the amplitude before the record, given the place; foremost (K,), the
-    probability that it is the first of its set; existence (K,), the probability that it is there,
-    at most 1."""
-
-    place: FloatArray
-    amplitude: FloatArray
-    covariance: FloatArray
-    prior_variance: FloatArray
-    foremost: FloatArray
-    existence: FloatArray
-
-
-def find_members(
-    sums: FloatArray, separation: int, most: int, least_existence: float, *, modes: bool = False
-) -> Members:
-    """At most `most` members whose existence is at least `least_existence`.
-
-    sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
-    share of first members on each cell, and with a shift three more (see `SetFilter.summarise`).
-    """
-    n, half = sums.shape[1], max(0, (separation - 1) // 2)
-    left = sums.copy()
-    found = []
-    for _ in range(most):
-        mass = _windowed(left[0], half)
-        peak = int(np.argmax(mass))
-        low, high = max(0, peak - separation + 1), min(n, peak + separation)
-        weight = left[0, low:high]
-        existence = float(weight.sum())
-        if not existence > 0.0 or existence < least_existence:
-            break
-        hill = left[:, low:high]
-        foremost = min(1.0, float(hill[4].sum()))
-        first, last = 0, len(weight)
-        if modes:
-            first, last = _greatest_hump(weight, max(1, separation // 4))
-        hump = _moments(hill[:, first:last], low + first)
-        found.append((*hump, foremost, min(1.0, existence)))
-        left[:, low:high] = 0.0
-    found.sort(key=lambda member: member[0])
-    if not found:
-        nothing = np.empty(0)
-        return Members(nothing, nothing, np.empty((0, 2, 2)), nothing, nothing, nothing)
-    return Members(*(np.array(column) for column in zip(*found)))
-
-
-def _greatest_hump(weight: FloatArray, width: int) -> tuple[int, int]:
-    """First cell and the one after the last of the greatest hump of a hill (n,), seen through a
-    window of `width` cells: from its top as far as it stays above `_VALLEY` of that; the whole
-    hill when less than `_ASIDE` of it lies elsewhere."""
-    seen = np.convolve(weight, np.ones(width), 'same')
-    top = int(np.argmax(seen))
-    low = np.flatnonzero(seen <= _VALLEY * seen[top])
-    first = int(low[low < top].max(initial=-1)) + 1
-    last = int(low[low > top].min(initial=len(weight)))
-    inside = float(weight[first:last].sum())
-    if inside >= (1.0 - _ASIDE) * float(weight.sum()):
-        return 0, len(weight)
-    return first, last
-
-
-def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float]:
-    cells = first + np.arange(sums.shape[1])
-    total = sums[0].sum()
-    place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
-    prior = float(sums[3].sum()) / total
-    if len(sums) > 5:
-        place, second = float(sums[5].sum()) / total, float(sums[6].sum()) / total
-        cross = float(sums[7].sum()) / total - place * amplitude
-        spread_of = max(0.0, second - place**2), cross
-        left = float(sums[2].sum()) / total - amplitude**2
-        left = max(left, cross**2 / spread_of[0] if spread_of[0] else 0.0)
-        return place, amplitude, np.array([spread_of, (cross, left)]), prior
-    spread = cells - place
-    cross = float(sums[1] @ spread) / total
-    covariance = np.array(
-        [
-            [float(sums[0] @ np.square(spread)) / total, cross],
-            [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
-        ]
-    )
-    return place, amplitude, covariance, prior
-
-
-def _windowed(intensity: FloatArray, half: int) -> FloatArray:
-    """Sums (n,) over cells no further than `half`."""
-    running = np.append(0.0, np.cumsum(np.pad(intensity, half)))
-    return np.asarray(running[2 * half + 1 :] - running[: -2 * half - 1])
 
 
 def _generator(key: tuple[int, int], purpose: int) -> np.random.Generator:

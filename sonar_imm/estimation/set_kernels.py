@@ -12,389 +12,137 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The verbs of `set_filter` compiled, into arrays of the caller.
+"""The verbs of `set_filter` that visit each particle, compiled, into arrays of the caller.
 
-Every kernel works on the particles ``first .. last - 1`` and touches no other, so that several
-threads may share the work. `moments` alone adds up over particles; it is run by one thread.
+A kernel works on the particles ``first .. last - 1`` and touches no other, so that several threads
+may share the work. `moments` alone adds up over particles; it is run by one thread. Sets are
+handed over column by column, named as in `set_model.Sets`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import FloatArray, IntArray
 from .jit import kernel
-from .set_model import Sets, Walks
-from .set_proposals import Beginning
-from .set_scatter import against, ScatterFit
-from .set_shifts import draw_shift, empty_memory, ShiftTables
 
-SUMS, SHIFTED_SUMS = 5, 8
-"""Rows of what `moments` adds up, without a shift and with one."""
 SLOTS = 8192
 """Of `weigh`, for what was found for a set and may be needed again."""
-
-
-class SetMotion(NamedTuple):
-    """How sets change from record to record: order_min; separation in cells; most_changes, how
-    many members can come and go at once; cumulative (orders, columns), the running sums of the
-    rows of the transition matrix, or of `set_model.turnover`."""
-
-    order_min: int
-    separation: int
-    most_changes: int
-    cumulative: FloatArray
-
-
-class Proposals(NamedTuple):
-    """Tables of one record, for S signs: walk (S n, 2 r + 1) cumulative, walk_ratio (S n, 2 r + 1)
-    of model to proposal, for cells from which a member walks (others are not filled in),
-    negative members in the second n rows; birth (n + 1,) running sum of the birth weights of both
-    signs, birth_ratio (S, n) log of model to weight, birth_positive (n,) the weight of positive
-    births; shifts; walks, from which the first two are made, with driven (S, n), exp of the gains,
-    where those are small enough, else (S, 0)."""
-
-    walk: FloatArray
-    walk_ratio: FloatArray
-    birth: FloatArray
-    birth_ratio: FloatArray
-    birth_positive: FloatArray
-    shifts: ShiftTables
-    walks: Walks
-    driven: FloatArray
-
-
-class AmplitudeModel(NamedTuple):
-    """How members answer: gram (n,) by lag; ridge, added to its diagonal; penalty in log
-    likelihood for each member; marginal: amplitudes are integrated out; memory: phi of a' = phi a
-    + noise, 0 for amplitudes drawn anew; variance of the amplitude of a new member."""
-
-    gram: FloatArray
-    ridge: float
-    penalty: float
-    marginal: bool
-    memory: float
-    variance: float
-
-
-class Scratch(NamedTuple):
-    """Room of one thread: L (J, J) and y (J,) of the Cholesky factor, and the scale (J,) of the
-    amplitudes in front of volume scatter."""
-
-    L: FloatArray
-    y: FloatArray
-    scale: FloatArray
-
-
-@kernel
-def _fill_row(
-    row: int,
-    z: int,
-    g: FloatArray,
-    share: float,
-    wanted: bool,
-    proposals: Proposals,
-) -> float:
-    """Row `row` of walk and walk_ratio of `proposals`, from the cell z, as far as it is wanted;
-    log Z of it."""
-    walks, kind = proposals.walks, proposals.walks.kind[z]
-    walk = walks.probability[kind]
-    n, width = len(g), len(walk)
-    radius = width // 2 - walks.centre[kind]
-    low, high = max(walks.first[kind], radius - z), min(walks.last[kind], n + radius - z)
-    best, inside = -math.inf, 0.0
-    # Of the places within reach; the row of ratios is scratch until its own numbers come.
-    driven = proposals.walk_ratio[row]
-    data_driven = 0.0
-    if proposals.driven.shape[1] > 0:
-        best, known = 0.0, proposals.driven[row // n]
-        for step in range(low, high):
-            inside += walk[step]
-            driven[step] = known[z + step - radius]
-            data_driven += walk[step] * driven[step]
-    else:
-        for step in range(low, high):
-            best = max(best, g[z + step - radius])
-            inside += walk[step]
-        for step in range(low, high):
-            driven[step] = math.exp(g[z + step - radius] - best)
-            data_driven += walk[step] * driven[step]
-    log_sum = best + math.log(data_driven) if data_driven > 0.0 else -math.inf
-    if not wanted:
-        return log_sum
-    total = 0.0
-    for step in range(width):
-        q = 0.0
-        if low <= step < high:
-            q = share * walk[step] * driven[step] / data_driven
-            q += (1.0 - share) * walk[step] / inside
-        total += q
-        proposals.walk[row, step] = total
-        proposals.walk_ratio[row, step] = walk[step] / q if q > 0.0 else 0.0
-    return log_sum
-
-
-@kernel
-def fill_walks(
-    sets: Sets,
-    gain: FloatArray,
-    share: float,
-    filled: BoolArray,
-    proposals: Proposals,
-) -> None:
-    """The rows from which a member of some particle walks, into walk and walk_ratio of
-    `proposals`; gain (S, n) for each sign; filled (S n,) is False throughout before,
-    and says which rows after."""
-    for i in range(sets.order.shape[0]):
-        for k in range(sets.order[i]):
-            z, negative = sets.cell[i, k], int(sets.sign[i, k] < 0)
-            row = z + gain.shape[1] * negative
-            if not filled[row]:
-                filled[row] = True
-                _fill_row(row, z, gain[negative], share, True, proposals)
-
-
-@kernel
-def fill_all_walks(sets: Sets, gain: FloatArray, share: float, proposals: Proposals) -> None:
-    """As `fill_walks`, where a shift is drawn before the walks: the rows that some particle may
-    come to by one, and log_sum of all rows."""
-    n, step, reached = gain.shape[1], proposals.shifts.step, np.zeros(gain.shape, np.bool_)
-    last = step * (len(proposals.shifts.start) - 1)
-    for i in range(sets.order.shape[0]):
-        for k in range(sets.order[i]):
-            reached[int(sets.sign[i, k] < 0), sets.cell[i, k]] = True
-    wanted = np.zeros(n, np.bool_)
-    for negative in range(gain.shape[0]):
-        wanted[:] = False
-        for z in range(n):
-            if reached[negative, z]:
-                wanted[z : z + last + 1 : step] = True
-        for z in range(n):
-            found = _fill_row(z + n * negative, z, gain[negative], share, wanted[z], proposals)
-            proposals.shifts.log_sum[negative, z] = found
-
-
-@kernel
-def _search(cumulative: FloatArray, low: int, high: int, point: float) -> int:
-    """The first place in low .. high - 1 whose entry exceeds `point`, high if none does."""
-    while low < high:
-        middle = (low + high) // 2
-        if cumulative[middle] > point:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@kernel
-def _placed(
-    low: int, high: int, left: float, birth: FloatArray, offset: int, proposals: Proposals
-) -> tuple[int, int, float]:
-    """(cell, sign, log ratio) of a birth in low .. high - 1, where the running sum of the weights
-    of births passes `left` from low on. offset: from cells of the lattice to those of the
-    record."""
-    point = birth[low + offset] + left
-    place = _search(birth[offset:], low, high, point) - 1
-    place = max(low, min(place, high - 1))
-    negative = 0
-    if proposals.birth_ratio.shape[0] > 1:
-        # What is left of the random number within the cell chooses the sign.
-        inside = point - birth[place + offset]
-        negative = int(inside >= proposals.birth_positive[place + offset])
-    return place, 1 - 2 * negative, proposals.birth_ratio[negative, place + offset]
-
-
-@kernel
-def _birth(
-    cells: IntArray,
-    m: int,
-    separation: int,
-    running: FloatArray,
-    proposals: Proposals,
-    uniform: float,
-    offset: int,
-) -> tuple[int, int, int, float]:
-    """(position in cells, cell, sign, log ratio) of one more member of cells[:m]; position -1 when
-    there is no room. running (n + 1,): sum of the weights of births; offset: from cells of the
-    lattice to those of the record."""
-    birth = running[offset:]
-    n = len(running) - 1 - proposals.shifts.step * (len(proposals.shifts.start) - 1)
-    total, last = 0.0, -1
-    for k in range(m + 1):
-        low = 0 if k == 0 else cells[k - 1] + separation
-        high = n if k == m else cells[k] - separation + 1
-        if high > low:
-            total += birth[high] - birth[low]
-            last = k
-    if last < 0:
-        return -1, 0, 1, -math.inf
-    left = uniform * total
-    for k in range(last + 1):
-        low = 0 if k == 0 else cells[k - 1] + separation
-        high = n if k == m else cells[k] - separation + 1
-        if high > low:
-            weight = birth[high] - birth[low]
-            if left < weight or k == last:
-                place, sign, paid = _placed(low, high, left, running, offset, proposals)
-                return k, place, sign, paid + math.log(total)
-            left -= weight
-    return -1, 0, 1, -math.inf
-
-
-@kernel
-def start(
-    first: int,
-    last: int,
-    motion: SetMotion,
-    charge: FloatArray,
-    proposals: Proposals,
-    beginning: Beginning,
-    uniform: FloatArray,
-    sets: Sets,
-    log_ratio: FloatArray,
-) -> None:
-    """Sets drawn where the first record will want them, and log_ratio (N,) of model to proposal;
-    charge (orders,): what sets of each size cost in it. Of `proposals` only births are used."""
-    orders, separation, J = motion.cumulative.shape[0], motion.separation, sets.cell.shape[1]
-    G = len(proposals.shifts.start)
-    n = len(proposals.birth) - 1 - proposals.shifts.step * (G - 1)
-    for i in range(first, last):
-        u, m, ratio, here, sign = uniform[i], 0, 0.0, sets.cell[i], sets.sign[i]
-        offset = 0
-        if G > 1:
-            offset = min(_search(proposals.shifts.start, 0, G, u[1 + J]), G - 1)
-            offset *= proposals.shifts.step
-        sets.shift[i] = offset
-        for k in range(len(beginning.sure)):
-            low, high = max(beginning.first[k] - offset, 0), min(beginning.last[k] - offset, n)
-            if not low < high:
-                continue
-            weight = proposals.birth[high + offset] - proposals.birth[low + offset]
-            sure, drawn = beginning.sure[k], u[len(u) - 1 - k]
-            if drawn >= sure:
-                ratio -= math.log1p(-sure)
-                continue
-            here[m], sign[m], paid = _placed(
-                low, high, drawn / sure * weight, proposals.birth, offset, proposals
-            )
-            ratio += paid + math.log(weight / sure)
-            if m > 0 and here[m] - here[m - 1] < separation:
-                ratio = -math.inf
-            m += 1
-        least = max(0, motion.order_min - m)
-        most = motion.order_min + orders - 1 - m
-        total, chance, more = 0.0, 1.0, least
-        for _ in range(least, most + 1):
-            total += chance
-            chance *= beginning.decay
-        left, chance = u[0] * total, 1.0
-        while left >= chance and more < most:
-            left -= chance
-            chance *= beginning.decay
-            more += 1
-        ratio += math.log(total / chance / orders) - math.lgamma(more + 1.0)
-        for k in range(more):
-            at, place, drawn, paid = _birth(
-                here, m, separation, beginning.elsewhere, proposals, u[1 + k], offset
-            )
-            ratio += paid
-            if at < 0:
-                break
-            for j in range(m, at, -1):
-                here[j], sign[j] = here[j - 1], sign[j - 1]
-            here[at], sign[at] = place, drawn
-            m += 1
-        sets.order[i] = max(m, motion.order_min)
-        log_ratio[i] = ratio - charge[sets.order[i] - motion.order_min]
 
 
 @kernel
 def propagate(
     first: int,
     last: int,
-    motion: SetMotion,
-    amplitudes: AmplitudeModel,
-    proposals: Proposals,
+    cells: int,
+    separation: int,
+    walks_from: int,
     uniform: FloatArray,
-    old: Sets,
-    new: Sets,
+    old_order: IntArray,
+    deaths: IntArray,
+    old_cell: IntArray,
+    old_sign: NDArray[np.int8],
+    parent: IntArray,
+    centre: IntArray,
+    walk: FloatArray,
+    walk_ratio: FloatArray,
+    birth: FloatArray,
+    birth_ratio: FloatArray,
+    birth_positive: FloatArray,
+    shift: IntArray,
+    order: IntArray,
+    cell: IntArray,
+    sign: NDArray[np.int8],
     log_ratio: FloatArray,
 ) -> None:
-    """Steps 1 to 5 of `set_model`: from the sets `old` to `new`, and log_ratio (N,) of model to
-    proposal, -inf for impossible sets (whose members mean nothing)."""
-    order_min, separation, changes, cumulative = motion
-    orders, columns = cumulative.shape
-    width, cells, walks = proposals.walk.shape[1], proposals.birth_ratio.shape[1], proposals.walks
-    J, G = new.cell.shape[1], len(proposals.shifts.start)
-    last_cell = cells - 1 - proposals.shifts.step * (G - 1)
-    parent, rows, memory = np.empty(J, np.int64), np.empty(J, np.int64), empty_memory(J, G)
+    """Steps 3 to 5 of `set_model`, for a lattice of `cells`: those that are left walk, others are
+    born.
+
+    old_order to parent: of `set_model.Left`. Each particle comes with its new `order` and shift,
+    and gets its members, the parent of each, -1 for those that are born, and in log_ratio (N,),
+    which is added to, that of model to proposal; -inf for impossible sets (whose members mean
+    nothing). uniform (N, U): column ``1 + deaths + k`` for the birth k, ``walks_from + k`` for the
+    walk of the member k. centre (n,): the middle of the walks from each cell of the record,
+    against that cell; walk and walk_ratio: of `set_proposals.WalkTables`; birth to birth_positive:
+    of `set_proposals.Births`.
+    """
+    width, (signs, n) = walk.shape[1], birth_ratio.shape
     for i in range(first, last):
-        before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
-        column = min(_search(cumulative[before - order_min], 0, columns, u[0]), columns - 1)
-        m = order_min + column % orders
-        left, ratio = before, 0.0
-        deaths = max(before - m, 0) + column // orders
-        for k in range(before):
-            parent[k] = k
-        for k in range(deaths):
-            death = min(int(u[1 + k] * left), left - 1)
-            left -= 1
-            for j in range(death, left):
-                parent[j] = parent[j + 1]
-        offset = 0
+        left, offset, ratio = old_order[i] - deaths[i], shift[i], log_ratio[i]
         for k in range(left):
-            negative = int(old.sign[i, parent[k]] < 0)
-            rows[k] = old.cell[i, parent[k]] + negative * cells
-        if G > 1:
-            drawn_at = u[1 + changes + J]
-            offset, ratio = draw_shift(
-                proposals.shifts, old.shift[i], rows, left, cells, drawn_at, memory
-            )
-        new.shift[i] = offset
-        for k in range(left):
-            source = parent[k]
-            z = old.cell[i, source]
-            row = rows[k] + offset
-            table = proposals.walk[row]
-            step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
-            paid = proposals.walk_ratio[row, step]
+            source = parent[i, k]
+            z = old_cell[i, source]
+            row = z + offset
+            step, end = 0, width
+            if old_sign[i, source] < 0:
+                row += n
+            point = uniform[i, walks_from + k] * walk[row, width - 1]
+            while step < end:
+                middle = (step + end) // 2
+                if walk[row, middle] > point:
+                    end = middle
+                else:
+                    step = middle + 1
+            step = min(step, width - 1)
+            paid = walk_ratio[row, step]
             ratio += math.log(paid) if paid > 0.0 else -math.inf
             # What leaves the lattice is impossible already; its number must stay an index.
-            z += step - width // 2 + walks.centre[walks.kind[z + offset]]
-            if not 0 <= z <= last_cell:
+            z += step - width // 2 + centre[z + offset]
+            if not 0 <= z < cells:
                 ratio = -math.inf
-            z = min(max(z, 0), last_cell)
+            z = min(max(z, 0), cells - 1)
             j = k
-            while j > 0 and here[j - 1] > z:
-                here[j], parent[j] = here[j - 1], parent[j - 1]
+            while j > 0 and cell[i, j - 1] > z:
+                cell[i, j], parent[i, j] = cell[i, j - 1], parent[i, j - 1]
                 j -= 1
-            here[j], parent[j] = z, source
+            cell[i, j], parent[i, j] = z, source
         for k in range(left):
-            sign[k] = old.sign[i, parent[k]]
-        for k in range(1, left):
-            if here[k] - here[k - 1] < separation:
+            sign[i, k] = old_sign[i, parent[i, k]]
+            if k > 0 and cell[i, k] - cell[i, k - 1] < separation:
                 ratio = -math.inf
-        for k in range(m - left):
-            if ratio > -math.inf:
-                count = left + k
-                at, place, drawn, paid = _birth(
-                    here, count, separation, proposals.birth, proposals, u[1 + deaths + k], offset
-                )
-                ratio += paid
-                if at >= 0:
-                    for j in range(count, at, -1):
-                        here[j], parent[j], sign[j] = here[j - 1], parent[j - 1], sign[j - 1]
-                    here[at], parent[at], sign[at] = place, -1, drawn
-        new.order[i], log_ratio[i] = m, ratio
-        if amplitudes.memory > 0.0 and ratio > -math.inf:
-            for k in range(m):
-                born, j = parent[k] < 0, parent[k]
-                new.prior_mean[i, k] = 0.0 if born else old.prior_mean[i, j]
-                variance = amplitudes.variance if born else old.prior_variance[i, j]
-                new.prior_variance[i, k] = variance
+        for m in range(left, order[i]):
+            # The running sum of the weights of births says what each free gap is worth.
+            total, final = 0.0, -1
+            for k in range(m + 1):
+                low = 0 if k == 0 else cell[i, k - 1] + separation
+                high = cells if k == m else cell[i, k] - separation + 1
+                if high > low:
+                    total += birth[high + offset] - birth[low + offset]
+                    final = k
+            if final < 0:
+                ratio = -math.inf
+            if not ratio > -math.inf:
+                break
+            rest = uniform[i, 1 + deaths[i] + m - left] * total
+            for gap in range(final + 1):
+                low = 0 if gap == 0 else cell[i, gap - 1] + separation
+                high = cells if gap == m else cell[i, gap] - separation + 1
+                if high > low:
+                    weight = birth[high + offset] - birth[low + offset]
+                    if rest < weight or gap == final:
+                        break
+                    rest -= weight
+            point = birth[low + offset] + rest
+            at, end = low, high
+            while at < end:
+                middle = (at + end) // 2
+                if birth[middle + offset] > point:
+                    end = middle
+                else:
+                    at = middle + 1
+            z, negative = max(low, min(at - 1, high - 1)), 0
+            # What is left of the random number within the cell chooses the sign.
+            if signs > 1 and point - birth[z + offset] >= birth_positive[z + offset]:
+                negative = 1
+            ratio += birth_ratio[negative, z + offset] + math.log(total)
+            for j in range(m, gap, -1):
+                cell[i, j], sign[i, j] = cell[i, j - 1], sign[i, j - 1]
+                parent[i, j] = parent[i, j - 1]
+            cell[i, gap], sign[i, gap], parent[i, gap] = z, 1 - 2 * negative, -1
+        log_ratio[i] = ratio
 
 
 @kernel
@@ -402,9 +150,27 @@ def weigh(
     first: int,
     last: int,
     b: FloatArray,
-    amplitudes: AmplitudeModel,
-    scatter: ScatterFit,
-    sets: Sets,
+    gram: FloatArray,
+    ridge: float,
+    penalty: float,
+    marginal: bool,
+    remembers: bool,
+    evidence: FloatArray,
+    level: FloatArray,
+    profile_row: IntArray,
+    profile: FloatArray,
+    spread: float,
+    apart: int,
+    order: IntArray,
+    cell: IntArray,
+    prior_mean: FloatArray,
+    prior_variance: FloatArray,
+    sign: NDArray[np.int8],
+    shift: IntArray,
+    L: FloatArray,
+    vectors: FloatArray,
+    owner: IntArray,
+    kept: FloatArray,
     log_weight: FloatArray,
     amplitude: FloatArray,
 ) -> None:
@@ -412,188 +178,139 @@ def weigh(
     where an amplitude is not of its member's sign, and write amplitude (N, J), its mean given the
     set, in units of the noise. Weights of -inf are left alone.
 
+    gram to remembers: of `set_filter.AmplitudeModel`; evidence to apart: of
+    `set_scatter.ScatterFit`. Scatter begins at the first member, or as probably at the second
+    where that is louder and well below. L (J, J), vectors (3, J), owner and kept (SLOTS,) are
+    scratch, owner -1 throughout.
+
     Particles crowd at the peaks of a record: of twenty thousand some three thousand differ. What
-    was found for one is kept, in a slot by its members, for those that are the same."""
-    J, memory = sets.cell.shape[1], amplitudes.memory > 0.0
-    scratch = Scratch(np.empty((J, J)), np.empty(J), np.ones(J))
-    owner, kept = np.full(SLOTS, -1, np.int64), np.empty(SLOTS)
+    was found for one is kept, in a slot by its members, for those that are the same.
+    """
+    scattered, middle, slot = len(level) > 0, profile.shape[1] // 2, 0
     for i in range(first, last):
         if not log_weight[i] > -math.inf:
             continue
-        if memory:
-            log_weight[i] += _explain(i, b, amplitudes, scatter, sets, amplitude, scratch)
-            continue
-        slot = 0
-        for k in range(sets.order[i]):
-            slot = (31 * slot + sets.cell[i, k] + sets.shift[i]) % 1_000_003
-        slot %= SLOTS
-        j = owner[slot]
-        if j >= 0 and _same(i, j, sets):
-            for k in range(sets.order[i]):
-                amplitude[i, k] = amplitude[j, k]
-        else:
-            owner[slot] = i
-            kept[slot] = _explain(i, b, amplitudes, scatter, sets, amplitude, scratch)
-        log_weight[i] += kept[slot]
-
-
-@kernel
-def _same(i: int, j: int, sets: Sets) -> bool:
-    if sets.order[i] != sets.order[j]:
-        return False
-    for k in range(sets.order[i]):
-        if sets.cell[i, k] + sets.shift[i] != sets.cell[j, k] + sets.shift[j]:
-            return False
-        if sets.sign[i, k] != sets.sign[j, k]:
-            return False
-    return True
-
-
-@kernel
-def _explain(
-    i: int,
-    b: FloatArray,
-    amplitudes: AmplitudeModel,
-    scatter: ScatterFit,
-    sets: Sets,
-    amplitude: FloatArray,
-    scratch: Scratch,
-) -> float:
-    """Log likelihood of the set i, whose row of `amplitude` is written. Scatter begins at the
-    first member, or as probably at the second where that is louder and well below."""
-    cell, apart = sets.cell[i], scatter.apart
-    if scatter.level.shape[0] == 0 or sets.order[i] < 2 or cell[1] - cell[0] < apart:
-        return _explain_from(0, i, b, amplitudes, scatter, sets, amplitude, scratch)
-    second = _explain_from(1, i, b, amplitudes, scatter, sets, amplitude, scratch)
-    louder = second > -math.inf and amplitude[i, 1] > amplitude[i, 0]
-    first = _explain_from(0, i, b, amplitudes, scatter, sets, amplitude, scratch)
-    if not louder:
-        return first
-    if second > first:
-        _explain_from(1, i, b, amplitudes, scatter, sets, amplitude, scratch)
-    best = max(first, second)
-    return best + math.log(0.5 * (1.0 + math.exp(min(first, second) - best)))
-
-
-@kernel
-def _explain_from(
-    begins: int,
-    i: int,
-    b: FloatArray,
-    amplitudes: AmplitudeModel,
-    scatter: ScatterFit,
-    sets: Sets,
-    amplitude: FloatArray,
-    scratch: Scratch,
-) -> float:
-    """`_explain` where the scatter begins at the member of that number. Cholesky: A = L L',
-    y = L^-1 h, a = L'^-1 y."""
-    order, cell, mean, variance, sign, shift = sets
-    L, y, scale = scratch
-    gram, memory, m = amplitudes.gram, amplitudes.memory > 0.0, order[i]
-    scattered, begin = scatter.level.shape[0] > 0, cell[i, begins] + shift[i]
-    value = scatter.evidence[begin] if scattered and m > 0 else 0.0
-    for r in range(m):
-        z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
-        if scattered:
-            h, scale[r] = against(scatter, h, begin, z + shift[i])
-        if memory:
-            precision = 1.0 / variance[i, r]
-            h += precision * mean[i, r]
-            value += 0.5 * (math.log(precision) - precision * mean[i, r] * mean[i, r])
-        row = L[r]
-        for c in range(r):
-            other = L[c]
-            value_rc = gram[z - cell[i, c]]
-            for k in range(c):
-                value_rc -= row[k] * other[k]
-            value_rc *= other[c]
-            row[c] = value_rc
-            h -= value_rc * y[c]
-        pivot = gram[0] + precision
-        for k in range(r):
-            pivot -= row[k] * row[k]
-        if not pivot > 1e-12:
-            value = -math.inf
-            break
-        # The diagonal of L is kept as its reciprocal.
-        row[r] = 1.0 / math.sqrt(pivot)
-        y[r] = h * row[r]
-        value += 0.5 * y[r] * y[r]
-        if amplitudes.marginal:
-            value -= 0.5 * math.log(pivot)
-        if not memory:
-            value -= amplitudes.penalty
-    if value > -math.inf:
-        a = amplitude[i]
-        for r in range(m - 1, -1, -1):
-            rest = y[r]
-            for k in range(r + 1, m):
-                rest -= L[k, r] * a[k]
-            a[r] = rest * L[r, r]
-            if not a[r] * sign[i, r] > 0.0:
-                value = -math.inf
-                break
-        for r in range(m if scattered else 0):
-            a[r] *= scale[r]
-    return value
-
-
-@kernel
-def remember(
-    first: int,
-    last: int,
-    amplitudes: AmplitudeModel,
-    amplitude: FloatArray,
-    sets: Sets,
-) -> None:
-    """Amplitudes (N, J) after a record become those expected before the next, a' = phi a + noise:
-    prior_mean and prior_variance of `sets`, in place. Each is kept for itself, given the others:
-    in place of their full covariance that costs less than 0.1 % of accuracy while neighbouring
-    pulses overlap by less than 0.3 (band pulses at the default separation: 0.06), and 2 to 6 % at
-    0.7."""
-    phi, stationary = amplitudes.memory, amplitudes.variance
-    for i in range(first, last):
-        for k in range(sets.order[i]):
-            after = 1.0 / (amplitudes.gram[0] + 1.0 / sets.prior_variance[i, k])
-            sets.prior_mean[i, k] = phi * amplitude[i, k]
-            sets.prior_variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
+        m = order[i]
+        if not remembers:
+            slot = 0
+            for k in range(m):
+                slot = (31 * slot + cell[i, k] + shift[i]) % 1_000_003
+            slot %= SLOTS
+            j = owner[slot]
+            same = j >= 0 and order[j] == m
+            for k in range(m):
+                if not same:
+                    break
+                same = cell[i, k] + shift[i] == cell[j, k] + shift[j] and sign[i, k] == sign[j, k]
+            if same:
+                for k in range(m):
+                    amplitude[i, k] = amplitude[j, k]
+                log_weight[i] += kept[slot]
+                continue
+        found = -math.inf
+        beginnings = 2 if scattered and m > 1 and cell[i, 1] - cell[i, 0] >= apart else 1
+        for begins in range(beginnings):
+            begin, value = 0, 0.0
+            if scattered and m > 0:
+                begin = cell[i, begins] + shift[i]
+                value = evidence[begin]
+            # Cholesky: A = L L', y = L^-1 h, a = L'^-1 y; y, a and the scale are the vectors.
+            for r in range(m):
+                z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], ridge
+                if scattered:
+                    lag = middle + z + shift[i] - begin
+                    mean = level[begin] * profile[profile_row[begin], lag]
+                    scale = math.sqrt(1.0 + (spread * mean) ** 2)
+                    vectors[2, r] = scale
+                    h = (h - mean) / scale
+                if remembers:
+                    precision = 1.0 / prior_variance[i, r]
+                    mean = prior_mean[i, r]
+                    h += precision * mean
+                    value += 0.5 * (math.log(precision) - precision * mean * mean)
+                for c in range(r):
+                    product = gram[z - cell[i, c]]
+                    for k in range(c):
+                        product -= L[r, k] * L[c, k]
+                    product *= L[c, c]
+                    L[r, c] = product
+                    h -= product * vectors[0, c]
+                pivot = gram[0] + precision
+                for k in range(r):
+                    pivot -= L[r, k] * L[r, k]
+                if not pivot > 1e-12:
+                    value = -math.inf
+                    break
+                # The diagonal of L is kept as its reciprocal.
+                L[r, r] = 1.0 / math.sqrt(pivot)
+                vectors[0, r] = h * L[r, r]
+                value += 0.5 * vectors[0, r] * vectors[0, r]
+                if marginal:
+                    value -= 0.5 * math.log(pivot)
+                if not remembers:
+                    value -= penalty
+            if value > -math.inf:
+                for r in range(m - 1, -1, -1):
+                    rest = vectors[0, r]
+                    for k in range(r + 1, m):
+                        rest -= L[k, r] * vectors[1, k]
+                    vectors[1, r] = rest * L[r, r]
+                    if not vectors[1, r] * sign[i, r] > 0.0:
+                        value = -math.inf
+                        break
+                for r in range(m if scattered else 0):
+                    vectors[1, r] *= vectors[2, r]
+            better = begins == 0 and value > -math.inf
+            if begins == 0:
+                found = value
+            elif value > -math.inf and vectors[1, 1] > vectors[1, 0]:
+                better, best = value > found, max(value, found)
+                found = best + math.log(0.5 * (1.0 + math.exp(min(value, found) - best)))
+            if better:
+                for k in range(m):
+                    amplitude[i, k] = vectors[1, k]
+        if not remembers:
+            owner[slot], kept[slot] = i, found
+        log_weight[i] += found
 
 
 @kernel
 def moments(
     w: FloatArray,
-    sets: Sets,
+    order_min: int,
+    order: IntArray,
+    cell: IntArray,
+    prior_variance: FloatArray,
+    shift: IntArray,
     amplitude: FloatArray,
+    new_variance: float,
     offset: FloatArray,
     variance: float,
-    prior_variance: float,
-    order_min: int,
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
     """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
-    amplitude, the variance it had before the record (prior_variance where sets have none of their
+    amplitude, the variance it had before the record (new_variance where sets have none of their
     own), and the share of members that are the first of their set, that lie on each cell. Both
-    are zero before. With a shift, cells are those of
-    the record, where members that share an error are not blurred by it, and sums (8, n + 2 pad)
-    has the first two moments of the cell on the lattice and its product with the amplitude
-    besides, with the mean offset (N,) of the shift and its variance (see `set_shifts`)."""
-    shifted, own = sums.shape[0] > SUMS, sets.prior_variance.shape[1] > 0
-    for i in range(w.shape[0]):
+    are zero before. With a shift, cells are those of the record, where members that share an error
+    are not blurred by it, and sums (8, n + 2 pad) has the first two moments of the cell on the
+    lattice and its product with the amplitude besides, with the mean offset (N,) of the shift and
+    its variance (see `set_shifts`); offset is empty without one."""
+    shifted, own = len(offset) > 0, prior_variance.shape[1] > 0
+    for i in range(len(w)):
         if w[i] > 0.0:
-            pmf[sets.order[i] - order_min] += w[i]
-            for k in range(sets.order[i]):
-                place, a = sets.cell[i, k], amplitude[i, k]
-                z = place + sets.shift[i]
+            pmf[order[i] - order_min] += w[i]
+            for k in range(order[i]):
+                place, a = cell[i, k], amplitude[i, k]
+                z = place + shift[i]
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
-                sums[3, z] += w[i] * (sets.prior_variance[i, k] if own else prior_variance)
+                sums[3, z] += w[i] * (prior_variance[i, k] if own else new_variance)
                 if shifted:
                     at = place - offset[i]
                     sums[5, z] += w[i] * at
                     sums[6, z] += w[i] * (at * at + variance)
                     sums[7, z] += w[i] * at * a
-            if sets.order[i] > 0:
-                sums[4, sets.cell[i, 0] + sets.shift[i]] += w[i]
+            if order[i] > 0:
+                sums[4, cell[i, 0] + shift[i]] += w[i]

@@ -124,31 +124,19 @@ def repeated_walk(walk: FloatArray, times: int, *, reach: float = 4.0) -> FloatA
 
 class Walks(NamedTuple):
     """How members walk by the time of a record, by the cell where each was: kind (n,) of a cell of
-    the record; for each of T kinds centre (T,), cells, and probability (T, 2 r + 1) around it,
-    zero but for first (T,) <= entry < last (T,); wide: some reach further than a member is from
-    the next, so that the peaks of the record are lowered to one mass."""
+    the record; for each of T kinds centre (T,), cells, and probability (T, 2 r + 1) around it;
+    wide: some reach further than a member is from the next, so that the peaks of the record are
+    lowered to one mass."""
 
     kind: IntArray
     centre: IntArray
     probability: FloatArray
-    first: IntArray
-    last: IntArray
     wide: bool
-
-    @classmethod
-    def of(
-        cls, kind: IntArray, centre: IntArray, probability: FloatArray, *, wide: bool = False
-    ) -> Walks:
-        """Without first and last, which are found."""
-        there = probability > 0.0
-        last = probability.shape[1] - np.argmax(there[:, ::-1], axis=1)
-        return cls(kind, centre, probability, np.argmax(there, axis=1), last, wide)
 
     @classmethod
     def alike(cls, walk: FloatArray, cells: int, *, wide: bool = False) -> Walks:
         """All of them by `walk` (2 r + 1,)."""
-        kind, centre = np.zeros(cells, np.int64), np.zeros(1, np.int64)
-        return cls(kind, centre, walk[None], centre, np.array([len(walk)]), wide)
+        return cls(np.zeros(cells, np.int64), np.zeros(1, np.int64), walk[None], wide)
 
 
 def turnover(transition: FloatArray, order_min: int, records: int) -> FloatArray:
@@ -326,3 +314,78 @@ class Sets(NamedTuple):
 
     def take(self, index: IntArray) -> Sets:
         return Sets._make(column[index] for column in self)
+
+
+class Left(NamedTuple):
+    """Who is left of sets: order (N,), cell and sign (N, J) as they were; deaths (N,), how many
+    members are not left, and parent (N, J), the members that are."""
+
+    order: IntArray
+    deaths: IntArray
+    cell: IntArray
+    sign: NDArray[np.int8]
+    parent: IntArray
+
+    @classmethod
+    def all_of(cls, sets: Sets) -> Left:
+        N, J = sets.cell.shape
+        parent = np.tile(np.arange(J, dtype=np.int64), (N, 1))
+        return cls(sets.order, np.zeros(N, np.int64), sets.cell, sets.sign, parent)
+
+
+def leave(
+    order_min: int, cumulative: FloatArray, sets: Sets, uniform: FloatArray
+) -> tuple[Left, IntArray]:
+    """Steps 1 and 2: who is left, and the order (N,) that the sets come to. cumulative (orders,
+    columns): running sums of the rows of the transition matrix, or of `turnover`; uniform
+    (N, U): a column for the order, then one for each death."""
+    left, column = Left.all_of(sets), np.empty_like(sets.order)
+    for row, chances in enumerate(cumulative):
+        i = np.flatnonzero(sets.order == order_min + row)
+        column[i] = np.searchsorted(chances, uniform[i, 0], 'right')
+    column = np.minimum(column, cumulative.shape[1] - 1)
+    replaced, order = np.divmod(column, len(cumulative))
+    order += order_min
+    left.deaths[:] = np.maximum(sets.order - order, 0) + replaced
+    for k in range(int(left.deaths.max())):
+        i = np.flatnonzero(left.deaths > k)
+        members, parent = sets.order[i] - k, left.parent[i]
+        death = np.minimum((uniform[i, 1 + k] * members).astype(np.int64), members - 1)
+        behind = np.arange(parent.shape[1] - 1) >= death[:, None]
+        parent[:, :-1] = np.where(behind, parent[:, 1:], parent[:, :-1])
+        left.parent[i] = parent
+    return left, order
+
+
+def inherited(model: SetModel, old: Sets, parent: IntArray, new: Sets) -> Sets:
+    """`new` with what its members know of their amplitudes by their parent (N, J), -1 for those
+    that were born."""
+    born, source = parent < 0, np.maximum(parent, 0)
+    mean = np.take_along_axis(old.prior_mean, source, axis=1)
+    variance = np.take_along_axis(old.prior_variance, source, axis=1)
+    return new._replace(
+        prior_mean=np.where(born, 0.0, mean),
+        prior_variance=np.where(born, model.amplitude_std**2, variance),
+    )
+
+
+def aged(model: SetModel, sets: Sets, records: int) -> Sets:
+    """Sets whose amplitudes, expected for the next record, are those for so many after it."""
+    if records < 1 or not model.amplitude_memory:
+        return sets
+    phi = model.amplitude_memory**records
+    fresh = (1.0 - phi**2) * model.amplitude_std**2
+    return sets._replace(
+        prior_mean=phi * sets.prior_mean, prior_variance=phi**2 * sets.prior_variance + fresh
+    )
+
+
+def remembered(model: SetModel, gram: FloatArray, sets: Sets, amplitude: FloatArray) -> Sets:
+    """Sets whose amplitudes (N, J) after a record become those expected before the next, a' =
+    phi a + noise. Each is kept for itself, given the others: in place of their full covariance
+    that costs less than 0.1 % of accuracy while neighbouring pulses overlap by less than 0.3 (band
+    pulses at the default separation: 0.06), and 2 to 6 % at 0.7."""
+    phi, stationary = model.amplitude_memory, model.amplitude_std**2
+    after = 1.0 / (gram[0] + 1.0 / sets.prior_variance)
+    variance = phi * phi * after + (1.0 - phi * phi) * stationary
+    return sets._replace(prior_mean=phi * amplitude, prior_variance=variance)

@@ -54,7 +54,6 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from .arrays import FloatArray, IntArray
-from .jit import kernel
 
 LEVEL_RATIO = 1.5
 """From one level of the grid to the next; the least is one standard deviation of the noise."""
@@ -154,15 +153,6 @@ def without_peaks(b: FloatArray, window: int) -> FloatArray:
     """b (n,) where nothing stands out: no cell above the median of the `window` cells around it.
     Echoes narrower than half of that are gone, edges of what is wide are where they were."""
     return np.minimum(b, median_filter(b, size=min(window, len(b)), mode='nearest'))
-
-
-@kernel
-def against(fit: ScatterFit, value: float, k: int, z: int) -> tuple[float, float]:
-    """(value - v D) / s and s in the cell z, for a first member in the cell k."""
-    middle = fit.profile.shape[1] // 2
-    mean = fit.level[k] * fit.profile[fit.row[k], middle + z - k]
-    s = math.sqrt(1.0 + (fit.spread * mean) ** 2)
-    return (value - mean) / s, s
 
 
 def seen_against(fit: ScatterFit, b: FloatArray, k: int) -> FloatArray:

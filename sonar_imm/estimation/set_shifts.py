@@ -50,13 +50,11 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from .arrays import FloatArray, IntArray
-from .jit import kernel
 
 _REACH = 4.0
 _TINY = 1e-280
 """A probability that is less is had by its logarithm."""
 MAX_SHIFTS = 401
-SLOTS = 256
 
 
 @frozen(kw_only=True)
@@ -168,127 +166,16 @@ def _log_normal(x: FloatArray, std: float) -> FloatArray:
 
 
 class ShiftTables(NamedTuple):
-    """Of one record: step; start (G,) running sum of p(shift) before the first record; log_prior
-    (G, G), a single row where nothing is remembered, and prior, the running sums of its rows;
-    log_sum (S, n + 2 pad) log Z by sign, in the cells of the record; share of the data-driven
-    proposal. Without a shift G is 1."""
+    """start (G,) running sum of p(shift) before the first record; log_prior (G, G), a single row
+    where nothing is remembered, and prior, the running sums of its rows."""
 
-    step: int
     start: FloatArray
     log_prior: FloatArray
     prior: FloatArray
-    log_sum: FloatArray
-    share: float
 
-
-def shift_tables(shift: Shift | None, log_sum: FloatArray, share: float) -> ShiftTables:
-    if shift is None:
-        return ShiftTables(1, np.ones(1), np.zeros((1, 1)), np.ones((1, 1)), log_sum, share)
-    start = np.cumsum(np.exp(shift.log_start()))
-    log_prior = shift.log_prior() if shift.memory else shift.log_start()[None]
-    prior = np.cumsum(np.exp(log_prior), axis=1)
-    return ShiftTables(shift.step, start, log_prior, prior, log_sum, share)
-
-
-class ShiftMemory(NamedTuple):
-    """What `score_shifts` found for sets that are likely to come again: sets that were resampled
-    from one have one proposal. For each of the SLOTS: key (J + 2,), driven (2, G), span (2,)."""
-
-    key: IntArray
-    driven: FloatArray
-    span: IntArray
-
-
-@kernel
-def empty_memory(members: int, shifts: int) -> ShiftMemory:
-    key = np.full((SLOTS if shifts > 1 else 1, members + 2), -1, np.int64)
-    return ShiftMemory(key, np.empty((len(key), 2, shifts)), np.empty((len(key), 2), np.int64))
-
-
-@kernel
-def score_shifts(
-    tables: ShiftTables, before: int, rows: IntArray, count: int, cells: int, driven: FloatArray
-) -> tuple[int, int]:
-    """The data-driven part of the proposal for the members rows[:count], their cell plus
-    `cells` (n + 2 pad) where they are negative: driven (2, G) gets its weights and their running
-    sums, both divided by their total, from the first place that has any to the last, which are
-    given."""
-    step, weight, running = tables.step, driven[0], driven[1]
-    G = len(weight)
-    for g in range(G):
-        weight[g] = tables.log_prior[before, g]
-    for k in range(count):
-        negative = rows[k] // cells
-        z = rows[k] - negative * cells
-        if step == 1:  # neighbours in memory: added several at a time
-            near = tables.log_sum[negative, z : z + G]
-            for g in range(G):
-                weight[g] += near[g]
-        else:
-            for g in range(G):
-                weight[g] += tables.log_sum[negative, z + g * step]
-    best = weight[0]
-    for g in range(1, G):
-        best = weight[g] if weight[g] > best else best
-    # What is less than e^-40 of the best is never drawn by these numbers.
-    first, last = 0, G - 1
-    while first < last and weight[first] < best - 40.0:
-        first += 1
-    while last > first and weight[last] < best - 40.0:
-        last -= 1
-    total = 0.0
-    for g in range(first, last + 1):
-        weight[g] = math.exp(weight[g] - best)
-        total += weight[g]
-        running[g] = total
-    for g in range(first, last + 1):
-        weight[g] /= total
-        running[g] /= total
-    return first, last
-
-
-@kernel
-def draw_shift(
-    tables: ShiftTables,
-    shift: int,
-    rows: IntArray,
-    count: int,
-    cells: int,
-    uniform: float,
-    memory: ShiftMemory,
-) -> tuple[int, float]:
-    """The shift plus pad, drawn from q of the module's text, and log of model to q. The members
-    are rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of
-    the record before, plus pad. `memory` changes the time and nothing else."""
-    before = shift // tables.step if len(tables.prior) > 1 else 0
-    slot = before
-    for k in range(count):
-        slot = (31 * slot + rows[k]) % 1_000_003
-    slot %= len(memory.key)
-    key, driven, span = memory.key[slot], memory.driven[slot], memory.span[slot]
-    known = key[0] == count and key[1] == before
-    for k in range(count):
-        known = known and key[2 + k] == rows[k]
-    if not known:
-        span[0], span[1] = score_shifts(tables, before, rows, count, cells, driven)
-        key[0], key[1] = count, before
-        for k in range(count):
-            key[2 + k] = rows[k]
-    share, prior, running = tables.share, tables.prior[before], driven[1]
-    first, last = span
-    low, high = 0, len(prior) - 1
-    point = uniform * (share + (1.0 - share) * prior[high])
-    while low < high:
-        middle = (low + high) // 2
-        below = 0.0 if middle < first else 1.0
-        if first <= middle < last:
-            below = running[middle]
-        if share * below + (1.0 - share) * prior[middle] > point:
-            high = middle
-        else:
-            low = middle + 1
-    log_prior = tables.log_prior[before, low]
-    q = (1.0 - share) * math.exp(log_prior)
-    if first <= low <= last:
-        q += share * driven[0, low]
-    return low * tables.step, log_prior - math.log(q)
+    @classmethod
+    def of(cls, shift: Shift) -> ShiftTables:
+        start, log_prior = shift.log_start(), shift.log_start()[None]
+        if shift.memory:
+            log_prior = shift.log_prior()
+        return cls(np.cumsum(np.exp(start)), log_prior, np.cumsum(np.exp(log_prior), axis=1))

@@ -160,8 +160,8 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
-            kernels={'pings': (21, 632), 'surfaces': (14, 379)},
-            all_kernels=(29, 898),
+            kernels={'pings': (4, 545), 'surfaces': (3, 239)},
+            all_kernels=(7, 784),
         ),
         System(
             name='diver',
@@ -179,8 +179,8 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
-            kernels={'records': (16, 540)},
-            all_kernels=(16, 540),
+            kernels={'records': (3, 277)},
+            all_kernels=(3, 277),
         ),
         System(
             name='obstacle',

@@ -15,7 +15,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import array, coherence, interference, laplace, likelihood_kernels
+from sonar_imm.acoustics import array, coherence, interference, laplace, wave_kernels
 
 
 def noise(rng, *shape):
@@ -111,7 +111,7 @@ def test_the_compiled_peaks_are_those_of_numpy():
     grid = array.direction_grid(8, 0.5)
     cosine, sines = np.cos(np.pi * grid), np.sin(np.pi * grid)
     height, place = np.empty(300), np.empty(300)
-    likelihood_kernels.beam_peaks(
+    wave_kernels.beam_peaks(
         form, cosine, sines, np.empty(len(grid)), np.empty(len(grid)), height, place
     )
     power = np.square(np.abs(iq)).sum(axis=1)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.rays import launch_table, look_up_each, profile_of, profile_problem, trace
+from sonar_imm.acoustics.rays import launch_table, look_up, profile_of, profile_problem, trace
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'rays.npz'
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
@@ -133,9 +133,9 @@ def test_between_cells_of_the_launch_table_there_is_a_bilinear_function():
     table = 1.0 + 2.0 * row + 0.5 * column - 0.3 * row * column
     rng = np.random.default_rng(0)
     rows, columns = rng.uniform(0.0, 3.0, 50), rng.uniform(0.0, 5.0, 50)
-    found = look_up_each(table, rows, 10.0, 0.25, 10.0 + 0.25 * columns)
+    found = look_up(table, rows, 10.0, 0.25, 10.0 + 0.25 * columns)
     assert found == pytest.approx(1.0 + 2.0 * rows + 0.5 * columns - 0.3 * rows * columns)
-    outside = look_up_each(table, np.ones(2), 10.0, 0.25, np.array([9.99, 11.26]))
+    outside = look_up(table, np.ones(2), 10.0, 0.25, np.array([9.99, 11.26]))
     assert np.isnan(outside).all()
 
 

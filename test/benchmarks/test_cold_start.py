@@ -32,4 +32,5 @@ def test_every_case_has_steps(name):
 
 
 def test_every_system_has_a_case_with_everything():
-    assert {case.system for case in CASES.values() if not case.inputs} == set(SYSTEMS)
+    compiled = {name for name, system in SYSTEMS.items() if system.kernels}
+    assert {case.system for case in CASES.values() if not case.inputs} == compiled

@@ -15,9 +15,8 @@
 """exp of a row."""
 
 import numpy as np
-from scipy import special, stats
 
-from sonar_imm.estimation.elementary import exponentials, gaussians, normals, phasors
+from sonar_imm.estimation.elementary import exponentials, phasors
 
 
 def row(values):
@@ -44,29 +43,6 @@ def test_a_row_gives_the_same_bits_however_it_is_cut():
     assert all(row([value])[0] == expected for value, expected in zip(values, whole))
 
 
-def bell(values):
-    values = np.array(values, float)
-    rows = np.empty((3, len(values)))
-    gaussians(values, *rows)
-    return rows[1:]
-
-
-def test_gaussians_are_those_of_the_library():
-    values = np.concatenate([np.linspace(-37.0, 37.0, 40_001), np.logspace(-18, 0, 101)])
-    density, below = bell(values)
-    # The square of a value is rounded before it stands in an exponent.
-    near = 1e-15 + 3e-16 * np.square(values)
-    assert (np.abs(density / np.exp(-0.5 * np.square(values)) - 1.0) <= near).all()
-    assert (np.abs(below / special.ndtr(values) - 1.0) <= near).all()
-    assert bell([0.0])[:, 0].tolist() == [1.0, 0.5]
-
-
-def test_what_is_certain_is_one_and_what_is_unknown_stays_so():
-    density, below = bell([-np.inf, np.inf, -50.0, 50.0, np.nan])
-    assert below[:4].tolist() == [0.0, 1.0, 0.0, 1.0] and np.isnan(below[4])
-    assert not density.any()
-
-
 def test_phasors_are_cosines_and_sines():
     values = np.concatenate([np.linspace(-60.0, 60.0, 4001), [np.nan]])
     cosine, sine = np.empty_like(values), np.empty_like(values)
@@ -74,22 +50,3 @@ def test_phasors_are_cosines_and_sines():
     assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
     assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
     assert np.isnan(cosine[-1]) and np.isnan(sine[-1])
-
-
-def test_normals_are_those_of_box_and_muller():
-    uniform = np.random.default_rng(1).random(10_000)
-    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
-    radius = np.sqrt(-2.0 * np.log1p(-uniform[:5000]))
-    angle = 2.0 * np.pi * uniform[5000:]
-    exact = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-    out = np.empty(10_000)
-    normals(uniform, out)
-    assert np.abs(out - exact).max() < 1e-13
-
-
-def test_normals_are_normal():
-    uniform = np.random.default_rng(2).random(200_000)
-    out = np.empty_like(uniform)
-    normals(uniform, out)
-    assert stats.kstest(out, 'norm').pvalue > 1e-3
-    assert abs(np.corrcoef(out[:100_000], out[100_000:])[0, 1]) < 0.015

@@ -25,13 +25,14 @@ import pytest
 
 from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from sonar_imm.estimation.set_filter import (
-    find_members,
     LagSmoother,
     levelled,
     SetFilter,
     Weighted,
 )
+from sonar_imm.estimation.set_members import find_members
 from sonar_imm.estimation.set_model import (
+    aged,
     banded_transition,
     gaussian_walk,
     repeated_walk,
@@ -100,20 +101,18 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
     from sonar_imm.estimation import set_filter
 
     if table == 'walk_ratio':
-        fill = set_filter.kernels.fill_walks
+        fill = set_filter.fill_walks
 
-        def unpaid(*arguments):
-            fill(*arguments)
-            ratio = arguments[-1].walk_ratio
-            ratio[ratio > 0.0] = 1.0
+        def unpaid(walks, g, share, wanted, tables, **options):
+            fill(walks, g, share, wanted, tables, **options)
+            tables.ratio[tables.ratio > 0.0] = 1.0
 
-        monkeypatch.setattr(set_filter.kernels, 'fill_walks', unpaid)
+        monkeypatch.setattr(set_filter, 'fill_walks', unpaid)
     else:
         births = set_filter.propose_births
+        nothing = np.zeros((1, model.cells))
         monkeypatch.setattr(
-            set_filter,
-            'propose_births',
-            lambda *a: (births(*a)[0], np.zeros((1, model.cells)), births(*a)[2]),
+            set_filter, 'propose_births', lambda *a: births(*a)._replace(ratio=nothing)
         )
     assert variation(run(model, exact['B'], 5000, seed=1)[0], exact) > 0.03
 
@@ -548,10 +547,10 @@ def test_amplitudes_and_shifts_are_forgotten_by_the_time(wide):
     assert record.passage.shift.memory == pytest.approx(0.8**4)
     sets = tracker.start(record).sets
     sets.prior_mean[:], sets.prior_variance[:] = 2.0, 0.5
-    aged = tracker._aged(sets, record)
-    assert aged.prior_mean[0, 0] == pytest.approx(2.0 * 0.9**3)
+    later = aged(tracker.model, sets, 3)
+    assert later.prior_mean[0, 0] == pytest.approx(2.0 * 0.9**3)
     fresh = (1.0 - 0.9**6) * wide.amplitude_std**2
-    assert aged.prior_variance[0, 0] == pytest.approx(0.9**6 * 0.5 + fresh)
+    assert later.prior_variance[0, 0] == pytest.approx(0.9**6 * 0.5 + fresh)
 
 
 # -- the offset between members and the shift they share, drawn anew ------------------------------

@@ -30,9 +30,18 @@ from sonar_imm.estimation.set_model import (
     independent_orders,
     SetModel,
     Sets,
+    Walks,
 )
-from sonar_imm.estimation.set_proposals import begin, gains, standing_out
+from sonar_imm.estimation.set_proposals import (
+    begin,
+    fill_walks,
+    gains,
+    standing_out,
+    walked_from,
+    WalkTables,
+)
 from sonar_imm.estimation.set_scatter import NO_SCATTER
+from sonar_imm.estimation.set_shifts import Shift
 
 N = 400
 GRAM = np.sinc(np.arange(N) / 5.0)
@@ -90,8 +99,8 @@ def test_nothing_stands_out_of_noise_and_blind_proposals_see_nothing():
     g, peaks = gains(blind, b, NO_SCATTER, GRAM)
     assert not len(peaks.first) and np.array_equal(g[0], 0.5 * np.square(np.maximum(b, 0.0)))
     beginning, births = begin(blind, g, peaks)
-    assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births[0])
-    assert np.diff(births[0]) == pytest.approx(1.0 / N)
+    assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births.running)
+    assert np.diff(births.running) == pytest.approx(1.0 / N)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -152,3 +161,54 @@ def test_before_the_first_record_members_neither_come_nor_go(start):
     record = tracker.record(b, (3, 1), records=0)
     step = tracker.weigh(tracker.propagate(tracker.start(record), record), record)
     assert tracker.summarise(step).pmf == pytest.approx(exact / exact.sum(), abs=0.01)
+
+
+@pytest.mark.parametrize('wide', [False, True])
+@pytest.mark.parametrize('all_sums', [False, True])
+def test_walks_are_drawn_by_what_they_come_to(wide, all_sums):
+    """Member by member, for walks of two kinds, of which one has a gap and leads aside; also
+    where it sees a peak that it cannot reach and whose worth is beyond numbers beside others."""
+    n, share, rng = 30, 0.8, np.random.default_rng(2)
+    g = 8.0 * rng.random((2, n))
+    if not wide:
+        g[0, [4, 17]] = 2000.0, 900.0
+    probability = np.array([[0.0, 0.25, 0.5, 0.25, 0.0], [0.3, 0.0, 0.2, 0.1, 0.4]])
+    kind, centre = (np.arange(n) % 3 == 1).astype(np.int64), np.array([0, 3])
+    wanted = rng.random(2 * n) < 0.6
+    tables = WalkTables(*np.full((2, 2 * n, 5), 7.0), np.full(2 * n, 7.0))
+    walks = Walks(kind, centre, probability, wide)
+    fill_walks(walks, g, share, wanted, tables, all_sums=all_sums)
+    for row in range(2 * n):
+        sign, z = divmod(row, n)
+        to = z + centre[kind[z]] + np.arange(-2, 3)
+        K = np.where((to >= 0) & (to < n), probability[kind[z]], 0.0)
+        if wanted[row] or all_sums:
+            scores = [math.log(p) + g[sign, k] for p, k in zip(K, to) if p > 0.0]
+            log_sum = np.logaddexp.reduce(scores) if scores else -math.inf
+            assert tables.log_sum[row] == pytest.approx(log_sum, rel=1e-12)
+        if not wanted[row]:
+            assert (tables.running[row] == 7.0).all() and (tables.ratio[row] == 7.0).all()
+        elif not K.any():
+            assert (tables.ratio[row] == 0.0).all()
+        else:
+            worth = [math.exp(g[sign, k] - log_sum) if p > 0.0 else 0.0 for p, k in zip(K, to)]
+            q = share * K * worth + (1.0 - share) * K / K.sum()
+            assert tables.running[row] == pytest.approx(np.cumsum(q), rel=1e-12)
+            ratio = np.divide(K, q, out=np.zeros(5), where=q > 0.0)
+            assert tables.ratio[row] == pytest.approx(ratio, rel=1e-12)
+
+
+@pytest.mark.parametrize('shift', [None, Shift(std=1.5, step=2)])
+def test_every_row_from_which_a_member_walks_is_known_to_be_wanted(shift):
+    its = evolve(MODEL, negative_probability=0.2, shift=shift)
+    sets = Sets.empty(its, 3)
+    sets.order[:] = 2, 1, 0
+    sets.cell[0, :2], sets.cell[1, 0], sets.sign[0, 1] = (5, 399), 30, -1
+    offsets = range(0, 2 * its.pad + 1, 2) if shift else [0]
+    expected = np.zeros((2, its.record_cells), bool)
+    for offset in offsets:
+        expected[0, [5 + offset, 30 + offset]] = expected[1, 399 + offset] = True
+    found = walked_from(its, sets).reshape(expected.shape)
+    assert (found >= expected).all()
+    # What is no member counts as one in the first cell.
+    assert found.sum() <= expected.sum() + len(offsets)

@@ -63,7 +63,7 @@ def judged(series, truth=None, **changes):
         words=summary_sentence,
         shown=METRICS,
         seen=seen,
-        sections=lambda: figures.sections(run, metrics, series, truth),
+        sections=lambda: figures.sections(metrics, series, truth),
         accuracy=lambda limit: None,
     )
 

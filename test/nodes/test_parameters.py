@@ -18,6 +18,7 @@ import pytest
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
+from sonar_imm.gone import GONE
 from sonar_imm.node_config import NodeConfig
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.parameters import ConfigError
@@ -121,6 +122,12 @@ def test_misspelt_names_are_warned_of_with_a_suggestion(start, capfd):
     assert (
         "'sound_sped' is not known and has no effect (did you mean 'sound_speed'?)" in warnings[0]
     )
+
+
+def test_removed_parameters_are_warned_of_with_what_to_use_instead(start, capfd):
+    start('targets_to:=127.0.0.1:4001')
+    (warning,) = [line for line in capfd.readouterr().err.splitlines() if '[WARN]' in line]
+    assert f"parameter 'targets_to' {GONE['parameter targets_to']}" in warning
 
 
 def test_changes_while_running(start):

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The verbs of `sonar_imm.estimation.imm_particles` in numpy, bit for bit the same."""
+"""The verbs of `trackers.bathymetry.filter_kernels` in numpy, bit for bit the same."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.elementary import exponentials
-from sonar_imm.estimation.imm_particles import LEAST_CHANCE
+from sonar_imm.trackers.bathymetry.filter_kernels import LEAST_CHANCE
 
 
 class WeightUpdate(NamedTuple):
@@ -115,6 +115,41 @@ def summarise(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray,
                 covariance[a, b] += mu[j] * spread
                 covariance[b, a] = covariance[a, b]
     return mean, covariance
+
+
+def effective_sample_size(w: FloatArray, mu: FloatArray) -> float:
+    """sum_j mu_j / sum_n w_jn^2: how many particles of the likely models count."""
+    return _total(np.array([m / _total(np.square(row)) for m, row in zip(mu, w)]))
+
+
+def filter_bins(x, w, mu, models, chains, uniform, noise, echo, look, drift):
+    """All bins of a ping; a bin's mean, covariance, mu, log likelihood and effective sample size
+    each, and the particles at the end. look(state, t): log likelihoods; drift(state, t): where
+    they are before they are moved."""
+    answers, w = [], w.copy()
+    M, _, N = x.shape
+    for t in range(len(noise)):
+        log_likelihood = 0.0
+        mixed, c, kind = x.copy(), mu, np.full(M, models.coast)
+        if echo[t]:
+            mixed, c = resample(x, w, mu, chains[0], uniform[t, 0])
+            if len(models.favour):
+                c = c * models.favour[t]
+                c = c / _total(c)
+            kind = np.arange(M)
+        for j in range(M):
+            mixed[j, 0] = drift(mixed[j, 0], t)
+        x = propagate(
+            mixed, models.F[kind], (models.G * models.scale[t][:, None, None])[kind], noise[t]
+        )
+        if echo[t]:
+            w, mu, log_likelihood, _ = weigh(np.array([look(row, t) for row in x[:, 0]]), c)
+        size = effective_sample_size(w, mu)
+        if len(chains) > 1 and echo[t]:
+            x, _ = resample(x, w, mu, chains[1], uniform[t, 1])
+            w = np.full((M, N), 1.0 / N)
+        answers.append([*summarise(x, w, mu), mu, log_likelihood, size])
+    return answers, x, w
 
 
 def _total(values: FloatArray) -> float:

@@ -17,17 +17,30 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray, IntArray
-from sonar_imm.estimation.set_kernels import Proposals
-from sonar_imm.estimation.set_model import SetModel, Sets, Walks
-from sonar_imm.estimation.set_proposals import begin, Beginning, gains, propose_births
+from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_proposals import begin, Beginning, Births, gains, propose_births
 from sonar_imm.estimation.set_scatter import fit_scatter, NO_SCATTER, ScatterFit
-from sonar_imm.estimation.set_shifts import shift_tables, ShiftTables
+from sonar_imm.estimation.set_shifts import Shift, ShiftTables
 
 IMPOSSIBLE = -math.inf
+
+
+class Proposals(NamedTuple):
+    """Tables of one record, for S signs, negative ones in the second n rows: walk (S n, 2 r + 1)
+    cumulative, walk_ratio (S n, 2 r + 1) of model to proposal, log_sum (S, n) log Z of the walks
+    from each cell; births; share of walks that see the record; the shift that all have."""
+
+    walk: FloatArray
+    walk_ratio: FloatArray
+    log_sum: FloatArray
+    births: Births
+    share: float
+    shift: Shift | None
 
 
 def background(model: SetModel, b: FloatArray) -> ScatterFit:
@@ -52,10 +65,9 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.where(q > 0.0, K / q, 0.0)
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
-    shifts = shift_tables(model.shift, log_sum, model.walk_share)
     births = propose_births(model, gained, model.birth_share, model.birth_cap)
-    walks = Walks.alike(model.walk, n)
-    return Proposals(np.cumsum(q, axis=1), ratio, *births, shifts, walks, np.empty((signs, 0)))
+    walk = np.cumsum(q, axis=1)
+    return Proposals(walk, ratio, log_sum, births, model.walk_share, model.shift)
 
 
 def start(
@@ -70,15 +82,15 @@ def start(
     N, J = len(uniform), model.order_max
     sets, log_ratio = Sets.empty(model, N), np.zeros(N)
     beginning, births = begin(model, *gains(model, b, background(model, b), model.gram))
-    inside = proposals._replace(birth=births[0], birth_ratio=births[1], birth_positive=births[2])
-    outside = inside._replace(birth=beginning.elsewhere)
+    outside = births._replace(running=beginning.elsewhere)
     for i in range(N):
         if model.shift:
-            place = np.searchsorted(proposals.shifts.start, uniform[i, 1 + J], 'right')
+            start = ShiftTables.of(model.shift).start
+            place = np.searchsorted(start, uniform[i, 1 + J], 'right')
             sets.shift[i] = min(int(place), model.shift.count - 1) * model.shift.step
         offset = int(sets.shift[i])
         drawn = uniform[i, ::-1][: len(beginning.sure)]
-        members, sign, paid = _peaks(model, inside, beginning, drawn, offset)
+        members, sign, paid = _peaks(model, births, beginning, drawn, offset)
         apart = all(b - a >= model.separation for a, b in zip(members, members[1:]))
         log_ratio[i] = paid if apart else IMPOSSIBLE
         least = max(0, model.order_min - len(members))
@@ -101,7 +113,7 @@ def start(
 
 
 def _peaks(
-    model: SetModel, births: Proposals, beginning: Beginning, drawn: FloatArray, offset: int
+    model: SetModel, births: Births, beginning: Beginning, drawn: FloatArray, offset: int
 ) -> tuple[list[int], dict[int, int], float]:
     """The members that a set begins with in the peaks of the record, by the random numbers drawn
     (K,), their signs, and the log ratio."""
@@ -114,13 +126,13 @@ def _peaks(
         if drawn[k] >= sure:
             paid -= math.log(1.0 - sure)
             continue
-        running = births.birth[cells[0] : cells[-1] + 2]
+        running = births.running[cells[0] : cells[-1] + 2]
         point = running[0] + drawn[k] / sure * (running[-1] - running[0])
         z = int(cells[min(int(np.searchsorted(running, point, 'right')) - 1, len(cells) - 1)])
-        negative = len(model.signs) > 1 and point - births.birth[z] >= births.birth_positive[z]
+        negative = len(model.signs) > 1 and point - births.running[z] >= births.positive[z]
         members.append(z - offset)
         sign[z - offset] = -1 if negative else 1
-        paid += births.birth_ratio[int(negative), z]
+        paid += births.ratio[int(negative), z]
         paid += math.log((running[-1] - running[0]) / sure)
     return members, sign, paid
 
@@ -145,7 +157,7 @@ def propagate(
         if model.shift:
             at = np.array([z for z, _ in members], np.int64)
             below = np.array([int(sets.sign[i, j] < 0) for _, j in members], np.int64)
-            chances, paid = propose_shift(proposals.shifts, int(sets.shift[i]), at, below)
+            chances, paid = propose_shift(proposals, int(sets.shift[i]), at, below)
             running = np.cumsum(chances)
             place = int(np.searchsorted(running, uniform[i, -1] * running[-1], 'right'))
             offset, log_ratio[i] = place * model.shift.step, paid[place]
@@ -166,7 +178,8 @@ def propagate(
             log_ratio[i] = IMPOSSIBLE
         for k in range(m - len(survivors)):
             if log_ratio[i] > IMPOSSIBLE:
-                log_ratio[i] += _birth(model, proposals, places, sign, uniform[i, 1 + k], offset)
+                drawn = uniform[i, 1 + k]
+                log_ratio[i] += _birth(model, proposals.births, places, sign, drawn, offset)
         new.order[i] = m
         if log_ratio[i] > IMPOSSIBLE:
             new.cell[i, :m] = places
@@ -181,7 +194,7 @@ def propagate(
 
 def _birth(
     model: SetModel,
-    proposals: Proposals,
+    births: Births,
     places: list[int],
     sign: dict[int, int],
     uniform: float,
@@ -190,7 +203,7 @@ def _birth(
     """Insert one more place into ascending `places`, as far from them as it must be, and its sign
     into `sign`; the log ratio of the model's birth to this one, -inf when there is no room.
     offset: from cells of the lattice to those of the record."""
-    birth = proposals.birth[offset:]
+    birth = births.running[offset:]
     edges = [-model.separation, *places, model.cells - 1 + model.separation]
     gaps = [
         (low + model.separation, high - model.separation + 1)
@@ -208,10 +221,10 @@ def _birth(
             place = min(max(found, low), high - 1)
             places.insert(k, place)
             # What is left of the random number within the cell chooses the sign.
-            negative = point - birth[place] >= proposals.birth_positive[place + offset]
+            negative = point - birth[place] >= births.positive[place + offset]
             sign[place] = -1 if negative and len(model.signs) > 1 else 1
             row = int(sign[place] < 0)
-            return float(proposals.birth_ratio[row, place + offset] + math.log(total))
+            return float(births.ratio[row, place + offset] + math.log(total))
         left -= weight
     raise AssertionError('a gap that has weight is always found')
 
@@ -271,14 +284,17 @@ def _weigh_from(
 
 
 def propose_shift(
-    tables: ShiftTables, before: int, cells: IntArray, negative: IntArray
+    proposals: Proposals, before: int, cells: IntArray, negative: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
     `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
-    prior = tables.log_prior[before // tables.step if len(tables.log_prior) > 1 else 0]
-    at = cells[:, None] + tables.step * np.arange(len(prior))
-    score = prior + tables.log_sum[negative[:, None], at].sum(axis=0)
+    shift, share = proposals.shift, proposals.share
+    assert shift
+    log_prior = ShiftTables.of(shift).log_prior
+    prior = log_prior[before // shift.step if len(log_prior) > 1 else 0]
+    at = cells[:, None] + shift.step * np.arange(len(prior))
+    score = prior + proposals.log_sum[negative[:, None], at].sum(axis=0)
     driven = np.exp(score - score.max())
-    q = tables.share * driven / driven.sum() + (1.0 - tables.share) * np.exp(prior)
+    q = share * driven / driven.sum() + (1.0 - share) * np.exp(prior)
     with np.errstate(divide='ignore'):
         return q, prior - np.log(q)

@@ -12,20 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The filters along the range bins of one ping, each compiled as one loop: particles and grid.
+"""What the filters along the range bins of one ping work on; and the filter on a grid.
 
-In `filter_block`, bin after bin, are the verbs of `estimation.imm_particles`:
+`filter_ping` and `smooth_ping` do on a grid, with the verbs of `estimation.grid`, what
+`filter_kernels` does with particles. What they work on stays in the cache.
 
-    resample    the particles of each model, from those of all models that could become it
-    propagate   each model moves its particles to the next bin
-    weigh       each particle meets the snapshot (`acoustics.likelihood_kernels`)
-    summarise   one answer for the bin
-
-`filter_ping` and `smooth_ping` do the same on a grid, with the verbs of `estimation.grid`. What
-they work on stays in the cache.
-
-Shapes: T bins of a ping, M models, n states, k noises, N particles per model, G cells of the grid,
-P staves.
+Shapes: T bins of a ping, M models, n states, N particles per model, G cells of the grid, P staves.
 """
 
 from __future__ import annotations
@@ -35,9 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import likelihood_kernels, rays
+from ...acoustics import likelihood_kernels
 from ...estimation import grid
-from ...estimation import imm_particles as imm
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...estimation.elementary import phasors
 from ...estimation.jit import kernel
@@ -92,33 +83,12 @@ class PingLikelihood(NamedTuple):
     geometry: Geometry
 
 
-class Motion(NamedTuple):
-    """How the models move: F (M, n, n), G (M, n, k) times scale (T, M); transition (M, M) of the
-    models; `coast` is the model that moves all particles through bins without an echo;
-    favour (T, M): see `models.TerrainModels`, (0, M) for none."""
-
-    F: FloatArray
-    G: FloatArray
-    scale: FloatArray
-    transition: FloatArray
-    coast: int
-    favour: FloatArray
-
-
 class Particles(NamedTuple):
     """x (M, n, N), their weights w (M, N) and the probabilities mu (M,) of the models."""
 
     x: FloatArray
     w: FloatArray
     mu: FloatArray
-
-
-class Draws(NamedTuple):
-    """Random numbers for B bins: uniform (B, 2, M) for resampling, standard normal
-    noise (B, M, k, N)."""
-
-    uniform: FloatArray
-    noise: FloatArray
 
 
 class Track(NamedTuple):
@@ -169,7 +139,7 @@ def sines_of(
         for s in range(n):
             first[s] = height - state[s]
         if geometry.launch.shape[0] > 0:
-            rays.look_up(
+            look_up(
                 geometry.launch,
                 geometry.row[t],
                 geometry.first_depth,
@@ -184,6 +154,27 @@ def sines_of(
         for s in range(n):
             if not abs(state[s]) <= _HALF_CIRCLE:
                 out[s] = math.nan
+
+
+@kernel
+def look_up(
+    value: FloatArray, row: float, first_depth: float, depth_step: float, depth: FloatArray
+) -> None:
+    """Replace depths (n,) by ``r sin(phi)`` from a launch table (R, D), bilinearly; row: the range
+    over its range step. NaN outside the table."""
+    k = min(max(int(row), 0), value.shape[0] - 2)
+    f = row - k
+    near, far, last = value[k], value[k + 1], value.shape[1] - 2
+    for s in range(depth.shape[0]):
+        place = (depth[s] - first_depth) / depth_step
+        if not 0.0 <= place <= last + 1.0:
+            depth[s] = math.nan
+            continue
+        i = min(int(place), last)
+        g = place - i
+        low = near[i] + g * (near[i + 1] - near[i])
+        high = far[i] + g * (far[i + 1] - far[i])
+        depth[s] = low + f * (high - low)
 
 
 @kernel
@@ -205,95 +196,6 @@ def drift(state: FloatArray, t: int, geometry: Geometry, out: FloatArray) -> Non
         elif down < -_HALF_CIRCLE:
             after = -math.pi - after
         out[s] = after - geometry.tilt[t]
-
-
-@kernel
-def favour_models(c: FloatArray, favour: FloatArray) -> None:
-    """Predicted probabilities c (M,) times the factors of each model, as probabilities again."""
-    total = 0.0
-    for j in range(c.shape[0]):
-        c[j] *= favour[j]
-        total += c[j]
-    for j in range(c.shape[0]):
-        c[j] /= total
-
-
-@kernel
-def filter_block(
-    first: int,
-    particles: Particles,
-    motion: Motion,
-    draws: Draws,
-    ping: PingLikelihood,
-    resample: bool,
-    track: Track,
-) -> None:
-    """Bins first, first + 1, ... of a ping, as many as `draws` last for.
-
-    `particles` are carried on, the answers go into `track`. Without an echo the chain of the
-    models rests. `resample` resamples each model's own particles besides, after they are weighed
-    and before the summary.
-    """
-    x, w, mu = particles
-    M, n, N = x.shape
-    F, G, scale, noise = motion.F, motion.G, motion.scale, draws.noise
-    echo, geometry, table = ping.echo, ping.geometry, ping.table
-    form, base, spread, signal = ping.form, ping.base, ping.spread, ping.signal
-    scratch = imm.ResampleScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
-    sines, value = np.empty(N), np.empty((M, N))
-    mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
-    step, alone = np.empty((n, G.shape[2])), np.empty((M, M))
-    for i in range(M):
-        for j in range(M):
-            alone[i, j] = 1.0 if i == j else 0.0
-    for b in range(noise.shape[0]):
-        t = first + b
-        if echo[t]:
-            imm.resample(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
-            if motion.favour.shape[0] > 0:
-                favour_models(c, motion.favour[t])
-        for j in range(M):
-            model = j if echo[t] else motion.coast
-            for a in range(n):
-                for k in range(G.shape[2]):
-                    step[a, k] = G[model, a, k] * scale[t, model]
-            if t >= geometry.drift_from:
-                before = mixed[j, 0] if echo[t] else x[j, 0]
-                drift(before, t, geometry, before)
-            if echo[t]:
-                imm.propagate(mixed[j], F[model], step, noise[b, j], x[j])
-                # Written out: a call that takes the whole of `ping` would cost 5 % of the ping.
-                sines_of(x[j, 0], t, geometry, work, sines)
-                likelihood_kernels.log_likelihoods(
-                    sines,
-                    geometry.spacing,
-                    form[t],
-                    base[t],
-                    spread[t],
-                    signal[t],
-                    table,
-                    work,
-                    value[j],
-                )
-                for s in range(N):
-                    w[j, s] = 1.0 / N
-            else:
-                imm.propagate(x[j], F[model], step, noise[b, j], mixed[j])
-                for a in range(n):
-                    for s in range(N):
-                        x[j, a, s] = mixed[j, a, s]
-        track.log_likelihood[t] = imm.weigh(value, c, w, mu, work[:2]) if echo[t] else 0.0
-        track.sample_size[t] = imm.effective_sample_size(w, mu)
-        if resample and echo[t]:
-            imm.resample(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
-            for j in range(M):
-                for s in range(N):
-                    w[j, s] = 1.0 / N
-                    for a in range(n):
-                        x[j, a, s] = mixed[j, a, s]
-        imm.summarise(x, w, mu, track.mean[t], track.covariance[t])
-        for j in range(M):
-            track.probability[t, j] = mu[j]
 
 
 @kernel

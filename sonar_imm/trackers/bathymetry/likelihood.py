@@ -174,7 +174,7 @@ class Swath:
         g = self.geometry
         if not len(g.launch):
             return depth
-        return rays.look_up_each(g.launch, g.row, g.first_depth, g.depth_step, depth)
+        return rays.look_up(g.launch, g.row, g.first_depth, g.depth_step, depth)
 
     def _reached(self, n: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How far below the array and outward echoes from directions n (T, 3) were made."""

@@ -25,8 +25,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import chain
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
@@ -38,17 +39,14 @@ from ...acoustics.layover import GATE, Layover, layover
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.elementary import normals
 from ...estimation.smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
+from .filter_kernels import filter_block, normals
 from .kernels import (
-    Draws,
-    filter_block,
     filter_ping,
     GridMotion,
-    Motion,
     Particles,
     PingLikelihood,
     smooth_ping,
@@ -219,30 +217,57 @@ def run_particles(
     start, draws, noises = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
     T, M = models.scale.shape
     n, k = models.F.shape[1], models.G.shape[2]
-    x, w = models.draw(count, start), np.full((M, count), 1.0 / count)
-    particles = Particles(x, w, models.initial.copy())
-    motion = Motion(
-        models.F, models.G, models.scale, models.transition, models.coast, models.favour
-    )
-    track = _empty(T, M, n)
-    block = max(1, min(_BLOCK // (M * k * count), T))
-    size = M * k * count
+    w = np.full((M, count), 1.0 / count)
+    particles = Particles(models.draw(count, start), w, models.initial.copy())
+    chains = np.stack([models.transition, np.eye(M)][: 1 + resample])
+    track, size = _empty(T, M, n), M * k * count
+    block = max(1, min(_BLOCK // size, T))
     uniform = np.empty(block * size + block * size % 2)
     noise = np.empty_like(uniform)
     for first in range(0, T, block):
         bins = min(block, T - first)
         noises.random(out=uniform)
-        normals(uniform, noise)
-        block_noise = noise[: bins * size].reshape(bins, M, k, count)
-        random = Draws(draws.random((bins, 2, M)), block_noise)
-        if watch is None:
-            filter_block(first, particles, motion, random, ping, resample, track)
-            continue
-        for b in range(bins):
-            single = Draws(random.uniform[b : b + 1], random.noise[b : b + 1])
-            filter_block(first + b, particles, motion, single, ping, resample, track)
-            watch(first + b, particles)
+        normals(uniform, uniform.view(np.int64), noise, noise.view(np.int64))
+        moves = noise[: bins * size].reshape(bins, M, k, count)
+        random = draws.random((bins, 2, M))
+        at_once = bins if watch is None else 1
+        for b in range(0, bins, at_once):
+            here = slice(b, b + at_once)
+            filter_bins(
+                first + b, particles, models, chains, random[here], moves[here], ping, track
+            )
+            if watch is not None:
+                watch(first + b, particles)
     return _with_constants(track, ping)
+
+
+def filter_bins(
+    first: int,
+    particles: Particles,
+    models: TerrainModels,
+    chains: FloatArray,
+    uniform: FloatArray,
+    noise: FloatArray,
+    ping: PingLikelihood,
+    track: Track,
+) -> None:
+    """Run `filter_block` with arrays of its own for scratch."""
+    g, (M, N) = ping.geometry, particles.w.shape
+    work = np.empty((5, N))
+    spread = ping.spread if ping.spread.shape[1] else None
+    launch = g.launch if len(g.launch) else None
+    drifting = None if g.of_heights else g.tilt, g.drift_from
+    groups: tuple[tuple[Any, ...], ...] = (
+        particles,
+        (models.F, models.G, models.scale, chains, models.coast, models.favour, uniform, noise),
+        (ping.echo, ping.form, ping.base, spread, ping.signal, ping.table),
+        (g.height, g.reach, g.cos_tilt, g.sin_tilt, g.spacing),
+        (launch, g.row, g.first_depth, g.depth_step, *drifting),
+        (np.empty(M), np.empty((M, N)), np.empty((M, N)), np.empty_like(particles.x)),
+        (np.empty(N + 1, np.int64), work, work.view(np.int64)),
+        track,
+    )
+    filter_block(first, *chain.from_iterable(groups))
 
 
 def run_grid(

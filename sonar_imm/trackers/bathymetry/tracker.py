@@ -19,10 +19,10 @@ noise, from which direction the floor answered, and the floor goes on from bin t
 few terrain models (`models`). So the filter runs *along the ping*: range is its time.
 
     snapshot -> likelihood of each bin (`likelihood`)
-             -> the cycle of the particle filter, bin after bin (`ping.run`, `kernels`)
+             -> the cycle of the particle filter, bin after bin (`ping.run`, `filter_kernels`)
              -> optional smoothing -> one row per bin (`ping.summarise`)
 
-The cycle of the particle filter, for each bin with an echo (`kernels.filter_block`):
+The cycle of the particle filter, for each bin with an echo (`filter_kernels`):
 
     resample    particles of each model, from those of all models that could become it: the
                 interaction of the multiple models, and the only resampling that is needed

@@ -46,7 +46,7 @@ from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.association import new_ids
-from ...estimation.set_filter import Members
+from ...estimation.set_members import Members
 from ...estimation.set_model import Walks
 from .config import FathometerConfig
 from .response import Lattice, Response

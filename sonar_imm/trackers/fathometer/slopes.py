@@ -231,7 +231,7 @@ def walks_to(
             probability[row] += weight * K / max(float(K.sum()), 0.99 * whole)
         probability[row] /= probability[row].sum()
     far = max(high - low for low, high in cells) * lattice.step > 2.0 * config.min_separation
-    return Walks.of(kind, centre, probability, wide=far)
+    return Walks(kind, centre, probability, far)
 
 
 def _cells(to: Ways, step: float, most: int) -> tuple[int, int]:

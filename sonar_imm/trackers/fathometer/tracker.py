@@ -55,7 +55,8 @@ import numpy as np
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
+from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
+from ...estimation.set_members import find_members
 from ...estimation.set_model import (
     banded_transition,
     gaussian_walk,

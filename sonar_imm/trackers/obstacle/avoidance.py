@@ -269,17 +269,22 @@ def _within(
     std_z, R = np.sqrt(var_z), safety.radius
     low = np.maximum(-safety.height, z - 6.0 * std_z)
     high = np.minimum(safety.height, z + 6.0 * std_z)
+    chance = np.zeros(len(z))
     # Most obstacles are passed far off: what follows would find the same.
-    near = (low <= high) & (np.abs(b) - R <= FAR * np.sqrt(var_b))
+    near = np.flatnonzero((low <= high) & (np.abs(b) - R <= FAR * np.sqrt(var_b)))
+    if not len(near):
+        return chance
+    z, var_z, b, var_b, both = (part[near] for part in (z, var_z, b, var_b, both))
+    std_z, low, high = std_z[near], low[near], high[near]
     slope = np.where(var_z > LITTLE, both / np.where(var_z > LITTLE, var_z, 1.0), 0.0)
     rest = np.sqrt(np.maximum(var_b - slope * both, 0.0))
     known = std_z <= 1e-9
     change = np.abs(slope) * (high - low) * FINE
     with np.errstate(divide='ignore', invalid='ignore'):
         count = np.where(change >= SLICES * rest, SLICES, 1 + np.floor(change / rest))
-    count = np.where(known | ~near, 1, count)
-    k = np.arange(SLICES)[:, None]
-    width = np.where(near, high - low, 0.0) / count
+    count = np.where(known, 1, count)
+    k = np.arange(int(count.max()))[:, None]
+    width = (high - low) / count
     end = low + (k + 1) * width
     std = np.where(known, 1.0, std_z)
     share = ndtr((end - z) / std) - ndtr((end - width - z) / std)
@@ -287,7 +292,8 @@ def _within(
     given = np.where(known, b, b + slope * (end - 0.5 * width - z))
     inside = ndtr(_off(R - given, rest, True)) - ndtr(_off(-R - given, rest, False))
     used = (k < count) & (share > LITTLE)
-    return np.where(near, (share * inside * used).sum(axis=0), 0.0)
+    chance[near] = (share * inside * used).sum(axis=0)
+    return chance
 
 
 def _off(edge: FloatArray, std: FloatArray, inside: bool) -> FloatArray:

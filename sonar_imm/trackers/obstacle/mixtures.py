@@ -194,8 +194,9 @@ def _gain(
 
 def _joseph(S: FloatArray, K: FloatArray, R: FloatArray) -> FloatArray:
     """Return (I - K H) S (I - K H)' + K R K' of the first two states, (n, n, L)."""
-    left = S - np.einsum('arl,rbl->abl', K, S[:2])
-    return left - np.einsum('arl,brl->abl', left[:, :2] - np.einsum('asl,srl->arl', K, R), K)
+    left = S - K[:, 0, None] * S[0] - K[:, 1, None] * S[1]
+    a, b = (left[:, r] - K[:, 0] * R[0, r] - K[:, 1] * R[1, r] for r in (0, 1))
+    return left - a[:, None] * K[:, 0] - b[:, None] * K[:, 1]
 
 
 def _nis(mu: FloatArray, r: FloatArray, S: FloatArray) -> FloatArray:

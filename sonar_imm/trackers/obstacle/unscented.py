@@ -133,7 +133,7 @@ def image_moments(
 def covariances(image: FloatArray, centre: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the covariances (q, q, L) of images (q, 1 + 2 k, L) without their means."""
     weights = np.concatenate([centre[None], weight, weight])
-    found = np.einsum('akl,kl,bkl->abl', image, weights, image)
+    found = (weights * image[:, None] * image[None]).sum(axis=2)
     return 0.5 * (found + np.swapaxes(found, 0, 1))
 
 
@@ -142,7 +142,7 @@ def cross_covariance(image: FloatArray, F: FloatArray, weight: FloatArray) -> Fl
     F (n, k, L) their rows of the root; weight (L,) of each point but the centre."""
     k = F.shape[1]
     difference = image[:, 1 : k + 1] - image[:, k + 1 :]
-    return np.einsum('qkl,nkl->qnl', difference, F) * weight
+    return (difference[:, None] * F[None]).sum(axis=2) * weight
 
 
 # -- prediction ----------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def _add_behaviour(
     y[COMMON:] *= keep
     S[COMMON:] *= keep
     S[:, COMMON:] *= keep
-    S[:2, :2] += push * push * noise * np.einsum('ail,bil->abl', J, J)
+    S[:2, :2] += push * push * noise * (J[:, None] * J[None]).sum(axis=2)
     S[:2, COMMON:] += push * noise * J
     S[COMMON:, :2] = np.swapaxes(S[:2, COMMON:], 0, 1)
     for a in (COMMON, COMMON + 1):

@@ -24,7 +24,6 @@ import pytest
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.bathymetry.kernels import favour_models
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run
 from sonar_imm.trackers.bathymetry.tracker import (
     Alone,
@@ -72,12 +71,6 @@ def enumerated(initial, transition, favour, steps):
         return weight / weight.sum(axis=1, keepdims=True)
 
     return np.array([marginals(t + 1)[t] for t in range(steps)]), marginals(steps)
-
-
-def test_favoured_probabilities_are_probabilities_again():
-    c = np.array([0.2, 0.3, 0.5])
-    favour_models(c, np.array([3.0, 1.0, 0.6]))
-    assert c == pytest.approx(np.array([0.5, 0.25, 0.25]))
 
 
 @pytest.mark.parametrize('engine', ['grid', 'particles'])

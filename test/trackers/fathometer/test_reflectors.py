@@ -24,7 +24,7 @@ import pytest
 from benchmarks import fathometer_vectors
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
-from sonar_imm.estimation.set_filter import Members
+from sonar_imm.estimation.set_members import Members
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.reflectors import (

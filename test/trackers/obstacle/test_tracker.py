@@ -14,6 +14,9 @@
 
 """The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
 
+import subprocess
+import sys
+
 from helpers.obstacle_runs import (
     approach,
     FIXED,
@@ -352,3 +355,23 @@ def test_the_band_holds_the_offset_under_real_motion():
     # It knows more than where obstacles are drawn, and than its own first answer.
     assert found['rmse_m'] < 0.9 * min(found['answering_zero_rmse_m'], found['spread_of_truth_m'])
     assert found['rmse_m'] < 0.9 * found['first_answer_rmse_m']
+
+
+def test_no_compiler_stands_before_the_first_estimate():
+    program = """
+import sys
+import numpy as np
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+for k in range(1, 20):
+    pose = Navigation(stamp_ns=k * 10**9, position=[k, 0.0, -20.0], orientation=[0, 0, 0, 1.0])
+    tracker.process(pose)
+    found = tracker.process(
+        Detections(stamp_ns=k * 10**9, range=[60.0 - k, 50.0], bearing=[0.1, -0.2])
+    )
+assert len(found) == 1 and len(found[0].extras['track_id']) > 0
+print('numba' in sys.modules)
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert done.stdout.split() == ['False'], done.stderr

@@ -1,0 +1,326 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The particle filter of a ping: bits of its verbs in numpy, which meet closed forms."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from oracles import imm_particles as oracle
+from oracles.markov import stationary_law
+import pytest
+from scipy import stats
+
+from sonar_imm.acoustics import interference, laplace, rays
+from sonar_imm.acoustics.likelihood_kernels import likelihood_table
+from sonar_imm.estimation import particles
+from sonar_imm.trackers.bathymetry import kernels, ping
+from sonar_imm.trackers.bathymetry.filter_kernels import normals
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'bathymetry'
+ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
+M, N, P = 3, 50, 5
+
+
+def normalised(w):
+    return w / w.sum(axis=1, keepdims=True)
+
+
+def random_set(rng, M=3, n=2, N=50):
+    return rng.normal(size=(M, n, N)), normalised(rng.random((M, N)) ** 4), rng.dirichlet([1] * M)
+
+
+def make_case(
+    echo, *, mu=None, heights=True, bent=False, beside=False, favours=False, again=False, seed=0
+):
+    """Bins of a ping with random everything: models of two states, snapshots, poses."""
+    rng, T = np.random.default_rng(seed), len(echo)
+    x, w, probability = random_set(rng)
+    x *= 1.0 if heights else 0.3
+    ranges = 20.0 + 0.4 * np.arange(T)
+    iq, ones = rng.normal(size=(T, P, 2)).view(complex)[..., 0], np.ones(T)
+    signal = rng.uniform(2.0, 30.0, T)
+    base, form, spread = np.zeros(T), laplace.form_coefficients(iq, signal, ones), iq[:, :0]
+    if beside:
+        sines = rng.uniform(-0.5, 0.5, (T, 2))
+        R = interference.noise_covariance(sines, np.ones((T, 2)), ones, P, np.pi)
+        parts = interference.interference_form(iq, R)
+        base, form, spread = parts.base, -signal[:, None] * parts.beam, parts.spread
+    tilt = rng.uniform(0.3, 0.6, T)
+    geometry = level_geometry(ranges, 15.0, 0.5, 0.5, of_heights=heights)._replace(
+        height=rng.normal(15.0, 0.3, T),
+        tilt=tilt,
+        cos_tilt=np.cos(tilt),
+        sin_tilt=np.sin(tilt),
+        drift_from=1,
+    )
+    if bent:
+        profile = rays.profile_of([0.0, 1520.0, 8.0, 1500.0, 20.0, 1490.0])
+        table = rays.launch_table(profile, 5.0, ranges[-1], 1500.0)
+        geometry = geometry._replace(
+            launch=table.value,
+            row=ranges / table.range_step,
+            first_depth=table.first_depth,
+            depth_step=table.depth_step,
+        )
+    arrays = (np.ascontiguousarray(part) for part in (form, base, spread, signal))
+    likelihood = kernels.PingLikelihood(
+        ranges, np.array(echo), *arrays, ones, np.zeros(T), likelihood_table(P), geometry
+    )
+    models = SimpleNamespace(
+        F=np.eye(2) + 0.1 * rng.normal(size=(M, 2, 2)),
+        G=0.1 * rng.normal(size=(M, 2, 2)) * np.array([[1.0, 0.0], [1.0, 1.0]]),
+        scale=rng.uniform(0.5, 2.0, (T, M)),
+        coast=1,
+        favour=rng.uniform(0.2, 2.0, (T, M)) if favours else np.empty((0, M)),
+    )
+    return SimpleNamespace(
+        start=kernels.Particles(x, w, probability if mu is None else mu),
+        models=models,
+        chains=np.stack([ASYMMETRIC if mu is None else np.eye(M), np.eye(M)][: 1 + again]),
+        uniform=rng.random((T, 2, M)),
+        noise=rng.normal(size=(T, M, 2, N)),
+        ping=likelihood,
+    )
+
+
+def compiled(case):
+    """Mean, covariance, probability, log likelihood and sample size of each bin; the particles."""
+    state = kernels.Particles(*(part.copy() for part in case.start))
+    T = len(case.noise)
+    track = kernels.Track(
+        np.empty((T, 2)), np.empty((T, 2, 2)), np.empty((T, M)), np.empty(T), np.empty(T)
+    )
+    for part in (slice(0, T // 2), slice(T // 2, T)):  # a ping is filtered block by block
+        drawn = case.uniform[part], case.noise[part]
+        ping.filter_bins(part.start, state, case.models, case.chains, *drawn, case.ping, track)
+    return [*track, state.x, state.w]
+
+
+def in_numpy(case):
+    told, g = case.ping, case.ping.geometry
+
+    def look(state, t):
+        out = np.empty(N)
+        kernels.state_log_likelihoods(state, told, t, np.empty(N), np.empty((4, N)), out)
+        return out
+
+    def drift(state, t):
+        out = state.copy()
+        if not g.of_heights and t >= g.drift_from:
+            kernels.drift(state, t, g, out)
+        return out
+
+    answers, x, w = oracle.filter_bins(
+        *case.start, case.models, case.chains, case.uniform, case.noise, told.echo, look, drift
+    )
+    return [*(np.array(column) for column in zip(*answers)), x, w]
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        {},
+        {'bent': True},
+        {'beside': True},
+        {'favours': True},
+        {'again': True},
+        {'heights': False},
+        {'heights': False, 'beside': True, 'favours': True, 'again': True},
+        {'bent': True, 'beside': True},
+    ],
+    ids=lambda options: ' '.join(options) or 'plain',
+)
+@pytest.mark.parametrize('seed', range(4))
+def test_the_kernel_gives_the_bits_of_the_verbs_in_numpy(options, seed):
+    echo = np.random.default_rng(seed).random(9) < 0.8
+    echo[1:3] = False, True
+    case = make_case(echo, seed=seed, **options)
+    for found, expected in zip(compiled(case), in_numpy(case)):
+        assert np.isfinite(found).all()
+        assert np.array_equal(found, expected)
+
+
+def test_bins_that_cannot_be_explained_leave_the_prediction():
+    case = make_case([True] * 6)
+    case.ping.geometry.height[2] = 1e3  # nothing is that far
+    case.ping.form[4] *= np.nan
+    case.start.x[0, 0, :7] = 1e3  # nor are these particles
+    found, expected = compiled(case), in_numpy(case)
+    assert np.isneginf(found[3][2])
+    for a, b in zip(found, expected):
+        assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_resampling_weights_that_are_not_finite_stays_in_its_arrays(value, monkeypatch):
+    case = make_case([True])
+    case.start.w[1, 7] = value
+    case.models.F[:], case.models.G[:] = np.eye(2), 0.0
+    guarded, kernel = np.full(N + 1 + 8, -7), ping.filter_block
+
+    def filter_block(*arguments):
+        numbers = [
+            getattr(each, 'dtype', None) == np.int64 and each.ndim == 1 for each in arguments
+        ]
+        assert sum(numbers) == 1
+        places = zip(arguments, numbers)
+        kernel(*(guarded[: N + 1] if origin else each for each, origin in places))
+
+    monkeypatch.setattr(ping, 'filter_block', filter_block)
+    x = compiled(case)[-2]
+    assert (guarded[N + 1 :] == -7).all() and (guarded[: N + 1] >= 0).all()
+    assert np.isin(x, case.start.x).all()
+
+
+def test_resampling_draws_from_the_exact_mixture():
+    rng = np.random.default_rng(3)
+    x, w, mu = random_set(rng, n=1)
+    runs = np.stack(
+        [oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))[0].mean(axis=2) for _ in range(4000)]
+    )
+    own = (w[:, None] * x).sum(axis=2)
+    c = mu @ ASYMMETRIC
+    expected = (ASYMMETRIC * mu[:, None]).T @ own / c[:, None]
+    error = runs.std(axis=0) / np.sqrt(len(runs))
+    assert (np.abs(runs.mean(axis=0) - expected) < 4.5 * error).all()
+    assert oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))[1] == pytest.approx(c)
+
+
+def test_a_model_that_nothing_can_become_stays_finite():
+    rng = np.random.default_rng(4)
+    x, w, mu = random_set(rng)
+    closed = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
+    mixed, c = oracle.resample(x, w, mu, closed, rng.random(3))
+    assert c[2] == 0.0 and np.isfinite(mixed).all()
+
+
+@pytest.mark.parametrize('tiny', [5e-324, 1e-310, 1e-300, 1e-280])
+def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
+    """The reciprocal of its probability overflows, and numbers particles outside of the set."""
+    rng = np.random.default_rng(4)
+    x, w, _ = random_set(rng)
+    mu, uniform = np.array([0.4, 0.6, tiny]), rng.random(3)
+    mixed, c = oracle.resample(x, w, mu, np.eye(3), uniform)
+    assert c[2] == tiny
+    # Copies of particles that were there: of the model's own, or of any model's.
+    assert np.isin(mixed[2, 0], x[2 if tiny > 1e-290 else slice(None), 0]).all()
+    case = make_case([True], mu=mu)
+    for found, expected in zip(compiled(case), in_numpy(case)):
+        assert np.array_equal(found, expected)
+
+
+def test_without_likelihood_the_chain_finds_its_stationary_law():
+    rng = np.random.default_rng(5)
+    x, w, mu = random_set(rng)
+    for _ in range(300):
+        x, c = oracle.resample(x, w, mu, ASYMMETRIC, rng.random(3))
+        step = oracle.weigh(np.zeros((3, 50)), c)
+        w, mu = step.w, step.mu
+    assert mu == pytest.approx(stationary_law(ASYMMETRIC), abs=1e-9)
+
+
+def test_likelihood_of_a_model_is_the_weighted_mean():
+    w = np.array([[0.9, 0.1], [0.5, 0.5]])
+    q = np.array([[1.0, 3.0], [2.0, 6.0]])
+    step = oracle.weigh(np.log(q), np.array([0.25, 0.75]), w)
+    L = (w * q).sum(axis=1)
+    assert step.mu == pytest.approx(np.array([0.25, 0.75]) * L / (0.25 * L[0] + 0.75 * L[1]))
+    assert step.w == pytest.approx(w * q / L[:, None])
+    assert step.log_likelihood == pytest.approx(np.log(0.25 * L[0] + 0.75 * L[1]))
+
+
+@pytest.mark.parametrize('value', [-np.inf, np.nan])
+def test_the_prediction_is_kept_when_nothing_is_possible(value):
+    rng = np.random.default_rng(6)
+    _, w, mu = random_set(rng)
+    step = oracle.weigh(np.full((3, 50), value), mu, w)
+    assert not step.ok and np.array_equal(step.w, w) and np.array_equal(step.mu, mu)
+
+
+def test_a_model_whose_particles_are_impossible_loses_all_probability():
+    log_likelihood = np.zeros((2, 4))
+    log_likelihood[1] = -np.inf
+    step = oracle.weigh(log_likelihood, np.array([0.1, 0.9]))
+    assert step.mu.tolist() == [1.0, 0.0] and (step.w == 0.25).all()
+
+
+def test_the_summary_is_the_moments_of_the_union():
+    rng = np.random.default_rng(7)
+    x, w, mu = random_set(rng)
+    union, weight = np.moveaxis(x, 1, 0).reshape(2, -1), (mu[:, None] * w).ravel()
+    mean, covariance = oracle.summarise(x, w, mu)
+    assert mean == pytest.approx(np.average(union, axis=1, weights=weight))
+    assert covariance == pytest.approx(np.cov(union, aweights=weight, ddof=0))
+
+
+def test_effective_sample_size_is_the_mean_over_models():
+    rng = np.random.default_rng(8)
+    _, w, mu = random_set(rng)
+    expected = mu @ particles.effective_sample_size(w)
+    assert oracle.effective_sample_size(w, mu) == pytest.approx(expected)
+
+
+@pytest.fixture(scope='module')
+def enumerated():
+    """Runs of the filter on the linear Gaussian system, and its exact answer over all 2^12
+    sequences of models."""
+    with np.load(VECTORS / 'jmls_enum.npz') as archive:
+        case = dict(archive)
+    width, N, runs = float(case['dS']), 10_000, 16
+    F = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, width], [0.0, 1.0]]])
+    G = np.array([[[1.0, 0.0], [0.0, 0.0]], [[width**2 / 2, 0.0], [width, 0.0]]])
+    answers = np.empty((runs, len(case['z']), 4))
+    for run in range(runs):
+        rng = np.random.default_rng(run)
+        x = np.stack([rng.normal(size=(2, N)), 0.1 * rng.normal(size=(2, N))], axis=1)
+        w, mu = np.full((2, N), 1.0 / N), case['mu0']
+        for k, z in enumerate(case['z']):
+            x, c = oracle.resample(x, w, mu, case['Pi'], rng.random(2))
+            x = oracle.propagate(x, F, G, rng.normal(size=(2, 2, N)))
+            w, mu, *_ = oracle.weigh(-0.5 * ((z - x[:, 0]) / case['so']) ** 2, c)
+            mean, covariance = oracle.summarise(x, w, mu)
+            answers[run, k] = *mean, mu[1], covariance[0, 0]
+    exact = np.column_stack([case[key] for key in ('mean', 'slope', 'p_ncs', 'var')])
+    return answers, exact
+
+
+def test_all_sequences_of_models_are_summed_over(enumerated):
+    answers, exact = enumerated
+    error = answers.std(axis=0, ddof=1) / np.sqrt(len(answers))
+    deviation = np.abs(answers.mean(axis=0) - exact)
+    assert (deviation < 5.0 * error + 1e-4).all()
+    # Tight where it can be: the ninth and later steps rest on few particles.
+    assert deviation[:9, 2].max() < 0.02 and deviation[:, 0].max() < 0.01
+
+
+def test_normals_are_those_of_box_and_muller():
+    uniform = np.random.default_rng(1).random(10_000)
+    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
+    radius = np.sqrt(-2.0 * np.log1p(-uniform[:5000]))
+    angle = 2.0 * np.pi * uniform[5000:]
+    exact = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+    out = np.empty(10_000)
+    normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
+    assert np.abs(out - exact).max() < 1e-13
+
+
+def test_normals_are_normal():
+    uniform = np.random.default_rng(2).random(200_000)
+    out = np.empty_like(uniform)
+    normals(uniform, uniform.view(np.int64), out, out.view(np.int64))
+    assert stats.kstest(out, 'norm').pvalue > 1e-3
+    assert abs(np.corrcoef(out[:100_000], out[100_000:])[0, 1]) < 0.015
