@@ -253,7 +253,8 @@ def tracker_from(saved: Saved, system: System, config: Config) -> Tracker:
         then = kind.from_mapping(saved.parameters)
     except ConfigError as error:
         raise StateError(f'it was saved with other parameters: {error}') from None
-    with understood():
+    # Odd numbers are refused, or lived with: numpy need not warn of them.
+    with understood(), np.errstate(all='ignore'):
         tracker = system.build(then)
         restore(tracker, saved.state)
         if then != config:
