@@ -71,7 +71,6 @@ CASES = {
 
 def cold_start(case: Case, cache: str) -> dict[str, float]:
     """Warm a tracker where nothing has been compiled yet; for a process of its own."""
-    os.environ['NUMBA_CACHE_DIR'] = cache
     from numba.core import event
 
     from sonar_imm import measurements
@@ -108,6 +107,8 @@ def cold_start(case: Case, cache: str) -> dict[str, float]:
 def main(cases: Sequence[str] = tuple(CASES)) -> Parts:
     for name in cases:
         with tempfile.TemporaryDirectory() as cache:
+            # Read when numba is imported, which the process does before it is called.
+            os.environ['NUMBA_CACHE_DIR'] = cache
             yield {'first start': {name: in_fresh_process(cold_start, CASES[name], cache)}}
 
 

@@ -123,15 +123,6 @@ def add_jitter(P: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def are_psd(P: FloatArray) -> BoolArray:
-    """`is_psd` of each of P (B, n, n), (B,)."""
-    L, good = np.empty(P.shape[1:]), np.empty(len(P), dtype=np.bool_)
-    for b in range(len(P)):
-        good[b] = is_psd(P[b], L)
-    return good
-
-
-@kernel
 def add_jitter_each(P: FloatArray) -> BoolArray:
     """`add_jitter` each of P (B, n, n) in place: which (B,) needed it."""
     L, needed = np.empty(P.shape[1:]), np.empty(len(P), dtype=np.bool_)
