@@ -18,28 +18,22 @@ Learning does not change the chain. It gives a *correction*, a factor for each t
 applied to the matrix of the next step: ``P(dt) = rownorm(P0(dt) * correction)``. So it works at
 irregular steps too.
 
-Two forms (`AdaptiveChain`):
+The correction is that of a Dirichlet prior: expected transitions ``n_ij += W_ij mu_j``, W the
+mixing weights, on top of a prior worth `weight` transitions per row, against those that the
+nominal chain predicts. At a constant step it is ``P = rownorm(n + weight P0)``, the mean of the
+posterior.
 
-counts
-    Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
-    transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``, the mean of the
-    posterior. The default of the diver tracker.
-fixed
-    The chain as it is.
-
-What `counts` does at each step is compiled; its arrays are float64 and C-contiguous.
+Where the models are families, a target learns inside each family only: how often it goes from one
+to another is too rare to be learnt from one target.
 """
 
 from __future__ import annotations
 
-from typing import get_args, Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from .arrays import FloatArray, IndexArray, IntArray
-from .jit import kernel
-
-Form = Literal['counts', 'fixed']
 
 
 class Chain(Protocol):
@@ -57,29 +51,51 @@ class AdaptiveChain:
     """A chain and the way the data of T targets correct it. What was learnt is a value that the
     caller keeps: `fresh` makes it, `learn` updates it.
 
-    weight: of counts, how many transitions per row the prior is worth.
+    weight: how many transitions per row the prior is worth; family (M,): the family of each model,
+    where targets learn inside of families only; learns: False for the chain as it is.
     """
 
-    def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0):
-        if form not in get_args(Form):
-            raise ValueError(f"the form of adaptation is one of {get_args(Form)}, not '{form}'")
+    def __init__(
+        self,
+        chain: Chain,
+        *,
+        weight: float = 2.0,
+        family: IntArray | None = None,
+        learns: bool = True,
+    ):
         self.chain = chain
-        self.form = form
         self.weight = weight
+        M = len(chain.matrix)
+        family = np.zeros(M, np.int64) if family is None else family
+        # The E transitions that can be learnt, row by row.
+        self._i, self._j = np.nonzero((family[:, None] == family) & learns)
+        self._first = np.flatnonzero(np.diff(self._i, prepend=-1))
+        self._prior = weight * chain.matrix[self._i, self._j]
 
     def fresh(self, targets: int) -> FloatArray:
-        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 0 for
-        fixed."""
-        M = len(self.chain.matrix)
-        return np.zeros((targets, 2 if self.form == 'counts' else 0, M, M))
+        """Return what is known before anything was learnt: (targets, 2, E), transitions seen and
+        expected, of the E that can be learnt."""
+        return np.zeros((targets, 2, len(self._i)))
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
-        """The matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing can be
-        learnt."""
+        """Return the matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing
+        can be learnt."""
         nominal = self.chain.transition(dt)
-        if self.form == 'fixed':
+        if not len(self._i):
             return np.array(nominal[None])
-        return counts_transition(nominal, learnt, self.chain.matrix, self.weight)
+        given = learnt[:, 1] + self._prior
+        known = given > 0.0
+        factor = np.where(known, (learnt[:, 0] + self._prior) / np.where(known, given, 1.0), 1.0)
+        due = nominal[self._i, self._j]
+        changed = due * factor
+        total = np.add.reduceat(changed, self._first, axis=1)[:, self._i]
+        kept = np.add.reduceat(due, self._first)[self._i]
+        out = np.repeat(nominal[None], len(learnt), axis=0)
+        possible = total > 0.0
+        out[:, self._i, self._j] = np.where(
+            possible, changed / np.where(possible, total, 1.0) * kept, due
+        )
+        return out
 
     def learn(
         self,
@@ -90,88 +106,20 @@ class AdaptiveChain:
         dt: float,
         hit: IndexArray | None = None,
     ) -> FloatArray:
-        """What is learnt after a step that used `transition` (targets or 1, M, M) and took the
-        model probabilities (targets, M) from `mu_before` to `mu_after`. Only the targets `hit`
+        """Return what is learnt after a step that used `transition` (targets or 1, M, M) and took
+        the model probabilities (targets, M) from `mu_before` to `mu_after`. Only the targets `hit`
         (all by default), which were measured, learn: a miss holds no information on
         transitions."""
-        if self.form == 'fixed':
+        if not len(self._i):
             return learnt
         hit = np.arange(len(learnt)) if hit is None else hit
-        nominal = self.chain.transition(dt)
-        return learn_counts(learnt, hit, transition, mu_before, mu_after, nominal)
-
-
-@kernel
-def counts_transition(
-    nominal: FloatArray, learnt: FloatArray, prior: FloatArray, weight: float
-) -> FloatArray:
-    """Multiply by (n + N0 P0) / (e + N0 P0) and renormalise the rows: the matrices (T, M, M) of a
-    step whose nominal one is `nominal` (M, M), after what was `learnt` (T, 2, M, M)."""
-    T, _, M, _ = learnt.shape
-    out = np.empty((T, M, M))
-    for t in range(T):
-        for i in range(M):
-            row = out[t, i]
-            for j in range(M):
-                pseudo = weight * prior[i, j]
-                given = learnt[t, 1, i, j] + pseudo
-                factor = (learnt[t, 0, i, j] + pseudo) / given if given > 0.0 else 1.0
-                row[j] = nominal[i, j] * factor
-            total = row_sum(row)
-            for j in range(M):
-                row[j] = row[j] / total if total > 0.0 else nominal[i, j]
-    return out
-
-
-@kernel
-def learn_counts(
-    learnt: FloatArray,
-    hit: IntArray,
-    transition: FloatArray,
-    mu_before: FloatArray,
-    mu_after: FloatArray,
-    nominal: FloatArray,
-) -> FloatArray:
-    """`learnt` (T, 2, M, M) after a step with `transition` (T or 1, M, M), new for the targets
-    `hit` alone: the expected transitions n_ij += W_ij mu_j, W the mixing weights, and e_ij, those
-    that the nominal matrix predicts for the same step."""
-    out = learnt.copy()
-    M = len(nominal)
-    reach, posterior = np.empty(M), np.empty(M)
-    for t in hit:
-        P = transition[t % len(transition)]
-        for j in range(M):
-            reach[j] = 0.0
-        for i in range(M):
-            for j in range(M):
-                reach[j] += P[i, j] * mu_before[t, i]
-        for i in range(M):
-            for j in range(M):
-                known = reach[j] if reach[j] > 0.0 else 1.0
-                posterior[j] = P[i, j] * mu_before[t, i] / known * mu_after[t, j]
-            total = row_sum(posterior)
-            for j in range(M):
-                out[t, 0, i, j] += posterior[j]
-                out[t, 1, i, j] += total * nominal[i, j]
-    return out
-
-
-@kernel
-def row_sum(row: FloatArray) -> float:
-    """The sum of up to 128 numbers, eight partial sums side by side, as numpy adds a row."""
-    n = len(row)
-    if n < 8:
-        total = 0.0
-        for k in range(n):
-            total += row[k]
-        return total
-    a, b, c, d = row[0], row[1], row[2], row[3]
-    e, f, g, h = row[4], row[5], row[6], row[7]
-    last = n - n % 8
-    for k in range(8, last, 8):
-        a, b, c, d = a + row[k], b + row[k + 1], c + row[k + 2], d + row[k + 3]
-        e, f, g, h = e + row[k + 4], f + row[k + 5], g + row[k + 6], h + row[k + 7]
-    total = ((a + b) + (c + d)) + ((e + f) + (g + h))
-    for k in range(last, n):
-        total += row[k]
-    return total
+        used = transition if len(transition) == 1 else transition[hit]
+        joint = used * mu_before[hit][:, :, None]
+        reach = joint.sum(axis=1)
+        share = mu_after[hit] / np.where(reach > 0.0, reach, 1.0)
+        posterior = joint * share[:, None]
+        nominal = self.chain.transition(dt)[self._i, self._j]
+        out = learnt.copy()
+        out[hit, 0] += posterior[:, self._i, self._j]
+        out[hit, 1] += posterior.sum(axis=2)[:, self._i] * nominal
+        return out

@@ -55,6 +55,8 @@ from .arrays import BoolArray, FloatArray, IndexArray
 __all__ = [
     'Bank',
     'combine',
+    'compare',
+    'expected',
     'Gaussians',
     'Innovations',
     'mix',
@@ -145,6 +147,10 @@ def mix(
     W = transition * mu[:, :, None]
     a = bank.units.shape[1]
     centre = _centre(blocks[0], mu[:, :a])
+    if bank.velocities:
+        # Moments about the origin lose the digits of a position, but not those of a speed, and
+        # those of a velocity follow from them.
+        centre[:, S] = 0.0
     moments = [_moments(block, _padded(centre, k)) for k, block in enumerate(blocks)]
     images = None
     if bank.velocities:
@@ -164,16 +170,10 @@ def mix(
 
 
 def _centre(block: Gaussians, mu: FloatArray) -> FloatArray:
-    """Return the mean (N, n) of the models of a block, its speed set to 0.
-
-    Moments about the origin of the map would lose the digits of a covariance; a speed of some
-    m/s loses none.
-    """
+    """Return the mean (N, n) of the models of a block."""
     weight = np.maximum(mu, 1e-12)
     weight = weight / weight.sum(axis=1, keepdims=True)
-    centre = np.asarray((block.x @ weight[..., None])[..., 0])
-    centre[:, S] = 0.0
-    return centre
+    return np.asarray((block.x @ weight[..., None])[..., 0])
 
 
 def _padded(centre: FloatArray, block: int) -> FloatArray:
@@ -364,15 +364,28 @@ POSITION: Measured = ((X,), (Y,))
 class Innovations(NamedTuple):
     """What p pairs of a row and a measurement of two values say of each of m models.
 
-    v (p, 2, m): innovations; PHt (p, n, 2, m); S (p, 3, m): xx, xy, yy of their covariance; R (p,
-    2, 2); log (p, m): ln N(v; 0, S), -inf where S is no covariance.
+    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log (p,
+    m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
     """
 
     v: FloatArray
-    PHt: FloatArray
     S: FloatArray
     R: FloatArray
+    nis: FloatArray
     log: FloatArray
+
+    def only(self, chosen: IndexArray | BoolArray) -> Innovations:
+        """Return the `chosen` pairs."""
+        return Innovations._make(part[chosen] for part in self)
+
+
+def expected(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
+    """Return what each model expects of a measurement, (N, 2, m), and the covariance of that, (N,
+    3, m): xx, xy, yy."""
+    PHt = np.swapaxes(_measure(block.P, measured), 1, 2)
+    HPHt = _measure(PHt, measured)
+    S = np.stack([HPHt[:, 0, 0], HPHt[:, 0, 1], HPHt[:, 1, 1]], axis=1)
+    return _measure(block.x, measured), S
 
 
 def weigh(
@@ -384,22 +397,31 @@ def weigh(
 ) -> Innovations:
     """Compare the models of each pair's row with its measurement: row (p,), z (p, 2), R (p, 2,
     2)."""
-    v = z[..., None] - _measure(block.x[row], measured)
-    PHt = np.swapaxes(_measure(block.P[row], measured), 1, 2)
-    HPHt = np.swapaxes(_measure(PHt, measured), 1, 2)
-    a, b, d = (HPHt[:, i, j] + R[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    return compare(*expected(block, measured), row, z, R)
+
+
+def compare(
+    h: FloatArray, S: FloatArray, row: IndexArray, z: FloatArray, R: FloatArray
+) -> Innovations:
+    """Compare each pair's measurement with what its row expects: h, S as of `expected`, the rest
+    as in `weigh`."""
+    v = z[..., None] - h[row]
+    S = S[row] + np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1)[..., None]
+    a, b, d = S[:, 0], S[:, 1], S[:, 2]
     # By the Cholesky factor, written out: a determinant would lose digits.
-    with np.errstate(divide='ignore', invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         left = d - b * b / a
         second = v[:, 1] - b / a * v[:, 0]
         nis = v[:, 0] * v[:, 0] / a + second * second / left
         log = -0.5 * (nis + np.log(a * left)) - LOG_2PI
         good = (a > 0.0) & (left > 0.0) & np.isfinite(log)
-    return Innovations(v, PHt, np.stack([a, b, d], axis=1), R, np.where(good, log, -np.inf))
+    return Innovations(v, S, R, np.where(good, nis, np.inf), np.where(good, log, -np.inf))
 
 
 def _measure(array: FloatArray, measured: Measured) -> FloatArray:
     """Return the measured values (p, 2, ...) of the components (p, n, ...)."""
+    if all(len(each) == 1 for each in measured):
+        return array[:, [each[0] for each in measured]]
     values = [array[:, list(each)].sum(axis=1) for each in measured]
     return np.stack(values, axis=1)
 
@@ -457,18 +479,19 @@ def _conditioned(
     """Return by how much each pair moves the means (p, n, m), and the covariances (p, n, n, m)
     after it, in Joseph's form."""
     a, b, d = (pairs.S[:, None, k] for k in range(3))
+    P = block.P[row]
+    PHt = np.swapaxes(_measure(P, measured), 1, 2)
     with np.errstate(divide='ignore', invalid='ignore'):
         left = d - b * b / a
-        second = (pairs.PHt[:, :, 1] - b / a * pairs.PHt[:, :, 0]) / left
-        K = np.stack([(pairs.PHt[:, :, 0] - b * second) / a, second], axis=2)
+        second = (PHt[:, :, 1] - b / a * PHt[:, :, 0]) / left
+        K = np.stack([(PHt[:, :, 0] - b * second) / a, second], axis=2)
     K = np.where(np.isfinite(pairs.log)[:, None, None], K, 0.0)
     if estimated is not None:
         K[:, ~estimated] = 0.0
     shift = K[:, :, 0] * pairs.v[:, None, 0] + K[:, :, 1] * pairs.v[:, None, 1]
     # (I - K H) P, then times (I - K H)' and with K R K'.
-    P = block.P[row]
     for r in range(2):
-        P -= K[:, :, None, r] * pairs.PHt[:, None, :, r]
+        P -= K[:, :, None, r] * PHt[:, None, :, r]
     PHt = np.swapaxes(_measure(np.swapaxes(P, 1, 2), measured), 1, 2)
     for r in range(2):
         KR = K[:, :, 0] * pairs.R[:, None, 0, r, None] + K[:, :, 1] * pairs.R[:, None, 1, r, None]

@@ -15,12 +15,17 @@
 """The table of rows: a target is a weighted set of filters, each under one assumption.
 
 A row is one filter of a `bank` under one assumption: a scale of the covariances, a depth at which
-the target began, a side of the array, a history of associations. The rows of all targets lie in
-one table, so that every verb runs over all of them at once; rows that belong to the same target
-lie side by side, and their weights sum to one.
+the target began, a side of the array, an offset of a sensor. The rows of all targets lie in one
+table, so that every verb runs over all of them at once; rows that belong to the same target lie
+side by side.
 
-Rows begin and end at run time. `Rows.key` says what a row assumes, by name; a row that is copied
-has its origin in `parent`, the row of the table before, so that a smoother can follow it back.
+Rows begin and end at run time. `Rows.key` says what a row assumes, by name. `parent` is the row of
+the table before that it came from, so that a smoother can follow it back.
+
+*Borrowing.* A scale of the covariances changes how a filter goes on, not what it is. So a scale
+that has become improbable need not be computed: it loses its row and keeps its weight in a list
+(`Borrowed`), reckoned from a row of the same target. When it becomes probable again, it gets a
+copy of that row. Nothing else may borrow: a start depth *is* its state.
 
 No array in a table is ever written again: tables of earlier scans share them.
 """
@@ -36,20 +41,25 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Rows']
+__all__ = ['Borrowed', 'log_sum', 'revived', 'Rows', 'thinned']
 
-MOST_ROWS = 32
-"""Rows of a target; the least probable ones leave."""
+LEAST_LOG = -345.0
+"""Logarithm of the weight, 1e-150, that a row keeps: it may become true later."""
+
+ROW_LOST, ROW_AGAIN = 1e-4, 1e-3
+"""Weights below which an assumption that may borrow loses its row, and above which it gets one
+again."""
 
 
 @frozen(eq=False)
 class Rows:
-    """N rows of M models each.
+    """N rows of M models each, of T targets, each of which has at least one.
 
     blocks: states of the models, see `bank`; mu (N, M): probabilities of the models in each row,
     which sum to one; logw (N,): logarithms of the weights of the rows, which sum to one for each
-    target; target (N,): the place of the target, in rising order; parent (N,): the row of the
-    table before, -1 for none; key: what each row assumes, by name, (N,) each.
+    target, but for what is `Borrowed`; target (N,): the place of the target, in rising order;
+    parent (N,): the row of the table before, -1 for none; key: what each row assumes, by name,
+    (N,) each.
     """
 
     blocks: tuple[Gaussians, ...]
@@ -64,13 +74,28 @@ class Rows:
 
     @property
     def first(self) -> IndexArray:
-        """(T,) the first row of each target that has one."""
-        return np.unique(self.target, return_index=True)[1]
+        """(T,) the first row of each target."""
+        return np.flatnonzero(np.diff(self.target, prepend=-1))
 
     @property
     def weight(self) -> FloatArray:
-        """(N,) the weights of the rows of each target."""
-        return np.exp(self.logw)
+        """(N,) the weights of the rows of each target; they sum to one."""
+        return self.weights_of(np.ones(len(self), np.bool_))
+
+    def weights_of(self, counted: BoolArray) -> FloatArray:
+        """Return the weights (N,) of the rows among those that are `counted` (N,), of targets that
+        have none of these among all."""
+        if not len(self):
+            return np.empty(0)
+        first = self.first
+        none = ~np.logical_or.reduceat(counted, first)
+        weight = np.where(counted | none[self.target], np.exp(self.logw), 0.0)
+        return weight / np.add.reduceat(weight, first)[self.target]
+
+    def weight_among_themselves(self) -> FloatArray:
+        """Return the weights (N,) of the rows of one target, whatever its place."""
+        weight = np.exp(self.logw - self.logw.max())
+        return np.asarray(weight / weight.sum())
 
     def take(self, rows: IndexArray) -> Rows:
         """Return those rows, in that order, each as often as it is named; `parent` says which they
@@ -85,9 +110,11 @@ class Rows:
         )
 
     def of_targets(self, kept: BoolArray) -> Rows:
-        """Return the rows of the targets where `kept` (T,) is True, which are numbered anew."""
-        chosen = self.take(np.flatnonzero(kept[self.target]))
-        return evolve(chosen, target=(np.cumsum(kept) - 1)[chosen.target])
+        """Return the rows of the targets where `kept` (T,) is True, which are numbered anew; their
+        parents stay."""
+        rows = np.flatnonzero(kept[self.target])
+        renumbered = (np.cumsum(kept) - 1)[self.target[rows]]
+        return evolve(self.take(rows), target=renumbered, parent=self.parent[rows])
 
     def append(self, new: Rows) -> Rows:
         """Return the table with more rows, of targets already there or of new ones.
@@ -105,66 +132,132 @@ class Rows:
             np.concatenate([self.mu, new.mu]),
             np.concatenate([self.logw, new.logw]),
             np.concatenate([self.target, new.target]),
-            np.concatenate([self.parent, np.full(len(new), -1)]),
+            np.concatenate([self.parent, new.parent]),
             {name: np.concatenate([self.key[name], new.key[name]]) for name in self.key},
         )
+        if (np.diff(both.target) >= 0).all():
+            return both
         order = np.argsort(both.target, kind='stable')
         return evolve(both.take(order), parent=both.parent[order])
 
-    def reweighed(self, log_likelihood: FloatArray) -> tuple[Rows, FloatArray]:
-        """Return the rows after evidence of `log_likelihood` (N,), and the logarithm (T,) of the
-        evidence of each target. A target none of whose rows explains it keeps its weights."""
-        log = self.logw + log_likelihood
-        total = self.log_sum(log)
-        known = np.isfinite(total)[self._place]
-        after = np.where(known, log - np.where(known, total[self._place], 0.0), self.logw)
-        return evolve(self, logw=after), total
+    def in_place_of(self, target: int, new: Rows) -> Rows:
+        """Return the table in which `new` are the rows of one target, without parents."""
+        left = self.take(np.flatnonzero(self.target != target))
+        left = evolve(left, parent=self.parent[left.parent])
+        count = len(new)
+        return left.append(evolve(new, target=np.full(count, target), parent=np.full(count, -1)))
+
+    def with_models(self, factor: FloatArray) -> tuple[Rows, FloatArray]:
+        """Return the rows after the probabilities of their models were multiplied by `factor` (N,
+        M), and by what (N,) that multiplied the weight of each row."""
+        mu = self.mu * factor
+        total = mu.sum(axis=1)
+        known = total > 0.0
+        mu = np.where(known[:, None], mu / np.where(known, total, 1.0)[:, None], self.mu)
+        return evolve(self, mu=mu), total
 
     def log_sum(self, log: FloatArray) -> FloatArray:
         """Return ln sum exp (T, ...) over the rows of each target of `log` (N, ...)."""
-        if not len(log):
-            return np.empty((0, *log.shape[1:]))
-        top = np.maximum.reduceat(log, self.first)
-        top = np.where(np.isfinite(top), top, 0.0)
-        with np.errstate(divide='ignore'):
-            return np.asarray(
-                top + np.log(np.add.reduceat(np.exp(log - top[self._place]), self.first))
-            )
+        return log_sum(log, self.target)
 
-    def spread(self, share: float) -> Rows:
-        """Return the rows after `share` of the weight of each target was spread evenly over its
-        rows, so that an assumption that becomes true is noticed."""
-        count = np.bincount(self._place)[self._place]
-        return evolve(self, logw=np.log((1.0 - share) * self.weight + share / count))
-
-    def pruned(self, least: float, most: int = MOST_ROWS) -> Rows:
-        """Return the rows without those below `least` in weight, and at most `most` of each
-        target; the heaviest row of a target stays. Weights sum to one again."""
-        order = np.lexsort((-self.logw, self._place))
-        rank = np.empty(len(self), np.int64)
-        rank[order] = np.arange(len(self)) - self.first[self._place[order]]
-        kept = (rank == 0) | ((self.weight >= least) & (rank < most))
-        chosen = self if kept.all() else self.take(np.flatnonzero(kept))
-        return evolve(chosen, logw=chosen.logw - chosen.log_sum(chosen.logw)[chosen._place])
-
-    @property
-    def _place(self) -> IndexArray:
-        """(N,) the place of each row's target among those that have rows."""
-        return np.asarray(np.unique(self.target, return_inverse=True)[1])
-
-    def combine(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def combine(
+        self, mean: FloatArray, covariance: FloatArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return mean (T, q) and covariance (T, q, q) of each target, of those of its rows (N, q),
-        (N, q, q)."""
-        w = self.weight[:, None]
-        centre = np.add.reduceat(w * mean, self.first)
-        d = mean - centre[self._place]
+        (N, q, q) with `weight` (N,)."""
+        if not len(self):
+            return mean, covariance
+        w, first = weight[:, None], self.first
+        centre = np.add.reduceat(w * mean, first)
+        d = mean - centre[self.target]
         spread = covariance + d[:, :, None] * d[:, None]
-        return centre, np.add.reduceat(w[..., None] * spread, self.first)
+        return centre, np.add.reduceat(w[..., None] * spread, first)
 
     def models(self) -> FloatArray:
         """Return the probabilities (T, M) of the models of each target, over all its rows."""
+        if not len(self):
+            return self.mu
         return np.asarray(np.add.reduceat(self.weight[:, None] * self.mu, self.first))
 
     def replace(self, **changes: Any) -> Rows:
         """Return the rows with other blocks, mu, logw or key."""
         return evolve(self, **changes)
+
+
+def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
+    """Return ln sum exp (T, ...) of what belongs to each target: log (A, ...), target (A,) in
+    rising order, each of T there."""
+    if not len(log):
+        return np.empty((0, *log.shape[1:]))
+    first = np.flatnonzero(np.diff(target, prepend=-1))
+    top = np.maximum.reduceat(log, first)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide='ignore'):
+        return np.asarray(top + np.log(np.add.reduceat(np.exp(log - top[target]), first)))
+
+
+@frozen(eq=False)
+class Borrowed:
+    """Assumptions without a row of their own: target (B,), the `key` (B,) they are known by, and
+    the logarithms of their weights (B,)."""
+
+    target: IntArray
+    key: FloatArray
+    logw: FloatArray
+
+    @classmethod
+    def none(cls) -> Borrowed:
+        """Return an empty list."""
+        return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    def of_targets(self, kept: BoolArray) -> Borrowed:
+        """Return those of the targets where `kept` (T,) is True, which are numbered anew."""
+        own = kept[self.target]
+        return Borrowed((np.cumsum(kept) - 1)[self.target[own]], self.key[own], self.logw[own])
+
+    def without(self, target: int) -> Borrowed:
+        """Return those of all other targets."""
+        other = self.target != target
+        return Borrowed(self.target[other], self.key[other], self.logw[other])
+
+    def lender(self, rows: Rows, name: str) -> IndexArray:
+        """Return the row (B,) of the same target that each is reckoned from: the nearest by the
+        logarithm of the key `name`, of two as near the heavier."""
+        if not len(self):
+            return np.empty(0, np.intp)
+        apart = np.abs(np.log(rows.key[name]) - np.log(self.key)[:, None])
+        apart = np.where(rows.target == self.target[:, None], apart - 1e-9 * rows.logw, np.inf)
+        return np.asarray(apart.argmin(axis=1))
+
+
+def thinned(
+    rows: Rows, borrowed: Borrowed, name: str, stays: BoolArray
+) -> tuple[Rows, Borrowed, IndexArray]:
+    """Return rows and list after rows that lost their weight were left out, but for those that
+    `stays` (N,), and which rows are left. name: of the key that may borrow."""
+    lost = (rows.logw < np.log(ROW_LOST)) & ~stays
+    left = np.flatnonzero(~lost)
+    if len(left) == len(rows):
+        return rows, borrowed, left
+    target = np.concatenate([borrowed.target, rows.target[lost]])
+    key = np.concatenate([borrowed.key, rows.key[name][lost]])
+    new = Borrowed(target, key, np.concatenate([borrowed.logw, rows.logw[lost]]))
+    return evolve(rows.take(left), parent=rows.parent[left]), new, left
+
+
+def revived(
+    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
+) -> tuple[Rows, Borrowed]:
+    """Return rows and list after assumptions `again` (B,) got a row, a copy of their lender."""
+    if not again.any():
+        return rows, borrowed
+    back, waiting = (
+        Borrowed(borrowed.target[own], borrowed.key[own], borrowed.logw[own])
+        for own in (again, ~again)
+    )
+    lender = back.lender(rows, name)
+    copies = evolve(rows.take(lender), logw=back.logw, parent=rows.parent[lender])
+    return rows.append(evolve(copies, key={**copies.key, name: back.key})), waiting
