@@ -20,8 +20,9 @@ r the receiver where it is said to be, o its horizontal offset, ``v = dc/c`` the
 the sound speed, k the error of the receiver's clock times the sound speed. A tag that emits by
 itself has the one leg, and its time of emission times the sound speed is added. z points up.
 
-`arrival_paths` and `arrival_angles` are for whole arrays. `observe` is the same for one number,
-compiled: it writes the gradient into the columns where a filter keeps its state.
+`arrival_paths` and `arrival_angles` are for one diver and many receivers. `observe` is the same
+for many states of a filter at once; its gradient stands in the columns where the filter keeps its
+state.
 
 Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with Applications to Tracking and
 Navigation*, 2001, ch. 10 (range and angle models).
@@ -29,14 +30,12 @@ Navigation*, 2001, ch. 10 (range and angle models).
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..estimation.arrays import FloatArray, IntArray
-from ..estimation.jit import kernel
+from ..estimation.arrays import FloatArray, IndexArray, IntArray
 
 PATH, ONE_WAY, BEARING, ELEVATION, HEIGHT = range(5)
 """Kinds of number that `observe` predicts: metres, metres, rad, rad, metres."""
@@ -113,75 +112,113 @@ def _leg(position: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArr
     return distance, d / np.where(distance > NEAREST, distance, np.inf)[:, None]
 
 
-@kernel
 def observe(
-    kind: int,
     x: FloatArray,
-    columns: IntArray,
     height: float,
+    kind: IntArray,
+    columns: IntArray,
     tx: FloatArray,
     rx: FloatArray,
-    gradient: FloatArray,
-) -> float:
-    """The number expected at a state x (n,), its gradient (n,) into `gradient`.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the C numbers expected at L states, (C, L), and their gradients, (C, n, L).
 
-    columns (7,): where x holds x, y, z, the receiver's offset, its clock, dc/c and the emission
-    (m), -1 for what is not a state; height: z of the diver where z is no state.
+    :param x: (n, L) states.
+    :param height: z of the diver where z is no state.
+    :param kind: (C,) kinds.
+    :param columns: (C, 7) where the states hold x, y, z, the receiver's offset, its clock, dc/c
+        and the emission (m), -1 for what is not a state. Numbers differ in offset and clock only.
+    :param tx: (C, 3) transmitters.
+    :param rx: (C, 3) receivers.
     """
-    for a in range(len(x)):
-        gradient[a] = 0.0
-    iz, io = columns[Z], columns[OFFSET]
-    z = x[iz] if iz >= 0 else height
-    if kind == HEIGHT:
-        if iz >= 0:
-            gradient[iz] = 1.0
-        return z
-    ix, iy = columns[X], columns[Y]
-    # Angles need no exact place of the receiver: an offset of metres turns them by little.
-    ox = x[io] if io >= 0 and kind <= ONE_WAY else 0.0
-    oy = x[io + 1] if io >= 0 and kind <= ONE_WAY else 0.0
-    dx, dy, dz = x[ix] - rx[0] - ox, x[iy] - rx[1] - oy, z - rx[2]
-    rho2 = dx * dx + dy * dy
-    ic = columns[CLOCK]
-    if kind == BEARING:
-        if rho2 > NEAREST**2:
-            gradient[ix], gradient[iy] = -dy / rho2, dx / rho2
-        if ic >= 0:
-            gradient[ic] = 1.0
-        return math.atan2(dy, dx) + (x[ic] if ic >= 0 else 0.0)
-    r = math.sqrt(rho2 + dz * dz)
-    if kind == ELEVATION:
-        rho = math.sqrt(rho2)
-        if rho > NEAREST:
-            gradient[ix], gradient[iy] = -dx * dz / rho / (r * r), -dy * dz / rho / (r * r)
+    value = np.empty((len(kind), x.shape[1]))
+    gradient = np.zeros((len(kind), *x.shape))
+    ix, iy, iz = columns[0, :3].tolist() if len(kind) else (0, 0, 0)
+    place = np.empty((3, x.shape[1]))
+    place[0], place[1], place[2] = x[ix], x[iy], x[iz] if iz >= 0 else height
+    for each in set(kind.tolist()):
+        rows = np.flatnonzero(kind == each)
+        if each == HEIGHT:
+            value[rows] = place[2]
             if iz >= 0:
-                gradient[iz] = rho / (r * r)
-        return math.atan2(dz, rho)
-    iv = columns[SOUND_SPEED_ERROR]
-    scale = 1.0 - (x[iv] if iv >= 0 else 0.0)
-    total = r
-    if r > NEAREST:
-        gradient[ix], gradient[iy] = scale * dx / r, scale * dy / r
-        if iz >= 0:
-            gradient[iz] = scale * dz / r
-        if io >= 0:
-            gradient[io], gradient[io + 1] = -scale * dx / r, -scale * dy / r
-    if kind == PATH:
-        tx_, ty_, tz_ = x[ix] - tx[0], x[iy] - tx[1], z - tx[2]
-        first = math.sqrt(tx_ * tx_ + ty_ * ty_ + tz_ * tz_)
-        total += first
-        if first > NEAREST:
-            gradient[ix] += scale * tx_ / first
-            gradient[iy] += scale * ty_ / first
+                gradient[rows, iz] = 1.0
+            continue
+        apart = place - rx[rows, :, None]
+        if each <= ONE_WAY:
+            leaving = place - tx[rows, :, None] if each == PATH else None
+            value[rows] = _paths(x, columns[rows], apart, leaving, gradient, rows)
+            continue
+        level2 = apart[:, 0] ** 2 + apart[:, 1] ** 2
+        if each == BEARING:
+            slope = 1.0 / np.where(level2 > NEAREST**2, level2, np.inf)
+            gradient[rows, ix], gradient[rows, iy] = -apart[:, 1] * slope, apart[:, 0] * slope
+            value[rows] = np.arctan2(apart[:, 1], apart[:, 0])
+            value[rows] += _clocks(x, columns[rows], gradient, rows)
+        else:
+            level = np.sqrt(level2)
+            slope = 1.0 / np.where(level > NEAREST, level2 + apart[:, 2] ** 2, np.inf)
+            sine = apart[:, 2] / np.maximum(level, NEAREST) * slope
+            gradient[rows, ix], gradient[rows, iy] = -apart[:, 0] * sine, -apart[:, 1] * sine
             if iz >= 0:
-                gradient[iz] += scale * tz_ / first
+                gradient[rows, iz] = level * slope
+            value[rows] = np.arctan2(apart[:, 2], level)
+    return value, gradient
+
+
+def _paths(
+    x: FloatArray,
+    columns: IntArray,
+    apart: FloatArray,
+    leaving: FloatArray | None,
+    gradient: FloatArray,
+    rows: IndexArray,
+) -> FloatArray:
+    """Return path lengths (R, L) of `rows` (R,); write their gradients.
+
+    :param apart: (R, 3, L) from the receivers to the diver, changed by their offsets.
+    :param leaving: (R, 3, L) from the transmitters to the diver, None for a tag.
+    """
+    ix, iy, iz, _, _, iv, ie = columns[0].tolist()
+    moved = np.flatnonzero(columns[:, OFFSET] >= 0)
+    at = columns[moved, OFFSET]
+    if len(moved):
+        apart[moved, 0] -= x[at]
+        apart[moved, 1] -= x[at + 1]
+    length, slope = _directions(apart)
+    scale = 1.0 - x[iv] if iv >= 0 else 1.0
+    if len(moved):
+        gradient[rows[moved], at] = -scale * slope[moved, 0]
+        gradient[rows[moved], at + 1] = -scale * slope[moved, 1]
+    if leaving is not None:
+        first, onward = _directions(leaving)
+        length, slope = length + first, slope + onward
     if iv >= 0:
-        gradient[iv] = -total
-    value = scale * total
-    if ic >= 0:
-        gradient[ic] = 1.0
-        value += x[ic]
-    if kind == ONE_WAY and columns[EMISSION] >= 0:
-        gradient[columns[EMISSION]] = 1.0
-        value += x[columns[EMISSION]]
-    return value
+        slope = slope * scale
+        gradient[rows, iv] = -length
+        length = length * scale
+    gradient[rows, ix], gradient[rows, iy] = slope[:, 0], slope[:, 1]
+    if iz >= 0:
+        gradient[rows, iz] = slope[:, 2]
+    if ie >= 0 and leaving is None:
+        gradient[rows, ie] = 1.0
+        length = length + x[ie]
+    return length + _clocks(x, columns, gradient, rows)
+
+
+def _directions(apart: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lengths (R, L) and directions (R, 3, L) of vectors (R, 3, L)."""
+    distance = np.sqrt((apart * apart).sum(axis=1))
+    return distance, apart / np.where(distance > NEAREST, distance, np.inf)[:, None]
+
+
+def _clocks(
+    x: FloatArray, columns: IntArray, gradient: FloatArray, rows: IndexArray
+) -> FloatArray | float:
+    """Return the errors (R, L) of the clocks, 0.0 where none is a state; write their gradients."""
+    at = columns[:, CLOCK]
+    known = np.flatnonzero(at >= 0)
+    if not len(known):
+        return 0.0
+    gradient[rows[known], at[known]] = 1.0
+    late = np.zeros((len(rows), x.shape[1]))
+    late[known] = x[at[known]]
+    return late

@@ -33,13 +33,10 @@ sec. 8.3.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
 from .covariance import JITTER, LIMIT
-from .jit import kernel
 
 
 def consider_update(
@@ -64,44 +61,86 @@ def consider_update(
     return x + K @ innovation, 0.5 * (updated + updated.T)
 
 
-@kernel
+def innovation_variances(
+    P: FloatArray, H: FloatArray, R: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``P h'`` (C, n, L) and ``S = h P h' + R`` (C, L) of C numbers in L filters.
+
+    S is NaN where it is not positive and finite. The rule of `covariance` for numbers that are too
+    good applies.
+
+    :param P: (n, n, L) covariances.
+    :param H: (C, n, L) rows of H.
+    :param R: (C, L) variances of the numbers.
+    """
+    cross = np.zeros(H.shape)
+    S = np.zeros(H[:, 0].shape) + R
+    active = np.flatnonzero(H.any(axis=(0, 2)))
+    for a in active:
+        cross += H[:, a, None] * P[:, a]
+    for a in active:
+        S += H[:, a] * cross[:, a]
+    if not (R > LIMIT * S).all():
+        S = np.where(R > LIMIT * S, S, S + JITTER * S)
+    return cross, S if ((S > 0.0) & (S < np.inf)).all() else _positive(S)
+
+
+def _positive(S: FloatArray) -> FloatArray:
+    return np.where((S > 0.0) & (S < np.inf), S, np.nan)
+
+
+def log_densities(S: FloatArray, innovation: FloatArray) -> FloatArray:
+    """Return the log-densities of innovations with variances S."""
+    return np.asarray(-0.5 * (innovation * innovation / S + np.log(2.0 * np.pi * S)))
+
+
 def consider_scalar(
     x: FloatArray,
     P: FloatArray,
     h: FloatArray,
-    R: float,
-    innovation: float,
+    R: FloatArray | float,
+    innovation: FloatArray,
     estimated: BoolArray,
-    PHt: FloatArray,
-) -> float:
-    """`consider_update` in place for one number: x (n,), P (n, n), h (n,) the row of H, R its
-    variance; PHt (n,) is scratch. Gives the log-density of the innovation, -inf where its variance
-    is not positive and finite, with x and P as they were."""
-    n = len(x)
-    S = R
-    for a in range(n):
-        PHt[a] = 0.0
-    for b in range(n):
-        if h[b] != 0.0:
-            for a in range(n):
-                PHt[a] += P[a, b] * h[b]
-    for a in range(n):
-        S += h[a] * PHt[a]
-    if not (S > 0.0 and math.isfinite(S)):
-        return -math.inf
-    if not R > LIMIT * S:  # the rule of `covariance` for values that are too good
-        S += JITTER * S
-    for a in range(n):
-        if estimated[a]:
-            x[a] += PHt[a] * innovation / S
-    for a in range(n):
-        for b in range(a + 1):
-            # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain
-            if estimated[a] or estimated[b]:
-                value = 0.5 * (P[a, b] + P[b, a]) - PHt[a] * PHt[b] / S
-                P[a, b] = value
-                P[b, a] = value
-    return -0.5 * (innovation * innovation / S + math.log(2.0 * math.pi * S))
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`consider_update` of L filters at once, by one number each.
+
+    :param x: (n, L) states.
+    :param P: (n, n, L) covariances, symmetric.
+    :param h: (n, L) the row of H.
+    :param R: (L,) the variance of the number, or one for all.
+    :param innovation: (L,).
+    :param estimated: (n,) False where a component is only considered.
+    :returns: x, P and the log-densities (L,) of the innovations. These are -inf where the variance
+        of the innovation is not positive and finite; x and P stay as they are there.
+    """
+    crosses, variances = innovation_variances(P, h[None], R)
+    cross, S = crosses[0], variances[0]
+    fit = log_densities(S, innovation)
+    if np.isnan(S).any():
+        lost = np.isnan(S)
+        cross, S = np.where(lost, 0.0, cross), np.where(lost, 1.0, S)
+        innovation, fit = np.where(lost, 0.0, innovation), np.where(lost, -np.inf, fit)
+    return *apply_gain(x, P, cross, S, innovation, estimated), fit
+
+
+def apply_gain(
+    x: FloatArray,
+    P: FloatArray,
+    cross: FloatArray,
+    S: FloatArray,
+    innovation: FloatArray,
+    estimated: BoolArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return x (n, L) and P (n, n, L) after `consider_scalar`, for known cross ``P h'`` (n, L) and
+    variances S (L,)."""
+    root = cross / np.sqrt(S)
+    # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain.
+    known = root[:, None] * root
+    moved = cross * (innovation / S)
+    if not estimated.all():
+        moved[~estimated] = 0.0
+        known[np.ix_(~estimated, ~estimated)] = 0.0
+    return x + moved, P - known
 
 
 def consider_models(

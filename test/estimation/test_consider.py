@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Schmidt's update: vectors, the scalar kernel, and a bias that must never be averaged away."""
+"""Schmidt's update: vectors, many filters at once, and a bias that is never averaged away."""
 
 from helpers.sea_vectors import vectors
 import numpy as np
@@ -43,7 +43,11 @@ def test_numbers_one_by_one_equal_the_joint_update(mask):
     for h, R, value in zip(v['H'], np.diag(v['R']), y):
         nu = value - h @ x
         expected = -0.5 * (nu**2 / (h @ P @ h + R) + np.log(2 * np.pi * (h @ P @ h + R)))
-        assert consider_scalar(x, P, h, R, nu, mask, np.empty(5)) == pytest.approx(expected)
+        # two filters at once, the same
+        both = np.stack([x, x], 1), np.stack([P, P], 2), np.stack([h, h], 1)
+        xs, Ps, fit = consider_scalar(*both, R, np.array([nu, nu]), mask)
+        assert fit == pytest.approx([expected, expected])
+        x, P = xs[:, 1], Ps[..., 1]
         plain_x, plain_P = consider_update(
             plain_x, plain_P, h[None], np.array([[R]]), np.array([value - h @ plain_x]), mask
         )

@@ -24,8 +24,8 @@ Explanations are grown number by number (`Explanation`), and those that fall `PR
 are dropped. A number that is rejected costs ``eps u`` in every explanation: without that charge
 the explanation that rejects everything wins.
 
-This is the mathematics as it reads; `trackers.diver.ping_kernels` is the same, compiled, for the
-arrivals of a ping.
+This is the mathematics as it reads; `trackers.diver.explanations` is the same, for all
+hypotheses about a diver at once.
 """
 
 from __future__ import annotations

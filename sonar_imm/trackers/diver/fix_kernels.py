@@ -27,8 +27,8 @@ import numpy as np
 from ...estimation import imm_kernels
 from ...estimation.adaptation import row_sum
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.consider import consider_scalar
 from ...estimation.consistency import FARTHEST
+from ...estimation.covariance import JITTER, LIMIT
 from ...estimation.jit import kernel
 
 Sums = tuple[float, float, float, float, float]
@@ -185,6 +185,46 @@ def watch(
 
 
 @kernel
+def _consider_scalar(
+    x: FloatArray,
+    P: FloatArray,
+    h: FloatArray,
+    R: float,
+    innovation: float,
+    estimated: BoolArray,
+    PHt: FloatArray,
+) -> float:
+    """`consider.consider_update` in place for one number: x (n,), P (n, n), h (n,) the row of H,
+    R its variance; PHt (n,) is scratch. Gives the log-density of the innovation, -inf where its
+    variance is not positive and finite, with x and P as they were."""
+    n = len(x)
+    S = R
+    for a in range(n):
+        PHt[a] = 0.0
+    for b in range(n):
+        if h[b] != 0.0:
+            for a in range(n):
+                PHt[a] += P[a, b] * h[b]
+    for a in range(n):
+        S += h[a] * PHt[a]
+    if not (S > 0.0 and math.isfinite(S)):
+        return -math.inf
+    if not R > LIMIT * S:  # the rule of `covariance` for values that are too good
+        S += JITTER * S
+    for a in range(n):
+        if estimated[a]:
+            x[a] += PHt[a] * innovation / S
+    for a in range(n):
+        for b in range(a + 1):
+            # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain
+            if estimated[a] or estimated[b]:
+                value = 0.5 * (P[a, b] + P[b, a]) - PHt[a] * PHt[b] / S
+                P[a, b] = value
+                P[b, a] = value
+    return -0.5 * (innovation * innovation / S + math.log(2.0 * math.pi * S))
+
+
+@kernel
 def update_heights(
     x: FloatArray,
     P: FloatArray,
@@ -233,7 +273,7 @@ def update_heights(
         without_x, without_P = x[t].copy(), P[t].copy()
         most = -math.inf
         for j in range(M):
-            density[j] = consider_scalar(
+            density[j] = _consider_scalar(
                 x[t, j], P[t, j], h[j], rest[k], innovation[j], estimated, scratch
             )
             if mu[t, j] > 0.0:

@@ -15,7 +15,7 @@
 """What becomes of the divers by a ping: which measurements are whose, and the update by them.
 
 Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets, more of them by heavy tails (`ping_kernels`). So are the arrivals of a tag,
+outlier subsets, more of them by heavy tails (`explanations`). So are the arrivals of a tag,
 however few: its time of emission is unknown, so that among three or four receivers no subset is
 refuted by the others, and what decides is whether the whole lies where the ping by itself would
 put it.
@@ -27,7 +27,7 @@ one step here: an `Explanation` says what each track that takes part becomes, an
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 import math
 from typing import NamedTuple
 
@@ -35,19 +35,17 @@ import numpy as np
 
 from ...acoustics.arrivals_3d import EMISSION
 from ...acoustics.multistatic import difference_projection
-from ...estimation import imm_kernels
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
-from ...estimation.covariance import is_psd
-from ...estimation.small_matrices import add_jitter_all
+from ...estimation.covariance import add_jitter, is_psd
 from ...measurements import Arrivals, NOBODY
 from . import coverage, offsets
 from .config import DiverConfig
-from .heights import spread
-from .ping_kernels import (
+from .explanations import (
     DEGREES,
     expect_measurements,
     expect_residuals,
+    fit_each,
     fit_measurements,
     MOST_EXPLANATIONS,
     PingMeasurements,
@@ -55,6 +53,7 @@ from .ping_kernels import (
     student_t_ping,
     subset_ping,
 )
+from .heights import spread
 from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
 from .state import ARRIVALS, DiverState, learnt_scale
 from .state_space import as_stated, each_kept, heights_of, Layout, ModelSet
@@ -80,7 +79,7 @@ DISTINCT = 1.0
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`ping_kernels`."""
+`explanations`."""
 
 TAKEN = 0.5
 """Probability of being good from which a measurement counts as a track's."""
@@ -232,12 +231,11 @@ def _explain_echoes(
     ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
     of the pairs is not what the ping shows; for it nothing happened.
     """
-    fits = [
-        fit_measurements(*_mixture(now, track), config.target_z, ping.measured)
-        for track in range(len(now.x))
-    ]
-    fit, nis = (np.array(column) for column in zip(*fits))
-    near = (nis < NEAR) & ping.echo
+    T, M, n = now.x.shape
+    each = now.x.reshape(-1, n), now.P.reshape(-1, n, n)
+    likelihood, nis = fit_each(*each, config.target_z, ping.measured)
+    fit = np.log(np.maximum((now.mu[:, None] @ likelihood.reshape(T, M, -1))[:, 0], 1e-300))
+    near = (nis.reshape(T, M, -1).min(axis=1) < NEAR) & ping.echo
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (now.life.status == TENTATIVE)
@@ -353,15 +351,17 @@ def _best_for_tag(
 
 def _allowed(before: Mixture, after: PingUpdate, config: DiverConfig) -> bool:
     """Whether the diver after a ping is where the prediction allows it to be."""
-    M, n = before[0].shape
-    E = np.zeros((M, 2, n))
-    E[:, 0, 0] = E[:, 1, 1] = 1.0
-    x, P, mu = before
-    mean, covariance = imm_kernels.combine(x[None], P[None], mu[None], E)
-    there, _ = imm_kernels.combine(after.x[None], after.P[None], after.mu[None], E)
-    gap = there[0] - mean[0]
-    distance = float(gap @ np.linalg.solve(covariance[0], gap))
+    (mean, covariance), (there, _) = _place(*before), _place(after.x, after.P, after.mu)
+    gap = there - mean
+    distance = float(gap @ np.linalg.solve(covariance, gap))
     return distance <= gate_threshold(config.gate_probability, 2)
+
+
+def _place(x: FloatArray, P: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean (2,) and covariance (2, 2) of the position of a mixture."""
+    mean = mu @ x[:, :2]
+    apart = x[:, :2] - mean
+    return mean, np.tensordot(mu, P[:, :2, :2], 1) + (apart.T * mu) @ apart
 
 
 # -- one track -----------------------------------------------------------------------------------
@@ -457,22 +457,17 @@ def update_by_ping(
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
+    measured, scale = _scaled(ping.measured, len(x), layout)
     if ping.passive or ping.pairs > MOST_SUBSETS:
-        starts = optima(ping, config)
-        found = []
-        for x_k, P_k, measured, least in _copies(x, P, ping, layout):
-            heavy = measured, starts, DEGREES
-            x_k, P_k, evidence, weights = student_t_ping(x_k, P_k, mask, config.target_z, *heavy)
-            squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
-            good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
-            found.append((x_k, P_k, evidence + least, good))
+        heavy = measured, optima(ping, config), DEGREES
+        x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
+        # The densities of scaled residuals are those of the residuals but for this.
+        evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
+        squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
+        good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
-        subsets = config.outlier_probability, MOST_EXPLANATIONS
-        found = [
-            subset_ping(x_k, P_k, mask, config.target_z, measured, *subsets)
-            for x_k, P_k, measured, _ in _copies(x, P, ping, layout)
-        ]
-    x, P, evidence, good = found[0] if len(found) == 1 else map(np.concatenate, zip(*found))
+        subsets = measured, config.outlier_probability, MOST_EXPLANATIONS
+        x, P, evidence, good = subset_ping(x, P, mask, config.target_z, *subsets)
     with np.errstate(divide='ignore'):
         weight = np.log(mu) + evidence
     best = weight.max(initial=-np.inf)
@@ -480,30 +475,26 @@ def update_by_ping(
         return None
     share = np.exp(weight - best)
     updated = each_kept(weight - best, share / share.sum(), len(layout.scales))
-    P = np.ascontiguousarray(P[:, :n, :n])
-    repairs = add_jitter_all(P)
-    return PingUpdate(
-        np.ascontiguousarray(x[:, :n]),
-        P,
-        updated,
-        updated @ good,
-        float(best + np.log(share.sum())),
-        repairs,
-    )
+    P, repairs = _repaired(P[:, :n, :n])
+    log_evidence = float(best + np.log(share.sum()))
+    return PingUpdate(x[:, :n].copy(), P, updated, updated @ good, log_evidence, repairs)
 
 
-def _copies(
-    x: FloatArray, P: FloatArray, ping: Ping, layout: Layout
-) -> Iterator[tuple[FloatArray, FloatArray, PingMeasurements, float]]:
-    """x (M, n) and P (M, n, n) of each copy of the models, the measurements with the variances
-    that it takes them to have, and the logarithm of what their densities are divided by for
-    that."""
-    M = len(x) // len(layout.scales)
-    for k, factor in enumerate(layout.scales.tolist()):
-        own, measured = slice(k * M, (k + 1) * M), ping.measured
-        if factor != 1.0:
-            measured = measured._replace(variance=measured.variance * factor)
-        yield x[own], P[own], measured, -0.5 * len(measured.value) * math.log(factor)
+def _scaled(
+    measured: PingMeasurements, hypotheses: int, layout: Layout
+) -> tuple[PingMeasurements, FloatArray]:
+    """Return measurements with the variances that each of the hypotheses, copy by copy, takes
+    them to have, and by what each (L,) multiplies them."""
+    scale = np.repeat(layout.scales, hypotheses // len(layout.scales))
+    if (scale == 1.0).all():
+        return measured, scale
+    return measured._replace(variance=scale[:, None] * measured.variance), scale
+
+
+def _repaired(P: FloatArray) -> tuple[FloatArray, int]:
+    """Return covariances P (L, n, n) that keep to the limit, and how many did not."""
+    out, repaired = add_jitter(P)
+    return out, int((repaired & np.isfinite(P).all(axis=(1, 2))).sum())
 
 
 def begin_from_ping(
@@ -524,9 +515,7 @@ def begin_from_ping(
     at, covariance, evidence, _ = student_t_ping(
         x, P, mask, config.target_z, ping.measured, position[None], DEGREES
     )
-    covariance = np.ascontiguousarray(covariance[:, :n, :n])
-    add_jitter_all(covariance)
-    return at[:, :n], covariance, evidence
+    return at[:, :n], _repaired(covariance[:, :n, :n])[0], evidence
 
 
 def residuals(
@@ -602,7 +591,7 @@ def _with_emission(
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P
-    residual, _ = expect_residuals(wide, mu, height, ping.measured)
+    residual = expect_residuals(wide, mu, height, ping.measured)
     wide[:, n] = np.median(residual[ping.echo]) if ping.echo.any() else 0.0
     covariance[:, n, n] = EMISSION_STD**2
     return wide, covariance, np.append(mask, True)

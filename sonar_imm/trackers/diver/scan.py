@@ -35,7 +35,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, Start
 from .clutter import Clutters
 from .config import CLUTTER, DiverConfig
-from .ping_kernels import PingMeasurements
+from .explanations import PingMeasurements
 from .state_space import Layout, ModelSet
 
 LEAST_VAR_TOA = 1e-13

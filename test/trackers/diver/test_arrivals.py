@@ -417,12 +417,11 @@ def test_a_vessel_that_moves_tells_how_its_transceiver_is_turned():
 
 
 def test_a_bearing_of_an_arrival_has_the_error_of_its_receiver():
-    x, gradient = np.array([3.0, 4.0, 0.05]), np.empty(3)
-    columns = np.array([0, 1, -1, -1, 2, -1, -1])
-    nowhere = np.zeros(3)
-    value = observe(BEARING, x, columns, 0.0, nowhere, nowhere, gradient)
-    assert value == pytest.approx(np.arctan2(4.0, 3.0) + 0.05)
-    np.testing.assert_allclose(gradient, [-4.0 / 25.0, 3.0 / 25.0, 1.0])
+    x, nowhere = np.array([[3.0], [4.0], [0.05]]), np.zeros((1, 3))
+    columns = np.array([[0, 1, -1, -1, 2, -1, -1]])
+    value, gradient = observe(x, 0.0, np.array([BEARING]), columns, nowhere, nowhere)
+    assert value[0, 0] == pytest.approx(np.arctan2(4.0, 3.0) + 0.05)
+    np.testing.assert_allclose(gradient[0, :, 0], [-4.0 / 25.0, 3.0 / 25.0, 1.0])
 
 
 def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Pings as numbers and their updates: kernels against the plain forms, order, quadrature."""
+"""Pings as numbers and their updates: lists against the plain forms, order, quadrature."""
 
 from attrs import evolve
 from helpers.sea_vectors import vectors
@@ -26,8 +26,12 @@ from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.acoustics.localisation import localise
 from sonar_imm.estimation.covariance import is_psd
 from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.trackers.diver.explanations import (
+    PingMeasurements,
+    student_t_ping,
+    subset_ping,
+)
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
 from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -49,8 +53,8 @@ def case(seed=0):
     tx = np.zeros((6, 3))
     columns = np.array([[0, 1, 3, 5 + 2 * (r % 3), 11, 12, 13] for r in range(6)])
     columns[kind == BEARING, CLOCK] = -1  # no error that all bearings have
-    value = [observe(k, x, c, 0.0, t, r, np.empty(N)) for k, c, t, r in zip(kind, columns, tx, rx)]
-    value = np.array(value) + rng.normal(size=6) * np.where(kind < 2, 0.3, 0.01)
+    value = observe(x[:, None], 0.0, kind, columns, tx, rx)[0][:, 0]
+    value = value + rng.normal(size=6) * np.where(kind < 2, 0.3, 0.01)
     value[2] += 9.0
     variance = np.where(kind < 2, 0.09, 1e-4)
     nobody = np.full(6, -1)
@@ -60,9 +64,9 @@ def case(seed=0):
 
     def plain(c):
         def of(state):
-            gradient = np.empty(N)
-            h = observe(kind[c], state, columns[c], 0.0, tx[c], rx[c], gradient)
-            return h, gradient
+            one = kind[[c]], columns[[c]], tx[[c]], rx[[c]]
+            h, gradient = observe(state[:, None], 0.0, *one)
+            return h[0, 0], gradient[0, :, 0]
 
         return of, value[c], variance[c]
 
@@ -84,7 +88,7 @@ def test_a_bearing_is_the_same_after_a_whole_turn(turns):
 
 
 @pytest.mark.parametrize('considered', [0, 6])
-def test_the_subset_kernel_is_the_plain_update(considered):
+def test_the_list_of_subsets_is_the_plain_update(considered):
     x, P, numbers, plain = case()
     mask = np.ones(N, bool)
     mask[5 : 5 + considered] = False
@@ -118,7 +122,7 @@ def test_too_many_explanations_keep_the_best():
     np.testing.assert_allclose(few[0], many[0], atol=0.05)
 
 
-def test_the_heavy_tailed_kernel_is_the_plain_one():
+def test_the_heavy_tailed_list_is_the_plain_update():
     x, P, numbers, plain = case()
     P = P + np.diag(np.arange(N) == 13) * 1e6
     got = student_t_ping(x[None], P[None], np.ones(N, bool), 0.0, numbers, x[None, :2], 4.0)
