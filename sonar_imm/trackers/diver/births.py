@@ -22,8 +22,8 @@ would have two; with a single diver, all do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import islice, product
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby, islice, product
 import math
 from typing import NamedTuple
 
@@ -32,25 +32,28 @@ import numpy as np
 
 from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
+from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
-from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE
+from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
+from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import families
+from . import depth
 from .config import DiverConfig
-from .heights import begin
-from .pings import begin_from_ping, FAR
+from .instruments import Layout
+from .known import Feature, Known, places
+from .models import ModelSet, start_depths, VELOCITY
 from .scan import (
     bearing_variance,
+    Group,
     Height,
+    Heights,
     name_of,
     ping_measurements,
-    Positions,
+    Scan,
     spread,
     systematic_variance,
     toa_variance,
 )
-from .state import DiverState
-from .state_space import heights_of, Layout, ModelSet
 
 SEED_PAIRS = 3
 """Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
@@ -83,34 +86,23 @@ class Birth(NamedTuple):
     seen_by: tuple[str, FloatArray] | None = None
 
 
-def births_from_fixes(
-    fixes: Positions, free: BoolArray, existence: FloatArray | None
-) -> list[Birth]:
-    """Every fix that is `free` (D,) is a place to begin a track; existence (D,): of that track,
-    None where its hits will tell."""
-    births = []
-    for d in np.flatnonzero(free).tolist():
-        known = math.nan if existence is None else float(existence[d])
-        name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
-        height = None if fixes.heights is None else fixes.heights.row(d)
-        births.append(
-            Birth(
-                fixes.z[d],
-                fixes.R[d],
-                existence=known,
-                target_id=name,
-                height=height,
-                seen_by=fixes.turned_by,
-            )
-        )
-    return births
+def at_fixes(known: Known, group: Group) -> Known:
+    """Note every fix that no track took as a place to begin one. A stage of the tracker."""
+    found = group.found
+    assert found is not None
+    for d in np.flatnonzero(found.free).tolist():
+        existence = math.nan if found.existence is None else float(found.existence[d])
+        name = NOBODY if group.target_id is None else int(group.target_id[d])
+        height = None if group.heights is None else group.heights.row(d)
+        place = group.z[d], group.R[d], None, None, existence, name, True, height
+        group.births.append(Birth(*place, group.turned_by))
+    return known
 
 
 def births_from_ping(
-    ping: Arrivals, free: BoolArray, config: DiverConfig, factor: float
+    ping: Arrivals, free: BoolArray, config: DiverConfig
 ) -> list[Birth]:
-    """Positions from the rows (n,) of a ping that are `free`; factor: on the variances of arrival
-    times.
+    """Positions from the rows (n,) of a ping that are `free`.
 
     With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
     which live until later pings tell them apart. With several, combinations of echoes of a few
@@ -123,8 +115,8 @@ def births_from_ping(
             break
         pairs = [rows] if ping.passive else _by_pair(ping, rows)
         if ping.passive or max(len(pair) for pair in pairs) == 1:
-            return births + _fix(ping, rows, config, factor)[0]
-        found, used = _best_combination(ping, pairs, config, factor)
+            return births + _fix(ping, rows, config)[0]
+        found, used = _best_combination(ping, pairs, config)
         if not found:
             return births
         births += found
@@ -138,11 +130,11 @@ def _by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
 
 
 def _fix(
-    ping: Arrivals, rows: IndexArray, config: DiverConfig, factor: float
+    ping: Arrivals, rows: IndexArray, config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
     rows = spread(rows)
-    fix = locate(ping, rows, config, factor)
+    fix = locate(ping, rows, config)
     if fix is None:
         return [], rows[:0]
     used = rows[fix.used | fix.used_bearing]
@@ -153,7 +145,7 @@ def _fix(
 
 
 def _best_combination(
-    ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig, factor: float
+    ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
     """The fix that most pairs agree with, at least one more than seeded it."""
     best: tuple[list[Birth], IndexArray] = ([], np.empty(0, np.intp))
@@ -161,24 +153,24 @@ def _best_combination(
         return best
     seeding = sorted(pairs, key=len)[:SEED_PAIRS]
     for seed in islice(product(*seeding), MAX_COMBINATIONS):
-        for birth in _fix(ping, np.array(seed), config, factor)[0]:
-            agreeing = _agreeing(ping, pairs, birth, config, factor)
+        for birth in _fix(ping, np.array(seed), config)[0]:
+            agreeing = _agreeing(ping, pairs, birth, config)
             if len(agreeing) > max(SEED_PAIRS, len(best[1])):
-                refined = _fix(ping, agreeing, config, factor)
+                refined = _fix(ping, agreeing, config)
                 best = refined if len(refined[1]) > len(best[1]) else best
     return best
 
 
 def _agreeing(
-    ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig, factor: float
+    ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig
 ) -> IndexArray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
     position, covariance = birth.position, birth.covariance
-    height = float(np.mean(heights_of(config)))
+    height = float(np.mean(start_depths(config)))
     expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
     slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, height)
     variance = config.sound_speed**2 * (
-        toa_variance(ping, config, factor) + systematic_variance(ping, config)
+        toa_variance(ping, config) + systematic_variance(ping, config)
     ) + np.einsum('na,ab,nb->n', slope, covariance, slope)
     nis = np.square(config.sound_speed * ping.toa - expected) / variance
     nearest = np.array([rows[np.argmin(nis[rows])] for rows in pairs])
@@ -186,15 +178,15 @@ def _agreeing(
 
 
 def locate(
-    ping: Arrivals, rows: IndexArray, config: DiverConfig, factor: float
+    ping: Arrivals, rows: IndexArray, config: DiverConfig
 ) -> Localisation | None:
     """The fix that `rows` of the ping give by themselves, None when they give none to believe.
 
     With depth as a state it is the best of those at the heights where the models begin.
     """
-    variance = toa_variance(ping, config, factor)[rows] + systematic_variance(ping, config)[rows]
+    variance = toa_variance(ping, config)[rows] + systematic_variance(ping, config)[rows]
     best: Localisation | None = None
-    for height in heights_of(config):
+    for height in start_depths(config):
         fix = localise(
             ping.rx[rows],
             ping.toa[rows],
@@ -214,8 +206,51 @@ def locate(
 # -- tracks that begin ---------------------------------------------------------------------------
 
 
+def beginning(
+    models: ModelSet,
+    config: DiverConfig,
+    layouts: Callable[[Known], Layout],
+    chain: AdaptiveChain,
+    features: Mapping[str, Feature],
+    rules: TrackRules,
+) -> Callable[[Known, Scan], Known]:
+    """Return the stage that begins a tentative track at each birth, as long as there is room, and
+    a confirmed one where somebody says that a diver is."""
+
+    def with_tracks(known: Known, found: Sequence[Birth]) -> Known:
+        layout = layouts(known)
+        for _, group in groupby(found, key=lambda birth: birth.seen_by and birth.seen_by[0]):
+            births = list(group)
+            columns = {name: feature.birth for name, feature in features.items()}
+            columns['learnt'] = chain.fresh(len(births))
+            columns['existence'] = [birth.existence for birth in births]
+            columns['target_id'] = [birth.target_id for birth in births]
+            life = known.life.born(len(births), known.stamp_ns, rules)
+            rows = rows_of(births, models, layout, config)
+            known = known.with_tracks(life, rows, columns)
+        return known
+
+    def begin(known: Known, scan: Scan) -> Known:
+        found = [birth for group in scan.fixes for birth in group.births] + scan.births
+        if found:
+            room = max(0, most_tracks(config) - len(known))
+            known = with_tracks(known, each_name_once(found)[:room])
+        for start in scan.starts:
+            known, free = make_room(known, start, config, models)
+            if free:
+                known = confirmed(with_tracks(known, [believed(start, config)]))
+        return known
+
+    return begin
+
+
+def most_tracks(config: DiverConfig) -> int:
+    """Return how many tracks there may be, tentative ones and all."""
+    return 10 + 5 * config.max_tracks
+
+
 def each_name_once(births: Sequence[Birth]) -> list[Birth]:
-    """Without a second birth of the same name."""
+    """Return the births without a second one of the same name."""
     names: set[int] = set()
     first = []
     for birth in births:
@@ -225,135 +260,152 @@ def each_name_once(births: Sequence[Birth]) -> list[Birth]:
     return first
 
 
-def new_tracks(
+def rows_of(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x (B, M, n + q), P (B, M, n + q, n + q) and mu (B, M) of tracks that begin."""
-    x, P, mu = _new_tracks(births, models, layout, config)
-    at_fix = np.array([birth.ping is None and birth.measured for birth in births])
-    if at_fix.any():
-        wide = P[at_fix]
-        families.with_velocities_at_fix(wide, models, config)
-        P[at_fix] = wide
-    for row, birth in enumerate(births):
-        if models.height >= 0 and birth.height is not None:
-            begin(x[row], P[row], birth.height, birth.covariance, models.height, config)
-        if birth.seen_by is not None:
-            x[row], P[row] = layout.as_seen(x[row], P[row], *birth.seen_by, back=True)
-    return x, P, mu
-
-
-def _new_tracks(
-    births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> Rows:
+    """Return the rows of tracks that begin, all seen by one sensor."""
     plain = models.height < 0 and layout.size == models.n
     if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
         position = np.array([birth.position for birth in births])
         covariance = np.array([birth.covariance for birth in births])
         # A start comes alone.
-        x, P, mu = models.new_tracks(position, covariance, measured=births[0].measured)
-        return *layout.widened(x, P), mu
-    parts = [_new_track(birth, models, layout, config, plain) for birth in births]
-    x, P, mu = (np.concatenate(part) for part in zip(*parts))
-    return x, P, mu
+        parts = models.new_tracks(position, covariance, measured=births[0].measured)
+        x, P = layout.widened(*parts[:2])
+        mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.copies))
+    else:
+        each = [_of_birth(birth, models, layout, config, plain) for birth in births]
+        x, P, mu, logw = (np.concatenate(part) for part in zip(*each))
+    for track, birth in enumerate(births):
+        if birth.ping is None and birth.measured:
+            with_velocities_at_fix(P[track], models, config)
+        if models.height >= 0 and birth.height is not None:
+            for row in range(x.shape[1]):
+                depth.begin(
+                    x[track, row],
+                    P[track, row],
+                    birth.height,
+                    birth.covariance,
+                    models.height,
+                    config,
+                )
+    rows = models.rows(x, P, mu, logw)
+    seen_by = births[0].seen_by
+    return rows if seen_by is None else layout.turned(rows, models, *seen_by, back=True)
 
 
-def _new_track(
+def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
+    """Give P (..., M, n, n) of tracks that begin at a fix the velocities that such a track may
+    have, in place."""
+    if models.families is not None:
+        moving = np.flatnonzero(models.families.kind == VELOCITY)
+        P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
+
+
+def _of_birth(
     birth: Birth, models: ModelSet, layout: Layout, config: DiverConfig, plain: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x, P and mu of one track, with a row."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one track."""
     where = birth.position[None]
+    logw = np.full((1, models.copies), -math.log(models.copies))
     if birth.ping is None or birth.rows is None or plain:
         x, P, mu = models.new_tracks(where, birth.covariance[None], birth.ping is None)
-        return *layout.widened(x, P), mu
+        return *layout.widened(x, P), mu, logw
+    from .arrivals import begin_from_ping, FAR
+
     x, P, mu = models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
     x, P = layout.widened(x, P)
-    factor = config.covariance_scale
-    ping = ping_measurements(birth.ping, birth.rows, config, factor, models, layout)
-    # All models of a copy begin alike: one of each is enough to ask.
-    M = len(models.names)
-    begins = np.ascontiguousarray(x[0, ::M]), np.ascontiguousarray(P[0, ::M])
-    first = begin_from_ping(*begins, ping, birth.position, config, layout)
-    known = np.isfinite(first[2]).any()
-    share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
-    mu = mu * np.repeat(share / share.sum() * len(share), M)
-    at, covariance = np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None]
-    if models.mixing is not None:
+    ping = ping_measurements(birth.ping, birth.rows, config, models, layout)
+    # All models of a row begin alike: one of each is enough to ask.
+    begins = np.ascontiguousarray(x[0, :, 0]), np.ascontiguousarray(P[0, :, 0])
+    own, covariance, evidence = begin_from_ping(*begins, ping, birth.position, config, layout)
+    if np.isfinite(evidence).any():
+        share = np.exp(evidence - evidence.max())
+        logw = np.log(np.maximum(share / share.sum(), 1e-150))[None]
+    at, spread_at = x.copy(), P.copy()
+    at[0], spread_at[0] = own[:, None], covariance[:, None]
+    if models.families is not None:
         # But for how it moves, of which a ping says nothing.
         moves = slice(2, 4)
         at[..., moves] = x[..., moves]
-        covariance[..., moves, :] = P[..., moves, :]
-        covariance[..., :, moves] = P[..., :, moves]
-    return at, covariance, mu
+        spread_at[..., moves, :] = P[..., moves, :]
+        spread_at[..., :, moves] = P[..., :, moves]
+    return at, spread_at, mu, logw
 
 
 def begun_anew(
-    now: DiverState,
+    known: Known,
     ping: Arrivals,
     free: BoolArray,
     models: ModelSet,
     layout: Layout,
     config: DiverConfig,
-) -> DiverState:
-    """The tracks after a ping, whose rows (n,) are taken but for those that are `free`. With depth
-    as a state, a track that took what was all but impossible begins anew where the ping alone puts
-    it: an update over such a way is far from linear, and what it makes of the depth is nothing
-    known."""
-    hit, rows = np.flatnonzero(now.nis_dof), np.flatnonzero(~free)
+) -> Known:
+    """Return the tracks after a ping, whose rows (n,) are taken but for those that are `free`.
+    With depth as a state, a track that took what was all but impossible begins anew where the ping
+    alone puts it: an update over such a way is far from linear, and what it makes of the depth is
+    nothing known."""
+    hit, rows = np.flatnonzero(known['nis_dof']), np.flatnonzero(~free)
     if models.height < 0 or len(hit) != 1:
-        return now
-    (track,) = hit
-    dof = int(now.nis_dof[track])
-    if dof < SEED_PAIRS or now.nis[track] <= gate_threshold(1.0 - LOST, dof):
-        return now
-    mean, covariance = now.positions(models.E[:, :2])
+        return known
+    track = int(hit[0])
+    dof = int(known['nis_dof'][track])
+    if dof < SEED_PAIRS or known['nis'][track] <= gate_threshold(1.0 - LOST, dof):
+        return known
+    mean, covariance = places(known, models)
     birth = Birth(mean[track], covariance[track], ping, rows)
-    parts = zip((now.x, now.P, now.mu), new_tracks([birth], models, layout, config))
-    x, P, mu = (np.concatenate([old[:track], new, old[track + 1 :]]) for old, new in parts)
-    if not (np.isfinite(x).all() and np.isfinite(P).all()):
-        return now
-    spreads = now.spreads.copy()
-    spreads[track] += 1
-    return now._replace(x=x, P=P, mu=mu, spreads=spreads)
+    new = rows_of([birth], models, layout, config)
+    if not all(np.isfinite(part).all() for block in new.blocks for part in block):
+        return known
+    return depth.spread_anew(known.with_rows_of(track, new), track)
 
 
 # -- starts --------------------------------------------------------------------------------------
 
 
+def believed(start: Start, config: DiverConfig) -> Birth:
+    """Return the birth of a track where somebody says that a diver is."""
+    height = None
+    if config.dimensions == 3:
+        stated = Heights.of(start.position[None], start.covariance[None], 1.0)
+        height = stated and stated.row(0)
+    plane = start.position[:2], start.covariance[:2, :2]
+    return Birth(*plane, measured=False, height=height)
+
+
 def make_room(
-    now: DiverState, start: Start, config: DiverConfig, E: FloatArray
-) -> tuple[DiverState, bool]:
-    """The tracks without those that give way to `start`, and whether there is room for its own; E
-    (M, 2, n): to the position."""
-    going = now.target_id == NOBODY
+    known: Known, start: Start, config: DiverConfig, models: ModelSet
+) -> tuple[Known, bool]:
+    """Return the tracks without those that give way to `start`, and whether there is room for its
+    own."""
+    going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
-        going &= _agree(now, start, config, E)
-    left = now.only(~going)
+        going &= _agree(known, start, config, models)
+    left = known.only(~going)
     if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
         return left, True
-    return now._replace(not_started=now.not_started + 1), False
+    return known.counted(not_started=1), False
 
 
-def confirmed(now: DiverState) -> DiverState:
-    """With its newest track confirmed."""
-    status = now.life.status.copy()
+def confirmed(known: Known) -> Known:
+    """Return the tracks with the newest one confirmed."""
+    status = known.life.status.copy()
     status[-1] = CONFIRMED
-    return now._replace(life=evolve(now.life, status=status))
+    return known.replace(life=evolve(known.life, status=status))
 
 
-def no_room(now: DiverState, config: DiverConfig) -> list[str]:
-    """What a user has to know of starts that began no track."""
-    if not now.not_started:
+def no_room(known: Known, config: DiverConfig) -> list[str]:
+    """Return what a user has to know of starts that began no track."""
+    count = known.counts.get('not_started', 0)
+    if not count:
         return []
     return [
-        f'{now.not_started} starts began no track: there are max_tracks '
-        f'({config.max_tracks}) confirmed ones'
+        f'{count} starts began no track: there are max_tracks ({config.max_tracks}) confirmed ones'
     ]
 
 
-def _agree(now: DiverState, start: Start, config: DiverConfig, E: FloatArray) -> BoolArray:
-    """Which tracks (T,) may be where the start is."""
-    mean, covariance = now.positions(E)
+def _agree(known: Known, start: Start, config: DiverConfig, models: ModelSet) -> BoolArray:
+    """Return which tracks (T,) may be where the start is."""
+    mean, covariance = places(known, models)
     apart = start.position[:2] - mean
     squared = np.einsum(
         'ta,ta->t',

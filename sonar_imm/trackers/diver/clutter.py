@@ -28,12 +28,18 @@ show some.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from ...estimation.arrays import FloatArray
+from ...estimation.association import TENTATIVE
+from ...measurements import NOBODY
 from .config import CLUTTER, DiverConfig
+
+if TYPE_CHECKING:
+    from .known import Known
+    from .scan import Group, Scan
 
 MOST = 1e-2
 """The greatest that is believed, per square metre: one within the usual gate of a fix good to a
@@ -123,6 +129,34 @@ def replaced(known: Clutters, sensor: str, clutter: Clutter) -> Clutters:
     return (*others, (sensor, clutter))[-MOST_SENSORS:]
 
 
+def count(known: Known, group: Group) -> Known:
+    """Take in the false ones of a scan. A stage of the tracker."""
+    if group.config.clutter_density or group.target_id is not None or not group.whole:
+        return known
+    clutters: Clutters = known.memory['clutter']
+    before = dict(clutters).get(group.sensor, Clutter())
+    assert group.found is not None
+    after = before.after(group.z, np.clip(1.0 - group.found.claimed, 0.0, 1.0))
+    return known.remember(clutter=replaced(clutters, group.sensor, after))
+
+
+def without_first_fixes(known: Known, scan: Scan) -> Known:
+    """Take back the first fixes of tracks that this scan confirmed, which were counted as false
+    ones. A stage of the tracker."""
+    clutters: Clutters = known.memory['clutter']
+    own = dict(clutters)
+    sensor = next((group.sensor for group in scan.fixes if group.sensor in own), None)
+    if sensor is None:
+        return known
+    life, before = known.life, scan.before.life
+    firm = life.track_id[(life.status != TENTATIVE) & (known['target_id'] == NOBODY)]
+    new = len(np.setdiff1d(firm, before.track_id[before.status != TENTATIVE]))
+    if not new:
+        return known
+    after = own[sensor]._replace(false=max(own[sensor].false - new, 0.0))
+    return known.remember(clutter=replaced(clutters, sensor, after))
+
+
 def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
     """Sentences on fixes that no track takes, where nobody is `tracked`, and on false ones that
     the association does not expect."""
@@ -139,6 +173,6 @@ def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
     return [
         f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
         f'({clutter.density:.1g} for each square metre), and association gnn expects '
-        f'{CLUTTER:g}: use association kbest or jipda, which learn this, or state clutter_density'
+        f'{CLUTTER:g}: use association jipda, which learns this, or state clutter_density'
         for clutter in found[:1]
     ]

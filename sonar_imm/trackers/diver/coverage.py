@@ -23,7 +23,7 @@ stated coverage
   leaves what the sensor covers, as that of a diver who has left does (`missed`). Expectations are
   means over `POINTS` of a normal distribution;
 * misses are counted by what they say: with the stated `detection_probability` p a miss is one,
-  where it was p_t it is ``ln(1 - p_t) / ln(1 - p)`` of one (`DiverState.looks`).
+  where it was p_t it is ``ln(1 - p_t) / ln(1 - p)`` of one (feature `looks`).
 
 The probability is a `Coverage`: `detection_probability` inside a sector, or a table over x and y
 or over the range, read from a file.
@@ -31,7 +31,7 @@ or over the range, read from a file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import csv
 import math
 from pathlib import Path
@@ -43,9 +43,15 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
+from ...estimation.bank import Gaussians
 from ...parameters import ConfigError
 from .config import DiverConfig
-from .state import DiverState
+from .known import Feature, Known, places
+from .models import ModelSet
+from .scan import Group
+
+FEATURES = {'looks': Feature(0.0)}
+"""Parts of a miss that have not been counted yet."""
 
 POINTS_OF_MODEL = 64
 """Places of a model at which the probability is asked for."""
@@ -225,85 +231,149 @@ class Seen(NamedTuple):
         return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.usual), 1.0)
 
 
-def detectable(
-    stated: Mapping[str, Coverage],
-    sensor: str,
-    now: DiverState,
-    config: DiverConfig,
+def detecting(
+    stated: Mapping[str, Coverage], models: ModelSet
+) -> Callable[[Known, Group], Known]:
+    """Return the stage that notes how probable the fixes of a group are, by what is `stated` of
+    sensors."""
+
+    def detect(known: Known, group: Group) -> Known:
+        coverage = of_sensor(stated, group.sensor, group.config)
+        if coverage is not None and group.target_id is None:
+            p = group.config.detection_probability
+            group.seen = seen(known, models, coverage, p, group.z, group.R)
+        return known
+
+    return detect
+
+
+def missing(
+    models: ModelSet, moves_all: Callable[[Known], bool]
+) -> Callable[[Known, Group], Known]:
+    """Return the stage that says what it means for tracks that a sensor looked and did not see
+    them; moves_all: whether an update may move all of the state."""
+
+    def miss(known: Known, group: Group) -> Known:
+        if not group.whole or group.target_id is not None:
+            return known
+        found = group.found
+        assert found is not None
+        exists = np.maximum(found.exists, 1e-300)
+        share = np.where(found.hit, 0.0, np.minimum(found.missed / exists, 1.0))
+        return missed(known, models, group.seen, share, moves_all(known))
+
+    return miss
+
+
+def of_sensor(
+    stated: Mapping[str, Coverage], sensor: str, config: DiverConfig
+) -> Coverage | None:
+    """Return what is `stated` of a sensor, None where it sees everywhere."""
+    return stated.get(sensor if sensor in config.sensors else '')
+
+
+def seen(
+    known: Known,
+    models: ModelSet,
+    coverage: Coverage,
+    p: float,
     z: FloatArray = NOWHERE,
     R: FloatArray = NO_COVARIANCE,
-) -> Seen | None:
-    """How probable detections by `sensor` are, by what is `stated`; None where it sees everywhere.
-    config: with the parameters of the sensor; the rest as in `seen`."""
-    coverage = stated.get(sensor if sensor in config.sensors else '')
-    return None if coverage is None else seen(now, coverage, config.detection_probability, z, R)
-
-
-def seen(now: DiverState, coverage: Coverage, p: float, z: FloatArray, R: FloatArray) -> Seen:
-    """How probable a detection is of the tracks, and of a diver where fixes z (D, 2), R (D, 2, 2)
-    are; p: where the sensor sees as it should."""
-    tracks = np.empty(len(now.x))
-    tentative = now.life.status == TENTATIVE
-    for t in range(len(tracks)):
-        constant = _constant(now, t, coverage, p, 1.0 if tentative[t] else FAR_OUT)
-        if constant is None:
-            at = coverage.probability(_places(now.x[t], now.P[t]), p)
-            constant = float(now.mu[t] @ at.mean(axis=1))
-        tracks[t] = min(constant, MOST)
+) -> Seen:
+    """Return how probable a detection is of the tracks, and of a diver where fixes z (D, 2), R (D,
+    2, 2) are; p: where the sensor sees as it should."""
+    tentative = known.life.status == TENTATIVE
+    tracks, same = _constant(known, models, coverage, p, np.where(tentative, 1.0, FAR_OUT))
+    if not same.all():
+        rows = known.rows
+        asked = np.flatnonzero(~same[rows.target])
+        at = np.concatenate(
+            [
+                coverage.probability(_of_models(block.rows(asked)), p).mean(axis=-1)
+                for block in rows.blocks
+            ],
+            axis=1,
+        )
+        of_row = rows.weight[asked] * (rows.mu[asked] * at).sum(axis=1)
+        whole = np.bincount(rows.target[asked], of_row, minlength=len(known))
+        tracks = np.where(same, tracks, whole)
     there = coverage.probability(_places(z, R), p).mean(axis=1)
-    return Seen(coverage, p, tracks, np.clip(there, LEAST, MOST))
+    return Seen(coverage, p, np.minimum(tracks, MOST), np.clip(there, LEAST, MOST))
 
 
-def missed(now: DiverState, seen: Seen | None, share: FloatArray, mask: BoolArray) -> DiverState:
-    """The tracks after a look that did not show them, with the probability `share` (T,).
+def missed(
+    known: Known, models: ModelSet, seen: Seen | None, share: FloatArray, moves_all: bool
+) -> Known:
+    """Return the tracks after a look that did not show them, with the probability `share` (T,).
 
-    seen: None for a sensor that sees everywhere; mask (n,): True for what an update may move.
-    Where it may not move all, only the models are weighed.
+    seen: None for a sensor that sees everywhere; where an update may not move all of the state,
+    only models and rows are weighed.
     """
     if seen is None:
-        return now._replace(looks=now.looks + 1.0)
+        return known.put(looks=known['looks'] + 1.0)
     coverage, p = seen.coverage, seen.usual
-    tentative = now.life.status == TENTATIVE
+    tentative = known.life.status == TENTATIVE
     looks = np.where(tentative, np.maximum(seen.looks, LEAST_LOOK), seen.looks)
-    now = now._replace(looks=now.looks + looks)
-    x, P, mu = now.x, now.P, now.mu
-    for t in np.flatnonzero((share > 0.0) & ~tentative).tolist():
-        if _constant(now, t, coverage, p, FAR_OUT) is not None:
-            continue
-        if x is now.x:
-            x, P, mu = x.copy(), P.copy(), mu.copy()
-        places = _places(x[t], P[t])
-        left = 1.0 - share[t] * coverage.probability(places, p)
-        kept = left.mean(axis=1)
-        mu[t] *= kept
-        mu[t] /= mu[t].sum()
-        if not mask.all():
-            continue
-        weight = left / left.sum(axis=1, keepdims=True)
-        mean = np.einsum('mk,mka->ma', weight, places)
-        apart = places - mean[:, None]
-        spread = np.einsum('mk,mka,mkb->mab', weight, apart, apart)
-        before = P[t, :, :2, :2]
-        # What is known of the place moves the rest by its regression on the place.
-        gain = np.swapaxes(np.linalg.solve(before, P[t, :, :2, :]), -1, -2)
-        x[t] += np.einsum('mna,ma->mn', gain, mean - x[t, :, :2])
-        grown = P[t] + gain @ (spread - before) @ np.swapaxes(gain, -1, -2)
-        P[t] = 0.5 * (grown + np.swapaxes(grown, -1, -2))
-    return now._replace(x=x, P=P, mu=mu)
+    known = known.put(looks=known['looks'] + looks)
+    asked = (share > 0.0) & ~tentative
+    if not asked.any():
+        return known
+    far_out = np.full(len(known), FAR_OUT)
+    asked &= ~_constant(known, models, coverage, p, far_out)[1]
+    rows = known.rows
+    own = np.flatnonzero(asked[rows.target])
+    if not len(own):
+        return known
+    factor, blocks = np.ones(rows.mu.shape), []
+    for part, block in zip(models.parts, rows.blocks):
+        points = _of_models(block.rows(own))
+        left = 1.0 - share[rows.target[own], None, None] * coverage.probability(points, p)
+        factor[own[:, None], np.arange(part.models.start, part.models.stop)] = left.mean(axis=-1)
+        blocks.append(_conditioned(block, own, points, left) if moves_all else block)
+    rows, total = rows.replace(blocks=tuple(blocks)).with_models(factor)
+    logw = rows.logw + np.log(np.maximum(total, 1e-300))
+    # Borrowed weights lie beside those of the rows; the sum of both stays.
+    sums = rows.log_sum(known.rows.logw) - rows.log_sum(logw)
+    return known.replace(rows=rows.replace(logw=logw + sums[rows.target]))
+
+
+def _conditioned(
+    block: Gaussians, own: np.ndarray, points: FloatArray, left: FloatArray
+) -> Gaussians:
+    """Return a block whose rows `own` (k,) lie where a look left them: points (k, m, 64, 2) with
+    weights `left` (k, m, 64)."""
+    weight = left / left.sum(axis=-1, keepdims=True)
+    mean = np.einsum('rmk,rmka->rma', weight, points)
+    apart = points - mean[:, :, None]
+    spread = np.einsum('rmk,rmka,rmkb->rmab', weight, apart, apart)
+    x, P = (np.moveaxis(part, -1, 1) for part in block.rows(own))
+    before = P[..., :2, :2]
+    # What is known of the place moves the rest by its regression on the place.
+    gain = np.swapaxes(np.linalg.solve(before, P[..., :2, :]), -1, -2)
+    moved = x + np.einsum('rmna,rma->rmn', gain, mean - x[..., :2])
+    grown = P + gain @ (spread - before) @ np.swapaxes(gain, -1, -2)
+    after_x, after_P = block.x.copy(), block.P.copy()
+    after_x[own] = np.moveaxis(moved, 1, -1)
+    after_P[own] = np.moveaxis(0.5 * (grown + np.swapaxes(grown, -1, -2)), 1, -1)
+    return Gaussians(after_x, after_P)
+
+
+def _of_models(block: Gaussians) -> FloatArray:
+    """Return the points (N, m, 64, 2) of all models."""
+    place, covariance = block.x[:, :2], block.P[:, :2, :2]
+    return _places(np.moveaxis(place, -1, 1), np.moveaxis(covariance, -1, 1))
 
 
 def _constant(
-    now: DiverState, track: int, coverage: Coverage, p: float, stretch: float
-) -> float | None:
-    """The probability of detection all over a track, `stretch` times as far as its points; None
-    where it is not the same there."""
-    place, weight = now.x[track, :, :2], now.mu[track]
-    mean = weight @ place
-    apart = place - mean
-    covariance = np.einsum('m,mab->ab', weight, now.P[track, :, :2, :2])
-    covariance += np.einsum('m,ma,mb->ab', weight, apart, apart)
-    at = coverage.probability(_places(mean[None], stretch**2 * covariance[None])[0], p)
-    return float(at[0]) if at.max() == at.min() else None
+    known: Known, models: ModelSet, coverage: Coverage, p: float, stretch: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the probability of detection (T,) all over each track, `stretch` (T,) times as far as
+    its points, and whether it is the same there."""
+    if not len(known):
+        return np.empty(0), np.empty(0, np.bool_)
+    mean, covariance = places(known, models)
+    at = coverage.probability(_places(mean, stretch[:, None, None] ** 2 * covariance), p)
+    return at[:, 0], at.max(axis=1) == at.min(axis=1)
 
 
 def _places(mean: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -14,8 +14,8 @@
 
 """Tracks whose name is known, and what to do when a diver is also seen without one.
 
-A named track takes its part of the fixes that have no name (`named_tracks: share`), so that a
-diver with a transponder on a sonar is one track. A second track can stand beside it all the same:
+A named track takes its part of the fixes that have no name, so that a diver with a transponder on a
+sonar is one track. A second track can stand beside it all the same:
 the sonar may have seen the diver before the transponder was heard. Two divers that swim together
 are seen together, now and then at least; a single diver never is. So a nameless track that stays
 beside a named one, for so many scans that two divers would have been seen together once but for a
@@ -28,7 +28,7 @@ still is seen goes on without its name.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Mapping
 import math
 
 import numpy as np
@@ -36,8 +36,12 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold, TrackStatus
 from ...measurements import NOBODY
-from .scan import Positions
-from .state import DiverState
+from .known import Feature, Known, places
+from .models import ModelSet
+from .scan import Group, Scan
+
+FEATURES = {'target_id': Feature(NOBODY, kind=np.int64)}
+"""Whose track it is, `NOBODY` where that is not known."""
 
 BESIDE = 4.0
 """Mahalanobis distance squared within which a nameless track is beside a named one."""
@@ -47,47 +51,58 @@ MISTAKEN = 1e-3
 
 
 def patience(detection_probability: float) -> int:
-    """Scans after which a track never seen together with the one beside it is the same diver."""
+    """Return the scans after which a track never seen together with the one beside it is the same diver."""
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
-def remembered(now: DiverState, names: Iterable[int], max_coast: float) -> DiverState:
-    """With the `names` of this stamp, and without those that nothing has said for `max_coast`."""
-    last = dict(now.last_named)
-    last.update((name, now.stamp_ns) for name in names)
-    tracked = set(now.target_id.tolist())
-    last = {
-        name: stamp_ns
-        for name, stamp_ns in last.items()
-        if now.stamp_ns - stamp_ns <= max_coast * 1e9
-        and (name in tracked or stamp_ns == now.stamp_ns)
-    }
-    known = np.isin(now.target_id, np.array(list(last), np.int64))
-    target_id = np.where(known, now.target_id, NOBODY)
-    return now._replace(last_named=tuple(last.items()), target_id=target_id)
+def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
+    """Return the stage that takes in the names of a scan, and forgets those that nothing has said
+    for `max_coast` seconds."""
+
+    def remember(known: Known, scan: Scan) -> Known:
+        last: Mapping[int, int] = known.memory['last_named']
+        if not scan.names and not last:
+            return known
+        last = {**last, **dict.fromkeys(scan.names, known.stamp_ns)}
+        tracked = set(known['target_id'].tolist())
+        last = {
+            name: stamp_ns
+            for name, stamp_ns in last.items()
+            if known.stamp_ns - stamp_ns <= max_coast * 1e9
+            and (name in tracked or stamp_ns == known.stamp_ns)
+        }
+        kept = np.isin(known['target_id'], np.array(list(last), np.int64))
+        target_id = np.where(kept, known['target_id'], NOBODY)
+        return known.put(target_id=target_id).remember(last_named=last)
+
+    return remember
 
 
-def merged(
-    now: DiverState, before: DiverState, fixes: Sequence[Positions], E: FloatArray
-) -> DiverState:
-    """Without the tracks that are divers with a name once more, and that name where it belongs.
+def merging(models: ModelSet) -> Callable[[Known, Scan], Known]:
+    """Return the stage that ends the tracks that are divers with a name once more, and puts that
+    name where it belongs."""
 
-    before: the state before any track of this scan ended; fixes: of this scan; E (M, 2, n): to the
-    position.
-    """
-    seen = [group for group in fixes if group.target_id is None and group.whole]
-    nameless, named = (np.flatnonzero((now.target_id == NOBODY) == free) for free in (True, False))
+    def merge(known: Known, scan: Scan) -> Known:
+        return merged(known, scan, models) if known.memory['last_named'] else known
+
+    return merge
+
+
+def merged(known: Known, scan: Scan, models: ModelSet) -> Known:
+    """Return the tracks without those that are divers with a name once more."""
+    seen = [group for group in scan.fixes if group.target_id is None and group.whole]
+    target_id = known['target_id'].copy()
+    nameless, named = (np.flatnonzero((target_id == NOBODY) == free) for free in (True, False))
     if not seen or not len(named) or not len(nameless):
-        return now
-    mean, covariance = now.positions(E)
+        return known
+    mean, covariance = places(known, models)
     apart = mean[nameless][:, None] - mean[named][None]
     distance = squared(apart, covariance[nameless][:, None] + covariance[named][None])
-    ids = now.life.track_id.astype(np.int64)
-    ago = dict(zip(before.life.track_id.tolist(), zip(before.near_to, before.near_for)))
+    ids, before = known.life.track_id.astype(np.int64), scan.before
+    ago = dict(zip(before.life.track_id.tolist(), zip(before['near_to'], before['near_for'])))
     limit = max(patience(group.config.detection_probability) for group in seen)
-    near_to, near_for = now.near_to.copy(), now.near_for.copy()
-    target_id, existence = now.target_id.copy(), now.existence.copy()
-    going_on = np.ones(len(ids), bool)
+    near_to, near_for = known['near_to'].copy(), known['near_for'].copy()
+    existence, going_on = known['existence'].copy(), np.ones(len(ids), bool)
     for row, place in zip(nameless.tolist(), distance.argmin(axis=1).tolist()):
         other = int(named[place])
         if distance[nameless == row, place].min() > BESIDE or not going_on[other]:
@@ -99,33 +114,31 @@ def merged(
         near_to[row], near_for[row] = ids[other], 1 + (count if partner == ids[other] else 0)
         if near_for[row] < limit:
             continue
-        stays, goes = (row, other) if _prefer(now, row, other) else (other, row)
+        stays, goes = (row, other) if _prefer(known, row, other) else (other, row)
         target_id[stays], existence[stays], going_on[goes] = target_id[other], math.nan, False
         near_to[stays] = near_for[stays] = 0
-    now = now._replace(
-        near_to=near_to, near_for=near_for, target_id=target_id, existence=existence
-    )
-    return now.only(going_on)
+    columns = {'near_to': near_to, 'near_for': near_for, 'target_id': target_id}
+    return known.put(existence=existence, **columns).only(going_on)
 
 
-def _prefer(now: DiverState, row: int, other: int) -> bool:
-    """Whether of two tracks of one diver the first goes on: confirmed before tentative, then
+def _prefer(known: Known, row: int, other: int) -> bool:
+    """Return whether of two tracks of one diver the first goes on: confirmed before tentative, then
     older."""
-    tentative = now.life.status == TrackStatus.TENTATIVE
+    tentative = known.life.status == TrackStatus.TENTATIVE
     if tentative[row] != tentative[other]:
         return bool(tentative[other])
-    return bool(now.life.track_id[row] < now.life.track_id[other])
+    return bool(known.life.track_id[row] < known.life.track_id[other])
 
 
-def near(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Which fixes (D,) of a scan are near one of two tracks: mean (2, 2), covariance (2, 2,
+def near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
+    """Return which fixes (D,) of a scan are near one of two tracks: mean (2, 2), covariance (2, 2,
     2)."""
-    apart = fixes.z[:, None] - mean[None]
-    distance = squared(apart, covariance[None] + fixes.R[:, None])
-    threshold = gate_threshold(fixes.config.gate_probability, 2)
+    apart = group.z[:, None] - mean[None]
+    distance = squared(apart, covariance[None] + group.R[:, None])
+    threshold = gate_threshold(group.config.gate_probability, 2)
     return np.asarray(distance.min(axis=1) <= threshold)
 
 
 def squared(apart: FloatArray, S: FloatArray) -> FloatArray:
-    """Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2, 2)."""
+    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2, 2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

@@ -48,7 +48,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .scan import Ping
-from .state_space import AT_TRANSMITTER
+from .instruments import AT_TRANSMITTER
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""
@@ -153,7 +153,6 @@ class Offsets(NamedTuple):
     length: FloatArray = np.zeros(0)
     square: float = 0.0
     freedom: float = 0.0
-    recent: RecentPairs = RecentPairs()
 
     def after(
         self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
@@ -196,22 +195,7 @@ class Offsets(NamedTuple):
             lengths,
             keep**2 * now.square + float(t @ t),
             keep**2 * now.freedom + len(t),
-            now.recent,
         )
-
-    def widened(self, mean: FloatArray, covariance: FloatArray, config: DiverConfig) -> FloatArray:
-        """The covariances (T, q, q) of outputs mean (T, q), position first, with what is assumed
-        of the instruments: nothing where something is stated, or fixes say where divers are."""
-        exact = config.systematic_errors == 'exact'
-        if not self.recent.pairs or exact or any(getattr(config, name) for name in STDS):
-            return covariance
-        # Depths that are states may be seen by elevations and sensors, which are not among these.
-        covariance, known = covariance.copy(), 2
-        for t, row in enumerate(mean):
-            place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
-            spread = self.recent.spread(place, known, config.sound_speed)
-            covariance[t, :known, :known] += spread
-        return covariance
 
     def _with_pairs(self, new: list[tuple[int, int]]) -> Offsets:
         if not new:
@@ -283,14 +267,15 @@ def most(rank: int) -> float:
 
 def watched(
     found: Offsets,
+    recent: RecentPairs,
     places: Mapping[int, FloatArray],
     took: Mapping[int, BoolArray],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
-) -> Offsets:
-    """The evidence `found` and that of a ping `seen`, of which tracks `took` (C,) measurements
-    each; only of those whose places (2 or 3,) are given.
+) -> tuple[Offsets, RecentPairs]:
+    """Return the evidence `found` and that of a ping `seen`, of which tracks `took` (C,)
+    measurements each, only of those whose places (2 or 3,) are given; and the pairs heard lately.
 
     Of each pair it is the echo that a track took, else the nearest that is no other track's: where
     an error is large, the echoes that have it are refused.
@@ -301,7 +286,7 @@ def watched(
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
-    found = found._replace(recent=found.recent.after(seen, taken, ids))
+    recent = recent.after(seen, taken, ids)
     for track, place in places.items():
         good = took[track]
         echo = np.flatnonzero(seen.echo)
@@ -317,7 +302,24 @@ def watched(
             members = np.flatnonzero(usable & (seen.measured.node[echo] == node))
             echoes[echo[members[off[members].argmin()]]] = True
         found = found.after(seen, echoes, ids, place, config)
-    return found
+    return found, recent
+
+
+def widened(
+    recent: RecentPairs, mean: FloatArray, covariance: FloatArray, config: DiverConfig
+) -> FloatArray:
+    """Return the covariances (T, q, q) of outputs mean (T, q), position first, with what is
+    assumed of the instruments: nothing where something is stated, or fixes say where divers
+    are."""
+    exact = config.systematic_errors == 'exact'
+    if not recent.pairs or exact or any(getattr(config, name) for name in STDS):
+        return covariance
+    # Depths that are states may be seen by elevations and sensors, which are not among these.
+    covariance, known = covariance.copy(), 2
+    for t, row in enumerate(mean):
+        place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
+        covariance[t, :known, :known] += recent.spread(place, known, config.sound_speed)
+    return covariance
 
 
 def _fitted(

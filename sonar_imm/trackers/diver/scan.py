@@ -25,9 +25,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
-from attrs import evolve, frozen
+from attrs import define, evolve, field, frozen
 import numpy as np
 
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
@@ -36,7 +36,14 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, 
 from .clutter import Clutters
 from .config import CLUTTER, DiverConfig
 from .explanations import PingMeasurements
-from .state_space import Layout, ModelSet
+from .instruments import Layout
+from .models import ModelSet
+
+if TYPE_CHECKING:
+    from .births import Birth
+    from .coverage import Seen
+    from .fixes import Association, Pairs
+    from .known import Known, Step
 
 LEAST_VAR_TOA = 1e-13
 """Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance
@@ -98,29 +105,35 @@ MOST_BIRTHS = 1.5
 """New divers for each false fix, at most, where the density of false fixes is learnt."""
 
 
-@frozen(eq=False)
-class Positions:
+@define(eq=False)
+class Group:
     """D fixes of one stamp and sensor, of which each diver causes at most one: z (D, 2), R
     (D, 2, 2).
 
-    config: the parameters, with those of the sensor; factor: what the stated covariances were
-    multiplied by to give R; target_id: (D,) whose fixes they are, None when that is not known of
-    any; whole: whether they are all that there was to see, so that a diver without a fix was
-    missed; heights: what they state of z, None where nothing, or depth is no state; sensor: its
-    name, and seen_from (2,) where it stands, None where that is not known; learnt: the density of
-    false fixes where `clutter_density` is not stated.
+    config: the parameters, with those of the sensor; target_id: (D,) whose fixes they are, None
+    when that is not known of any; whole: whether they are all that there was to see, so that a
+    diver without a fix was missed; heights: what they state of z, None where nothing, or depth is
+    no state; sensor: its name, and seen_from (2,) where it stands, None where that is not known;
+    learnt: the density of false fixes where `clutter_density` is not stated.
+
+    What stages tell later ones, each slot written by one: seen, how probable detections are where
+    the sensor does not see everywhere (`coverage`); pairs and found, which fixes are whose
+    (`fixes`); births, where tracks may begin (`births`).
     """
 
     z: FloatArray
     R: FloatArray
     config: DiverConfig
-    factor: float
     target_id: IntArray | None
     whole: bool
     heights: Heights | None = None
     sensor: str = ''
     seen_from: FloatArray | None = None
     learnt: float = CLUTTER
+    seen: Seen | None = field(default=None, init=False)
+    pairs: Pairs | None = field(default=None, init=False)
+    found: Association | None = field(default=None, init=False)
+    births: list[Birth] = field(factory=list, init=False)
 
     @property
     def turned_by(self) -> tuple[str, FloatArray] | None:
@@ -136,41 +149,43 @@ class Positions:
         return self.config.clutter_density or self.learnt
 
     @property
-    def births(self) -> float:
+    def birth_density(self) -> float:
         """The density of new divers, 1/m^2: where that of false fixes is learnt, not many more.
         Else a sensor that gives none has its fixes doubted for divers that may yet come."""
         stated = self.config.birth_density
         return stated if self.config.clutter_density else min(stated, MOST_BIRTHS * self.learnt)
 
 
-@frozen(eq=False)
+@define(eq=False)
 class Scan:
     """The measurements of one stamp.
 
     fixes: groups of them; pings: each with its rows in order, of tags one for each tag; starts:
     where somebody says that a diver is; names: whose fixes and pings are among them; complete:
-    whether a diver of whom nothing is known at this stamp was missed; factor: on the variances of
-    arrival times.
+    whether a diver of whom nothing is known at this stamp was missed.
+
+    What stages tell later ones: before, what was known before the scan, and step, how the time to
+    it was crossed (the prediction); births, where a ping shows a new diver.
     """
 
-    fixes: list[Positions]
+    fixes: list[Group]
     pings: list[Arrivals]
     starts: list[Start]
     names: list[int]
     complete: bool
-    factor: float
+    before: Known = field(init=False)
+    step: Step = field(init=False)
+    births: list[Birth] = field(factory=list, init=False)
 
     @classmethod
     def of(
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
-        factor: tuple[float, float],
         clutter: Clutters = (),
     ) -> Scan:
-        """The scan of `items`; factor: on the covariances of fixes and of arrival times; clutter:
-        of each sensor, where it is learnt."""
-        fixes, names = position_groups(items, config, factor[0]), []
+        """The scan of `items`; clutter: of each sensor, where it is learnt."""
+        fixes, names = position_groups(items, config), []
         known = dict(clutter) if config.pairing != 'gnn' else {}
         for at, group in enumerate(fixes):
             if group.target_id is None and group.sensor in known:
@@ -191,7 +206,7 @@ class Scan:
             complete |= config.fixes_are_scans and name == NOBODY
             if name != NOBODY:
                 names.append(name)
-        return cls(fixes, pings, starts, names, complete, factor[1])
+        return cls(fixes, pings, starts, names, complete)
 
 
 def name_of(ping: Arrivals) -> int:
@@ -208,13 +223,10 @@ def _of_each_tag(ping: Arrivals) -> list[Arrivals]:
 # -- fixes ---------------------------------------------------------------------------------------
 
 
-def position_groups(
-    items: Sequence[Measurement], config: DiverConfig, factor: float
-) -> list[Positions]:
+def position_groups(items: Sequence[Measurement], config: DiverConfig) -> list[Group]:
     """The fixes of one stamp: all single ones of a sensor together, then scan by scan those that
-    say whose they are, of each diver the first, and those that do not. factor: on their
-    covariances."""
-    groups: list[Positions] = []
+    say whose they are, of each diver the first, and those that do not."""
+    groups: list[Group] = []
     single: dict[str, list[Fix]] = {}
     for item in items:
         if isinstance(item, Fix):
@@ -226,31 +238,31 @@ def position_groups(
             if fix.target_id == NOBODY:
                 nameless.append(fix)
             else:
-                group = _group(scan_of(fix), np.arange(1), own, factor, named=True)
+                group = _group(scan_of(fix), np.arange(1), own, named=True)
                 groups.append(_seen_from(fix, group))
         if nameless:
-            groups.append(_together(nameless, own, factor))
+            groups.append(_together(nameless, own))
     for item in items:
         if isinstance(item, Fixes):
-            groups += _named_and_nameless(item, config.of_sensor(item.sensor), factor)
+            groups += _named_and_nameless(item, config.of_sensor(item.sensor))
     return groups
 
 
-def _named_and_nameless(scan: Fixes, config: DiverConfig, factor: float) -> list[Positions]:
+def _named_and_nameless(scan: Fixes, config: DiverConfig) -> list[Group]:
     if scan.target_id is None:
-        return [_group(scan, np.arange(len(scan)), config, factor, named=False)]
+        return [_group(scan, np.arange(len(scan)), config, named=False)]
     known = np.flatnonzero(scan.target_id != NOBODY)
     _, first = np.unique(scan.target_id[known], return_index=True)
-    groups = [_group(scan, known[first], config, factor, named=True)] if len(known) else []
+    groups = [_group(scan, known[first], config, named=True)] if len(known) else []
     if len(known) < len(scan) or not len(scan):
         nameless = np.flatnonzero(scan.target_id == NOBODY)
-        groups.append(_group(scan, nameless, config, factor, named=False))
+        groups.append(_group(scan, nameless, config, named=False))
     return groups
 
 
 def _group(
-    scan: Fixes, rows: IndexArray, config: DiverConfig, factor: float, *, named: bool
-) -> Positions:
+    scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool
+) -> Group:
     """The rows of a scan, with their names or as all that there was to see."""
     position, covariance = scan.position[rows], np.full((len(rows), 3, 3), np.nan)
     if scan.covariance is not None:
@@ -258,14 +270,14 @@ def _group(
     R = np.ascontiguousarray(covariance[:, :2, :2])
     if not (stated := np.isfinite(R)).all():
         R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
-    heights = Heights.of(position, covariance, factor) if config.dimensions == 3 else None
+    heights = Heights.of(position, covariance, config.covariance_scale) if config.dimensions == 3 else None
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _place(config)
-    return Positions(z, R * factor, config, factor, *named_rows)
+    return Group(z, R * config.covariance_scale, config, *named_rows)
 
 
-def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
+def _together(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     """Single fixes of one sensor as one group."""
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
@@ -274,16 +286,16 @@ def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Posit
         z[row] = fix.position[:2]
         stated = None if fix.covariance is None else fix.covariance[:2, :2]
         R[row] = unknown if stated is None or math.isnan(stated[0, 0]) else stated
-    heights = None
+    heights, factor = None, config.covariance_scale
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
         whole = [nothing if fix.covariance is None else fix.covariance for fix in fixes]
         heights = Heights.of(np.array([fix.position for fix in fixes]), np.array(whole), factor)
     more = None, config.fixes_are_scans, heights, fixes[0].sensor
-    return _seen_from(fixes[0], Positions(z, R * factor, config, factor, *more, _place(config)))
+    return _seen_from(fixes[0], Group(z, R * factor, config, *more, _place(config)))
 
 
-def _seen_from(fix: Fix, group: Positions) -> Positions:
+def _seen_from(fix: Fix, group: Group) -> Group:
     """A group of fixes with the place of the sensor that `fix` states."""
     return group if fix.seen_from is None else evolve(group, seen_from=fix.seen_from)
 
@@ -343,11 +355,10 @@ def ping_measurements(
     ping: Arrivals,
     rows: IndexArray,
     config: DiverConfig,
-    factor: float,
     models: ModelSet,
     layout: Layout,
 ) -> Ping:
-    """The usable `rows` of a ping as measurements; factor: on the variances of arrival times."""
+    """The usable `rows` of a ping as measurements."""
     usable = rows[np.isfinite(ping.toa[rows])]
     if not ping.passive:
         usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
@@ -355,7 +366,7 @@ def ping_measurements(
         usable = spread(usable[np.argsort(ping.rx_id[usable], kind='stable')])
     speed = config.sound_speed
     first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
-    variance = toa_variance(ping, config, factor)[usable] * speed**2
+    variance = toa_variance(ping, config)[usable] * speed**2
     deep = models.height >= 0
     table: list[tuple[int, int, int, float, float, float, int]] = []
     if deep:
@@ -430,11 +441,11 @@ def systematic_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
     )
 
 
-def toa_variance(ping: Arrivals, config: DiverConfig, factor: float) -> FloatArray:
+def toa_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
     """Variance (n,) of the arrival times, s^2: the sender's, not below `LEAST_VAR_TOA`."""
     known = np.isfinite(ping.var_toa) & (ping.var_toa > 0.0)
     stated = np.where(known, np.maximum(ping.var_toa, LEAST_VAR_TOA), config.toa_std**2)
-    return np.asarray(stated * factor)
+    return np.asarray(stated * config.covariance_scale)
 
 
 def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:

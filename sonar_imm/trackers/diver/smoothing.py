@@ -12,22 +12,27 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diver tracker offline: what each estimate would have been, had the future been known."""
+"""The diver tracker offline: what each estimate would have been, had the future been known.
+
+Rows do not switch between each other, so that what a row weighs at the end it weighs all along. So
+each row that a track ends with is followed back by its parents, and smoothed by itself. Families,
+whose states are unequal, are smoothed each by itself, and then what they weigh.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from attrs import field, frozen
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import FloatArray, IndexArray
+from ...estimation.rows import Borrowed, Rows
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from . import kbest
-from .state import cross, DiverState
+from .known import crossed, Known, Step
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
@@ -36,10 +41,21 @@ in a long gap is too crude to carry the future back: on the tag of docs/real_rec
 every 29 s, it made estimates worse."""
 
 
+class _Scan(NamedTuple):
+    """A scan in common components: known; x (N, M, n), P (N, M, n, n) of its rows; steps: those
+    that crossed the time to it, and the same of them."""
+
+    known: Known
+    x: FloatArray
+    P: FloatArray
+    steps: tuple[Step, ...]
+    between: tuple[tuple[FloatArray, FloatArray], ...]
+
+
 @frozen(eq=False)
-class _Pass:
-    """The forward pass of one track, step by step: the number of the scan (None for a step inside
-    a gap), the state after it, and how it was reached."""
+class _Path:
+    """The forward pass of one row, step by step: the number of the scan (None for a step inside a
+    gap), the state after it, and how it was reached."""
 
     scans: list[int | None] = field(factory=list)
     x: list[FloatArray] = field(factory=list)
@@ -55,8 +71,19 @@ class _Pass:
             column.append(value)
 
 
+class _Smoothed(NamedTuple):
+    """Rows of one track at one scan, given all data: x (M, n), P (M, n, n), mu (M,), the weight
+    and what the row assumes of each."""
+
+    x: list[FloatArray]
+    P: list[FloatArray]
+    mu: list[FloatArray]
+    logw: list[float]
+    key: list[dict[str, Any]]
+
+
 def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
-    """What each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and the
+    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and the
     transitions (K, M, M) into each step; of all models together what they weigh at the end."""
     filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)
     if len(blocks) == 1:
@@ -82,7 +109,7 @@ class SmoothingDiverTracker(DiverTracker):
 
     def reset(self) -> None:
         super().reset()
-        self._passed: dict[int, DiverState] = {}
+        self._passed: dict[int, Known] = {}
         self._smoothed_repairs = 0
 
     def health(self) -> dict[str, float]:
@@ -90,7 +117,7 @@ class SmoothingDiverTracker(DiverTracker):
         health['covariance_repairs'] += self._smoothed_repairs
         return health
 
-    def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
+    def _revise(self, measurement: Measurement) -> list[tuple[int, Known]]:
         revised = super()._revise(measurement)
         self._passed.update(revised)
         return revised
@@ -102,88 +129,136 @@ class SmoothingDiverTracker(DiverTracker):
         """
         if not self._passed:
             return []
-        newest = self._passed[max(self._passed)]
-        layout = newest.instruments.layout(self.config, self.models)
-        scans = []
-        for stamp in sorted(self._passed):
-            scan = self._passed[stamp]
-            x, P = layout.widened(scan.x, scan.P)
-            scans.append(scan._replace(x=x, P=P, instruments=newest.instruments))
-        if self._keeps_hypotheses:
-            scans = kbest.one_past(scans)
-        smooth = [
-            scan._replace(x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
-        ]
-        for track_id, forward in self._passes(scans):
-            x, P, mu = self._smooth(forward)
-            for k, number in enumerate(forward.scans):
-                if number is not None:
-                    row = np.flatnonzero(scans[number].life.track_id == track_id)[0]
-                    smooth[number].x[row], smooth[number].P[row] = x[k], P[k]
-                    smooth[number].mu[row] = mu[k]
-        return [self._estimate(scan) for scan in smooth]
+        scans = self._scans()
+        found: dict[tuple[int, int], _Smoothed] = {}
+        for track_id, first, last in self._passes(scans):
+            self._smooth(scans, track_id, first, last, found)
+        return [self._estimate(self._told(scan, k, found)) for k, scan in enumerate(scans)]
 
-    def _smooth(self, forward: _Pass) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x (K, M, n), P (K, M, n, n), mu (K, M) of a pass, smoothed copy by copy: copies do not
-        switch, so that what each weighs at the end it weighs all along. Families, whose states are
-        unequal, are smoothed each by itself, and then what they weigh (`_family_weights`)."""
-        x, P, mu = np.stack(forward.x), np.stack(forward.P), np.stack(forward.mu)
-        M = len(self.models.names)
-        moves = self._moves(forward, x.shape[-1])
-        transition = np.stack(forward.transition)
-        parts = self.models.copies * len(self.models.blocks)
-        for copy in range(self.models.copies):
-            whole = slice(copy * M, (copy + 1) * M)
-            weights = _family_weights(mu[:, whole], transition, self.models.blocks)
-            for block, weight in zip(self.models.blocks, weights.T):
-                own = slice(copy * M + block.start, copy * M + block.stop)
-                total = mu[:, own].sum(axis=1, keepdims=True)
-                if not (total > 0.0).all():
-                    mu[:, own] = 0.0
+    def _scans(self) -> list[_Scan]:
+        """All scans, with the constants of all instruments, and how each was reached."""
+        newest = self._passed[max(self._passed)]
+        layout = self._layouts(newest)
+        scans: list[_Scan] = []
+        for stamp in sorted(self._passed):
+            known = self._passed[stamp]
+            known = known.replace(rows=layout.of_rows(known.rows, self.models))
+            before = scans[-1].known if scans else known
+            dt = (known.stamp_ns - before.stamp_ns) * 1e-9
+            crossing = self.models, self._chain, before.rows, before['learnt']
+            steps = tuple(crossed(*crossing, dt, self.config.longest_step))
+            between = tuple(self.models.common(step.rows.blocks) for step in steps[:-1])
+            scans.append(_Scan(known, *self.models.common(known.rows.blocks), steps, between))
+        return scans
+
+    def _passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:
+        """Identity, first and last scan of each track, cut where a gap is too long to look across,
+        and where its rows have no past of their own."""
+        passes: list[tuple[int, int, int]] = []
+        open_: dict[int, int] = {}
+        for k, scan in enumerate(scans):
+            before = scans[k - 1].known if k else scan.known
+            long = len(scan.between) >= LONGEST_GAP and len(self.models.names) > 1
+            ids = scan.known.life.track_id.tolist()
+            for track_id in [each for each in open_ if each not in ids]:
+                passes.append((track_id, open_.pop(track_id), k - 1))
+            for track, track_id in enumerate(ids):
+                came = np.flatnonzero(before.life.track_id == track_id)
+                rows = scan.known.rows
+                cut = not k or not len(came) or long
+                cut |= bool((rows.parent[rows.target == track] < 0).any())
+                if not cut:
+                    cut = before['spreads'][came[0]] != scan.known['spreads'][track]
+                if cut:
+                    if track_id in open_:
+                        passes.append((track_id, open_[track_id], k - 1))
+                    open_[track_id] = k
+        return passes + [(each, first, len(scans) - 1) for each, first in open_.items()]
+
+    def _smooth(
+        self,
+        scans: Sequence[_Scan],
+        track_id: int,
+        first: int,
+        last: int,
+        found: dict[tuple[int, int], _Smoothed],
+    ) -> None:
+        """Smooth the rows that a track ends a pass with, and put them into `found` by scan and
+        identity."""
+        end = scans[last].known.rows
+        rows: IndexArray = np.flatnonzero(end.target == _place(scans[last].known, track_id))
+        weight = end.take(rows).weight_among_themselves()
+        for row, share in zip(rows.tolist(), weight.tolist()):
+            path = self._path(scans, track_id, row, first, last)
+            x, P, mu = self._along(path)
+            key = {name: column[row] for name, column in end.key.items()}
+            for k, number in enumerate(path.scans):
+                if number is None:
                     continue
-                inside = mu[:, own] / total if parts > 1 else mu
-                steps = transition[:, block, block]
-                if len(weights.T) > 1:
-                    steps = steps / steps.sum(axis=2, keepdims=True)
-                result = imm_smooth(
-                    x[:, own], P[:, own], inside, steps, *(part[:, block] for part in moves)
-                )
-                self._smoothed_repairs += int(result.repaired.sum())
-                x[:, own], P[:, own] = result.x, result.P
-                mu[:, own] = result.mu * weight[:, None] if parts > 1 else result.mu
-        if parts > 1:
+                kept = found.setdefault((number, track_id), _Smoothed([], [], [], [], []))
+                logw = float(np.log(max(share, 1e-300)))
+                for column, value in zip(kept, (x[k], P[k], mu[k], logw, key)):
+                    column.append(value)
+
+    def _path(
+        self, scans: Sequence[_Scan], track_id: int, row: int, first: int, last: int
+    ) -> _Path:
+        """The forward pass that leads to a row of the `last` scan."""
+        chain = [row]
+        for scan in scans[last:first:-1]:
+            chain.append(int(scan.known.rows.parent[chain[-1]]))
+        path = _Path()
+        for number, own in zip(range(first, last + 1), reversed(chain)):
+            scan = scans[number]
+            transition, dt = self.models.chain.matrix, 0.0
+            if number > first:
+                came = chain[last - number + 1]
+                at = _place(scans[number - 1].known, track_id)
+                for step, (x, P) in zip(scan.steps, scan.between):
+                    mu, used = step.rows.mu[came], _of_track(step.transition, at)
+                    path.add(None, x[came], P[came], mu, used, step.dt)
+                transition, dt = _of_track(scan.steps[-1].transition, at), scan.steps[-1].dt
+            mu = scan.known.rows.mu[own]
+            path.add(number, scan.x[own], scan.P[own], mu, transition, dt)
+        return path
+
+    def _along(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x (K, M, n), P (K, M, n, n), mu (K, M) of a path, smoothed."""
+        x, P, mu = np.stack(path.x), np.stack(path.P), np.stack(path.mu)
+        moves, transition = self._moves(path, x.shape[-1]), np.stack(path.transition)
+        blocks = self._families()
+        weights = _family_weights(mu, transition, blocks)
+        for block, weight in zip(blocks, weights.T):
+            total = mu[:, block].sum(axis=1, keepdims=True)
+            if not (total > 0.0).all():
+                mu[:, block] = 0.0
+                continue
+            steps = transition[:, block, block]
+            if len(blocks) > 1:
+                steps = steps / steps.sum(axis=2, keepdims=True)
+            inside = mu[:, block] / total if len(blocks) > 1 else mu
+            own = (part[:, block] for part in moves)
+            result = imm_smooth(x[:, block], P[:, block], inside, steps, *own)
+            self._smoothed_repairs += int(result.repaired.sum())
+            x[:, block], P[:, block] = result.x, result.P
+            mu[:, block] = result.mu * weight[:, None] if len(blocks) > 1 else result.mu
+        if len(blocks) > 1:
             mu /= mu.sum(axis=1, keepdims=True)
-            mu[-1] = forward.mu[-1]
+            mu[-1] = path.mu[-1]
         return x, P, mu
 
-    def _passes(self, scans: Sequence[DiverState]) -> list[tuple[int, _Pass]]:
-        """Each track, cut where a gap is too long to look across."""
-        passes: list[tuple[int, _Pass]] = []
-        newest: dict[int, _Pass] = {}
-        for number, (before, now) in enumerate(zip([*scans[:1], *scans], scans)):
-            dt = (now.stamp_ns - before.stamp_ns) * 1e-9
-            *between, last = cross(self.models, self._chain, before, dt, self.config.longest_step)
-            for row, track_id in enumerate(now.life.track_id.tolist()):
-                came = np.flatnonzero(before.life.track_id == track_id)
-                cut = len(between) >= LONGEST_GAP and len(self.models.names) > 1
-                # Copies that were spread anew have no past of their own.
-                cut |= any(before.spreads[came] != now.spreads[row])
-                if not number or not len(came) or cut:
-                    newest[track_id] = _Pass()
-                    passes.append((track_id, newest[track_id]))
-                    transition, step_dt = self.models.chain.matrix, 0.0
-                else:
-                    for step in between:
-                        newest[track_id].add(None, *step.row(came[0]))
-                    *_, transition, step_dt = last.row(came[0])
-                newest[track_id].add(
-                    number, now.x[row], now.P[row], now.mu[row], transition, step_dt
-                )
-        return passes
+    def _families(self) -> list[slice]:
+        """The places of models with states of the same components that switch between each
+        other."""
+        kinds = self.models.families
+        if kinds is None:
+            return [slice(0, len(self.models.names))]
+        ends = np.cumsum(np.bincount(kinds.family)).tolist()
+        return [slice(first, last) for first, last in zip([0, *ends], ends)]
 
-    def _moves(self, forward: _Pass, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _moves(self, path: _Path, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, Q (K, M, size, size) and B (K, M, size): the motion, and constants that stay."""
-        moves = [self.models.motion(dt) for dt in forward.dt]
+        moves = [self.models.motion(dt) for dt in path.dt]
         F, Q, B = (np.stack(parts) for parts in zip(*moves))
         n = B.shape[-1]
         if size == n:
@@ -193,3 +268,30 @@ class SmoothingDiverTracker(DiverTracker):
         F_all[..., :n, :n], Q_all[..., :n, :n], B_all[..., :n] = F, Q, B
         F_all[..., range(n, size), range(n, size)] = 1.0
         return F_all, Q_all, B_all
+
+    def _told(
+        self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]
+    ) -> Known:
+        """What is known of a scan, given all data."""
+        known = scan.known
+        parts = [found[number, track_id] for track_id in known.life.track_id.tolist()]
+        if not parts:
+            return known
+        target = np.repeat(np.arange(len(parts)), [len(part.logw) for part in parts])
+        x, P, mu, logw = (
+            np.array([value for part in parts for value in part[k]]) for k in range(4)
+        )
+        keys = [key for part in parts for key in part.key]
+        key = {name: np.array([each[name] for each in keys]) for name in known.rows.key}
+        blocks, nobody = self.models.blocks(x, P), np.full(len(target), -1)
+        rows = Rows(blocks, mu, logw, target, nobody, key)
+        return known.replace(rows=rows, borrowed=Borrowed.none())
+
+
+def _place(known: Known, track_id: int) -> int:
+    return int(np.flatnonzero(known.life.track_id == track_id)[0])
+
+
+def _of_track(transition: FloatArray, track: int) -> FloatArray:
+    """The matrix (M, M) of a track among transitions (T or 1, M, M)."""
+    return transition[0 if len(transition) == 1 else track]

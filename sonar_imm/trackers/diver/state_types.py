@@ -19,7 +19,8 @@ from __future__ import annotations
 from ...acoustics.geodesy import Origin
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from ...estimation.hypotheses import Hypotheses
+from ...estimation.rows import Borrowed, Rows
+from ...estimation.bank import Gaussians
 from ...intake.stream import REPLAY_TYPES
 from ...measurements import (
     Arrivals,
@@ -36,16 +37,18 @@ from ...measurements import (
 from ..navigation import NavigationBuffer
 from . import clutter
 from .config import DiverConfig
+from .depth import HeightCounts
 from .georeferencing import Georeferencer, Samples
+from .innovations import FixConsistency
+from .instruments import Instruments
+from .known import Known
 from .offsets import Offsets, RecentPairs
-from .state import DiverState, FixConsistency, HeightCounts
-from .state_space import Instruments
 
 STATE_TYPES = (
     *REPLAY_TYPES,
     *(Arrivals, Fix, Fixes, Start),
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
-    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments, Hypotheses),
+    *(Known, Rows, Borrowed, Gaussians, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments),
     *(Offsets, RecentPairs, clutter.Clutter),
 )

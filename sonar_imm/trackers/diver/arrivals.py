@@ -15,37 +15,40 @@
 """What becomes of the divers by a ping: which measurements are whose, and the update by them.
 
 Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets, more of them by heavy tails (`explanations`). So are the arrivals of a tag,
+outlier subsets, more of them by heavy tails (`ping_kernels`). So are the arrivals of a tag,
 however few: its time of emission is unknown, so that among three or four receivers no subset is
 refuted by the others, and what decides is whether the whole lies where the ping by itself would
 put it.
 
 A track takes the measurements that its best explanation calls good. So association and update are
 one step here: an `Explanation` says what each track that takes part becomes, and
-`with_takings` is the state in which that has happened.
+`with_takings` is the value in which that has happened.
+
+All rows of a track are explained at once, as one list of hypotheses: a hypothesis is a row and a
+model. So every assumption has a row here, also one that fixes had made improbable.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ...acoustics.arrivals_3d import EMISSION
-from ...acoustics.multistatic import difference_projection
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
 from ...estimation.covariance import add_jitter, is_psd
+from ...estimation.rows import LEAST_LOG, revived
 from ...measurements import Arrivals, NOBODY
 from . import coverage, offsets
 from .config import DiverConfig
+from .depth import spread, with_rows
 from .explanations import (
     DEGREES,
     expect_measurements,
     expect_residuals,
-    fit_each,
     fit_measurements,
     MOST_EXPLANATIONS,
     PingMeasurements,
@@ -53,10 +56,11 @@ from .explanations import (
     student_t_ping,
     subset_ping,
 )
-from .heights import spread
+from .fixes import STATED
+from .instruments import Layout
+from .known import Known
+from .models import ModelSet, start_depths
 from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
-from .state import ARRIVALS, DiverState, learnt_scale
-from .state_space import as_stated, each_kept, heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
@@ -79,7 +83,7 @@ DISTINCT = 1.0
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`explanations`."""
+`ping_kernels`."""
 
 TAKEN = 0.5
 """Probability of being good from which a measurement counts as a track's."""
@@ -90,18 +94,30 @@ EVERYWHERE: Mapping[str, coverage.Coverage] = {}
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
 
-Mixture = tuple[FloatArray, FloatArray, FloatArray]
-"""x (M, n), P (M, n, n) and mu (M,) of one diver."""
-
-
-class PingUpdate(NamedTuple):
-    """A diver after a ping: x (M, n), P (M, n, n), mu (M,); good (C,): how sure each measurement
-    is this diver's; log_evidence, comparable between divers of the same ping; repairs: covariances
-    repaired (`estimation.covariance`)."""
+class Mixture(NamedTuple):
+    """One diver: L hypotheses, x (L, n), P (L, n, n) with probabilities mu (L,), and by what
+    `scale` (L,) each multiplies the variances of measurements."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
+    scale: FloatArray
+
+    @property
+    def stated(self) -> FloatArray:
+        """mu (L,) of the hypotheses that say how well a place is known."""
+        mu = np.where(self.scale >= STATED, self.mu, 0.0)
+        total = mu.sum()
+        return np.asarray(mu / total) if total > 0.0 else self.mu
+
+
+class PingUpdate(NamedTuple):
+    """A diver after a ping; log (L,): logarithms of the probabilities of the hypotheses; good
+    (C,): how sure each measurement is this diver's; log_evidence, comparable between divers of the
+    same ping; repairs: covariances repaired (`estimation.covariance`)."""
+
+    after: Mixture
+    log: FloatArray
     good: FloatArray
     log_evidence: float
     repairs: int
@@ -109,14 +125,12 @@ class PingUpdate(NamedTuple):
 
 class Taking(NamedTuple):
     """What a track becomes by the measurements of a ping that it takes: after; good (C,): those;
-    nis of dof of them, 0 for too few; residual (m,), covariance and stated (m, m): of the
-    arrivals, to learn their scale, None where that is not asked."""
+    nis of dof of them, 0 for too few."""
 
     after: PingUpdate
     good: BoolArray
     nis: float
     dof: int
-    scale: tuple[FloatArray, FloatArray, FloatArray] | None
 
 
 class Explanation(NamedTuple):
@@ -132,98 +146,127 @@ class Explanation(NamedTuple):
 
 
 def associate_and_update(
-    now: DiverState,
+    known: Known,
     ping: Arrivals,
     config: DiverConfig,
-    factor: float,
     models: ModelSet,
     covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
-) -> tuple[DiverState, BoolArray]:
-    """The tracks after a ping, `factor` on the variances of its arrival times, and the rows (n,)
-    that are no track's; covered: what is stated of sensors. A tag whose name is known has a track
-    of its own or begins one."""
-    before, seen = now.nis_dof, coverage.detectable(covered, '', now, config)
-    now, free = _by_ping(now, ping, config, factor, models, seen)
+) -> tuple[Known, BoolArray]:
+    """Return the tracks after a ping, and the rows (n,) of it that are no track's; covered: what
+    is stated of sensors. A tag whose name is known has a track of its own or begins one."""
+    before, seen, where = known['nis_dof'], None, coverage.of_sensor(covered, '', config)
+    if where is not None:
+        seen = coverage.seen(known, models, where, config.detection_probability)
+    known, free = _by_ping(known, ping, config, models, seen)
     if covered and config.fixes_are_scans and name_of(ping) == NOBODY:
-        share = (now.nis_dof == before) & (now.target_id == NOBODY)
-        mask = now.instruments.layout(config, models).mask
-        now = coverage.missed(now, seen, share.astype(np.float64), mask)
-    return now, free
+        share = (known['nis_dof'] == before) & (known['target_id'] == NOBODY)
+        all_moves = known.memory['instruments'].layout(config, models).mask.all()
+        share = share.astype(np.float64)
+        known = coverage.missed(known, models, seen, share, bool(all_moves))
+    return known, free
 
 
 def _by_ping(
-    now: DiverState,
+    known: Known,
     ping: Arrivals,
     config: DiverConfig,
-    factor: float,
     models: ModelSet,
     detected: coverage.Seen | None,
-) -> tuple[DiverState, BoolArray]:
+) -> tuple[Known, BoolArray]:
     """`associate_and_update` of what was heard; detected: None where that is equally probable."""
     name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
-    own = np.flatnonzero(now.target_id == name) if name != NOBODY else rows[:0]
+    own = np.flatnonzero(known['target_id'] == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
-        return now, free
-    instruments = now.instruments.with_receivers(ping, config)
+        return known, free
+    instruments = known.memory['instruments'].with_receivers(ping, config)
     layout = instruments.layout(config, models)
-    x, P = layout.widened(now.x, now.P)
-    now = now._replace(x=x, P=P, instruments=instruments)
-    seen = ping_measurements(ping, rows, config, factor, models, layout)
-    if not len(x) or seen.pairs <= int(ping.passive):
-        return now, free & (name == NOBODY)
-    now = spread(now, seen, layout, models)
+    every = np.ones(len(known.borrowed), np.bool_)
+    table, borrowed = revived(known.rows, known.borrowed, 'scale', every)
+    known = known.replace(rows=layout.of_rows(table, models), borrowed=borrowed)
+    known = known.remember(instruments=instruments)
+    seen = ping_measurements(ping, rows, config, models, layout)
+    if not len(known) or seen.pairs <= int(ping.passive):
+        return known, free & (name == NOBODY)
+    known = spread(known, seen, layout, models)
+    mixtures = [mixture_of(known, track, models) for track in range(len(known))]
     if name != NOBODY:
-        taking = _taking(now, int(own[0]), seen, config, layout, factor)
+        taking = _taking(mixtures[int(own[0])], seen, config, layout)
         takings = {} if taking is None else {int(own[0]): taking}
-        return _watched(with_takings(now, takings), takings, ping, seen, config, models), ~free
+        known = with_takings(known, takings, models)
+        return _watched(known, takings, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
-    takings, taken, score = explain(now, seen, config, layout, factor)
+    takings, taken, score = explain(known, mixtures, seen, config, layout)
     if detected is not None:
         looks = 1 if ping.passive else len(seen.nodes)
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
     free[seen.row[taken & seen.echo]] = False
     free &= free.all() or not ping.passive  # a tag's are of one track, also those not used
-    now = _watched(with_takings(now, takings), takings, ping, seen, config, models)
-    return now._replace(score=score), free
+    known = with_takings(known, takings, models)
+    return _watched(known, takings, ping, seen, config, models).put(score=score), free
 
 
 def _watched(
-    now: DiverState,
+    known: Known,
     takings: dict[int, Taking],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
     models: ModelSet,
-) -> DiverState:
-    """With what the ping says of errors that last, by the confirmed tracks that took of it."""
+) -> Known:
+    """Return the tracks with what the ping says of errors that last, by the confirmed tracks that
+    took of it."""
     took = {track: taking.good for track, taking in takings.items() if taking.dof}
     axes = [0, 1] if models.height < 0 else [0, 1, models.height]
-    at = {t: now.x[t, now.mu[t].argmax(), axes] for t in took if now.life.status[t] != TENTATIVE}
-    return now._replace(offsets=offsets.watched(now.offsets, at, took, ping, seen, config))
+    at = {}
+    for track in took:
+        if known.life.status[track] != TENTATIVE:
+            after = takings[track].after.after
+            at[track] = after.x[after.mu.argmax(), axes]
+    memory = known.memory['offsets'], known.memory['recent']
+    found, recent = offsets.watched(*memory, at, took, ping, seen, config)
+    return known.remember(offsets=found, recent=recent)
 
 
-def with_takings(now: DiverState, takings: dict[int, Taking]) -> DiverState:
-    """The state in which tracks have taken what they take."""
+def mixture_of(known: Known, track: int, models: ModelSet) -> Mixture:
+    """Return the hypotheses of a track, row by row."""
+    rows = known.rows.take(known.rows_of(track))
+    x, P = models.common(rows.blocks)
+    N, M, n = x.shape
+    mu = rows.weight_among_themselves()[:, None] * rows.mu
+    scale = np.repeat(rows.key['scale'], M)
+    return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
+
+
+def with_takings(known: Known, takings: dict[int, Taking], models: ModelSet) -> Known:
+    """Return the tracks after they have taken what they take."""
     if not takings:
-        return now
-    x, P, mu = now.x.copy(), now.P.copy(), now.mu.copy()
-    nis, nis_dof, scale, repairs = now.nis.copy(), now.nis_dof.copy(), now.scale, now.repairs
+        return known
+    nis, nis_dof, repairs = known['nis'].copy(), known['nis_dof'].copy(), 0
+    rows, M = known.rows, len(models.names)
     for track, taking in takings.items():
-        x[track], P[track], mu[track] = taking.after.x, taking.after.P, taking.after.mu
+        after, own = taking.after.after, known.rows_of(track)
+        # A ping of many arrivals can be e^700 times as probable in one row as in another.
+        n, log = after.x.shape[-1], taking.after.log.reshape(-1, M)
+        top = log.max(axis=1, keepdims=True)
+        inside = np.exp(log - np.where(np.isfinite(top), top, 0.0))
+        weight = inside.sum(axis=1, keepdims=True)
+        inside = np.where(weight > 0.0, inside / np.where(weight > 0.0, weight, 1.0), rows.mu[own])
+        blocks = models.blocks(after.x.reshape(-1, M, n), after.P.reshape(-1, M, n, n))
+        with np.errstate(divide='ignore'):
+            logw = np.maximum((top + np.log(weight))[:, 0], LEAST_LOG)
+        rows = with_rows(rows, own, blocks, inside, logw)
         nis[track] += taking.nis
         nis_dof[track] += np.uint16(taking.dof)
         repairs += taking.after.repairs
-        if taking.scale is not None:
-            scale = learnt_scale(scale, ARRIVALS, *(part[None] for part in taking.scale))
-    return now._replace(x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, scale=scale, repairs=repairs)
-
-
-def _mixture(now: DiverState, track: int) -> Mixture:
-    return now.x[track], now.P[track], now.mu[track]
+    return known.replace(rows=rows).put(nis=nis, nis_dof=nis_dof).counted(repairs=repairs)
 
 
 def _explain_echoes(
-    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+    known: Known,
+    mixtures: Sequence[Mixture],
+    ping: Ping,
+    config: DiverConfig,
+    layout: Layout,
 ) -> Explanation:
     """Which tracks take which echoes of one transmission.
 
@@ -231,28 +274,28 @@ def _explain_echoes(
     ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
     of the pairs is not what the ping shows; for it nothing happened.
     """
-    T, M, n = now.x.shape
-    each = now.x.reshape(-1, n), now.P.reshape(-1, n, n)
-    likelihood, nis = fit_each(*each, config.target_z, ping.measured)
-    fit = np.log(np.maximum((now.mu[:, None] @ likelihood.reshape(T, M, -1))[:, 0], 1e-300))
-    near = (nis.reshape(T, M, -1).min(axis=1) < NEAR) & ping.echo
+    fits = [
+        fit_measurements(*mixture[:3], config.target_z, ping.measured) for mixture in mixtures
+    ]
+    fit, nis = (np.array(column) for column in zip(*fits))
+    near = (nis < NEAR) & ping.echo
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
-    rank = 2 * (len(pairs) - explained) + (now.life.status == TENTATIVE)
-    first, hits = _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)
+    rank = 2 * (len(pairs) - explained) + (known.life.status == TENTATIVE)
+    first, hits = _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)
     doubtful = (hits > 0) & (2 * hits < len(pairs))
     if not doubtful.any():
         return first
     rank = np.where(doubtful, EXCLUDED, rank)
-    return _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)[0]
+    return _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)[0]
 
 
 def _by_rank(
-    now: DiverState,
+    known: Known,
+    mixtures: Sequence[Mixture],
     ping: Ping,
     config: DiverConfig,
     layout: Layout,
-    factor: float,
     rank: IntArray,
     fit: FloatArray,
     near: BoolArray,
@@ -262,7 +305,7 @@ def _by_rank(
     p = config.detection_probability
     taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
     takings: dict[int, Taking] = {}
-    score = now.score + len(pairs) * np.log1p(-p)
+    score = known['score'] + len(pairs) * np.log1p(-p)
     gain = np.log(p / (1.0 - p))
     gain -= 0.5 * np.log(config.usual_clutter)
     for turn in np.unique(rank[rank != EXCLUDED]):
@@ -272,7 +315,7 @@ def _by_rank(
         for track in tracks.tolist():
             mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
             index = np.flatnonzero(mine)
-            taking = _taking(now, track, ping.only(mine), config, layout, factor)
+            taking = _taking(mixtures[track], ping.only(mine), config, layout)
             if taking is not None:
                 index = index[taking.good]
                 good = np.zeros(len(taken), bool)
@@ -311,7 +354,11 @@ def _owners(
 
 
 def _explain_tag(
-    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+    known: Known,
+    mixtures: Sequence[Mixture],
+    ping: Ping,
+    config: DiverConfig,
+    layout: Layout,
 ) -> Explanation:
     """Which track takes a tag's ping, all of it.
 
@@ -319,14 +366,14 @@ def _explain_tag(
     the ping best of those that need not jump for it. Confirmed tracks come first; others are asked
     where less than half of the arrivals fit the one chosen.
     """
-    score = now.score + np.log1p(-config.detection_probability)
+    score = known['score'] + np.log1p(-config.detection_probability)
     takings: dict[int, Taking] = {}
-    tentative = now.life.status == TENTATIVE
+    tentative = known.life.status == TENTATIVE
     for turn in (~tentative, tentative):
-        best = _best_for_tag(now, np.flatnonzero(turn), ping, config, layout)
+        best = _best_for_tag(mixtures, np.flatnonzero(turn), ping, config, layout)
         if best is not None:
             track, after = best
-            taking = taking_of(_mixture(now, track), after, ping, config, layout, factor)
+            taking = taking_of(mixtures[track], after, ping, config)
             takings[track] = taking
             score[track] += float(taking.good.sum())
             if 2 * taking.good.sum() >= len(taking.good):
@@ -335,72 +382,59 @@ def _explain_tag(
 
 
 def _best_for_tag(
-    now: DiverState, tracks: IndexArray, ping: Ping, config: DiverConfig, layout: Layout
+    mixtures: Sequence[Mixture],
+    tracks: IndexArray,
+    ping: Ping,
+    config: DiverConfig,
+    layout: Layout,
 ) -> tuple[int, PingUpdate] | None:
-    """Which of `tracks` explains a tag's ping best, and what becomes of it."""
+    """Return which of `tracks` explains a tag's ping best, and what becomes of it."""
     best: tuple[int, PingUpdate] | None = None
     for track in tracks.tolist():
-        before = _mixture(now, track)
-        after = update_by_ping(*before, ping, config, layout)
-        if after is None or not (config.max_tracks == 1 or _allowed(before, after, config)):
+        after = update_by_ping(mixtures[track], ping, config, layout)
+        if after is None:
+            continue
+        if not (config.max_tracks == 1 or _allowed(mixtures[track], after.after, config)):
             continue
         if best is None or after.log_evidence > best[1].log_evidence:
             best = track, after
     return best
 
 
-def _allowed(before: Mixture, after: PingUpdate, config: DiverConfig) -> bool:
-    """Whether the diver after a ping is where the prediction allows it to be."""
-    (mean, covariance), (there, _) = _place(*before), _place(after.x, after.P, after.mu)
-    gap = there - mean
+def _allowed(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
+    """Return whether the diver after a ping is where the prediction allows it to be."""
+    mean = before.mu @ before.x[:, :2]
+    apart = before.x[:, :2] - mean
+    covariance = np.einsum('l,lab->ab', before.mu, before.P[:, :2, :2])
+    covariance += np.einsum('l,la,lb->ab', before.mu, apart, apart)
+    gap = after.mu @ after.x[:, :2] - mean
     distance = float(gap @ np.linalg.solve(covariance, gap))
     return distance <= gate_threshold(config.gate_probability, 2)
-
-
-def _place(x: FloatArray, P: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean (2,) and covariance (2, 2) of the position of a mixture."""
-    mean = mu @ x[:, :2]
-    apart = x[:, :2] - mean
-    return mean, np.tensordot(mu, P[:, :2, :2], 1) + (apart.T * mu) @ apart
 
 
 # -- one track -----------------------------------------------------------------------------------
 
 
-def _taking(
-    now: DiverState, track: int, ping: Ping, config: DiverConfig, layout: Layout, factor: float
-) -> Taking | None:
-    """What a track takes of the measurements it may have; None where no model can explain them."""
-    before = _mixture(now, track)
-    after = update_by_ping(*before, ping, config, layout) if ping.echo.any() else None
-    return None if after is None else taking_of(before, after, ping, config, layout, factor)
+def _taking(before: Mixture, ping: Ping, config: DiverConfig, layout: Layout) -> Taking | None:
+    """Return what a track takes of the measurements it may have; None where no model can explain
+    them."""
+    after = update_by_ping(before, ping, config, layout) if ping.echo.any() else None
+    return None if after is None else taking_of(before, after, ping, config)
 
 
-def taking_of(
-    before: Mixture,
-    after: PingUpdate,
-    ping: Ping,
-    config: DiverConfig,
-    layout: Layout,
-    factor: float,
-) -> Taking:
-    """What a track takes, `before` it and after."""
+def taking_of(before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig) -> Taking:
+    """Return what a track takes, `before` it and after."""
     good = np.asarray(after.good > TAKEN)
-    nis, dof, scale = 0.0, 0, None
+    nis, dof = 0.0, 0
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.compared(good)
-        x, P, mu = before
-        mu = as_stated(mu, layout.stated)
-        residual, covariance, dof = residuals(x, P, mu, own, config.target_z)
+        residual, covariance, dof = residuals(before, own, config.target_z)
         nis = _joint_nis(residual, covariance, own.measured.variance)
-    if config.estimate_covariance_scale and (good & ping.echo).any():
-        own = ping.compared(good & ping.echo)
-        scale = _for_scale(after, as_stated(after.mu, layout.stated), own, config, factor)
-    return Taking(after, good, nis, dof, scale)
+    return Taking(after, good, nis, dof)
 
 
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
+    """Return ``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
 
     Beside what is expected of exact arrivals after a long silence their own variances are lost in
     rounding, and S can have no inverse. Its eigenvalues in units of the variances are 1 at least.
@@ -414,87 +448,61 @@ def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArra
     return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
 
 
-def _for_scale(
-    after: PingUpdate, mu: FloatArray, ping: Ping, config: DiverConfig, factor: float
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Residuals of the arrivals that a track took, their covariance and what is stated of it."""
-    residual, covariance, dof = residuals(after.x, after.P, mu, ping, config.target_z)
-    stated = np.diag(ping.measured.variance / factor)
-    if ping.passive and dof:
-        # The emission is unknown: differences, whitened by what is stated.
-        projection = difference_projection(ping.measured.variance / factor)
-        residual, stated = projection @ residual, np.eye(dof)
-        covariance = projection @ covariance @ projection.T
-    return (residual, covariance, stated) if dof else None
-
-
 def update_by_ping(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    ping: Ping,
-    config: DiverConfig,
-    layout: Layout,
+    before: Mixture, ping: Ping, config: DiverConfig, layout: Layout
 ) -> PingUpdate | None:
-    """One diver, x (M, n + q), P (M, n + q, n + q), mu (M,), updated by all of a ping; None where
-    no model can be.
+    """Return a diver updated by all of a ping; None where no hypothesis can be.
 
     Of more than `MOST_MEASUREMENTS` those are used that are nearest to what is expected; the
     others are good where they fit what became of the diver.
     """
     if len(ping.row) > MOST_MEASUREMENTS:
-        _, nis = fit_measurements(x, P, mu, config.target_z, ping.measured)
+        _, nis = fit_measurements(*before[:3], config.target_z, ping.measured)
         keep = np.zeros(len(nis), bool)
         keep[np.argsort(nis, kind='stable')[:MOST_MEASUREMENTS]] = True
         keep = ping.kept(keep)
-        after = update_by_ping(x, P, mu, ping.only(keep), config, layout)
-        if after is None:
+        found = update_by_ping(before, ping.only(keep), config, layout)
+        if found is None:
             return None
-        _, nis = fit_measurements(after.x, after.P, after.mu, config.target_z, ping.measured)
+        _, nis = fit_measurements(*found.after[:3], config.target_z, ping.measured)
         good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
-        good[keep] = after.good
-        return after._replace(good=good)
+        good[keep] = found.good
+        return found._replace(good=good)
+    x, P, mu, scale = before
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
-    measured, scale = _scaled(ping.measured, len(x), layout)
+    measured = ping.measured
+    if not (scale == 1.0).all():
+        measured = measured._replace(variance=scale[:, None] * measured.variance)
     if ping.passive or ping.pairs > MOST_SUBSETS:
-        heavy = measured, optima(ping, config), DEGREES
+        starts = optima(ping, config)
+        heavy = measured, starts, DEGREES
         x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
         # The densities of scaled residuals are those of the residuals but for this.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
         squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
-        subsets = measured, config.outlier_probability, MOST_EXPLANATIONS
-        x, P, evidence, good = subset_ping(x, P, mask, config.target_z, *subsets)
+        subsets = config.outlier_probability, MOST_EXPLANATIONS
+        x, P, evidence, good = subset_ping(x, P, mask, config.target_z, measured, *subsets)
     with np.errstate(divide='ignore'):
         weight = np.log(mu) + evidence
     best = weight.max(initial=-np.inf)
     if not np.isfinite(best):
         return None
     share = np.exp(weight - best)
-    updated = each_kept(weight - best, share / share.sum(), len(layout.scales))
+    updated = share / share.sum()
     P, repairs = _repaired(P[:, :n, :n])
+    after = Mixture(x[:, :n].copy(), P, updated, scale)
     log_evidence = float(best + np.log(share.sum()))
-    return PingUpdate(x[:, :n].copy(), P, updated, updated @ good, log_evidence, repairs)
-
-
-def _scaled(
-    measured: PingMeasurements, hypotheses: int, layout: Layout
-) -> tuple[PingMeasurements, FloatArray]:
-    """Return measurements with the variances that each of the hypotheses, copy by copy, takes
-    them to have, and by what each (L,) multiplies them."""
-    scale = np.repeat(layout.scales, hypotheses // len(layout.scales))
-    if (scale == 1.0).all():
-        return measured, scale
-    return measured._replace(variance=scale[:, None] * measured.variance), scale
+    return PingUpdate(after, weight - log_evidence, updated @ good, log_evidence, repairs)
 
 
 def _repaired(P: FloatArray) -> tuple[FloatArray, int]:
     """Return covariances P (L, n, n) that keep to the limit, and how many did not."""
-    out, repaired = add_jitter(P)
-    return out, int((repaired & np.isfinite(P).all(axis=(1, 2))).sum())
+    out, spoilt = add_jitter(P)
+    return out, int((spoilt & np.isfinite(P).all(axis=(1, 2))).sum())
 
 
 def begin_from_ping(
@@ -518,11 +526,10 @@ def begin_from_ping(
     return at[:, :n], _repaired(covariance[:, :n, :n])[0], evidence
 
 
-def residuals(
-    x: FloatArray, P: FloatArray, mu: FloatArray, ping: Ping, height: float
-) -> tuple[FloatArray, FloatArray, int]:
-    """Residuals (C,) of a diver's measurements, the covariance (C, C) expected of them without
-    their own variances, and how many of them are independent."""
+def residuals(before: Mixture, ping: Ping, height: float) -> tuple[FloatArray, FloatArray, int]:
+    """Return residuals (C,) of a diver's measurements, the covariance (C, C) expected of them
+    without their own variances, and how many of them are independent."""
+    x, P, mu = before.x, before.P, before.stated
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
     residual, covariance = expect_measurements(x, P, mu, height, ping.measured)
@@ -542,7 +549,7 @@ def optima(ping: Ping, config: DiverConfig) -> FloatArray:
     mean = np.zeros(size)
     mean[:2] = measured.rx[:, :2].mean(axis=0)
     spread = np.diag([FAR**2, FAR**2, (10.0 * FAR) ** 2][:size])
-    height = float(np.mean(heights_of(config)))
+    height = float(np.mean(start_depths(config)))
     found, value = student_t_maxima(mean, spread, starts, measured, height, DEGREES)
     kept: list[FloatArray] = []
     for k in np.argsort(-value, kind='stable'):

@@ -1,0 +1,407 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Depth as a state (`dimensions: 3`): what fixes say of z, and when its rows are spread anew.
+
+*Fixes.* Association and the update by x and y are the same with z and without. Then z is one more
+number for the track that took the fix: z less what the errors of x and y, which are known by now,
+have to do with its own. With ``R`` the covariance of the fix, split into that of x and y, of z,
+and between them,
+
+    z - g (x, y) = z_track - g (x, y)_track + e,    g = R_z,xy R_xy^-1,    var e = R_zz - g R_xy,z
+
+where e has nothing to do with the errors of x and y. So the two updates in turn are the one by all
+three coordinates. It weighs the models too, and with them the copies of the depth bank.
+
+z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
+z alone. What is refused is remembered; the next fix that agrees with it says that the depth was
+wrong, and z begins there.
+
+*Rows.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
+Far away all rows of a track, each of which began in its part of the water column, may come to agree
+on a depth that is not well known. When the diver then comes near, one Gaussian cannot become two
+depths, and all rows may go to the wrong one. So rows that agree are spread over what they believe,
+before a ping that bends within it: the Gaussian becomes the sum of narrower ones with the same mean
+and variance, and the arrivals choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.association import gate_threshold
+from ...estimation.covariance import add_jitter
+from ...estimation.bank import Gaussians, LOG_2PI
+from ...estimation.rows import LEAST_LOG, Rows
+from .config import DiverConfig
+from .instruments import Layout
+from .known import Feature, Known, repaired
+from .models import ModelSet
+from .scan import Group, Height, Ping
+
+FEATURES = {
+    'refused_z': Feature(math.nan, (3,)),
+    'spreads': Feature(0, kind=np.int64),
+}
+"""Stamp, z and variance of the last height of a fix that was not believed; how often the rows were
+spread anew."""
+
+DOUBTED = 0.1
+"""Share of the heights of fixes from which what is doubted of them is said, after `MANY` of
+them."""
+
+MANY = 20
+
+BEYOND = 3.0
+"""Standard deviations by which a fix lies above or below the water column, so that it was stated
+wrong."""
+
+AGREE = 0.5
+"""Rows agree whose means vary by less than this share of the variance that they have."""
+
+BENT = 0.1
+"""Standard deviations of an arrival by which the path may bend within what is believed of z,
+before the rows are spread. What one ping does not see many do: the bend is the same in all."""
+
+APART, POSSIBLE = 2.0, 0.05
+"""There are two depths where the rows above a gap and those below weigh more than `POSSIBLE`
+each. A gap is wider than `APART` times the standard deviations of both its neighbours together."""
+
+
+class HeightCounts(NamedTuple):
+    """How many heights of fixes there were for tracks, how many of them were refused, and how many
+    lie outside `depth_min` to `depth_max`."""
+
+    seen: int = 0
+    refused: int = 0
+    outside: int = 0
+
+    def warnings(self, config: DiverConfig) -> list[str]:
+        """Sentences for the user."""
+        if self.seen < MANY:
+            return []
+        found = []
+        if self.outside > DOUBTED * self.seen:
+            found.append(
+                f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
+                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
+                'origin_height for positions in latitude and longitude'
+            )
+        if self.refused > DOUBTED * self.seen:
+            found.append(
+                f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
+                'than it states, or the divers go up and down faster than vertical_speed_std'
+            )
+        return found
+
+
+def begin(
+    x: FloatArray,
+    P: FloatArray,
+    height: Height,
+    covariance: FloatArray,
+    place: int,
+    config: DiverConfig,
+) -> None:
+    """Let a new track, x (M, n), P (M, n, n) in place, begin at the z that its fix states; its x
+    and y have `covariance` (2, 2). Not where the water column, of `depth_min` to `depth_max`, says
+    more than the fix, and does not contradict it: then z begins as without a fix."""
+    variance = height.variance(covariance)
+    width = config.depth_max - config.depth_min
+    if variance <= width**2 / 12.0 or _outside(height.value, variance, config):
+        _set(x, P, place, height.value, variance, config)
+        P[:, :2, place] = P[:, place, :2] = covariance @ height.gain
+
+
+def _outside(value: float, variance: float, config: DiverConfig) -> bool:
+    room = BEYOND * math.sqrt(variance)
+    return not -config.depth_max - room <= value <= -config.depth_min + room
+
+
+def _set(
+    x: FloatArray, P: FloatArray, place: int, value: float, variance: float, config: DiverConfig
+) -> None:
+    """Forget what x (M, n), P (M, n, n) know of z and its rate, which follows it."""
+    own = slice(place, place + 2)
+    P[:, own, :] = P[:, :, own] = 0.0
+    x[:, place], x[:, place + 1] = value, 0.0
+    P[:, place, place], P[:, place + 1, place + 1] = variance, config.vertical_speed_std**2
+
+
+def updating(
+    models: ModelSet, layouts: Callable[[Known], Layout], config: DiverConfig
+) -> Callable[[Known, Group], Known]:
+    """Return the stage that updates tracks by the heights of the fixes that are theirs."""
+
+    def update_heights(known: Known, group: Group) -> Known:
+        return update(known, group, models, layouts(known), config)
+
+    return update_heights
+
+
+def update(
+    known: Known, group: Group, models: ModelSet, layout: Layout, config: DiverConfig
+) -> Known:
+    """Return the tracks after the heights of the fixes of a group that are theirs."""
+    heights, found = group.heights, group.found
+    assert found is not None
+    tracks = np.flatnonzero(found.hit)
+    if heights is None or not len(tracks):
+        return known
+    tracks = tracks[np.isfinite(heights.value[found.fix[tracks]])]
+    threshold = gate_threshold(config.gate_probability, 1)
+    columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'refused_z')}
+    counts: HeightCounts = known.memory['heights']
+    seen, doubted, outside = counts
+    for track in tracks.tolist():
+        fix = int(found.fix[track])
+        own = heights.row(fix)
+        assert own is not None
+        share = 1.0
+        if found.weighed:
+            share = min(found.beta[track, fix] / found.exists[track], 1.0)
+        known, nis = _updated(known, track, own, group.z[fix], share, models, layout, threshold)
+        variance = own.variance(group.R[fix])
+        outside += _outside(own.value, variance, config)
+        if nis <= threshold:
+            columns['nis'][track] += nis
+            columns['nis_dof'][track] += np.uint16(1)
+            columns['refused_z'][track] = np.nan
+            continue
+        stamp, before, its = columns['refused_z'][track].tolist()
+        moved = config.vertical_speed_std * (known.stamp_ns - stamp) * 1e-9
+        if (own.value - before) ** 2 <= threshold * (variance + its + moved**2):
+            known = _at_height(known, track, own.value, variance, models, config)
+            columns['refused_z'][track] = np.nan
+        else:
+            columns['refused_z'][track] = known.stamp_ns, own.value, variance
+            doubted += 1
+    after = HeightCounts(seen + len(tracks), doubted, outside)
+    return known.put(**columns).remember(heights=after)
+
+
+def _at_height(
+    known: Known, track: int, value: float, variance: float, models: ModelSet, config: DiverConfig
+) -> Known:
+    """Return the tracks after one forgot what it knew of z, and begins at `value`."""
+    own = known.rows_of(track)
+    rows = known.rows.take(own)
+    x, P = models.common(rows.blocks)
+    for row in range(len(rows)):
+        _set(x[row], P[row], models.height, value, variance, config)
+    return known.replace(rows=with_rows(known.rows, own, models.blocks(x, P), rows.mu, rows.logw))
+
+
+def with_rows(
+    rows: Rows, own: np.ndarray, blocks: tuple[Gaussians, ...], mu: FloatArray, logw: FloatArray
+) -> Rows:
+    """Return the table with other states, models and weights of the rows `own` (k,)."""
+    merged = []
+    for block, new in zip(rows.blocks, blocks):
+        x, P = block.x.copy(), block.P.copy()
+        x[own], P[own] = new
+        merged.append(Gaussians(x, P))
+    all_mu, all_logw = rows.mu.copy(), rows.logw.copy()
+    all_mu[own], all_logw[own] = mu, logw
+    return rows.replace(blocks=tuple(merged), mu=all_mu, logw=all_logw)
+
+
+def _updated(
+    known: Known,
+    track: int,
+    height: Height,
+    z: FloatArray,
+    share: float,
+    models: ModelSet,
+    layout: Layout,
+    threshold: float,
+) -> tuple[Known, float]:
+    """Return the tracks after one was updated by one number, z of a fix less its `gain` times the
+    x and y (2,) of that fix, and the NIS of its mixture, by which nothing changes where it is
+    above `threshold`.
+
+    share: probability that the number is the track's. Below 1 each model becomes the mixture of
+    what it is with it and without.
+    """
+    own = known.rows_of(track)
+    rows, value = known.rows.take(own), height.value - float(height.gain @ z)
+    weight = rows.weight_among_themselves()[:, None] * rows.mu
+    masks = layout.estimated(models)
+    parts = [
+        _compared(block, part.seen, part.height, height, value)
+        for part, block in zip(models.parts, rows.blocks)
+    ]
+    v, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
+    mean, square = float((weight * v).sum()), float((weight * (S + v * v)).sum())
+    nis = mean * mean / (square - mean * mean)
+    good = (S > 0.0) & np.isfinite(S)
+    if not nis <= threshold or not (good & (weight > 0.0)).any():
+        return known, nis if not nis <= threshold else math.inf
+    log = np.where(good, -0.5 * (v * v / np.where(good, S, 1.0) + LOG_2PI + np.log(S)), -np.inf)
+    density = np.exp(log - log[weight > 0.0].max())
+    factor = share * density / (weight * density).sum() + (1.0 - share)
+    blocks = []
+    for part, block, mask, (PHt, nu, s) in zip(models.parts, rows.blocks, masks, parts):
+        certain = share * density[:, part.models] / (weight * density).sum()
+        blocks.append(_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
+    sound, repairs = repaired(tuple(blocks))
+    rows, total = rows.replace(blocks=sound).with_models(factor)
+    with np.errstate(divide='ignore'):
+        logw = np.maximum(rows.logw + np.log(total), LEAST_LOG)
+    known = known.replace(rows=with_rows(known.rows, own, rows.blocks, rows.mu, logw))
+    return known.counted(repairs=repairs), nis
+
+
+def _compared(
+    block: Gaussians, seen: FloatArray, place: int, height: Height, value: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return PHt (N, n, m), innovation (N, m) and its variance (N, m) of ``z - gain (x, y)``."""
+    h = np.zeros((block.x.shape[1], block.x.shape[2]))
+    h[: len(seen[0])] = -height.gain[0] * seen[0] - height.gain[1] * seen[1]
+    h[place] += 1.0
+    PHt = (block.P * h).sum(axis=2)
+    return PHt, value - (h * block.x).sum(axis=1), (h * PHt).sum(axis=1) + height.rest
+
+
+def _scalar(
+    block: Gaussians,
+    PHt: FloatArray,
+    v: FloatArray,
+    S: FloatArray,
+    R: float,
+    certain: FloatArray,
+    without: float,
+    estimated: BoolArray | None,
+) -> Gaussians:
+    """Return the block after one number: in each model the mixture of what it is with it, with the
+    weight `certain` (N, m), and `without`."""
+    K = PHt / np.where(S > 0.0, S, 1.0)[:, None]
+    if estimated is not None:
+        K[:, ~estimated] = 0.0
+    shift = K * v[:, None]
+    P = block.P - K[:, :, None] * PHt[:, None] - PHt[:, :, None] * K[:, None]
+    P = P + K[:, :, None] * K[:, None] * S[:, None, None]
+    total = certain + without
+    share = np.where(total > 0.0, certain / np.where(total > 0.0, total, 1.0), 0.0)[:, None]
+    x = block.x + share * shift
+    both = share[:, None] * P + (1.0 - share[:, None]) * block.P
+    both = both + (share * (1.0 - share))[:, None] * shift[:, :, None] * shift[:, None]
+    return Gaussians(x, both)
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+def _of_rows(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return weight, mean and variance of z of each row, (N,) each."""
+    z, variance = (
+        np.concatenate(parts, axis=1)
+        for parts in zip(
+            *(
+                (block.x[:, part.height], block.P[:, part.height, part.height])
+                for part, block in zip(models.parts, rows.blocks)
+            )
+        )
+    )
+    mean = (rows.mu * z).sum(axis=1)
+    square = (rows.mu * (variance + z * z)).sum(axis=1)
+    return rows.weight, mean, np.maximum(square - mean * mean, 0.0)
+
+
+def ambiguous(known: Known, models: ModelSet) -> BoolArray:
+    """Return which divers (T,) may be at another depth as well."""
+    two = np.zeros(len(known), bool)
+    weights, means, variances = _of_rows(known.rows, models)
+    for track in range(len(known)):
+        own = known.rows_of(track)
+        weight, mean, variance = weights[own], means[own], variances[own]
+        counts = np.flatnonzero(weight > POSSIBLE / 10.0)
+        order = counts[np.argsort(mean[counts], kind='stable')]
+        reach = APART * np.sqrt(variance[order])
+        gap = np.diff(mean[order]) > reach[1:] + reach[:-1]
+        below = np.cumsum(weight[order])[:-1]
+        two[track] = (gap & (np.minimum(below, weight.sum() - below) > POSSIBLE)).any()
+    return two
+
+
+def spread(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
+    """Return the tracks as `seen` will find them: with the rows spread where they agree and the
+    paths bend within what they believe."""
+    echo = seen.echo
+    if models.height < 0 or models.copies == 1 or not len(known) or not echo.any():
+        return known
+    weights, means, variances = _of_rows(known.rows, models)
+    measured = seen.measured
+    for track in range(len(known)):
+        own = known.rows_of(track)
+        weight, mean, variance = weights[own], means[own], variances[own]
+        middle = float(weight @ mean)
+        between, within = float(weight @ (mean - middle) ** 2), float(weight @ variance)
+        if not between < AGREE * within:
+            continue
+        rows = known.rows.take(own)
+        x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
+        place = np.append(np.einsum('r,rm,ram->a', weight, rows.mu, x), middle)
+        bend = _bend(place, measured.rx[echo])
+        if not seen.passive:
+            bend = bend + _bend(place, measured.tx[echo])
+        deviation = 0.5 * bend * (within + between) / np.sqrt(measured.variance[echo])
+        if deviation.max() > BENT:
+            new = _spread(rows, layout.mask, models)
+            known = known.replace(rows=with_rows(known.rows, own, *new))
+            known = spread_anew(known, track)
+    return known
+
+
+def spread_anew(known: Known, track: int) -> Known:
+    """Return the tracks with one more spread of the rows of a track."""
+    spreads = known['spreads'].copy()
+    spreads[track] += 1
+    return known.put(spreads=spreads)
+
+
+def _bend(place: FloatArray, instrument: FloatArray) -> FloatArray:
+    """Return the second derivative (C,) in z of the distance from `place` (3,) to instruments (C,
+    3), not nearer than a metre, 1/m."""
+    apart = instrument - place
+    distance = np.maximum(np.sqrt((apart * apart).sum(axis=1)), 1.0)
+    return np.asarray((1.0 - np.minimum(apart[:, 2] / distance, 1.0) ** 2) / distance)
+
+
+def _spread(
+    rows: Rows, estimated: BoolArray, models: ModelSet
+) -> tuple[tuple[Gaussians, ...], FloatArray, FloatArray]:
+    """Return states, models (K, M) and weights (K,) of the K rows of a track, with what all rows
+    believe spread over them; estimated (n,): see `estimation.consider`."""
+    place = models.height
+    each = rows.weight_among_themselves()[:, None] * rows.mu
+    K, total = len(each), each.sum(axis=0)
+    share = np.where(total > 0.0, each / np.where(total > 0.0, total, 1.0), 1.0 / K)
+    x, P = models.common(rows.blocks)
+    mean = np.einsum('km,kma->ma', share, x)
+    apart = x - mean
+    whole = np.einsum('km,kmab->mab', share, P + apart[..., :, None] * apart[..., None, :])
+    line = whole[:, place] / np.sqrt(whole[:, place, place])[:, None]
+    moved = estimated[:, None] | estimated[None, :]
+    # Standard deviations: what lies between the rows does not lie within them.
+    steps = np.linspace(-1.0, 1.0, K)
+    narrow = whole - (steps**2).mean() * line[:, :, None] * line[:, None, :] * moved
+    at = mean + steps[:, None, None] * np.where(estimated, line, 0.0)
+    covariance = np.tile(add_jitter(narrow)[0], (K, 1, 1, 1))
+    return models.blocks(at, covariance), np.tile(total, (K, 1)), np.full(K, -math.log(K))

@@ -1,0 +1,137 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is published of the divers, and what a user has to know of the input."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...acoustics.geodesy import Origin
+from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
+from ...estimation.association import TENTATIVE
+from ...estimation.consistency import ENOUGH
+from . import births, clutter, depth, offsets
+from .config import DiverConfig
+from .fixes import scale_of, stated_weight
+from .forgetting import PUBLISHES
+from .known import Known, outputs
+from .models import FAMILIES, HOVER, ModelSet
+
+
+def estimate_of(
+    known: Known, models: ModelSet, config: DiverConfig, frame_id: str, origin: Origin | None
+) -> Estimate:
+    """Return what is published of a scan; origin: where the frame lies on Earth, None when that is
+    not known."""
+    # Of tracks whose hits are counted the existence is NaN.
+    known = known.only(~(known['existence'] <= PUBLISHES))
+    mean, covariance = published(known, models)
+    covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
+    xyz = np.full((len(mean), 3), config.target_z)
+    dimensions = 3 if models.height >= 0 else 2
+    xyz[:, :dimensions] = mean[:, :dimensions]
+    extras: dict[str, np.ndarray] = {
+        'track_id': known.life.track_id,
+        'track_state': known.life.status,
+        **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
+        'target_id': known['target_id'].astype(np.int32),
+        **of_families(known, models),
+    }
+    if models.height >= 0 and models.copies > 1:
+        extras['depth_ambiguous'] = depth.ambiguous(known, models).astype(np.uint8)
+    if origin is not None:
+        place = origin.geodetic(xyz)
+        extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
+    return Estimate(
+        stamp_ns=known.stamp_ns,
+        frame_id=frame_id,
+        xyz=xyz,
+        state_names=models.outputs,
+        state=mean,
+        covariance=covariance,
+        model_names=models.names,
+        probabilities=known.rows.models(),
+        extras=extras,
+    )
+
+
+def published(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, q) and covariance (T, q, q): where all rows say, and how far off that may be
+    for those that say how well a place is known.
+
+    Fixes that are better than stated look like fixes whose errors last. If they are as stated, the
+    row that says so is the optimal filter: its error is uncorrelated with all that is computed of
+    the data, so that of the mean of all rows has its covariance and the square of how far the two
+    are apart. If they are better, this is cautious.
+    """
+    maps = tuple(part.outputs for part in models.parts)
+    mean, covariance = outputs(known.rows, maps)
+    if len(models.scales) > 1:
+        own, covariance = outputs(known.rows, maps, stated_weight(known.rows))
+        off = mean - own
+        covariance = covariance + off[:, :, None] * off[:, None, :]
+    return mean, covariance
+
+
+def of_families(known: Known, models: ModelSet) -> dict[str, FloatArray]:
+    """Return what is published of families beside the probabilities of their models."""
+    if models.families is None:
+        return {}
+    each = known.rows.models()
+    family = np.eye(len(FAMILIES))[models.families.family]
+    out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
+    out['hover'] = each @ (models.families.kind == HOVER)
+    out['covariance_scale'] = scale_of(known.rows)
+    return out
+
+
+def health(known: Known, waiting: int) -> dict[str, float]:
+    """Return numbers for diagnostics; waiting: fixes that wait for the vessel."""
+    hit = known['nis_dof'] > 0
+    mean = float(np.mean(known['nis'][hit] / known['nis_dof'][hit])) if hit.any() else float('nan')
+    return {
+        'tracks': len(known),
+        'confirmed': int((known.life.status != TENTATIVE).sum()),
+        'nis_mean': mean,
+        'broken_tracks': known.counts.get('broken', 0),
+        'covariance_repairs': known.counts.get('repairs', 0),
+        'not_started': known.counts.get('not_started', 0),
+        'fixes_mean_nis': known.memory['fixes'].mean_nis,
+        'fixes_lag_1': known.memory['fixes'].lag_1,
+        'arrivals_mean_nis': known.memory['arrivals'].mean,
+        'waiting_for_vessel': waiting,
+    }
+
+
+def warnings(known: Known, config: DiverConfig) -> list[str]:
+    """Return what of the input cannot be true or used, in sentences for the user."""
+    advice = 'check var_toa, var_bearing and toa_std'
+    stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
+    unstated = [name for name in stds if not getattr(config, name)]
+    if config.dimensions == 2:
+        unstated.insert(0, 'target_z (or dimensions: 3)')
+    if unstated:
+        advice += ', or state what is not exact: ' + ', '.join(unstated)
+    memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
+    more = memory['excess'] >= ENOUGH
+    return [
+        *memory['fixes'].warnings(config.fix_bias_std > 0.0),
+        *memory['heights'].warnings(config),
+        *memory['arrivals'].warnings('arrivals', advice, more_than_stated=more),
+        *memory['offsets'].warnings(config),
+        *births.no_room(known, config),
+        *clutter.warnings(memory['clutter'], config, tracked),
+    ]
