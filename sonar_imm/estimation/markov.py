@@ -154,7 +154,7 @@ class ModelChain:
         self.matrix = check_transition_matrix(matrix)
         mu = np.full(models, 1.0 / models) if initial is None else initial
         self.initial = np.array(mu, np.float64)
-        if self.matrix.shape != (models, models) or not _is_law(self.initial, models):
+        if self.matrix.shape != (models, models) or not _are_probabilities(self.initial, models):
             raise ValueError(
                 f'transition and initial need {models} x {models} and {models} probabilities'
             )
@@ -165,16 +165,17 @@ class ModelChain:
         if dt == self.step:
             return self.matrix
         if self._rates is None:
-            self._rates = RateChain(self.matrix, self.step)
-        if self._rates.residual > NOT_EMBEDDABLE:
-            raise ValueError(
-                'the transition matrix has no generator, so only steps of dt = '
-                f'{self.step:g} s can be taken, not of {dt:g} s'
-            )
+            rates = RateChain(self.matrix, self.step)
+            if rates.residual > NOT_EMBEDDABLE:
+                raise ValueError(
+                    'the transition matrix has no generator, so only steps of dt = '
+                    f'{self.step:g} s can be taken, not of {dt:g} s'
+                )
+            self._rates = rates
         return self._rates.transition(dt)
 
 
-def _is_law(mu: FloatArray, models: int) -> bool:
+def _are_probabilities(mu: FloatArray, models: int) -> bool:
     return mu.shape == (models,) and bool((mu >= 0.0).all()) and abs(mu.sum() - 1.0) <= 1e-6
 
 
