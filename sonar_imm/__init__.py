@@ -24,6 +24,7 @@ import msg_adapters as _adapters
 if TYPE_CHECKING:
     from .estimation.imm_filter import IMM, MeasurementModel, position, range_bearing
     from .estimation.motion import ca, ct, cv, hover, Model, Motion
+    from .estimation.particle_imm import ParticleIMM
 
 __all__ = [
     'ca',
@@ -34,10 +35,12 @@ __all__ = [
     'MeasurementModel',
     'Model',
     'Motion',
+    'ParticleIMM',
     'position',
     'range_bearing',
 ]
-_MOTION = {'ca', 'ct', 'cv', 'hover', 'Model', 'Motion'}
+_MODULES = dict.fromkeys(('ca', 'ct', 'cv', 'hover', 'Model', 'Motion'), 'motion')
+_MODULES['ParticleIMM'] = 'particle_imm'
 
 __version__ = '1.0.0'
 
@@ -59,8 +62,8 @@ _check_adapters()
 
 
 def __getattr__(name: str) -> Any:
-    """What `__all__` lists, loaded when it is asked for: numba takes a second."""
+    """Import a name of `__all__` when it is first asked for: numpy and scipy take a moment."""
     if name not in __all__:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    module = 'motion' if name in _MOTION else 'imm_filter'
+    module = _MODULES.get(name, 'imm_filter')
     return getattr(import_module(f'{__name__}.estimation.{module}'), name)

@@ -465,14 +465,16 @@ def test_the_page_of_commands_names_every_subcommand() -> None:
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
-def test_the_example_of_the_library_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_of_the_library_run(capsys: pytest.CaptureFixture[str]) -> None:
     page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
+    table = page.partition('| name | use |')[2].partition('\n\n')[0]
+    assert sorted(re.findall(r'`(\w+)`', table)) == sorted(sonar_imm.__all__)
     examples = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
     for example in examples:
         exec(compile(example, 'library.md', 'exec'), {})
         assert capsys.readouterr().out
     lines = [line for line in examples[0].splitlines() if line.strip()]
-    assert len(examples) == 2 and len(lines) <= 10
+    assert len(examples) == 3 and len(lines) <= 10
 
 
 def test_topics_page_names_every_input() -> None:

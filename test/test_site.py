@@ -78,7 +78,7 @@ def test_the_api_has_every_public_module(made: Any) -> None:
         name for name in public if any(f'{name}.'.startswith(f'{item}.') for item in NO_API)
     }
     assert '::: sonar_imm.estimation.imm\n' in made.api_page('sonar_imm.estimation', 'x')
-    assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')
+    assert 'set_kernels' not in made.api_page('sonar_imm.estimation', 'x')
 
 
 def test_files_and_tests_named_on_pages_exist() -> None:

@@ -41,6 +41,7 @@ __all__ = [
     'marginals',
     'markov',
     'motion',
+    'particle_imm',
     'particles',
     'rows',
     'set_filter',

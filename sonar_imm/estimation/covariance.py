@@ -34,9 +34,8 @@ The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measur
 than `LIMIT` of it as its own noise: there R is raised by `JITTER` of S's diagonal, so that a
 perfect measurement leaves a variance, and can be repeated.
 
-`small_matrices` has the rules and repairs compiled. Reference: Bierman, *Factorization Methods
-for Discrete Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation*
-(2000), ch. 12.
+Reference: Bierman, *Factorization Methods for Discrete Sequential Estimation* (1977); Kailath,
+Sayed, Hassibi, *Linear Estimation* (2000), ch. 12.
 """
 
 from __future__ import annotations

@@ -26,21 +26,19 @@ Shapes: T targets, M models, n states, m measured values. ``x (T, M, n)``, ``P (
 Q (M, n, n)``, ``B (M, n)``. A scan without a measurement for a target is mix and predict alone,
 with ``mu <- c``: the chain moves on, the transition matrix does not learn.
 
-Models whose states differ in meaning or size share one embedding: `embed` pads the smaller one
-with components that are redrawn from a stated law at each step, and the output maps ``E (M, q,
-n)`` bring every model to the same outputs, e.g. position and velocity.
+Models whose states differ in meaning or size share one state (`motion.Joint`), and the output maps
+``E (M, q, n)`` bring every model to the same outputs, e.g. position and velocity.
 
-This module is the readable numpy form. `imm_kernels` compiles the same mathematics; the tests hold
-the two together.
+This is the form to read, for any measurement. `bank` does the same for position fixes with the
+model as the last axis, for many targets at once; the tests compare the two.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .arrays import BoolArray, FloatArray
 from .covariance import (
@@ -252,35 +250,6 @@ def pairs_inside(fit: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     # Flat indices: for a million entries several times faster than two-dimensional ones.
     target, detection = np.divmod(np.flatnonzero(fit > -np.inf), max(fit.shape[1], 1))
     return target, detection
-
-
-def embed(
-    F: ArrayLike,
-    Q: ArrayLike,
-    B: ArrayLike,
-    index: Sequence[int],
-    n: int,
-    fill_mean: ArrayLike = 0.0,
-    fill_variance: ArrayLike = 1.0,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A model of fewer states inside an n-dimensional one: its own states sit at `index`; each
-    other component is drawn afresh from N(fill_mean, fill_variance) at every step, so that a model
-    that needs it meets a sane prior when mixed.
-
-    Gives F (n, n), Q (n, n), B (n,).
-    """
-    own = np.asarray(index, dtype=np.intp)
-    if len(set(own.tolist())) != len(own) or (own < 0).any() or (own >= n).any():
-        raise ValueError(f'index {list(index)} must name distinct components of {n}')
-    big_F, big_Q, big_B = (
-        np.zeros((n, n)),
-        np.diag(np.full(n, fill_variance, dtype=np.float64)),
-        np.full(n, fill_mean, np.float64),
-    )
-    big_F[np.ix_(own, own)] = np.asarray(F, np.float64)
-    big_Q[np.ix_(own, own)] = np.asarray(Q, np.float64)
-    big_B[own] = np.asarray(B, np.float64)
-    return big_F, big_Q, big_B
 
 
 def _mixture_nis(c: FloatArray, innovation: FloatArray, S: FloatArray) -> FloatArray:

@@ -36,7 +36,6 @@ measurement that is not linear is linearised about each model's prediction (exte
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 import math
 from typing import Literal, NamedTuple
 
@@ -49,12 +48,9 @@ from .angles import wrap_angle
 from .arrays import FloatArray
 from .covariance import is_psd
 from .history import ReplayHistory
-from .markov import check_transition_matrix, RateChain
+from .markov import ModelChain, RateChain
 from .motion import Joint, Model, Motion
 from .smoothing import imm_smooth
-
-NOT_EMBEDDABLE = 1e-6
-"""A chain whose generator misses the matrix by more has none."""
 
 FOREVER_NS = 2**63 - 1
 
@@ -156,14 +152,14 @@ _Item = tuple['FloatArray | None', 'MeasurementModel | None']
 class IMM:
     """The filter of Blom and Bar-Shalom (1988).
 
-    models: M of them, see `motion`; their states may differ, by named components. transition
-    (M, M): ``transition[i, j] = Pr(model j | model i before)`` over `dt` seconds; for other steps
-    it follows from its generator. mean (n,), covariance (n, n): at the start, in the order of
-    `components`; also the law of a component for models that lack it. measurement: of `step`,
-    unless that names another. initial (M,): model probabilities, uniform if not given. stamp: of
-    the start [s]; None: a step of `dt` before the first measurement, or its stamp. history: how
-    late a measurement may be, and how far back `smooth` looks [s]; finite where a filter runs for
-    days, because all of it is kept.
+    models: M of them, see `motion`; their states may differ, by named components. transition (M,
+    M): ``transition[i, j] = Pr(model j | model i before)`` over `dt` seconds; for other steps it
+    follows from its generator; or a `markov.RateChain`. mean (n,), covariance (n, n): at the
+    start, in the order of `components`; also the law of a component for models that lack it.
+    measurement: of `step`, unless that names another. initial (M,): model probabilities, uniform
+    if not given. stamp: of the start [s]; None: a step of `dt` before the first measurement, or
+    its stamp. history: how late a measurement may be, and how far back `smooth` looks [s]; finite
+    where a filter runs for days, because all of it is kept.
 
     components: names of the n states; outputs: names of the q values of `estimate`, the components
     first. A component that a model lacks is zero in what it gives out.
@@ -174,7 +170,7 @@ class IMM:
     def __init__(
         self,
         models: Sequence[Model],
-        transition: ArrayLike,
+        transition: ArrayLike | RateChain,
         mean: ArrayLike,
         covariance: ArrayLike,
         measurement: MeasurementModel | None = None,
@@ -196,18 +192,16 @@ class IMM:
             )
         if not is_psd(P):
             raise ValueError('covariance has to be positive definite')
-        self.transition = check_transition_matrix(transition)
-        mu = np.full(M, 1.0 / M) if initial is None else np.array(initial, np.float64)
-        if self.transition.shape != (M, M) or mu.shape != (M,) or abs(mu.sum() - 1.0) > 1e-6:
-            raise ValueError(f'transition and initial need {M} x {M} and {M} probabilities')
-        if not (dt > 0.0 and history >= 0.0):
-            raise ValueError('dt has to be positive, and history cannot be negative')
+        if not history >= 0.0:
+            raise ValueError('history cannot be negative')
         self.dt, self.measurement = _nanoseconds(dt) / 1e9, measurement
+        self._chain = ModelChain(transition, self.dt, M, initial)
+        self.transition = self._chain.matrix
         self._window_ns = FOREVER_NS if math.isinf(history) else _nanoseconds(history)
         self._law = x, np.diag(P).copy()
         both = self._joint.has[:, :, None] & self._joint.has[:, None]
         P = np.where(both | np.eye(n, dtype=bool), P, 0.0)
-        self._first = _State(0, np.tile(x, (1, M, 1)), P[None], mu[None])
+        self._first = _State(0, np.tile(x, (1, M, 1)), P[None], self._chain.initial[None])
         self._history: ReplayHistory[_State, _Item] | None = None
         if stamp is not None:
             self._begin(_nanoseconds(stamp))
@@ -311,7 +305,7 @@ class IMM:
     def _cycle(self, before: _State, stamp_ns: int, items: Sequence[_Item]) -> _State:
         """The state after all measurements of a stamp. Pure."""
         dt = (stamp_ns - before.stamp_ns) / 1e9
-        transition = self._over(dt)
+        transition = self._chain.over(dt)
         x, P, c = imm.mix(before.x, before.P, before.mu, transition[None])
         motion = self._joint.motion(x[0], dt, *self._law)
         x, P, _ = imm.predict(x, P, *motion)
@@ -329,21 +323,6 @@ class IMM:
         after = imm.update(now.x, now.P, now.mu, innovation[None], H[None], sensor.R[None])
         found = float(after.log_likelihood[0]), float(after.nis[0])
         return _State(now.stamp_ns, *after[:3], now.motion, now.transition, *found)
-
-    def _over(self, dt: float) -> FloatArray:
-        """The transition matrix over a step. Raises ValueError where the chain has none."""
-        if dt == self.dt:
-            return self.transition
-        if self._chain.residual > NOT_EMBEDDABLE:
-            raise ValueError(
-                'the transition matrix has no generator, so only steps of dt = '
-                f'{self.dt:g} s can be taken, not of {dt:g} s'
-            )
-        return self._chain.transition(dt)
-
-    @cached_property
-    def _chain(self) -> RateChain:
-        return RateChain(self.transition, self.dt)
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -18,7 +18,8 @@ Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 
 A chain is stated at a reference step, but measurements of a sonar come at irregular times.
 `RateChain` turns the matrix into a generator once, ``P(step) = expm(G step)``, and gives ``P(dt)``
-for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation` corrects a chain by data.
+for any step, so that ten steps of 0.1 s equal one of 1 s. `ModelChain` is what a filter takes: a
+matrix or such a chain, with the probabilities at the start. `adaptation` corrects a chain by data.
 
 ``P(dt)`` is computed by uniformisation: with the largest rate q, ``U = I + G / q`` is itself a
 transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` is a mixture of its powers, which are
@@ -38,6 +39,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray
+
+NOT_EMBEDDABLE = 1e-6
+"""A chain whose generator misses the matrix by more has none."""
 
 _CACHED_STEPS = 256
 _TERMS = 24
@@ -123,6 +127,56 @@ class RateChain:
         for _ in range(halvings):
             P = _stochastic(P @ P)
         return P
+
+
+class ModelChain:
+    """The models of a filter as a Markov chain: probabilities at the start and over any step.
+
+    transition: (M, M) over `step` seconds, or a `RateChain`. initial: (M,) probabilities at the
+    start, uniform if None. Other steps than `step` follow from the generator of the matrix, which
+    is computed when it is first needed.
+
+    Raises ValueError when transition or initial are no probabilities of M models.
+    """
+
+    def __init__(
+        self,
+        transition: ArrayLike | RateChain,
+        step: float,
+        models: int,
+        initial: ArrayLike | None = None,
+    ):
+        if not step > 0.0:
+            raise ValueError('dt has to be positive')
+        self.step = step
+        self._rates = transition if isinstance(transition, RateChain) else None
+        matrix = transition.transition(step) if isinstance(transition, RateChain) else transition
+        self.matrix = check_transition_matrix(matrix)
+        mu = np.full(models, 1.0 / models) if initial is None else initial
+        self.initial = np.array(mu, np.float64)
+        if self.matrix.shape != (models, models) or not _are_probabilities(self.initial, models):
+            raise ValueError(
+                f'transition and initial need {models} x {models} and {models} probabilities'
+            )
+
+    def over(self, dt: float) -> FloatArray:
+        """Return the transition matrix (M, M) over dt seconds. Raises ValueError where the matrix
+        has no generator and dt is not its step."""
+        if dt == self.step:
+            return self.matrix
+        if self._rates is None:
+            rates = RateChain(self.matrix, self.step)
+            if rates.residual > NOT_EMBEDDABLE:
+                raise ValueError(
+                    'the transition matrix has no generator, so only steps of dt = '
+                    f'{self.step:g} s can be taken, not of {dt:g} s'
+                )
+            self._rates = rates
+        return self._rates.transition(dt)
+
+
+def _are_probabilities(mu: FloatArray, models: int) -> bool:
+    return mu.shape == (models,) and bool((mu >= 0.0).all()) and abs(mu.sum() - 1.0) <= 1e-6
 
 
 def _stochastic(P: FloatArray) -> FloatArray:

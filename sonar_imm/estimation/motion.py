@@ -16,8 +16,8 @@
 
 A `Model` names the components of its state and says how they move. Models of different components
 run side by side in one state that has them all (`Joint`). A component that a model lacks is drawn
-afresh from a stated law at each step, so that a model that needs it meets a sane prior when mixed
-(`imm.embed`); and it is zero under that model: who hovers has no velocity.
+afresh from a stated law at each step, so that a model that needs it meets a sane prior when mixed;
+and it is zero under that model: who hovers has no velocity.
 
 Components of the models here: px, py position [m]; vx, vy velocity [m/s]; ax, ay acceleration
 [m/s^2]; turn [rad/s, counter-clockwise]. Noises are densities of white noise, so that ten steps of
@@ -38,7 +38,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import FloatArray
-from .imm import embed
 
 POSITION, VELOCITY, ACCELERATION = ('px', 'py'), ('vx', 'vy'), ('ax', 'ay')
 
@@ -130,7 +129,8 @@ def hover(noise: float, name: str = 'hover') -> Model:
 class Joint:
     """M models in one state of n components.
 
-    Raises ValueError when models share a name, or a row of outputs does not fit.
+    Raises ValueError when models share a name, a model names a component twice, or a row of
+    outputs does not fit.
 
     names (M,), components (n,): of the state, in the order in which models name them; outputs
     (q,): the components and what else models say; E (M, q, n): outputs of each model; has (M, n):
@@ -146,9 +146,12 @@ class Joint:
         more = (name for model in models for name in model.outputs)
         self.outputs = tuple(dict.fromkeys((*self.components, *more)))
         self._index = [[self.components.index(c) for c in model.components] for model in models]
+        self._places = [np.ix_(own, own) for own in self._index]
         self.has = np.zeros((len(models), len(self.components)), bool)
         self.E = np.zeros((len(models), len(self.outputs), len(self.components)))
         for model, own, has, E in zip(models, self._index, self.has, self.E):
+            if len(set(own)) < len(own):
+                raise ValueError(f"model '{model.name}' names a component twice")
             has[own] = True
             E[own, own] = 1.0
             for name, row in model.outputs.items():
@@ -163,17 +166,19 @@ class Joint:
     def motion(self, x: FloatArray, dt: float, mean: ArrayLike, variance: ArrayLike) -> Motion:
         """The step of all models from their means x (M, n); mean, variance (n,): the law of what
         a model lacks. Raises ValueError for a motion of another size."""
-        steps = []
-        for model, own, state in zip(self.models, self._index, x):
-            F, Q, B = (np.asarray(part, np.float64) for part in model.motion(state[own], dt))
+        M, n = self.has.shape
+        F, B = np.zeros((M, n, n)), np.tile(np.full(n, mean, np.float64), (M, 1))
+        Q = np.tile(np.diag(np.full(n, variance, np.float64)), (M, 1, 1))
+        for j, (model, own, places) in enumerate(zip(self.models, self._index, self._places)):
+            step = [np.asarray(part, np.float64) for part in model.motion(x[j, own], dt)]
             k = len(own)
-            if (F.shape, Q.shape, B.shape) != ((k, k), (k, k), (k,)):
+            if [part.shape for part in step] != [(k, k), (k, k), (k,)]:
                 raise ValueError(
                     f"model '{model.name}': motion has to give F ({k}, {k}), Q ({k}, {k}) and B "
-                    f'({k},), got {F.shape}, {Q.shape} and {B.shape}'
+                    f'({k},), got {", ".join(str(part.shape) for part in step)}'
                 )
-            steps.append(embed(F, Q, B, own, len(self.components), mean, variance))
-        return Motion(*map(np.stack, zip(*steps)))
+            F[j][places], Q[j][places], B[j, own] = step
+        return Motion(F, Q, B)
 
 
 def white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:

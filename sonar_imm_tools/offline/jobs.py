@@ -31,7 +31,7 @@ from sonar_imm.parameters import ConfigError
 
 from ..recordings.sources import BagError
 
-LIBRARIES = ['sonar_imm_tools.offline.tracking', 'sonar_imm.estimation.imm_kernels']
+LIBRARIES = ['sonar_imm_tools.offline.tracking']
 """Modules that most of the work needs, and that take seconds to load."""
 CONNECT_SECONDS = 10.0
 """How long a scheduler may take to answer."""

@@ -37,6 +37,7 @@ from sonar_imm import (
     position,
     range_bearing,
 )
+from sonar_imm.estimation.markov import RateChain
 from sonar_imm.estimation.motion import turning, white_acceleration
 
 T = np.array([[0.95, 0.05], [0.2, 0.8]])  # asymmetric: a transposed matrix would show
@@ -187,6 +188,16 @@ def test_ten_short_steps_without_measurement_are_a_long_one():
     assert short.model_probabilities == pytest.approx(long.model_probabilities, rel=1e-12)
 
 
+def test_a_chain_of_rates_is_its_matrix():
+    for chain in (RateChain(T, 1.0), RateChain(RateChain(T, 1.0).transition(0.5), 0.5)):
+        imm, plain = (IMM(MODELS, each, **START, measurement=position(1.0)) for each in (chain, T))
+        for z, dt in zip(walk(10)[0], (None, 0.3, 1.0, 0.7, None, 2.0, 0.0, 1.0, 1.0, 0.1)):
+            imm.step(z, dt)
+            plain.step(z, dt)
+        assert imm.transition == pytest.approx(T, abs=1e-12)
+        assert imm.estimate.mean == pytest.approx(plain.estimate.mean, rel=1e-11)
+
+
 def test_a_chain_without_generator_takes_its_own_step_only():
     imm = IMM(MODELS, [[0.1, 0.9], [0.9, 0.1]], **START)
     assert imm.step(None) == 'used'
@@ -280,6 +291,7 @@ def test_constant_acceleration_composes():
         ({'transition': [[0.5, 0.4], [0.0, 1.0]]}, 'row 0 of the transition matrix sums to 0.9'),
         ({'models': [cv(noise=0.1)] * 2}, 'names of their own'),
         ({'initial': [0.5, 0.6]}, '2 probabilities'),
+        ({'initial': [1.5, -0.5]}, '2 probabilities'),
         ({'dt': 0.0}, 'dt has to be positive'),
     ],
 )
@@ -300,12 +312,3 @@ def test_measurements_that_do_not_fit_are_refused():
         IMM(MODELS, T, **START).step([1.0, 2.0])
     with pytest.raises(ValueError, match='nothing to smooth'):
         imm.smooth()
-
-
-def test_the_package_stays_light():
-    """`import sonar_imm` loads no numba; the names come when they are asked for."""
-    import subprocess
-    import sys
-
-    code = 'import sys, sonar_imm; assert "numba" not in sys.modules; sonar_imm.IMM'
-    subprocess.run([sys.executable, '-c', code], check=True)

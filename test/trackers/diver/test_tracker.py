@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation.consistency import average_bounds
-from sonar_imm.estimation.imm_kernels import combine
+from sonar_imm.estimation.imm import combine
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS

@@ -1,0 +1,429 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The particle filter of several models against exact filters: a hidden Markov model, Kalman's,
+and a tree of all mode sequences."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sonar_imm import cv, IMM, ParticleIMM, position
+from sonar_imm.estimation import kalman
+from sonar_imm.estimation.markov import RateChain
+
+T = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
+TWO = np.array([[0.95, 0.05], [0.3, 0.7]])
+"""Asymmetric: a transposed matrix would show."""
+SIGMAS = 4.5
+
+
+def still(x, rng, dt):
+    return x
+
+
+def normal(variance):
+    """ln N(z; x, variance) of scalar states."""
+    return lambda x, z: -0.5 * ((z - x[:, 0]) ** 2 / variance + math.log(2 * math.pi * variance))
+
+
+def walk(variance, drift=0.0):
+    return lambda x, rng, dt: x + drift * dt + rng.normal(0.0, math.sqrt(variance * dt), x.shape)
+
+
+def forward(transition, likelihood, mu):
+    """The hidden Markov model: probabilities (K, M) and log-likelihoods (K,) of likelihoods (K,
+    M); a row of ones for a missed scan."""
+    found = []
+    for row in likelihood:
+        joint = (mu @ transition) * row
+        mu = joint / joint.sum()
+        found.append((mu, math.log(joint.sum())))
+    return np.array([mu for mu, _ in found]), np.array([log for _, log in found])
+
+
+def close(samples, exact, bias):
+    """Runs (R, ...) of independent seeds have the exact mean, but for a bias of order 1 / N."""
+    error = np.std(samples, axis=0, ddof=1) / math.sqrt(len(samples))
+    return bool((np.abs(np.mean(samples, axis=0) - exact) <= SIGMAS * error + bias).all())
+
+
+# -- exact discrete filters -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('order', [[0, 1, 2], [2, 0, 1]])
+def test_where_the_state_says_nothing_it_is_the_forward_algorithm(order):
+    """To the last digits, and in any order of the models."""
+    rng, names = np.random.default_rng(3), np.array(['a', 'b', 'c'])
+    likelihood = rng.random((30, 3))
+    likelihood[7] = likelihood[8] = 1.0
+    mu, log = forward(T, likelihood, np.array([0.2, 0.5, 0.3]))
+
+    def sensor(j):
+        return lambda x, k: np.full(len(x), math.log(likelihood[k, j]))
+
+    tracker = ParticleIMM(
+        {names[j]: still for j in order},
+        T[np.ix_(order, order)],
+        rng.normal(size=(50, 2)),
+        {names[j]: sensor(j) for j in reversed(order)},
+        rng,
+        initial=np.array([0.2, 0.5, 0.3])[order],
+    )
+    assert tracker.names == tuple(names[order])
+    for k in range(30):
+        tracker.step(None if k in (7, 8) else k)
+        np.testing.assert_allclose(tracker.model_probabilities, mu[k, order], atol=1e-13)
+        if k not in (7, 8):
+            assert tracker.log_likelihood == pytest.approx(log[k], abs=1e-12)
+        else:
+            assert math.isnan(tracker.log_likelihood)
+
+
+def test_static_states_beside_models_are_a_larger_hidden_markov_model():
+    """Which of four bottoms it is never changes, which of three models holds does: twelve states,
+    of which the filter has the models exactly and the bottoms as particles."""
+    rng, bottoms = np.random.default_rng(5), np.arange(4.0)
+    emission = rng.dirichlet(np.full(5, 0.7), (3, 4))  # of model and bottom, five kinds of echo
+    echoes = rng.integers(5, size=12)
+    likelihood = emission[:, :, echoes].reshape(12, -1).T
+    joint, log = forward(np.kron(T, np.eye(4)), likelihood, np.full(12, 1.0 / 12.0))
+    exact = joint[-1].reshape(3, 4)
+    mean = exact.sum(axis=0) @ bottoms
+    variance = exact.sum(axis=0) @ (bottoms - mean) ** 2
+    runs = []
+    for seed in range(40):
+        tracker = ParticleIMM(
+            dict.fromkeys('abc', still),
+            T,
+            np.tile(bottoms, 200)[:, None],
+            {
+                name: lambda x, z, e=e: np.log(e[x[:, 0].astype(int), z])
+                for name, e in zip('abc', emission)
+            },
+            np.random.default_rng(seed),
+        )
+        total = 0.0
+        for echo in echoes:
+            tracker.step(echo)
+            total += tracker.log_likelihood
+        found = tracker.estimate
+        runs.append([*tracker.model_probabilities, found.mean[0], found.covariance[0, 0], total])
+    assert close(runs, [*exact.sum(axis=1), mean, variance, log.sum()], bias=0.01)
+
+
+# -- linear Gaussian models -----------------------------------------------------------------------
+
+
+def test_one_linear_model_is_the_kalman_filter():
+    """Mean and covariance within Monte Carlo error, and the truth inside the bounds of each."""
+    rng, count = np.random.default_rng(7), 60
+    F, Q, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.diag([0.1, 0.05]), np.eye(1, 2), np.eye(1)
+    root = np.linalg.cholesky(Q)
+    inside, off, spread, total = 0, [], [], []
+    for _ in range(count):
+        truth, P = rng.normal(size=2), np.eye(2)
+        tracker = ParticleIMM(
+            {'cv': lambda x, rng, dt: x @ F.T + rng.normal(size=x.shape) @ root.T},
+            [[1.0]],
+            rng.normal(size=(3000, 2)),
+            normal(1.0),
+            rng,
+        )
+        x = np.zeros(2)
+        log = 0.0
+        for _ in range(10):
+            truth = F @ truth + root @ rng.normal(size=2)
+            z = truth[:1] + rng.normal(size=1)
+            tracker.step(z[0])
+            x, P, _ = kalman.predict(x, P, F, Q)
+            after = kalman.update(x, P, z - H @ x, H, R)
+            x, P, log = after.x, after.P, log + float(after.log_likelihood)
+            log -= tracker.log_likelihood
+        found = tracker.estimate
+        off.append((found.mean - x) / np.sqrt(np.diag(P)))
+        spread.append(found.covariance / P)
+        total.append(log)
+        d = truth - found.mean
+        inside += d @ np.linalg.solve(found.covariance, d) < 5.991
+    assert close(off, 0.0, bias=0.005) and np.std(off) < 0.1
+    assert close(spread, 1.0, bias=0.01)
+    assert close(total, 0.0, bias=0.01)
+    assert 0.95 * count - 3 * math.sqrt(0.0475 * count) <= inside
+
+
+MODES = ((0.01, 0.0), (0.5, 1.0))
+"""Variance and drift of the two scalar walks."""
+
+
+def tree(transition, z, variance=0.25):
+    """Probabilities (2,) of the models, mean and variance after 8 steps, and the log-likelihood:
+    one Kalman filter for each of the 512 sequences of models."""
+    x, P, log, mode = np.zeros(2), np.ones(2), np.full(2, math.log(0.5)), np.arange(2)
+    for each in z:
+        x, P, log = (np.repeat(part, 2) for part in (x, P, log))
+        before, mode = np.repeat(mode, 2), np.tile(np.arange(2), len(mode))
+        q, drift = np.array(MODES)[mode].T
+        x, P, S = x + drift, P + q, P + q + variance
+        log = log + np.log(transition[before, mode])
+        log -= 0.5 * ((each - x) ** 2 / S + np.log(2.0 * math.pi * S))
+        x, P = x + P / S * (each - x), P * variance / S
+    weight = np.exp(log - log.max())
+    total, weight = log.max() + math.log(weight.sum()), weight / weight.sum()
+    mean = weight @ x
+    return [
+        *np.bincount(mode, weight), mean, weight @ (P + (x - mean) ** 2), total
+    ]  # fmt: skip
+
+
+Z = np.array([0.1, -0.3, 0.4, 1.7, 2.2, 2.5, 3.9, 4.0])
+
+
+def particle_run(seed, transition=TWO, order=(0, 1), count=2000):
+    rng = np.random.default_rng(seed)
+    tracker = ParticleIMM(
+        {f'm{j}': walk(*MODES[j]) for j in order},
+        transition[np.ix_(order, order)],
+        rng.normal(size=(count, 1)),
+        normal(0.25),
+        rng,
+    )
+    total = 0.0
+    for z in Z:
+        tracker.step(z)
+        total += tracker.log_likelihood
+    mu = tracker.model_probabilities[np.argsort(order)]
+    found = tracker.estimate
+    return [*mu, found.mean[0], found.covariance[0, 0], total]
+
+
+@pytest.mark.parametrize('order', [(0, 1), (1, 0)])
+def test_two_models_are_the_tree_of_all_sequences(order):
+    runs = [particle_run(seed, order=order) for seed in range(40)]
+    exact = tree(TWO, Z)
+    assert np.std(runs, axis=0)[0] < 0.02
+    assert close(runs, exact, bias=0.002)
+    assert not close(runs, tree(TWO.T, Z), bias=0.002)
+
+
+def test_mixing_of_particles_is_nearer_to_the_tree_than_mixing_of_moments():
+    """The Gaussian filter of the same models is off by more than the particles scatter."""
+    exact = tree(TWO, Z)[0]
+    x, P, mu = np.zeros(2), np.ones(2), np.full(2, 0.5)
+    q, drift = np.array(MODES).T
+    for z in Z:
+        c = mu @ TWO
+        W = TWO * mu[:, None] / c
+        mean = W.T @ x
+        P = (W * (P[:, None] + (x[:, None] - mean) ** 2)).sum(axis=0) + q
+        x, S = mean + drift, P + 0.25
+        mu = c * np.exp(-0.5 * (z - x) ** 2 / S) / np.sqrt(S)
+        mu, x, P = mu / mu.sum(), x + P / S * (z - x), P * 0.25 / S
+    runs = [particle_run(seed, count=20_000)[0] for seed in range(4)]
+    assert np.abs(np.mean(runs) - exact) < 0.5 * abs(mu[0] - exact)
+
+
+def test_many_models_agree_with_the_gaussian_filter_where_nothing_switches():
+    """Constant velocities that never change: both filters are exact."""
+    rng, models = np.random.default_rng(9), [cv(0.05, name='calm'), cv(0.4, name='lively')]
+    P0 = np.diag([1.0, 1.0, 0.25, 0.25])
+    gaussian = IMM(models, np.eye(2), np.zeros(4), P0, position(0.5))
+
+    def moves(model):
+        F, Q, _ = model.motion(np.zeros(4), 1.0)
+        return lambda x, rng, dt: x @ F.T + rng.multivariate_normal(np.zeros(4), Q, len(x))
+
+    def fix(x, z):
+        return -0.5 * (((z - x[:, :2]) / 0.5) ** 2).sum(axis=1)
+
+    particles = ParticleIMM(
+        {model.name: moves(model) for model in models},
+        np.eye(2),
+        rng.multivariate_normal(np.zeros(4), P0, 20_000),
+        fix,
+        rng,
+    )
+    for k in range(6):
+        z = [0.4 * k, 0.1 * k]
+        gaussian.step(z)
+        particles.step(z)
+    np.testing.assert_allclose(
+        particles.model_probabilities, gaussian.model_probabilities, atol=0.02
+    )
+    np.testing.assert_allclose(particles.estimate.mean, gaussian.estimate.mean, atol=0.03)
+    np.testing.assert_allclose(
+        particles.estimate.covariance, gaussian.estimate.covariance, atol=0.03
+    )
+
+
+# -- resampling, recovery, time -------------------------------------------------------------------
+
+
+def alone(**options):
+    rng = np.random.default_rng(0)
+    return ParticleIMM({'m': still}, [[1.0]], np.arange(8.0)[:, None], normal(1e4), rng, **options)
+
+
+def test_a_model_alone_is_resampled_by_its_effective_number():
+    tracker = alone()
+    for _ in range(3):
+        tracker.step(3.0)
+    assert tracker.weights.std() > 0.0 and tracker.particles[0, :, 0].tolist() == [*range(8)]
+    assert 7.0 < tracker.effective_sample_size[0] < 8.0
+    always = alone(resample_below=1.0)
+    always.step(3.0)
+    always.step(None)
+    assert (always.weights == 0.125).all()
+    tracker._sensors = (normal(0.01),)
+    tracker.step(3.0)
+    tracker.step(None)
+    assert set(tracker.particles[0, :, 0]) == {3.0}
+    assert (tracker.weights == 0.125).all()
+
+
+def test_a_measurement_that_nothing_explains_changes_nothing():
+    tracker = alone()
+    tracker._sensors = (lambda x, z: np.full(len(x), -np.inf),)
+    tracker.step(1.0)
+    assert tracker.log_likelihood == -math.inf
+    assert tracker.model_probabilities.tolist() == [1.0] and tracker.estimate.mean == [3.5]
+
+
+def test_a_model_that_cannot_be_comes_back_when_the_chain_allows():
+    rng = np.random.default_rng(2)
+    tracker = ParticleIMM(
+        {'a': walk(0.1), 'b': walk(0.1)},
+        [[0.9, 0.1], [0.2, 0.8]],
+        rng.normal(size=(100, 1)),
+        {'a': lambda x, z: np.full(len(x), -np.inf), 'b': normal(1.0)},
+        rng,
+    )
+    for z in (0.0, 0.1, -0.1):
+        tracker.step(z)
+        assert tracker.model_probabilities.tolist() == [0.0, 1.0]
+    tracker.step(None)
+    assert tracker.model_probabilities == pytest.approx([0.2, 0.8])
+    absorbed = ParticleIMM(
+        {'a': walk(0.1), 'b': walk(0.1)}, [[1, 0], [1, 0]], np.ones((9, 1)), normal(1.0), rng
+    )
+    for z in (1.0, 1.1):
+        absorbed.step(z)
+        assert absorbed.model_probabilities.tolist() == [1.0, 0.0]
+    assert np.isfinite(absorbed.particles).all()
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
+    assert particle_run(1) == particle_run(1) != particle_run(2)
+
+
+def test_steps_of_any_length_follow_the_generator():
+    rng, chain = np.random.default_rng(4), RateChain(TWO, 1.0)
+    for transition in (TWO, chain):
+        long, short = (
+            ParticleIMM({'a': still, 'b': still}, transition, np.ones((5, 1)), normal(1.0), rng)
+            for _ in range(2)
+        )
+        long.step(None)
+        for _ in range(4):
+            short.step(None, dt=0.25)
+        assert short.model_probabilities == pytest.approx(long.model_probabilities, abs=1e-12)
+        assert long.model_probabilities == pytest.approx([0.625, 0.375])
+    swapped = ParticleIMM(
+        {'a': still, 'b': still}, [[0.1, 0.9], [0.9, 0.1]], np.ones((5, 1)), normal(1.0), rng
+    )
+    with pytest.raises(ValueError, match='no generator'):
+        swapped.step(None, dt=0.5)
+
+
+# -- what does not fit ----------------------------------------------------------------------------
+
+GOOD = {
+    'models': {'a': still, 'b': still},
+    'transition': TWO,
+    'particles': np.ones((10, 3)),
+    'log_likelihood': normal(1.0),
+}
+
+
+@pytest.mark.parametrize(
+    'values, problem',
+    [
+        ({'models': {}}, 'at least one'),
+        ({'transition': np.eye(3)}, '2 x 2 and 2 probabilities'),
+        ({'transition': [[0.5, 0.4], [0.0, 1.0]]}, 'row 0 of the transition matrix sums to 0.9'),
+        ({'initial': [1.5, -0.5]}, '2 probabilities'),
+        ({'dt': 0.0}, 'dt has to be positive'),
+        ({'particles': np.ones(10)}, r'\(N, n\) or \(2, N, n\), got shape \(10,\)'),
+        ({'particles': np.ones((3, 10, 2))}, r'got shape \(3, 10, 2\)'),
+        ({'particles': np.full((10, 2), np.nan)}, 'finite'),
+        ({'log_likelihood': {'a': normal(1.0)}}, 'one for each of a, b, got a'),
+        ({'rng': 3}, 'has to be a numpy.random.Generator, got 3'),
+        ({'resample_below': 2.0}, 'between 0 and 1'),
+    ],
+)
+def test_what_does_not_fit_is_refused(values, problem):
+    with pytest.raises(ValueError, match=problem):
+        ParticleIMM(**{'rng': np.random.default_rng(0), **GOOD, **values})
+
+
+@pytest.mark.parametrize(
+    'values, problem',
+    [
+        ({'models': {'a': still, 'b': lambda x, rng, dt: x[:5]}}, r"'b' .* got shape \(5, 3\)"),
+        ({'models': {'a': lambda x, rng, dt: x / 0.0, 'b': still}}, "'a' has to give finite"),
+        ({'log_likelihood': lambda x, z: x}, r"'a' has to give 10 numbers.* got shape \(10, 3\)"),
+        ({'log_likelihood': lambda x, z: x[:, 0] * np.nan}, 'none of them NaN'),
+    ],
+)
+def test_functions_that_give_something_else_are_refused_and_nothing_changes(values, problem):
+    tracker = ParticleIMM(**{'rng': np.random.default_rng(0), **GOOD, **values})
+    before = tracker.particles.copy()
+    with np.errstate(all='ignore'), pytest.raises(ValueError, match=problem):
+        tracker.step(1.0)
+    np.testing.assert_array_equal(tracker.particles, before)
+    with pytest.raises(ValueError, match='cannot be negative'):
+        tracker.step(None, dt=-1.0)
+
+
+def test_a_function_may_write_into_the_particles_it_is_given():
+    def shift(x, rng, dt):
+        x += dt
+        return x
+
+    tracker = ParticleIMM(
+        **{**GOOD, 'models': {'a': shift, 'b': still}}, rng=np.random.default_rng(0)
+    )
+    first = tracker.particles
+    tracker.step(None)
+    assert (first == 1.0).all() and set(tracker.particles[0].ravel()) == {2.0}
+
+
+def test_the_filters_need_no_compiler():
+    code = (
+        'import sys, numpy as np\n'
+        'from sonar_imm import cv, hover, IMM, ParticleIMM, position\n'
+        'imm = IMM([cv(0.1), hover(0.1)], np.eye(2), np.zeros(4), np.eye(4), position(1.0))\n'
+        'imm.step([0.0, 0.0])\n'
+        'imm.step([1.0, 0.0], dt=0.5)\n'
+        'imm.smooth()\n'
+        'rng = np.random.default_rng(0)\n'
+        'pf = ParticleIMM({"a": lambda x, rng, dt: x}, [[1.0]], np.ones((5, 1)),\n'
+        '                 lambda x, z: -x[:, 0], rng)\n'
+        'pf.step(0.0)\n'
+        'assert "numba" not in sys.modules'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True)
