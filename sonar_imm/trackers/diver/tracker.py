@@ -52,6 +52,7 @@ from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
+from ..protocol import WarmStep
 from . import births, clutter, coverage, depth, estimate, fixes, forgetting, names, restart
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -181,6 +182,9 @@ class DiverTracker:
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Do nothing: there is nothing to compile."""
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        return []
 
     def health(self) -> dict[str, float]:
         return estimate.health(self._stream.state, len(self._georeferencer))
