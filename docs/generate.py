@@ -84,7 +84,6 @@ MATTER = {
         'covariance_scale': 'a warning says that fixes scatter more, or less, than they state',
         'target': 'not a diver: `rov`, `fish`, `boat` or `ship`',
         'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
-        'association': 'divers who stay side by side, or carry transponders: `kbest`',
         'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
         'clutter_density': 'false fixes per square metre and scan, when you know them',
         'coverage_sector': 'the sensor sees a sector only: who leaves it is not deleted',

@@ -59,6 +59,11 @@ GONE: dict[str, str] = {
             'heading_speed_lateral',
         )
     },
+    'parameter hypotheses': 'was removed together with association: kbest',
+    'parameter named_tracks': 'was removed: a track with a name also takes fixes without one',
+    'choice association kbest': (
+        'was removed: jipda, the default, weighs all joint events of a scan exactly'
+    ),
     'choice adaptation paper': _LEARNT,
     'choice adaptation ratio': _LEARNT,
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',

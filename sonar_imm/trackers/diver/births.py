@@ -214,6 +214,11 @@ def locate(
 # -- tracks that begin ---------------------------------------------------------------------------
 
 
+def most_tracks(config: DiverConfig) -> int:
+    """Tracks there may be, tentative ones and all."""
+    return 10 + 5 * config.max_tracks
+
+
 def each_name_once(births: Sequence[Birth]) -> list[Birth]:
     """Without a second birth of the same name."""
     names: set[int] = set()

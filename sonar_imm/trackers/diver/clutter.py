@@ -139,6 +139,6 @@ def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
     return [
         f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
         f'({clutter.density:.1g} for each square metre), and association gnn expects '
-        f'{CLUTTER:g}: use association kbest or jipda, which learn this, or state clutter_density'
+        f'{CLUTTER:g}: use association jipda, which learns this, or state clutter_density'
         for clutter in found[:1]
     ]

@@ -77,8 +77,7 @@ of it. A boat is tracked no other way, and it costs a diver nothing."""
 
 ADAPTATIONS = ('counts', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate', 'exact')
-ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
-NAMED_TRACKS = ('share', 'alone')
+ASSOCIATIONS = ('gnn', 'jipda')
 VESSELS = ('moving', 'fixed')
 RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
 SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density', 'coverage_file')
@@ -249,13 +248,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # -- association -----------------------------------------------------------------------------
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         range=(0.0, 1e4),
-        description='number of false fixes expected in a scan, per square metre; 0: jipda and '
-        'kbest learn it from the fixes that are no track of theirs, else 1e-6')
+        description='number of false fixes expected in a scan, per square metre; 0: jipda '
+        'learns it from the fixes that belong to no track, gnn takes 1e-6')
     association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
-        'jipda (all pairings weighed, tracks confirmed by existence), kbest (the most probable '
-        'histories of pairings, for divers side by side) or auto (jipda with model_set families, '
-        'else gnn)',
+        'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
+        'model_set families, else gnn)',
         choices=('auto', *ASSOCIATIONS))
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
         description='number of hits within confirm_window that confirm a track, with association '
@@ -263,14 +261,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5,
         description='number of consecutive scans without a hit that cover a confirmed target and '
         'so end its track, with association gnn and of raw arrivals')
-    hypotheses: int = parameter(30, '',
-        'kbest: largest number of histories of pairings that are kept of divers near each other',
-        range=(1, 1000))
     birth_density: float = live(1.2e-5, '1/m^2',
-        'jipda and kbest: number of new divers expected in a scan, per square metre',
+        'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
     survival_time: float = live(500.0, 's',
-        'jipda and kbest: time for which a diver is expected to stay', range=(1.0, 1e7))
+        'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 
     # -- what the sensor covers ------------------------------------------------------------------
     coverage_sector: tuple[float, ...] = live((), 'm, deg',
@@ -288,10 +283,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
         'that name, belongs to this diver and goes to his own track without association',
         kind='str[]')
-    named_tracks: str = parameter('share', '',
-        'what a track with a name does with fixes without one: share (it takes part in the '
-        'association, and a track never seen together with it is the same diver) or alone (it '
-        'takes only its own)', choices=NAMED_TRACKS)
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '
         'counted; 0: use them', range=(0.0, 3600.0))

@@ -93,8 +93,7 @@ class Association(NamedTuple):
     (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
     may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
     where these and not the pairs update the tracks; densities: of all pairs, of `families`;
-    counted (T,): tracks whose innovations tell how consistent fixes are, None for all; seen: how
-    probable detections are, where the sensor does not see everywhere."""
+    seen: how probable detections are, where the sensor does not see everywhere."""
 
     tracks: IndexArray
     detection: IntArray
@@ -104,7 +103,6 @@ class Association(NamedTuple):
     existence: FloatArray | None = None
     weights: JointWeights | None = None
     densities: families.Densities | None = None
-    counted: BoolArray | None = None
     seen: Seen | None = None
 
     @property

@@ -14,7 +14,7 @@
 
 """Tracks whose name is known, and what to do when a diver is also seen without one.
 
-A named track takes its part of the fixes that have no name (`named_tracks: share`), so that a
+A named track takes its part of the fixes that have no name, so that a
 diver with a transponder on a sonar is one track. A second track can stand beside it all the same:
 the sonar may have seen the diver before the transponder was heard. Two divers that swim together
 are seen together, now and then at least; a single diver never is. So a nameless track that stays

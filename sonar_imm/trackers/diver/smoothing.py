@@ -26,7 +26,6 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from . import kbest
 from .state import cross, DiverState
 from .tracker import DiverTracker
 
@@ -109,8 +108,6 @@ class SmoothingDiverTracker(DiverTracker):
             scan = self._passed[stamp]
             x, P = layout.widened(scan.x, scan.P)
             scans.append(scan._replace(x=x, P=P, instruments=newest.instruments))
-        if self._keeps_hypotheses:
-            scans = kbest.one_past(scans)
         smooth = [
             scan._replace(x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
         ]

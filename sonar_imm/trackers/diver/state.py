@@ -28,7 +28,6 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray, with_rows
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from ...estimation.hypotheses import Hypotheses
 from ...estimation.motion import Motion
 from . import family_kernels
 from .clutter import Clutters
@@ -85,8 +84,6 @@ ROWS = (
     'near_to',
     'near_for',
     'refused',
-    'history',
-    'came_from',
     'looks',
     'refused_z',
     'spreads',
@@ -214,12 +211,10 @@ class DiverState(NamedTuple):
     position and covariance (xx, xy, yy) of the last fix that may have been its own and was not
     believed, NaN since it took another (`families`); refused_z (T, 3): stamp, z and variance of
     the last height of a fix that was not, spreads (T,): how often the copies of the models were
-    spread anew (`heights`); history (T, w): the numbers of its last
-    fixes, came_from (T,): which row it was before this scan, -1 for none, hypotheses: which rows
-    belong together, and serial: of the last fix (`kbest`; nothing elsewhere); looks (T,): parts
-    of a miss that have not been counted yet, where the sensor does not see everywhere
-    (`coverage`); scale (2, 2): for fixes and for arrivals the sum of squared residuals in units
-    of their stated variance, and their number; fixes, arrivals: what innovations say of the
+    spread anew (`heights`); looks (T,): parts of a miss that have not been counted yet, where the
+    sensor does not see everywhere (`coverage`); scale (2, 2): for fixes and
+    for arrivals the sum of squared residuals in units of their stated variance, and their number;
+    fixes, arrivals: what innovations say of the
     stated covariances of either; excess: of `estimation.consistency`, that those of arrivals are
     too small; offsets: that arrivals miss by the same ping after ping; heights: how many z of
     fixes could be used; clutter: what each sensor
@@ -247,8 +242,6 @@ class DiverState(NamedTuple):
     refused: FloatArray
     refused_z: FloatArray
     spreads: IntArray
-    history: IntArray
-    came_from: IntArray
     looks: FloatArray
     scale: FloatArray
     fixes: FixConsistency = FixConsistency()
@@ -257,8 +250,6 @@ class DiverState(NamedTuple):
     heights: HeightCounts = HeightCounts()
     offsets: Offsets = Offsets()
     instruments: Instruments = Instruments()
-    hypotheses: Hypotheses = Hypotheses.none()
-    serial: int = 0
     clutter: Clutters = ()
     last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
@@ -267,10 +258,7 @@ class DiverState(NamedTuple):
 
     def require_like(self, other: DiverState, n: int) -> None:
         """Raise ValueError where this is no state of the models of `other` with n states each."""
-        shapes = [
-            (state.x.shape[1], *map(np.shape, (state.learnt[:0], state.history[:0])))
-            for state in (self, other)
-        ]
+        shapes = [(state.x.shape[1], state.learnt[:0].shape) for state in (self, other)]
         seen = self.life.seen.shape[1:] == other.life.seen.shape[1:]
         if shapes[0] != shapes[1] or (len(self.x) and self.x.shape[2] != n) or not seen:
             raise ValueError('states are of other models')
@@ -296,8 +284,6 @@ class DiverState(NamedTuple):
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
             refused=np.empty((0, 6)),
-            history=np.empty((0, 0), np.int64),
-            came_from=np.empty(0, np.int64),
             looks=np.empty(0),
             refused_z=np.empty((0, 3)),
             spreads=np.empty(0, np.int64),
@@ -313,13 +299,12 @@ class DiverState(NamedTuple):
         """The tracks where `kept` (T,) is True; `life` is that of those."""
         if kept.all():
             return self._replace(life=life)
-        return self.at(kept.nonzero()[0], life, hypotheses=self.hypotheses.only(kept))
+        return self.at(kept.nonzero()[0], life)
 
-    def at(self, rows: IndexArray, life: Tracks, **other: Any) -> DiverState:
-        """The rows of those numbers; `life` is that of them. Hypotheses are left as they are, but
-        for what is `other`."""
+    def at(self, rows: IndexArray, life: Tracks) -> DiverState:
+        """The rows of those numbers; `life` is that of them."""
         parts: dict[str, Any] = {name: getattr(self, name).take(rows, axis=0) for name in ROWS}
-        return self._replace(life=life, **parts, **other)
+        return self._replace(life=life, **parts)
 
     def only(self, kept: BoolArray) -> DiverState:
         """The tracks where `kept` (T,) is True."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 from ...acoustics.geodesy import Origin
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from ...estimation.hypotheses import Hypotheses
 from ...intake.stream import REPLAY_TYPES
 from ...measurements import (
     Arrivals,
@@ -46,6 +45,6 @@ STATE_TYPES = (
     *(Arrivals, Fix, Fixes, Start),
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
-    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments, Hypotheses),
+    *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments),
     *(Offsets, RecentPairs, clutter.Clutter),
 )

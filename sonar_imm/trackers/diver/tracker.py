@@ -50,7 +50,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
 from ..protocol import WarmStep
-from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
+from . import births, clutter, coverage, families, fix_kernels, heights, jipda, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -89,7 +89,6 @@ class DiverTracker:
     def _settle(self, config: DiverConfig) -> None:
         """What follows from the parameters, once and not in every scan."""
         self.config = config
-        self._keeps_hypotheses = config.pairing == 'kbest'
         self.rules = track_rules(config)
         layouts = partial(Instruments.layout, config=config, models=self.models)
         self._layout = lru_cache(maxsize=16)(layouts)
@@ -107,18 +106,13 @@ class DiverTracker:
         self._georeferencer = Georeferencer(self.config, self.counts)
 
     def _nobody(self, life: Tracks) -> DiverState:
-        nobody = DiverState.of_nobody(life, self.models, self._chain.fresh(0))
-        return nobody._replace(history=np.empty((0, self._window), np.int64))
+        return DiverState.of_nobody(life, self.models, self._chain.fresh(0))
 
     def restored(self) -> None:
         """Raise ValueError for states, put in, that are none of these models."""
         nobody = self._nobody(Tracks.none(self.rules))
         for state in self._stream.kept:
             state.require_like(nobody, self._layout(state.instruments).size)
-
-    @property
-    def _window(self) -> int:
-        return kbest.WINDOW if self._keeps_hypotheses else 0
 
     @property
     def origin(self) -> Origin | None:
@@ -178,8 +172,6 @@ class DiverTracker:
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
-        if self._keeps_hypotheses:
-            now = kbest.shown(now)
         hit = now.nis_dof > 0
         return {
             'tracks': len(now.life),
@@ -235,9 +227,6 @@ class DiverTracker:
         now, step = self._predict(before, stamp_ns)
         found: list[Birth] = []
         for fixes in scan.fixes:
-            if self._keeps_hypotheses:
-                now = self._branch(now, fixes)
-                continue
             now = now.as_seen(fixes.turned_by, self._layout)
             association = self._associate(now, fixes)
             now, again = self._reacquire(now, fixes, association)
@@ -250,8 +239,6 @@ class DiverTracker:
                 now = self._missed(now, fixes, association)
             now = now.as_seen(fixes.turned_by, self._layout, back=True)
             found += births.births_from_fixes(fixes, association.free, association.existence)
-        if scan.pings and self._keeps_hypotheses:
-            now = kbest.decided(now)
         for ping in scan.pings:
             of_ping = ping, self.config, scan.factor, self.models, self._covered
             now, free = pings.associate_and_update(now, *of_ping)
@@ -287,7 +274,6 @@ class DiverTracker:
             nis_dof=np.zeros(count, np.uint16),
             score=SCORE_MEMORY * before.score,
             existence=before.existence * math.exp(-dt / self.config.survival_time),
-            came_from=np.arange(count),
             repairs=before.repairs + last.repairs,
         )
         return now, last._replace(dt=dt)
@@ -307,9 +293,7 @@ class DiverTracker:
                 good = densities.whole[tracks, row] > families.bound(fixes)
                 tracks, row = tracks[good], row[good]
             return Association(tracks, row, expected, now.score, free, densities=densities)
-        excluded = now.target_id != NOBODY
-        if config.named_tracks == 'share':
-            excluded = np.zeros(len(excluded), bool)
+        excluded = np.zeros(len(now.x), bool)
         where = now, config, fixes.z, fixes.R
         seen = coverage.detectable(self._covered, fixes.sensor, *where)
         if config.pairing == 'jipda':
@@ -339,21 +323,7 @@ class DiverTracker:
         weights = association.weights
         share = np.ones(len(now.x)) if weights is None else weights.missed_share
         share[association.tracks] = 0.0
-        if self.config.named_tracks == 'alone':
-            share[now.target_id != NOBODY] = 0.0
         return coverage.missed(now, association.seen, share, self._layout(now.instruments).mask)
-
-    def _branch(self, now: DiverState, fixes: Positions) -> DiverState:
-        """The tracks in all hypotheses after `fixes`, those that may begin there among them."""
-        now = now.as_seen(fixes.turned_by, self._layout)
-        layout = self._layout(now.instruments)
-        found = kbest.branched(now, fixes, self.models, self._chain, layout, self._covered)
-        now = self._update(found.state, fixes, found.association)
-        now = self._update_heights(now, fixes, found.association)
-        now = now.as_seen(fixes.turned_by, self._layout, back=True)
-        new = births.births_from_fixes(fixes, found.association.free, found.association.existence)
-        now = self._with_tracks(now, new)
-        return kbest.begun(now, found)
 
     def _reacquire(
         self, now: DiverState, fixes: Positions, association: Association
@@ -385,8 +355,6 @@ class DiverTracker:
             mean, covariance = imm_kernels.combine(now.x, now.P, stated, layout.H[0])
             z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
-            if association.counted is not None:
-                tentative |= ~association.counted
             scale = np.ones(len(tracks))
             if self.models.mixing is not None:
                 scale = families.scale(now.mu[tracks], self.models)
@@ -428,9 +396,6 @@ class DiverTracker:
     ) -> DiverState:
         """With the scale of the stated covariances learnt from the pairs of an association."""
         tracks, detection = association.tracks, association.detection
-        if association.counted is not None:
-            counts = association.counted[tracks]
-            tracks, detection = tracks[counts], detection[counts]
         if not self.config.estimate_covariance_scale or not len(tracks):
             return now
         layout = self._layout(now.instruments)
@@ -444,17 +409,14 @@ class DiverTracker:
         """What the hits say of the transitions, and of the stated variances of arrivals where no
         fix says the same."""
         hit = now.nis_dof > 0
-        if self._keeps_hypotheses:
-            learnt = kbest.learnt(before, now, step, self.models, self._chain)
-        else:
-            learnt = self._chain.learn(
-                before.learnt,
-                step.transition,
-                self.models.by_model(before.mu),
-                self.models.by_model(now.mu),
-                step.dt,
-                np.flatnonzero(hit),
-            )
+        learnt = self._chain.learn(
+            before.learnt,
+            step.transition,
+            self.models.by_model(before.mu),
+            self.models.by_model(now.mu),
+            step.dt,
+            np.flatnonzero(hit),
+        )
         nis, arrivals, more = np.where(hit, now.nis, np.nan), before.arrivals, before.excess
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
@@ -468,9 +430,6 @@ class DiverTracker:
         config, before = self.config, now
         if scan.names or now.last_named:
             now = names.remembered(now, scan.names, config.max_coast)
-        if self._keeps_hypotheses:
-            looked = scan.complete & (now.target_id == NOBODY)
-            return kbest.pruned(now, now.nis_dof > 0, looked, self.rules, config)
         alive = fix_kernels.finite(now.x, now.P)
         if not alive.all():
             now = now._replace(broken=now.broken + int((~alive).sum()))
@@ -508,7 +467,7 @@ class DiverTracker:
             kept[kept] = room
             life = life.only(room)
         now = now.rows(kept, life)
-        if config.named_tracks == 'share' and now.last_named:
+        if now.last_named:
             now = names.merged(now, before, scan.fixes, self._position)
         return now
 
@@ -517,10 +476,8 @@ class DiverTracker:
         where somebody says that a diver is."""
         config = self.config
         if found:
-            room = max(0, kbest.most_tracks(config) - len(now.life))
+            room = max(0, births.most_tracks(config) - len(now.life))
             now = self._with_tracks(now, births.each_name_once(found)[:room])
-        if starts and self._keeps_hypotheses:
-            now = kbest.decided(now)
         for start in starts:
             now, free = births.make_room(now, start, config, self._position)
             if free:
@@ -540,8 +497,6 @@ class DiverTracker:
             return now
         layout = self._layout(now.instruments)
         x, P, mu = births.new_tracks(found, self.models, layout, self.config)
-        if self._keeps_hypotheses:
-            now = now._replace(hypotheses=now.hypotheses.with_alone(count))
         return now.with_rows(
             now.life.born(count, now.stamp_ns, self.rules),
             {
@@ -559,8 +514,6 @@ class DiverTracker:
                 'near_to': 0,
                 'near_for': 0,
                 'refused': np.nan,
-                'history': 0,
-                'came_from': -1,
                 'looks': 0.0,
                 'refused_z': np.nan,
                 'spreads': 0,
@@ -568,8 +521,6 @@ class DiverTracker:
         )
 
     def _estimate(self, state: DiverState) -> Estimate:
-        if self._keeps_hypotheses:
-            state = kbest.shown(state)
         # Of tracks whose hits are counted the existence is NaN.
         state = state.only(~(state.existence <= jipda.PUBLISHES))
         mean, covariance = families.positions(state, self.models)

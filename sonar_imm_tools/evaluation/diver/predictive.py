@@ -46,13 +46,8 @@ from ..tuning import Scores, Tunable
 
 
 def for_tuning(config: DiverConfig) -> DiverConfig:
-    """One copy: the scale is what is fitted. One density of false fixes, that it can be too; and a
-    single history, which `Scored` can follow."""
-    association = 'gnn' if config.pairing == 'kbest' else config.pairing
-    density = config.usual_clutter
-    return evolve(
-        config, covariance_scales=(1.0,), clutter_density=density, association=association
-    )
+    """One copy: the scale is what is fitted. One density of false fixes, that it can be too."""
+    return evolve(config, covariance_scales=(1.0,), clutter_density=config.usual_clutter)
 
 
 def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:

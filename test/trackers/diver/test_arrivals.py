@@ -354,7 +354,7 @@ def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
     np.testing.assert_allclose(again[1], P, atol=1e-9)
 
 
-@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda'])
 def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(association):
     """What is added is the variance of the bearing times the distance squared, in the direction in
     which an error of the bearing moves the diver, as in closed form."""

@@ -437,7 +437,7 @@ def boat(speed, dt, count, std, name=NOBODY):
 
 
 @pytest.mark.parametrize('name', [NOBODY, 7], ids=['no name', 'name'])
-@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda'])
 @pytest.mark.parametrize(('speed', 'dt', 'std'), [(8.0, 1.0, 0.3), (12.0, 1.0, 1.0)])
 def test_what_is_faster_than_any_diver_is_tracked_from_its_third_fix(
     association, name, speed, dt, std
