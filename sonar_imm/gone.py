@@ -28,6 +28,7 @@ _WITH_ITS_SET = 'was removed together with its model set'
 _ROLL = 'was removed: use the elevation of the echoes, or let the vehicle roll'
 _OWN_SET = 'was removed: families contains constant velocity; docs/howto/own_model.md adds a set'
 _LEARNT = 'was removed: counts is the form that learns; benchmarks/diver_paper.py has the others'
+_CONSTANT = 'was removed: its default is a constant now'
 _RAW_FILE = 'was removed: convert the file to npz (kind snapshots) or to XTF'
 _LIVE_VIEW = (
     'was removed: view opens the report; show live topics with foxglove_bridge and '
