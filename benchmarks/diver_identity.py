@@ -114,9 +114,7 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
     for seed in range(runs):
         items, scene, stated, cutoff = scene_of(name, seed)
         density = stated['clutter_density']
-        tracker = DiverTracker(
-            DiverConfig.from_mapping(({} if nothing_stated else stated) | settings)
-        )
+        tracker = DiverTracker(DiverConfig(**({} if nothing_stated else stated) | settings))
         if not seed:
             tracker.warm()
             tracker.reset()

@@ -22,7 +22,7 @@ from typing import Any
 from attrs import evolve, fields, frozen
 
 from ...acoustics.geodesy import Origin
-from ...parameters import inherited, live, MODELS, parameter
+from ...parameters import constant, inherited, live, MODELS, parameter
 from ..model_checks import chain_problems
 from ..own_models import diver_models
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
@@ -108,22 +108,22 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         choices=tuple(TARGETS))
     directions: int = parameter(16, '',
         'number of headings (heading_speed, families)', range=(4, 64))
-    hover: bool = parameter(True, '',
+    hover: bool = constant(True, '',
         'add a model for standing still (heading_speed, families)')
-    reference_step: float = parameter(1.0, 's',
+    reference_step: float = constant(1.0, 's',
         'time step for which the probabilities and noises of the models are stated; values for '
         'other steps are derived from them', range=(1e-3, 3600.0))
-    longest_step: float = parameter(2.0, 's',
+    longest_step: float = constant(2.0, 's',
         'longer gaps are crossed in steps of this length, so that the diver may turn within them',
         range=(1e-3, 3600.0))
     stay_probability: float = parameter(0.86, '',
         'probability of keeping the heading over a reference step', range=(0.0, 1.0))
-    heading_concentration: float = parameter(3.0, '',
+    heading_concentration: float = constant(3.0, '',
         'kappa: a turn by an angle a has a probability proportional to exp(kappa cos a); 0: all '
         'turns are alike', range=(0.0, 50.0))
-    hover_enter: float = parameter(0.02, '',
+    hover_enter: float = constant(0.02, '',
         'probability of stopping over a reference step', range=(0.0, 1.0))
-    hover_stay: float = parameter(0.9, '',
+    hover_stay: float = constant(0.9, '',
         'probability of staying stopped over a reference step', range=(0.0, 1.0))
     transition_matrix: tuple[float, ...] = parameter((), '',
         'whole transition matrix over a reference step, row-major, row = from; empty: built from '
@@ -131,19 +131,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
-    family_switch_rate: float = parameter(0.001, '1/s',
+    family_switch_rate: float = constant(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
         'families: factors by which copies of the filter multiply the covariances of all '
-        'measurements; with dimensions 3: one copy, times 1',
+        'measurements; those below 1 say where the diver is, but not how well that is known; with '
+        'dimensions 3: one copy, times 1',
         range=(0.01, 1e4), kind='float[]')
-    least_covariance_scale: float = parameter(1.0, '',
-        'families: copies with a lower scale say where the diver is, but not how well that is '
-        'known; lower it only where errors are known not to last', range=(0.01, 1.0))
-    adaptation: str = parameter('counts', '',
+    adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
         choices=ADAPTATIONS)
-    adaptation_prior: float = parameter(2.0, '',
+    adaptation_prior: float = constant(2.0, '',
         'adaptation counts: weight of the prior matrix, in transitions per row', range=(1e-3, 1e6))
 
     # -- how divers move -------------------------------------------------------------------------
@@ -152,19 +150,19 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     speed_std: float = parameter(0.4, 'm/s',
         'standard deviation of the speed of a new track around speed_mean (heading_speed, '
         'families)', range=(1e-3, 20.0))
-    velocity_std: float = parameter(0.7, 'm/s',
+    velocity_std: float = constant(0.7, 'm/s',
         'families: standard deviation on each axis of the velocity of a new track, around zero; '
         '2 at a fix of a diver', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
         'random walk of the speed over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
-    brisk_speed_noise: float = parameter(0.07, 'm/s',
+    brisk_speed_noise: float = constant(0.07, 'm/s',
         'families: random walk of the speed over a reference step in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
-    lateral_noise: float = parameter(0.24, 'm',
+    lateral_noise: float = constant(0.24, 'm',
         'random walk sideways over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
-    hover_noise: float = parameter(0.05, 'm',
+    hover_noise: float = constant(0.05, 'm',
         'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
         'families: acceleration noise of lively_calm, lively_sharp and quiet over a reference '
@@ -176,9 +174,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         range=(1e-4, 1e5))
     covariance_scale: float = live(1.0, '',
         'factor by which measurement covariances are multiplied before use', range=(1e-4, 1e4))
-    estimate_covariance_scale: bool = parameter(False, '',
-        'estimate a further factor of the measurement covariances from the innovations, for '
-        'sensors whose stated covariances are optimistic')
     sound_speed: float = live(1500.0, 'm/s',
         'speed of sound with which arrival times become distances', range=(1300.0, 1700.0))
     toa_std: float = live(1e-3, 's',
@@ -214,9 +209,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'least depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
     depth_max: float = parameter(20.0, 'm',
         'greatest depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
-    vertical_speed_std: float = parameter(0.1, 'm/s',
+    vertical_speed_std: float = constant(0.1, 'm/s',
         'standard deviation of the vertical speed (dimensions 3)', range=(1e-4, 10.0))
-    vertical_speed_time: float = parameter(10.0, 's',
+    vertical_speed_time: float = constant(10.0, 's',
         'time over which the vertical speed is correlated (dimensions 3)', range=(1e-2, 1e5))
 
     # -- systematic errors of instruments --------------------------------------------------------
@@ -231,7 +226,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
         'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
         'place coverage_sector states', range=(0.0, 45.0))
-    systematic_errors: str = parameter('mixed', '',
+    systematic_errors: str = constant('mixed', '',
         'treatment of errors of receivers, clocks, sound speed and bearings: consider (in the '
         'covariance, never estimated), estimate, mixed (clocks and sound speed estimated, the '
         'rest considered) or exact (nothing is off); where none is stated, 0.3 m, 0.1 ms and 2 '
@@ -241,7 +236,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     fix_bias_std: float = parameter(0.0, 'm',
         'standard deviation on each axis of a lasting error of the fixes, on top of their '
         'covariance', range=(0.0, 1e4))
-    fix_bias_time: float = parameter(60.0, 's',
+    fix_bias_time: float = constant(60.0, 's',
         'time over which the lasting error of the fixes (fix_bias_std) is correlated',
         range=(1e-2, 1e6))
 
@@ -255,16 +250,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
         'model_set families, else gnn)',
         choices=('auto', *ASSOCIATIONS))
-    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
-        description='number of hits within confirm_window that confirm a track, with association '
-        'gnn and of raw arrivals')
-    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5,
-        description='number of consecutive scans without a hit that cover a confirmed target and '
-        'so end its track, with association gnn and of raw arrivals')
+    gate_probability: float = inherited(
+        DetectionParameters, 'gate_probability', 0.999, constant=True)
+    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
+    confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
+    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
+    max_gap: float = inherited(StreamParameters, 'max_gap', 3600.0, constant=True)
+    restart_after: int = inherited(StreamParameters, 'restart_after', 5, constant=True)
     birth_density: float = live(1.2e-5, '1/m^2',
         'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
-    survival_time: float = live(500.0, 's',
+    survival_time: float = constant(500.0, 's',
         'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 
     # -- what the sensor covers ------------------------------------------------------------------
@@ -327,7 +323,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     transceiver_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
         'vector from the reference of nav, or the antenna of nav_fix, to the transceiver: x '
         'forward, y port, z up', range=(-1e4, 1e4))
-    transceiver_lever_std: float = parameter(0.0, 'm',
+    transceiver_lever_std: float = constant(0.0, 'm',
         'standard deviation of transceiver_lever on each axis', range=(0.0, 100.0))
     transceiver_mount_rpy_deg: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg',
         'roll, pitch, yaw of the transceiver on the vessel (forward, port, up: pitch positive '
@@ -351,13 +347,13 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     magnetic_declination_deg: float = parameter(0.0, 'deg',
         'angle from true to magnetic north, positive east, for headings (input heading) and '
         'relative fixes levelled by a compass; 0: they are from true north', range=(-180.0, 180.0))
-    vessel_attitude_std_deg: float = live(0.5, 'deg',
+    vessel_attitude_std_deg: float = constant(0.5, 'deg',
         "standard deviation of the vessel's roll and pitch where its message states none",
         range=(0.0, 45.0))
-    vessel_max_gap: float = parameter(2.0, 's',
+    vessel_max_gap: float = constant(2.0, 's',
         'longest time between two poses of the vessel that is interpolated; relative fixes in a '
         'longer gap are left out and counted', range=(0.01, 600.0))
-    vessel_max_extrapolation: float = parameter(0.0, 's',
+    vessel_max_extrapolation: float = constant(0.0, 's',
         'time by which a relative fix may be newer than the newest pose of the vessel; later '
         'ones wait for the next pose', range=(0.0, 60.0))
     # fmt: on
@@ -390,7 +386,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         """These parameters with those of the kind of target where they are at their defaults."""
         if self.model_set != 'families':
             return self
-        defaults = {spec.name: spec.default for spec in self.specs()}
+        defaults = {field.name: field.default for field in fields(type(self))}
         own = {
             name: value
             for name, value in TARGETS[self.target].items()

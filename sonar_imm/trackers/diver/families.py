@@ -163,7 +163,7 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
         initial = 0.25 / np.bincount(family)[family]
     # Copies of the models begin at heights where depth is a state; one thing at a time.
     scales = (1.0,) if config.dimensions == 3 else config.covariance_scales
-    least = min(config.least_covariance_scale, max(scales))
+    least = min(1.0, max(scales))
     stated = tuple(each >= least for each in scales)
     names = [f'{name}_{each}' for name in FAMILIES[:2] for each in steady.names]
     return ModelSet(

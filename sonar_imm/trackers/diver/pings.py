@@ -34,7 +34,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics.arrivals_3d import EMISSION
-from ...acoustics.multistatic import difference_projection
 from ...estimation import imm_kernels
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
@@ -56,7 +55,7 @@ from .ping_kernels import (
     subset_ping,
 )
 from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
-from .state import ARRIVALS, DiverState, learnt_scale
+from .state import DiverState
 from .state_space import as_stated, each_kept, heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
@@ -110,14 +109,12 @@ class PingUpdate(NamedTuple):
 
 class Taking(NamedTuple):
     """What a track becomes by the measurements of a ping that it takes: after; good (C,): those;
-    nis of dof of them, 0 for too few; residual (m,), covariance and stated (m, m): of the
-    arrivals, to learn their scale, None where that is not asked."""
+    nis of dof of them, 0 for too few."""
 
     after: PingUpdate
     good: BoolArray
     nis: float
     dof: int
-    scale: tuple[FloatArray, FloatArray, FloatArray] | None
 
 
 class Explanation(NamedTuple):
@@ -174,11 +171,11 @@ def _by_ping(
         return now, free & (name == NOBODY)
     now = spread(now, seen, layout, models)
     if name != NOBODY:
-        taking = _taking(now, int(own[0]), seen, config, layout, factor)
+        taking = _taking(now, int(own[0]), seen, config, layout)
         takings = {} if taking is None else {int(own[0]): taking}
         return _watched(with_takings(now, takings), takings, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
-    takings, taken, score = explain(now, seen, config, layout, factor)
+    takings, taken, score = explain(now, seen, config, layout)
     if detected is not None:
         looks = 1 if ping.passive else len(seen.nodes)
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
@@ -208,15 +205,13 @@ def with_takings(now: DiverState, takings: dict[int, Taking]) -> DiverState:
     if not takings:
         return now
     x, P, mu = now.x.copy(), now.P.copy(), now.mu.copy()
-    nis, nis_dof, scale, repairs = now.nis.copy(), now.nis_dof.copy(), now.scale, now.repairs
+    nis, nis_dof, repairs = now.nis.copy(), now.nis_dof.copy(), now.repairs
     for track, taking in takings.items():
         x[track], P[track], mu[track] = taking.after.x, taking.after.P, taking.after.mu
         nis[track] += taking.nis
         nis_dof[track] += np.uint16(taking.dof)
         repairs += taking.after.repairs
-        if taking.scale is not None:
-            scale = learnt_scale(scale, ARRIVALS, *(part[None] for part in taking.scale))
-    return now._replace(x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, scale=scale, repairs=repairs)
+    return now._replace(x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=repairs)
 
 
 def _mixture(now: DiverState, track: int) -> Mixture:
@@ -224,7 +219,7 @@ def _mixture(now: DiverState, track: int) -> Mixture:
 
 
 def _explain_echoes(
-    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout
 ) -> Explanation:
     """Which tracks take which echoes of one transmission.
 
@@ -241,12 +236,12 @@ def _explain_echoes(
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (now.life.status == TENTATIVE)
-    first, hits = _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)
+    first, hits = _by_rank(now, ping, config, layout, rank, fit, near, pairs)
     doubtful = (hits > 0) & (2 * hits < len(pairs))
     if not doubtful.any():
         return first
     rank = np.where(doubtful, EXCLUDED, rank)
-    return _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)[0]
+    return _by_rank(now, ping, config, layout, rank, fit, near, pairs)[0]
 
 
 def _by_rank(
@@ -254,7 +249,6 @@ def _by_rank(
     ping: Ping,
     config: DiverConfig,
     layout: Layout,
-    factor: float,
     rank: IntArray,
     fit: FloatArray,
     near: BoolArray,
@@ -274,7 +268,7 @@ def _by_rank(
         for track in tracks.tolist():
             mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
             index = np.flatnonzero(mine)
-            taking = _taking(now, track, ping.only(mine), config, layout, factor)
+            taking = _taking(now, track, ping.only(mine), config, layout)
             if taking is not None:
                 index = index[taking.good]
                 good = np.zeros(len(taken), bool)
@@ -312,9 +306,7 @@ def _owners(
     return owner
 
 
-def _explain_tag(
-    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
-) -> Explanation:
+def _explain_tag(now: DiverState, ping: Ping, config: DiverConfig, layout: Layout) -> Explanation:
     """Which track takes a tag's ping, all of it.
 
     A single diver known to be there is given every ping. Otherwise it is the track that explains
@@ -328,7 +320,7 @@ def _explain_tag(
         best = _best_for_tag(now, np.flatnonzero(turn), ping, config, layout)
         if best is not None:
             track, after = best
-            taking = taking_of(_mixture(now, track), after, ping, config, layout, factor)
+            taking = taking_of(_mixture(now, track), after, ping, config, layout)
             takings[track] = taking
             score[track] += float(taking.good.sum())
             if 2 * taking.good.sum() >= len(taking.good):
@@ -368,12 +360,12 @@ def _allowed(before: Mixture, after: PingUpdate, config: DiverConfig) -> bool:
 
 
 def _taking(
-    now: DiverState, track: int, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+    now: DiverState, track: int, ping: Ping, config: DiverConfig, layout: Layout
 ) -> Taking | None:
     """What a track takes of the measurements it may have; None where no model can explain them."""
     before = _mixture(now, track)
     after = update_by_ping(*before, ping, config, layout) if ping.echo.any() else None
-    return None if after is None else taking_of(before, after, ping, config, layout, factor)
+    return None if after is None else taking_of(before, after, ping, config, layout)
 
 
 def taking_of(
@@ -382,21 +374,17 @@ def taking_of(
     ping: Ping,
     config: DiverConfig,
     layout: Layout,
-    factor: float,
 ) -> Taking:
     """What a track takes, `before` it and after."""
     good = np.asarray(after.good > TAKEN)
-    nis, dof, scale = 0.0, 0, None
+    nis, dof = 0.0, 0
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.compared(good)
         x, P, mu = before
         mu = as_stated(mu, layout.stated)
         residual, covariance, dof = residuals(x, P, mu, own, config.target_z)
         nis = _joint_nis(residual, covariance, own.measured.variance)
-    if config.estimate_covariance_scale and (good & ping.echo).any():
-        own = ping.compared(good & ping.echo)
-        scale = _for_scale(after, as_stated(after.mu, layout.stated), own, config, factor)
-    return Taking(after, good, nis, dof, scale)
+    return Taking(after, good, nis, dof)
 
 
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
@@ -412,20 +400,6 @@ def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArra
     values, vectors = np.linalg.eigh(weight[:, None] * covariance * weight)
     whitened = vectors.T @ (weight * residual)
     return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
-
-
-def _for_scale(
-    after: PingUpdate, mu: FloatArray, ping: Ping, config: DiverConfig, factor: float
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Residuals of the arrivals that a track took, their covariance and what is stated of it."""
-    residual, covariance, dof = residuals(after.x, after.P, mu, ping, config.target_z)
-    stated = np.diag(ping.measured.variance / factor)
-    if ping.passive and dof:
-        # The emission is unknown: differences, whitened by what is stated.
-        projection = difference_projection(ping.measured.variance / factor)
-        residual, stated = projection @ residual, np.eye(dof)
-        covariance = projection @ covariance @ projection.T
-    return (residual, covariance, stated) if dof else None
 
 
 def update_by_ping(

@@ -36,15 +36,6 @@ from .family_kernels import Mixing
 from .offsets import Offsets
 from .state_space import Instruments, Layout, ModelSet
 
-FIXES, ARRIVALS = 0, 1
-"""Rows of the learnt scale."""
-
-SCALE_PRIOR = 20.0
-"""Values measured that the stated covariances are worth when their scale is being learnt."""
-
-SCALE_MEMORY = 400.0
-"""Values measured over which the learnt scale forgets."""
-
 MEMORY = 50.0
 """Fixes over which `FixConsistency` is gathered and forgotten."""
 
@@ -212,9 +203,7 @@ class DiverState(NamedTuple):
     believed, NaN since it took another (`families`); refused_z (T, 3): stamp, z and variance of
     the last height of a fix that was not, spreads (T,): how often the copies of the models were
     spread anew (`heights`); looks (T,): parts of a miss that have not been counted yet, where the
-    sensor does not see everywhere (`coverage`); scale (2, 2): for fixes and
-    for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    fixes, arrivals: what innovations say of the
+    sensor does not see everywhere (`coverage`); fixes, arrivals: what innovations say of the
     stated covariances of either; excess: of `estimation.consistency`, that those of arrivals are
     too small; offsets: that arrivals miss by the same ping after ping; heights: how many z of
     fixes could be used; clutter: what each sensor
@@ -243,7 +232,6 @@ class DiverState(NamedTuple):
     refused_z: FloatArray
     spreads: IntArray
     looks: FloatArray
-    scale: FloatArray
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
     excess: float = 0.0
@@ -287,13 +275,7 @@ class DiverState(NamedTuple):
             looks=np.empty(0),
             refused_z=np.empty((0, 3)),
             spreads=np.empty(0, np.int64),
-            scale=np.zeros((2, 2)),
         )
-
-    def factor(self) -> tuple[float, float]:
-        """By what the covariances of fixes and of arrivals have to be multiplied."""
-        factor = (SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1])
-        return float(factor[0]), float(factor[1])
 
     def rows(self, kept: BoolArray, life: Tracks) -> DiverState:
         """The tracks where `kept` (T,) is True; `life` is that of those."""
@@ -341,23 +323,6 @@ class DiverState(NamedTuple):
         if x.shape[-1] > n:
             x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
         return imm_kernels.combine(x, P, self.mu, E)
-
-
-def learnt_scale(
-    scale: FloatArray,
-    kind: int,
-    residual: FloatArray,
-    covariance: FloatArray,
-    stated: FloatArray,
-) -> FloatArray:
-    """`scale` after residuals (t, m) were compared with the `stated` covariance (t, m, m):
-    E[r r' + H P H'] = R after the update, where R is right. kind: `FIXES` or `ARRIVALS`."""
-    spread = residual[:, :, None] * residual[:, None, :] + covariance
-    total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())
-    row = scale[kind] + (total, residual.size)
-    scale = scale.copy()
-    scale[kind] = row * min(1.0, SCALE_MEMORY / row[1])
-    return scale
 
 
 class Step(NamedTuple):

@@ -58,7 +58,7 @@ from .jipda import Association
 from .models import build_models
 from .offsets import RecentPairs
 from .scan import Heights, Positions, Scan
-from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
+from .state import cross, DiverState, MEMORY, Step
 from .state_space import as_stated, Instruments
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
@@ -186,8 +186,6 @@ class DiverTracker:
             'fixes_lag_1': now.fixes.lag_1,
             'arrivals_mean_nis': now.arrivals.mean,
             'waiting_for_vessel': len(self._georeferencer),
-            'scale_fixes': now.factor()[0],
-            'scale_arrivals': now.factor()[1],
         }
 
     def warnings(self) -> list[str]:
@@ -250,9 +248,8 @@ class DiverTracker:
         return self._spawn(now, found, scan.starts)
 
     def _scan(self, before: DiverState, items: Sequence[Measurement]) -> Scan:
-        stated, learns = self.config.covariance_scale, self.config.estimate_covariance_scale
-        fixes, arrivals = before.factor() if learns else (1.0, 1.0)
-        return Scan.of(items, self.config, (stated * fixes, stated * arrivals), before.clutter)
+        stated = self.config.covariance_scale
+        return Scan.of(items, self.config, (stated, stated), before.clutter)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> tuple[DiverState, Step]:
         """The tracks as this scan should show them, and the step that led there."""
@@ -366,10 +363,9 @@ class DiverTracker:
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
             weights, considered = association.weights, ~layout.mask
-            now = jipda.update_jointly(
+            return jipda.update_jointly(
                 now, fixes, weights, tracks, h, layout, considered, association.densities
             )
-            return self._with_scale(now, fixes, association)
         if not len(tracks):
             return now
         if association.densities is not None:
@@ -381,29 +377,14 @@ class DiverTracker:
         else:
             after = families.considered_update(now, fixes, tracks, detection, h, layout)
         x, P, mu, nis, nis_dof, repairs = after
-        now = now._replace(
+        return now._replace(
             x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
         )
-        return self._with_scale(now, fixes, association)
 
     def _update_heights(self, now: DiverState, fixes: Positions, found: Association) -> DiverState:
         """The tracks after what the fixes that are theirs state of z."""
         layout, place = self._layout(now.instruments), self.models.height
         return heights.update(now, fixes, found, layout, place, self.config)
-
-    def _with_scale(
-        self, now: DiverState, fixes: Positions, association: Association
-    ) -> DiverState:
-        """With the scale of the stated covariances learnt from the pairs of an association."""
-        tracks, detection = association.tracks, association.detection
-        if not self.config.estimate_covariance_scale or not len(tracks):
-            return now
-        layout = self._layout(now.instruments)
-        mu = as_stated(now.mu[tracks], layout.stated)
-        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], mu, layout.H[0])
-        residual, stated = fixes.z[detection] - mean, fixes.R[detection] / fixes.factor
-        scale = learnt_scale(now.scale, FIXES, residual, covariance, stated)
-        return now._replace(scale=scale)
 
     def _learn(self, before: DiverState, now: DiverState, step: Step, scan: Scan) -> DiverState:
         """What the hits say of the transitions, and of the stated variances of arrivals where no

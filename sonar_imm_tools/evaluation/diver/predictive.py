@@ -66,18 +66,11 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             found.append(
                 Tunable(name='acceleration_noise', start=value, place=place, whole=tuple(noise))
             )
-        found.append(_of(config, 'velocity_std', usual=False))
     else:
         found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
         found.append(_of(config, 'speed_mean', std=0.7))
         found.append(_of(config, 'speed_std', std=0.7, usual=False))
         found.append(_of(config, 'speed_noise', usual=False))
-        found.append(_of(config, 'lateral_noise', std=1.0, usual=False))
-        for name in ('hover_enter', 'hover_stay'):
-            found.append(_of(config, name, kind='logit', usual=False))
-        if config.model_set == 'families':
-            found.append(_of(config, 'brisk_speed_noise', usual=False))
-            found.append(_of(config, 'family_switch_rate', usual=False))
     scans = any(isinstance(item, Fixes) and len(item) != 1 for item in measurements)
     found.append(_of(config, 'detection_probability', kind='logit', usual=scans))
     found.append(Tunable(name='clutter_density', start=config.usual_clutter, usual=scans))

@@ -66,12 +66,7 @@ VARIANTS = {
             'tags': ['a'],
             'max_tracks': 4,
         },
-        {
-            'dimensions': 3,
-            'association': 'jipda',
-            'estimate_covariance_scale': True,
-            'max_tracks': 4,
-        },
+        {'dimensions': 3, 'association': 'jipda', 'max_tracks': 4},
         {'association': 'jipda', 'model_set': 'heading_speed', 'tags': ['a'], 'max_tracks': 4},
     ),
     'fathometer': (
