@@ -201,7 +201,9 @@ def node_specs(system: System) -> tuple[ParameterSpec, ...]:
 
 def shared_specs() -> tuple[ParameterSpec, ...]:
     """Give the parameters that the live nodes of all systems have alike."""
-    first, *others = (node_specs(system) for system in SYSTEMS.values())
+    first, *others = (
+        (*type_specs(name), *node_config_type(system).specs()) for name, system in SYSTEMS.items()
+    )
     return tuple(spec for spec in first if all(spec in other for other in others))
 
 

@@ -84,6 +84,8 @@ GONE: dict[str, str] = {
         'was removed: state how good instruments are; that they are exact says 1e-6 '
         '(parameter sound_speed_std)'
     ),
+    'parameter fixes_are_scans': 'was removed: set -1 where it was false (parameter scan_period)',
+    'parameter map_frame': 'was removed: the frame of the input is this one (parameter frame_id)',
     'parameter least_covariance_scale': 'was removed: state the covariances as they are',
     'parameter estimate_covariance_scale': (
         'was removed: set the factor of the warning (parameter covariance_scale)'

@@ -102,7 +102,7 @@ def test_parameters_come_from_file_and_command(call, dive, tmp_path):
         '/**:\n  ros__parameters:\n    model_set: heading_speed\n    max_tracks: 2\n'
         '    use_sim_time: true\n'
     )
-    given = ('max_tracks=1', 'covariance_scales=1.0, 3', 'fixes_are_scans=false')
+    given = ('max_tracks=1', 'covariance_scales=1.0, 3', 'scan_period=-1')
     words = [word for setting in given for word in ('--set', setting)]
     run = call('track', dive, tmp_path / 'out', '--params', params, *words)
     parameters = run['parameters']

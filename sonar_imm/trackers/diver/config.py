@@ -182,14 +182,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'standard deviation of a bearing that comes without variance', range=(1e-3, 90.0))
     target_z: float = live(0.0, 'm',
         'z of the diver that is assumed when arrival times are used', range=(-12000.0, 12000.0))
-    fixes_are_scans: bool = live(True, '',
-        'fixes of one stamp are a whole scan, in which a diver without a fix was missed; false '
-        'for transponders polled in turn')
-
     scan_period: float = parameter(0.0, 's',
         'time in which a sensor that rotates or polls looks at everyone once: fixes without a '
-        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are',
-        range=(0.0, 3600.0))
+        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are '
+        'a scan, in which a diver without a fix was missed; -1: fixes are no scans, of '
+        'transponders polled in turn', range=(-1.0, 3600.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
@@ -217,11 +214,14 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     # -- systematic errors of instruments --------------------------------------------------------
     receiver_position_std: float = parameter(0.0, 'm',
         'standard deviation on each horizontal axis of the stated positions of receivers; a '
-        'receiver at the place of the transmitter has no such error', range=(0.0, 1e3))
+        'receiver at the place of the transmitter has no such error. Where this, '
+        'receiver_clock_std and sound_speed_std are 0, 0.3 m, 0.1 ms and 2 m/s are part of the '
+        'covariance of tracks from arrivals alone; exact instruments: 1e-6', range=(0.0, 1e3))
     receiver_clock_std: float = parameter(0.0, 's',
-        "standard deviation of the error of a receiver's clock", range=(0.0, 1.0))
+        "standard deviation of the error of a receiver's clock; 0: see receiver_position_std",
+        range=(0.0, 1.0))
     sound_speed_std: float = parameter(0.0, 'm/s',
-        'standard deviation of sound_speed', range=(0.0, 100.0))
+        'standard deviation of sound_speed; 0: see receiver_position_std', range=(0.0, 100.0))
     bearing_bias_std_deg: float = parameter(0.0, 'deg',
         'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
         'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
@@ -312,8 +312,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     origin_height: float = parameter(0.0, 'm',
         'height of the origin of the frame of the tracks above the ellipsoid',
         range=(-12000.0, 12000.0))
-    map_frame: str = parameter('map', '',
-        'name of the frame of positions that come as latitude and longitude')
+    frame_id: str = parameter('', '',
+        'frame that the input must be in, and the frame of positions given in latitude and '
+        'longitude; empty: the frame of the first message accepted, and map')
 
     # -- relative to a transceiver ---------------------------------------------------------------
     vessel: str = parameter('moving', '',
@@ -431,6 +432,16 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                     f"{name}: '{bad[0]}' cannot be part of a topic; letters, digits and _ can"
                 )
         return problems
+
+    @property
+    def fixes_are_scans(self) -> bool:
+        """Whether a diver without a fix among those of a stamp was missed."""
+        return self.scan_period >= 0.0
+
+    @property
+    def map_frame(self) -> str:
+        """The frame of positions that come as latitude and longitude."""
+        return self.frame_id or 'map'
 
     def origin(self) -> Origin | None:
         """The origin that is stated, None for none."""

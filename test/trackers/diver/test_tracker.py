@@ -259,7 +259,7 @@ def test_false_detections_do_not_pile_up_tracks():
 
 
 def test_polled_divers_are_not_missed_when_another_one_answers():
-    tracker = DiverTracker(DiverConfig(fixes_are_scans=False, confirm_hits=2))
+    tracker = DiverTracker(DiverConfig(scan_period=-1.0, confirm_hits=2))
     for second in range(1, 80):
         diver = second % 8
         last = tracker.process(fix(second, 60.0 * diver + 0.05 * second, 0.0))[-1]
