@@ -90,6 +90,13 @@ GONE: dict[str, str] = {
     'parameter estimate_covariance_scale': (
         'was removed: set the factor of the warning (parameter covariance_scale)'
     ),
+    **{
+        f'parameter sensor_{name}': f'was removed: write <sensor>.{name} (parameter sensors)'
+        for name in (
+            *('fix_std', 'detection_probability', 'clutter_density'),
+            *('coverage_sector', 'coverage_file'),
+        )
+    },
     'parameter hypotheses': 'was removed together with association: kbest',
     'parameter named_tracks': 'was removed: a track with a name also takes fixes without one',
     'choice association kbest': (

@@ -252,6 +252,17 @@ class Config:
         return tuple(spec for spec in cls._fields() if not spec.constant)
 
     @classmethod
+    def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
+        """`specs`, and what is declared because `values` are given: names with a dot, of what
+        another parameter names."""
+        return cls.specs()
+
+    @classmethod
+    def attributes(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The attributes of a config by parameters of `specs_with`."""
+        return dict(values)
+
+    @classmethod
     def _fields(cls) -> tuple[ParameterSpec, ...]:
         """The parameters and the constants."""
         fields = attrs.fields_dict(cls)
@@ -275,7 +286,7 @@ class Config:
     ) -> C:
         """Build from untrusted keys. Raises `ConfigError` naming every unknown key (with a
         suggestion) and bad value."""
-        specs = {spec.name: spec for spec in cls.specs()}
+        specs = {spec.name: spec for spec in cls.specs_with(values)}
         unknown = [key for key in values if key not in specs]
         problems = [] if ignore_unknown else [unknown_parameter(key, specs) for key in unknown]
         known = {key: value for key, value in values.items() if key in specs}
@@ -284,7 +295,7 @@ class Config:
         ]
         if problems:
             raise ConfigError(*problems)
-        return cls(**known)
+        return cls(**cls.attributes(known))
 
     def require_changeable(self, other: Config) -> None:
         """Raise ValueError naming the parameters of `other` that differ and are read-only."""
@@ -367,7 +378,7 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
         if isinstance(section, dict) and 'ros__parameters' in section
     }
     if not sections:
-        return {str(key): value for key, value in tree.items()}
+        return _flat(tree)
     values: dict[str, Any] = {}
     for key, section in sections.items():
         if not isinstance(section, (dict, type(None))):
@@ -375,7 +386,18 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
             raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
         name = str(key).strip('/').split('/')[-1]
         if key in ('/**', '/*') or not node_name or name == node_name:
-            values.update((str(entry), value) for entry, value in (section or {}).items())
+            values.update(_flat(section or {}))
+    return values
+
+
+def _flat(tree: Mapping[Any, Any], before: str = '') -> dict[str, Any]:
+    """Values by their names; those of a mapping stand behind its name and a dot, as in ROS."""
+    values: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            values.update(_flat(value, f'{before}{key}.'))
+        else:
+            values[f'{before}{key}'] = value
     return values
 
 

@@ -387,9 +387,10 @@ def test_keys_that_are_no_text_are_named(form):
 
 def test_groups_of_parameters_are_named_not_guessed():
     nested = 'ship:\n  walker_node:\n    ros__parameters: {speed: 1.0}\n'
-    assert problems(**parameters_from_yaml(nested)) == ("unknown parameter 'ship'",)
+    (sentence,) = problems(**parameters_from_yaml(nested))
+    assert sentence == "unknown parameter 'ship.walker_node.ros__parameters.speed'"
     (sentence,) = problems(**parameters_from_yaml('speed: {mean: 1.0}'))
-    assert sentence == "parameter 'speed' must be a number, got {'mean': 1.0}"
+    assert sentence == "unknown parameter 'speed.mean' (did you mean 'speed'?)"
 
 
 @pytest.mark.parametrize('text', ['/**:\n  ros__parameters: 5\n', 'a:\n  ros__parameters: [1]\n'])

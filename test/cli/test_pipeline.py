@@ -100,14 +100,15 @@ def test_parameters_come_from_file_and_command(call, dive, tmp_path):
     params = tmp_path / 'diver.yaml'
     params.write_text(
         '/**:\n  ros__parameters:\n    model_set: heading_speed\n    max_tracks: 2\n'
-        '    use_sim_time: true\n'
+        '    use_sim_time: true\n    radar: {fix_std: 2.0, clutter_density: 1.0e-4}\n'
     )
-    given = ('max_tracks=1', 'covariance_scales=1.0, 3', 'scan_period=-1')
+    given = ('max_tracks=1', 'covariance_scales=1.0, 3', 'sensors=radar,b', 'radar.fix_std=4')
     words = [word for setting in given for word in ('--set', setting)]
     run = call('track', dive, tmp_path / 'out', '--params', params, *words)
     parameters = run['parameters']
     assert parameters['model_set'] == 'heading_speed' and parameters['max_tracks'] == 1
     assert parameters['covariance_scales'] == [1.0, 3.0]
+    assert (parameters['radar.fix_std'], parameters['radar.clutter_density']) == (4.0, 1e-4)
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import re
-from typing import Any
+from typing import Any, cast
 
 from attrs import evolve, fields, frozen
 
 from ...acoustics.geodesy import Origin
-from ...parameters import constant, inherited, live, MODELS, parameter
+from ...parameters import Config, constant, inherited, live, MODELS, parameter, ParameterSpec
 from ..model_checks import chain_problems
 from ..own_models import diver_models
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
@@ -80,8 +81,14 @@ SYSTEMATIC = ('mixed', 'consider', 'estimate', 'exact')
 ASSOCIATIONS = ('gnn', 'jipda')
 VESSELS = ('moving', 'fixed')
 RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
-SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density', 'coverage_file')
-"""Parameters that may differ from sensor to sensor, as `coverage_sector` may."""
+OF_SENSOR = (
+    'fix_std',
+    'detection_probability',
+    'clutter_density',
+    'coverage_sector',
+    'coverage_file',
+)
+"""Parameters that may differ from sensor to sensor."""
 
 CLUTTER = 1e-6
 """False fixes per square metre and scan where nobody says how many there are."""
@@ -94,8 +101,10 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 @frozen(kw_only=True)
 class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
-    """All parameters of the diver tracker. The defaults are the `families` of the
-    docs."""
+    """All parameters of the diver tracker. The defaults are the `families` of the docs.
+
+    own: values that sensors have of their own, by names as ``radar.fix_std``.
+    """
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
@@ -285,22 +294,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     # -- sensors ---------------------------------------------------------------------------------
     sensors: tuple[str, ...] = parameter((), '',
-        'names of sensors with parameters of their own (sensor_...): they apply to what comes on '
-        '<name>/fix, <name>/fixes or <name>/relative, or in a frame of that name', kind='str[]')
-    sensor_fix_std: tuple[float, ...] = parameter((), 'm',
-        'fix_std of each of the sensors; empty: as fix_std', range=(1e-4, 1e5), kind='float[]')
-    sensor_detection_probability: tuple[float, ...] = parameter((), '',
-        'detection_probability of each of the sensors; empty: as detection_probability',
-        range=(0.01, 0.9999), kind='float[]')
-    sensor_coverage_sector: tuple[float, ...] = live((), 'm, deg',
-        'coverage_sector of each of the sensors, six numbers each; a width of 360 and a range '
-        'from 0 to 1e6 is everywhere; empty: as coverage_sector', kind='float[]')
-    sensor_coverage_file: tuple[str, ...] = parameter((), '',
-        "coverage_file of each of the sensors, '' for none; empty: as coverage_file",
+        'names of sensors, of which fix_std, detection_probability, clutter_density, '
+        'coverage_sector and coverage_file may be stated as <name>.fix_std and so on: they apply '
+        'to what comes on <name>/fix, <name>/fixes or <name>/relative, or in a frame of that name',
         kind='str[]')
-    sensor_clutter_density: tuple[float, ...] = parameter((), '1/m^2',
-        'clutter_density of each of the sensors; empty: as clutter_density', range=(0.0, 1e4),
-        kind='float[]')
+    own: tuple[tuple[str, Any], ...] = ()
 
     # -- latitude and longitude ------------------------------------------------------------------
     origin_latitude: float = parameter(0.0, 'deg',
@@ -404,28 +402,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     def _sensor_problems(self) -> list[str]:
         problems = []
-        for name in SENSOR_NUMBERS:
-            given = getattr(self, f'sensor_{name}')
-            if len(given) not in (0, len(self.sensors)):
-                problems.append(
-                    f'sensor_{name} needs one value for each of the {len(self.sensors)} sensors, '
-                    f'got {len(given)}'
-                )
-        places = 'coverage_sector', 'sensor_coverage_sector'
-        for name, count in zip(places, (1, len(self.sensors))):
-            sectors = getattr(self, name)
-            if len(sectors) not in (0, SECTOR * count):
-                each = f' for each of the {count} sensors' if name != places[0] else ''
-                problems.append(f'{name} needs {SECTOR} values{each}, got {len(sectors)}')
+        for name, sector in [('coverage_sector', self.coverage_sector), *self.own]:
+            if not name.endswith('coverage_sector') or not sector:
                 continue
-            for first in range(0, len(sectors), SECTOR):
-                width, least, greatest = sectors[first + 3 : first + SECTOR]
-                if not 0.0 < width <= 360.0:
-                    problems.append(f'{name}: a width of {width:g} is not between 0 and 360')
-                if not 0.0 <= least < greatest:
-                    problems.append(
-                        f'{name}: a range from {least:g} to {greatest:g} holds nothing'
-                    )
+            if len(sector) != SECTOR:
+                problems.append(f'{name} needs {SECTOR} values, got {len(sector)}')
+                continue
+            width, least, greatest = sector[3:]
+            if not 0.0 < width <= 360.0:
+                problems.append(f'{name}: a width of {width:g} is not between 0 and 360')
+            if not 0.0 <= least < greatest:
+                problems.append(f'{name}: a range from {least:g} to {greatest:g} holds nothing')
         for name in ('tags', 'sensors'):
             if bad := [word for word in getattr(self, name) if not _WORD.fullmatch(word)]:
                 problems.append(
@@ -449,19 +436,47 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
             return None
         return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
+    @classmethod
+    def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
+        """`specs`, and those of `OF_SENSOR` that `values` state of one of its `sensors`."""
+        found = {spec.name: spec for spec in cls.specs()}
+        sensors = values.get('sensors', ())
+        names = [
+            f'{sensor}.{name}'
+            for sensor in (sensors if isinstance(sensors, (list, tuple)) else ())
+            for name in OF_SENSOR
+        ]
+        own = [
+            evolve(found[name.rpartition('.')[2]], name=name) for name in names if name in values
+        ]
+        return (*found.values(), *own)
+
+    @classmethod
+    def attributes(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        own = {spec.name: spec for spec in cls.specs_with(values) if '.' in spec.name}
+        plain = {name: value for name, value in values.items() if name not in own}
+        return plain | {
+            'own': tuple((name, spec.convert(values[name])) for name, spec in own.items())
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        stated = {name: list(v) if isinstance(v, tuple) else v for name, v in self.own}
+        return super().as_dict() | stated
+
+    def require_changeable(self, other: Config) -> None:
+        super().require_changeable(other)
+        for sensor in self.sensors:
+            of_other = cast(DiverConfig, other).of_sensor(sensor)
+            super(DiverConfig, self.of_sensor(sensor)).require_changeable(of_other)
+
     def of_sensor(self, sensor: str) -> DiverConfig:
         """These parameters with those of a sensor in place."""
-        if sensor not in self.sensors:
-            return self
-        place = self.sensors.index(sensor)
         own = {
-            name: values[place]
-            for name in SENSOR_NUMBERS
-            if (values := getattr(self, f'sensor_{name}'))
+            name.rpartition('.')[2]: value
+            for name, value in self.own
+            if name.rpartition('.')[0] == sensor
         }
-        if sectors := self.sensor_coverage_sector:
-            own['coverage_sector'] = sectors[SECTOR * place : SECTOR * (place + 1)]
-        return evolve(self, **own)
+        return evolve(self, **own) if own else self
 
     @property
     def pairing(self) -> str:

@@ -84,12 +84,14 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
 
 def test_each_sensor_has_its_own():
     tracker = DiverTracker(
-        DiverConfig(
-            association='jipda',
-            model_set='heading_speed',
-            directions=4,
-            sensors=('left', 'right'),
-            sensor_clutter_density=(0.0, 3e-5),
+        DiverConfig.from_mapping(
+            {
+                'association': 'jipda',
+                'model_set': 'heading_speed',
+                'directions': 4,
+                'sensors': ['left', 'right'],
+                'right.clutter_density': 3e-5,
+            }
         )
     )
     for item in scans(10, 4.0, 40.0):

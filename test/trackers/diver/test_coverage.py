@@ -189,9 +189,12 @@ def test_tables_are_read_between_their_points(tmp_path):
 
 
 def test_each_sensor_has_its_own():
-    config = DiverConfig(
-        sensors=('left', 'right'),
-        sensor_coverage_sector=(*AHEAD, 0.0, 0.0, 180.0, 90.0, 0.0, 50.0),
+    config = DiverConfig.from_mapping(
+        {
+            'sensors': ['left', 'right'],
+            'left.coverage_sector': AHEAD,
+            'right.coverage_sector': [0, 0, 180, 90, 0, 50],
+        }
     )
     found = coverage.stated(config)
     assert sorted(found) == ['left', 'right']
@@ -219,14 +222,14 @@ def test_two_divers_outside_are_not_taken_for_one():
         ({'coverage_sector': (0, 0, 0, 0, 0, 9)}, 'a width of 0 is not between 0 and 360'),
         ({'coverage_sector': (0, 0, 0, 90, 9, 9)}, 'a range from 9 to 9 holds nothing'),
         (
-            {'sensors': ('a', 'b'), 'sensor_coverage_sector': AHEAD},
-            'sensor_coverage_sector needs 6 values for each of the 2 sensors, got 6',
+            {'sensors': ['a', 'b'], 'b.coverage_sector': AHEAD[:5]},
+            'b.coverage_sector needs 6 values, got 5',
         ),
     ],
 )
 def test_sectors_that_are_none_are_refused(values, problem):
     with pytest.raises(ConfigError, match=problem):
-        DiverConfig(**values)
+        DiverConfig.from_mapping(values)
 
 
 @pytest.mark.parametrize(
