@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whose track is whose: three ways to pair fixes and divers on the same scans.
+"""Whose track is whose: two ways to pair fixes and divers on the same scans.
 
     python -m benchmarks.diver_identity --out docs/results/diver_identity.json
 
@@ -29,8 +29,7 @@ diver of that name in the last minute; `clutter` the density of false fixes that
 end, over the true one. CPU of a scan is that of this process. In `single` a diver is alone:
 `clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`. `cost` is
 of four divers 10 m apart, .7 m on each axis, and two false fixes in a square of 160 m. `recorded`
-are the boats of `real_recordings`. `hypotheses` repeats `buddies` with other numbers of
-hypotheses and `model_set: heading_speed`.
+are the boats of `real_recordings`.
 """
 
 from __future__ import annotations
@@ -53,10 +52,9 @@ from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
-ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
+ASSOCIATIONS = ('gnn', 'jipda')
 SCENES = ('buddies', 'crossing', 'harbour')
 ALONE = ('clean', 'usbl', 'usbl, named', 'wild')
-COUNTS = (1, 10, 30)
 HOUR = 3600.0
 LEGS: dict[str, Any] = {
     'motion': 'legs',
@@ -116,9 +114,7 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
     for seed in range(runs):
         items, scene, stated, cutoff = scene_of(name, seed)
         density = stated['clutter_density']
-        tracker = DiverTracker(
-            DiverConfig.from_mapping(({} if nothing_stated else stated) | settings)
-        )
+        tracker = DiverTracker(DiverConfig(**({} if nothing_stated else stated) | settings))
         if not seed:
             tracker.warm()
             tracker.reset()
@@ -180,7 +176,7 @@ def recorded(sensor: str, association: str) -> dict[str, float]:
     return dict(zip(('GOSPA', 'missed', 'false', 'tracks', 'RMSE'), map(float, found)))
 
 
-def cost(association: str, minutes: int = 10, **settings: Any) -> dict[str, float]:
+def cost(association: str, minutes: int = 10) -> dict[str, float]:
     """What an hour of four divers in clutter costs, from the first minutes of it."""
     values = LEGS | {
         'divers': 4,
@@ -194,7 +190,7 @@ def cost(association: str, minutes: int = 10, **settings: Any) -> dict[str, floa
         'clutter_range': 80.0,
     }
     scene = simulate(scenario('table1', values), 3)
-    tracker, rows = DiverTracker(DiverConfig(association=association, **settings)), 0
+    tracker, rows = DiverTracker(DiverConfig(association=association)), 0
     tracker.warm()
     tracker.reset()
     begin = time.process_time()
@@ -210,7 +206,6 @@ def main(
     nothing_stated: int = 10,
     scenes: tuple[str, ...] = SCENES,
     associations: tuple[str, ...] = ASSOCIATIONS,
-    counts: tuple[int, ...] = COUNTS,
 ) -> Parts:
     yield {'runs': runs, 'untold_runs': nothing_stated}
     for name in scenes:
@@ -230,11 +225,6 @@ def main(
             yield {'recorded': {f'{sensor}, {association}': recorded(sensor, association)}}
     for association in associations:
         yield {'cost': {association: cost(association)}}
-    for count in counts[:-1]:
-        yield {'cost': {f'kbest, {count}': cost('kbest', hypotheses=count)}}
-    for count in counts:
-        settings: dict[str, Any] = {'hypotheses': count, 'model_set': 'heading_speed'}
-        yield {'hypotheses': {str(count): case('buddies', runs, association='kbest', **settings)}}
 
 
 if __name__ == '__main__':

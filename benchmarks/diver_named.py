@@ -20,9 +20,8 @@ Two divers swim legs at .75 m/s for 120 s (`simulate diver`). A sonar sees them 
 scan per second, .5 m on each axis, P_D .9, two false fixes in a square of 120 m. Transponders are
 heard in turn from the 20th second on, each every four seconds, good to 2 m. In `apart` they are
 30 m apart and both have a transponder; in `buddies` they swim the same way 2 m apart, and only the
-first has one. GOSPA (10 m, 2) counts confirmed tracks. `named_tracks: alone` is what a named track
-that takes only its own fixes does. The scenes and the tracker were not tuned on this; the scans
-before two tracks are one follow from P_D (`names.patience`).
+first has one. GOSPA (10 m, 2) counts confirmed tracks. The scenes and the tracker were not tuned
+on this; the scans before two tracks are one follow from P_D (`names.patience`).
 """
 
 from __future__ import annotations
@@ -114,13 +113,12 @@ def named_errors(made: Iterable[Estimate], truth: Iterable[TrueTrack]) -> list[f
     return error
 
 
-def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
+def run(scene: str, association: str, seed: int) -> dict[str, float]:
     """The scores of one run."""
     truth = truth_of(scene, seed)
     config = DiverConfig(
         model_set='heading_speed',
         association=association,
-        named_tracks=mode,
         detection_probability=P_DETECTION,
         clutter_density=FALSE / (2.0 * HALF) ** 2,
     )
@@ -141,9 +139,9 @@ def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
 
 def main(runs: int = 8) -> Parts:
     yield {'runs': runs}
-    for scene, association, mode in product(SCENES, ('gnn', 'jipda'), ('alone', 'share')):
-        scores = mean_of([run(scene, association, mode, seed) for seed in range(runs)])
-        yield {'rows': [{'scene': scene, 'association': association, 'named': mode} | scores]}
+    for scene, association in product(SCENES, ('gnn', 'jipda')):
+        scores = mean_of([run(scene, association, seed) for seed in range(runs)])
+        yield {'rows': [{'scene': scene, 'association': association} | scores]}
 
 
 if __name__ == '__main__':

@@ -73,10 +73,6 @@ THINNED = ('CV Kalman', 'steady alone (heading_speed)', 'brisk alone')
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
     'tow tag, fixes': ('fixes', TAG),
     'tow tag, fixes, covariances times 6': ('fixes', {**TAG, 'covariance_scale': 6.0}),
-    'tow tag, fixes, covariance scale learnt': (
-        'fixes',
-        {**TAG, 'estimate_covariance_scale': True},
-    ),
     'tow tag, arrivals': ('arrivals', TAG),
     **{f'tow tag, {n} receivers a ping': (f'arrivals {n}', TAG) for n in RECEIVERS},
     'boats, radar, stamps -1.5 s': ('radar', {'fix_std': 4.0}),
@@ -193,7 +189,7 @@ def trackers(kind: str, stated: dict[str, Any]) -> Iterator[tuple[str, Callable[
     yield 'default', lambda: DiverTracker(DiverConfig(**stated))
     for name, values in SINGLE.items():
         yield name, partial(ours, values)
-    if kind == 'fixes' and 'estimate_covariance_scale' not in stated:
+    if kind == 'fixes':
         yield 'FilterPy, CV Kalman', lambda: Peer(stated.get('covariance_scale', 1.0))
     if kind in BOATS:
         yield 'plain CV Kalman', lambda: PlainKalman(0.3, stated['fix_std'], 3, 5)

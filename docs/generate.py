@@ -84,7 +84,6 @@ MATTER = {
         'covariance_scale': 'a warning says that fixes scatter more, or less, than they state',
         'target': 'not a diver: `rov`, `fish`, `boat` or `ship`',
         'dimensions': '3 when the depth is wanted, from fixes with z or from arrival times',
-        'association': 'divers who stay side by side, or carry transponders: `kbest`',
         'detection_probability': 'divers are seen in fewer, or more, scans than nine of ten',
         'clutter_density': 'false fixes per square metre and scan, when you know them',
         'coverage_sector': 'the sensor sees a sector only: who leaves it is not deleted',
@@ -202,7 +201,9 @@ def node_specs(system: System) -> tuple[ParameterSpec, ...]:
 
 def shared_specs() -> tuple[ParameterSpec, ...]:
     """Give the parameters that the live nodes of all systems have alike."""
-    first, *others = (node_specs(system) for system in SYSTEMS.values())
+    first, *others = (
+        (*type_specs(name), *node_config_type(system).specs()) for name, system in SYSTEMS.items()
+    )
     return tuple(spec for spec in first if all(spec in other for other in others))
 
 

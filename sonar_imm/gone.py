@@ -27,7 +27,11 @@ _BRIDGE = 'was removed: republish ~/odometry or ~/obstacles with a node of your 
 _WITH_ITS_SET = 'was removed together with its model set'
 _ROLL = 'was removed: use the elevation of the echoes, or let the vehicle roll'
 _OWN_SET = 'was removed: families contains constant velocity; docs/howto/own_model.md adds a set'
-_LEARNT = 'was removed: counts is the form that learns; benchmarks/diver_paper.py has the others'
+_CONSTANT = 'was removed: its default is a constant now'
+_OF_TARGET = (
+    'was removed: a preset has it (parameter target); a set of your own models may differ, see '
+    'docs/howto/own_model.md'
+)
 _RAW_FILE = 'was removed: convert the file to npz (kind snapshots) or to XTF'
 _LIVE_VIEW = (
     'was removed: view opens the report; show live topics with foxglove_bridge and '
@@ -51,7 +55,6 @@ GONE: dict[str, str] = {
             *('turn_rate_deg', 'baseline_stay_probability'),
         )
     },
-    'parameter adaptation_guard': 'was removed together with adaptation: paper',
     **{
         f'choice model_set {name}': _OWN_SET
         for name in (
@@ -59,8 +62,46 @@ GONE: dict[str, str] = {
             'heading_speed_lateral',
         )
     },
-    'choice adaptation paper': _LEARNT,
-    'choice adaptation ratio': _LEARNT,
+    **{
+        f'parameter {name}': _OF_TARGET
+        for name in (
+            *('hover', 'hover_enter', 'hover_stay', 'hover_noise', 'heading_concentration'),
+            *('lateral_noise', 'brisk_speed_noise', 'velocity_std', 'family_switch_rate'),
+            *('vertical_speed_std', 'vertical_speed_time'),
+        )
+    },
+    **{
+        f'parameter {name}': _CONSTANT
+        for name in (
+            *('adaptation', 'adaptation_prior', 'adaptation_guard', 'reference_step'),
+            *('longest_step', 'transceiver_lever_std', 'vessel_attitude_std_deg'),
+            *('vessel_max_gap', 'vessel_max_extrapolation', 'fix_bias_time', 'survival_time'),
+            *('confirm_hits', 'confirm_window', 'delete_misses', 'gate_probability'),
+            *('max_gap', 'restart_after'),
+        )
+    },
+    'parameter systematic_errors': (
+        'was removed: state how good instruments are; that they are exact says 1e-6 '
+        '(parameter sound_speed_std)'
+    ),
+    'parameter fixes_are_scans': 'was removed: set -1 where it was false (parameter scan_period)',
+    'parameter map_frame': 'was removed: the frame of the input is this one (parameter frame_id)',
+    'parameter least_covariance_scale': 'was removed: state the covariances as they are',
+    'parameter estimate_covariance_scale': (
+        'was removed: set the factor of the warning (parameter covariance_scale)'
+    ),
+    **{
+        f'parameter sensor_{name}': f'was removed: write <sensor>.{name} (parameter sensors)'
+        for name in (
+            *('fix_std', 'detection_probability', 'clutter_density'),
+            *('coverage_sector', 'coverage_file'),
+        )
+    },
+    'parameter hypotheses': 'was removed together with association: kbest',
+    'parameter named_tracks': 'was removed: a track with a name also takes fixes without one',
+    'choice association kbest': (
+        'was removed: jipda, the default, weighs all joint events of a scan exactly'
+    ),
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',
     **{
         f'parameter {name}': 'was removed: the printed form is in benchmarks/fathometer_paper.py'

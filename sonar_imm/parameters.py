@@ -23,7 +23,8 @@ A tracker is built from one frozen attrs class that derives from `Config`. Every
         speed: float = parameter(0.5, 'm/s', 'speed of the walker', range=(0.0, 10.0))
 
 A long description begins on the next line; `live` in place of `parameter` declares what a running
-node may change.
+node may change, `constant` what only code may set: it is checked like a parameter, but neither
+declared, documented nor read from YAML.
 
 Parameters that several classes share stand in a base of theirs, written with ``slots=False`` so
 that a class can have several such bases; `inherited` gives one of them another default.
@@ -71,7 +72,8 @@ class ConfigError(ValueError):
 @frozen
 class ParameterSpec:
     """What is known of one parameter. `kind` is one of KINDS; `low` and `high` are inclusive and
-    hold for every element of an array. group: entry-point group whose names are choices too."""
+    hold for every element of an array. group: entry-point group whose names are choices too.
+    constant: the field is no parameter."""
 
     name: str
     kind: str
@@ -83,6 +85,7 @@ class ParameterSpec:
     choices: tuple[str, ...] = ()
     read_only: bool = True
     group: str = ''
+    constant: bool = False
 
     def problem(self, value: Any) -> str | None:
         """Say what is wrong with `value`, or None when it is good."""
@@ -173,6 +176,7 @@ def parameter(
     choices: tuple[str, ...] = (),
     read_only: bool = True,
     group: str = '',
+    constant: bool = False,
 ) -> Any:
     """One field of a `Config`. The kind follows from the default; an empty list needs `kind`.
 
@@ -191,12 +195,15 @@ def parameter(
             choices=choices,
             read_only=read_only,
             group=group,
+            constant=constant,
         )
     )
 
 
 live = partial(parameter, read_only=False)
 """`parameter` of what a running node may change without losing its tracks."""
+constant = partial(parameter, constant=True)
+"""A field of a `Config` that is no parameter: tests and benchmarks may construct it."""
 
 
 def inherited(
@@ -205,7 +212,8 @@ def inherited(
     """The parameter `name` of `base` with another default, to be assigned to that name in a class
     that derives from `base`.
 
-    changes: what else differs, e.g. ``unit``. Raises KeyError when `base` has no such parameter.
+    changes: what else differs, e.g. ``unit``, or ``constant=True``. Raises KeyError when `base`
+    has no such parameter.
     """
     spec = attrs.fields_dict(base)[name].metadata[_KEY]
     if range is not None:
@@ -220,7 +228,9 @@ class Config:
 
     def __attrs_post_init__(self) -> None:
         problems = [
-            trouble for spec in self.specs() if (trouble := spec.problem(getattr(self, spec.name)))
+            trouble
+            for spec in self._fields()
+            if (trouble := spec.problem(getattr(self, spec.name)))
         ]
         if not problems:
             problems = list(self.check())
@@ -239,6 +249,22 @@ class Config:
     def specs(cls) -> tuple[ParameterSpec, ...]:
         """The parameters: those of the class itself, then those of each base, where an `inherited`
         one stays among its neighbours."""
+        return tuple(spec for spec in cls._fields() if not spec.constant)
+
+    @classmethod
+    def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
+        """`specs`, and what is declared because `values` are given: names with a dot, of what
+        another parameter names."""
+        return cls.specs()
+
+    @classmethod
+    def attributes(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The attributes of a config by parameters of `specs_with`."""
+        return dict(values)
+
+    @classmethod
+    def _fields(cls) -> tuple[ParameterSpec, ...]:
+        """The parameters and the constants."""
         fields = attrs.fields_dict(cls)
         declared = [
             field.name
@@ -260,7 +286,7 @@ class Config:
     ) -> C:
         """Build from untrusted keys. Raises `ConfigError` naming every unknown key (with a
         suggestion) and bad value."""
-        specs = {spec.name: spec for spec in cls.specs()}
+        specs = {spec.name: spec for spec in cls.specs_with(values)}
         unknown = [key for key in values if key not in specs]
         problems = [] if ignore_unknown else [unknown_parameter(key, specs) for key in unknown]
         known = {key: value for key, value in values.items() if key in specs}
@@ -269,13 +295,13 @@ class Config:
         ]
         if problems:
             raise ConfigError(*problems)
-        return cls(**known)
+        return cls(**cls.attributes(known))
 
     def require_changeable(self, other: Config) -> None:
         """Raise ValueError naming the parameters of `other` that differ and are read-only."""
         fixed = [
             spec.name
-            for spec in self.specs()
+            for spec in self._fields()
             if spec.read_only and getattr(other, spec.name) != getattr(self, spec.name)
         ]
         if fixed:
@@ -352,7 +378,7 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
         if isinstance(section, dict) and 'ros__parameters' in section
     }
     if not sections:
-        return {str(key): value for key, value in tree.items()}
+        return _flat(tree)
     values: dict[str, Any] = {}
     for key, section in sections.items():
         if not isinstance(section, (dict, type(None))):
@@ -360,7 +386,18 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
             raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
         name = str(key).strip('/').split('/')[-1]
         if key in ('/**', '/*') or not node_name or name == node_name:
-            values.update((str(entry), value) for entry, value in (section or {}).items())
+            values.update(_flat(section or {}))
+    return values
+
+
+def _flat(tree: Mapping[Any, Any], before: str = '') -> dict[str, Any]:
+    """Values by their names; those of a mapping stand behind its name and a dot, as in ROS."""
+    values: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            values.update(_flat(value, f'{before}{key}.'))
+        else:
+            values[f'{before}{key}'] = value
     return values
 
 

@@ -183,7 +183,7 @@ def test_names_in_a_bag_do_not_steer_the_terminal_nor_the_report(tmp_path, capsy
     monkeypatch.setattr(webbrowser, 'open', opened.append)
     monkeypatch.setenv('DISPLAY', ':0')
     assert main(['info', str(bag)]) == 0
-    assert main(['track', str(bag), str(run), '--set', f'map_frame={name}']) == 0
+    assert main(['track', str(bag), str(run), '--set', f'frame_id={name}']) == 0
     assert main(['export', str(run), str(tmp_path / 'tracks.csv')]) == 0
     assert main(['view', str(run)]) == 0
     assert main(['track', str(bag), str(run)]) == 2  # there is one

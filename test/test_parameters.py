@@ -25,7 +25,9 @@ import pytest
 from sonar_imm.parameters import (
     Config,
     ConfigError,
+    constant,
     did_you_mean,
+    inherited,
     KINDS,
     live,
     markdown_table,
@@ -235,6 +237,27 @@ def test_a_derived_class_keeps_the_parameters_of_its_base():
     assert Runner(pulse=90, speed=1.0).as_dict()['pulse'] == 90
 
 
+@attrs.frozen(kw_only=True)
+class Sleeper(Walker):
+    rest: float = constant(8.0, 'h', 'how long he sleeps', range=(0.0, 24.0))
+    steps: int = inherited(Walker, 'steps', 1, constant=True)
+
+
+def test_a_constant_is_checked_but_no_parameter():
+    names = [spec.name for spec in Sleeper.specs()]
+    assert names == [spec.name for spec in Walker.specs() if spec.name != 'steps']
+    sleeper = Sleeper(rest=7, steps=2)
+    assert (sleeper.rest, sleeper.steps) == (7.0, 2) and list(sleeper.as_dict()) == names
+    for name in ('rest', 'steps'):
+        with pytest.raises(ConfigError, match=f"unknown parameter '{name}'"):
+            Sleeper.from_mapping({name: 1})
+        assert Sleeper.from_mapping({name: 1}, ignore_unknown=True) == Sleeper()
+        with pytest.raises(ConfigError, match=f"'{name}' must be "):
+            Sleeper(**{name: -1})
+    with pytest.raises(ValueError, match='need a new tracker: rest'):
+        sleeper.require_changeable(Sleeper(steps=2))
+
+
 def test_plain_values_come_back():
     values = Walker(stops=(1, 2)).as_dict()
     assert values['stops'] == [1, 2] and values['weights'] == [0.25, 0.75]
@@ -364,9 +387,10 @@ def test_keys_that_are_no_text_are_named(form):
 
 def test_groups_of_parameters_are_named_not_guessed():
     nested = 'ship:\n  walker_node:\n    ros__parameters: {speed: 1.0}\n'
-    assert problems(**parameters_from_yaml(nested)) == ("unknown parameter 'ship'",)
+    (sentence,) = problems(**parameters_from_yaml(nested))
+    assert sentence == "unknown parameter 'ship.walker_node.ros__parameters.speed'"
     (sentence,) = problems(**parameters_from_yaml('speed: {mean: 1.0}'))
-    assert sentence == "parameter 'speed' must be a number, got {'mean': 1.0}"
+    assert sentence == "unknown parameter 'speed.mean' (did you mean 'speed'?)"
 
 
 @pytest.mark.parametrize('text', ['/**:\n  ros__parameters: 5\n', 'a:\n  ros__parameters: [1]\n'])

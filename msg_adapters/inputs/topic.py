@@ -57,7 +57,7 @@ class Labels:
         sensors = tuple(settings.get('sensors', ())) if 'sensors' in named_by else ()
         if not tags and not sensors:
             return None
-        return cls(frozenset(topic.split('/')), tags, sensors, settings.get('map_frame', 'map'))
+        return cls(frozenset(topic.split('/')), tags, sensors, settings.get('frame_id') or 'map')
 
     def __call__(self, measurement: Any) -> Any:
         """The measurement with what its topic and its frame say; what it says itself stays."""

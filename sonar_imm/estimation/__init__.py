@@ -32,7 +32,6 @@ __all__ = [
     'gauss_markov',
     'grid',
     'history',
-    'hypotheses',
     'imm',
     'imm_filter',
     'jipda',

@@ -68,11 +68,12 @@ class NodeParameters:
         self._node = node
         self._types = tuple(config_types)
         self._choices = {spec.name: spec for spec in choices}
+        given = {name: given.value for name, given in _overrides(node).items()}
         # Where two classes share a parameter, the first one, the tracker's, describes it.
         self._specs = {
             spec.name: spec
             for config_type in reversed(self._types)
-            for spec in config_type.specs()
+            for spec in config_type.specs_with(given)
         } | self._choices
         values = self._start_values()
         self._configs = self._build(values)

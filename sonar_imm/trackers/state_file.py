@@ -38,7 +38,7 @@ import struct
 from typing import Any
 import zipfile
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from .. import __version__, intake
@@ -239,7 +239,7 @@ def tracker_from(saved: Saved, system: System, config: Config) -> Tracker:
         raise StateError(f'it is of a {saved.system} tracker')
     kind = system.config_type()
     parameters = config.as_dict()
-    known = {spec.name: spec for spec in kind.specs()}
+    known = {spec.name: spec for spec in kind.specs_with(parameters)}
     if set(saved.parameters) != set(parameters):
         raise StateError('it was saved with other parameters')
     differ = [
@@ -250,7 +250,9 @@ def tracker_from(saved: Saved, system: System, config: Config) -> Tracker:
     if differ:
         raise StateError(f'it was saved with other parameters: {"; ".join(differ[:3])}')
     try:
-        then = kind.from_mapping(saved.parameters)
+        then = evolve(
+            config, **kind.attributes(saved.parameters)
+        )  # with the constants of `config`
     except ConfigError as error:
         raise StateError(f'it was saved with other parameters: {error}') from None
     # Odd numbers are refused, or lived with: numpy need not warn of them.

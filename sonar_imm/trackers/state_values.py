@@ -57,10 +57,9 @@ _SHAPES = {
     'Bodies': 'number:T std:T2',
     'Cells': 'key:C number:C height:C variance:C stamp_ns:C',
     'DiverState': 'x:TMn P:TMnn mu:TM learnt:TaLL nis:T nis_dof:T score:T white:T2 existence:T '
-    'evidence:T target_id:T near_to:T near_for:T refused:T6 refused_z:T3 spreads:T history:Tw '
-    'came_from:T looks:T scale:22 life.age:T',
+    'evidence:T target_id:T near_to:T near_for:T refused:T6 refused_z:T3 spreads:T looks:T '
+    'life.age:T',
     'Existence': 'log_odds:T pings:T held:T silence:T',
-    'Hypotheses': 'cluster:H log_weight:H shown:H member:HT',
     'Landmark': 'which:k x:kn P:knn mu:k place:3 covariance:33',
     'Looks': 'seen:T due:T missed:T silent:T shown.mu:TK',
     'Mixture': 'x:TKn P:TKnn mu:TK',

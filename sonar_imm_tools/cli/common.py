@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 import json
 from pathlib import Path
@@ -163,8 +163,17 @@ def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
     """Texts of ``--set`` in the types of the parameters. Others stay texts; Config refuses
     them."""
-    specs = {spec.name: spec for spec in config_type.specs()}
+    specs = specs_with(config_type, {}, overrides)
     return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
+
+
+def specs_with(
+    config_type: type[Config], values: Mapping[str, Any], overrides: Mapping[str, str]
+) -> dict[str, ParameterSpec]:
+    """The parameters by name where `values` of a file and texts of ``--set`` are given."""
+    plain = {spec.name: spec for spec in config_type.specs()}
+    typed = {name: _typed(text, plain.get(name)) for name, text in overrides.items()}
+    return {spec.name: spec for spec in config_type.specs_with({**values, **typed})}
 
 
 def _typed(text: str, spec: ParameterSpec | None) -> Any:
@@ -198,7 +207,8 @@ def load_config(
     tracker, node = system.config_type(), node_config_type(system)
     choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system, system.name, report=True) if params else {}
-    specs = {spec.name: spec for config in (tracker, node) for spec in config.specs()} | choices
+    specs = {spec.name: spec for spec in node.specs()} | specs_with(tracker, values, overrides)
+    specs |= choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
     unknown = [

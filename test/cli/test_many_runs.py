@@ -165,8 +165,8 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     assert contents(out) == first
     assert (out / 'b' / 'estimate.csv').stat().st_mtime_ns == times[out / 'b' / 'estimate.csv']
     # Another parameter, another recording, another version: refused, and by --overwrite made anew.
-    assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
-    assert 'b holds another run, which differs in parameters (gate_probability)' in (
+    assert track(*bags, out, '--set', 'detection_probability=0.8') == 1
+    assert 'b holds another run, which differs in parameters (detection_probability)' in (
         capsys.readouterr().err
     )
     run = json.loads((out / 'b' / 'run.json').read_text())
@@ -174,10 +174,10 @@ def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
     (out / 'b' / 'run.json').write_text(json.dumps(run))
     assert track(*bags, out) == 1
     assert 'b holds another run, which differs in versions (sonar_imm)' in capsys.readouterr().err
-    assert track(*bags, out, '--overwrite', '--set', 'gate_probability=0.9') == 0
+    assert track(*bags, out, '--overwrite', '--set', 'detection_probability=0.8') == 0
     capsys.readouterr()
     (bags[0] / 'notes.txt').write_text('one byte more')
-    assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
+    assert track(*bags, out, '--set', 'detection_probability=0.8') == 1
     output = capsys.readouterr()
     assert 'a holds another run, which differs in bag_bytes, bag_sha256' in output.err
     assert '3 runs in' in output.out and '2 kept, 1 failed' in output.out

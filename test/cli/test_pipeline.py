@@ -99,15 +99,16 @@ def test_evaluate_takes_truth_from_another_bag_and_says_when_that_has_none(call,
 def test_parameters_come_from_file_and_command(call, dive, tmp_path):
     params = tmp_path / 'diver.yaml'
     params.write_text(
-        '/**:\n  ros__parameters:\n    model_set: heading_speed\n    confirm_hits: 2\n'
-        '    use_sim_time: true\n'
+        '/**:\n  ros__parameters:\n    model_set: heading_speed\n    max_tracks: 2\n'
+        '    use_sim_time: true\n    radar: {fix_std: 2.0, clutter_density: 1.0e-4}\n'
     )
-    given = ('confirm_hits=1', 'acceleration_noise=0.1, 1.5', 'hover=false')
+    given = ('max_tracks=1', 'covariance_scales=1.0, 3', 'sensors=radar,b', 'radar.fix_std=4')
     words = [word for setting in given for word in ('--set', setting)]
     run = call('track', dive, tmp_path / 'out', '--params', params, *words)
     parameters = run['parameters']
-    assert parameters['model_set'] == 'heading_speed' and parameters['confirm_hits'] == 1
-    assert parameters['acceleration_noise'] == [0.1, 1.5] and parameters['hover'] is False
+    assert parameters['model_set'] == 'heading_speed' and parameters['max_tracks'] == 1
+    assert parameters['covariance_scales'] == [1.0, 3.0]
+    assert (parameters['radar.fix_std'], parameters['radar.clutter_density']) == (4.0, 1e-4)
 
 
 @pytest.mark.parametrize(

@@ -135,12 +135,10 @@ def test_a_file_beside_the_recording_is_used(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (bag / 'beam.csv').write_text(TABLE)
     (bag / 'other.csv').symlink_to('beam.csv')
-    own = state(
-        bag, 'coverage_file: beam.csv', 'sensors: [a, b]', 'sensor_coverage_file: ["", other.csv]'
-    )
+    own = state(bag, 'coverage_file: beam.csv', 'sensors: [a, b]', 'b: {coverage_file: other.csv}')
     tracker, _ = config_of(own)
     assert tracker.coverage_file == str(bag.resolve() / 'beam.csv')
-    assert tracker.sensor_coverage_file == ('', str(bag.resolve() / 'beam.csv'))
+    assert tracker.own == (('b.coverage_file', str(bag.resolve() / 'beam.csv')),)
     SYSTEMS['diver'].build(tracker)
 
 

@@ -108,7 +108,7 @@ def test_a_part_of_the_topic_is_a_name_and_a_part_of_that_is_none():
 
 
 def test_a_frame_is_a_name_and_then_the_frame_is_the_map():
-    named = label('/fix', fix('amy'), tags=['amy'], map_frame='odom')
+    named = label('/fix', fix('amy'), tags=['amy'], frame_id='odom')
     assert (named.target_id, named.frame_id) == (1, 'odom')
     other = label('/fix', fix('map'), tags=['amy'])
     assert (other.target_id, other.frame_id) == (NOBODY, 'map')

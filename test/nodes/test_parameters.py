@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from sonar_imm.gone import GONE
 from sonar_imm.node_config import NodeConfig
 from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 
@@ -113,6 +114,18 @@ def test_bad_start_values_are_explained(start, parameter, sentence):
 
 def test_all_mistakes_are_told_at_once(start):
     assert len(refusal(start, 'sound_speed:=1500', 'steps:=2.5', 'queue_depth:=1.0')) == 3
+
+
+def test_what_a_sensor_has_of_its_own_is_declared_where_it_is_given(make_bench):
+    given = 'sensors:=[radar, b]', 'radar.fix_std:=4.0'
+    bench = make_bench(*(word for p in given for word in ('-p', p)))
+    node = bench.add(DiverNode(context=bench.context))
+    assert node.tracker.config.of_sensor('radar').fix_std == 4.0
+    assert node.get_parameter('radar.fix_std').value == 4.0 and not node.has_parameter('b.fix_std')
+    assert node.set_parameters([Parameter('radar.fix_std', value=2.0)])[0].successful
+    assert node.tracker.config.of_sensor('radar').fix_std == 2.0
+    result = node.set_parameters([Parameter('radar.fix_std', value=-2.0)])[0]
+    assert not result.successful and 'radar.fix_std' in result.reason
 
 
 def test_misspelt_names_are_warned_of_with_a_suggestion(start, capfd):

@@ -55,7 +55,7 @@ def write_bag(path, records):
 
 def tracked(bag, folder, topics=None, **parameters):
     """run.json and the last estimate."""
-    config = DiverConfig(**parameters)
+    config = DiverConfig.from_mapping(parameters)
     with BagReader(bag) as reader:
         offline = OfflineRun(reader, SYSTEMS['diver'], config, InputOptions(topics=topics))
         run_folder = RunFolder(folder)
@@ -222,8 +222,7 @@ def test_sensors_by_topic_have_their_own_numbers(tmp_path):
         _, estimates = tracked(
             bag,
             tmp_path / f'run_{sensor}',
-            sensors=('radar', 'lidar'),
-            sensor_fix_std=(5.0, 0.5),
+            **{'sensors': ['radar', 'lidar'], 'radar.fix_std': 5.0, 'lidar.fix_std': 0.5},
         )
         spread[sensor] = estimates[-1].covariance[0, 0, 0]
     assert spread['radar'] > 4.0 * spread['lidar']

@@ -71,7 +71,7 @@ def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_a_bag_is_there_as_a_whole_or_not_at_all(tmp_path, fix_message, storage):
-    values = {'diver': {'gate_probability': 0.9}}
+    values = {'diver': {'detection_probability': 0.8}}
     with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / 'bag', storage=storage) as bag:
         bag.write('/fix', fix_message(0), 5)
         raise KeyboardInterrupt

@@ -138,7 +138,7 @@ def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
     [
         (('-p', 'sound_speed:=1500'), 'write 1500.0 instead of 1500'),
         (('-p', 'sound_speed:=15.0'), 'must be between 1300 and 1700'),
-        (('-p', 'confirm_hits:=9'), 'confirm_hits (9) cannot exceed confirm_window'),
+        (('-p', 'depth_min:=90.0'), 'depth_min (90) cannot exceed depth_max (20)'),
         (('-p', 'qos_overrides./fix.subscription.reliability:=often'), 'often'),
         (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
         (('--no-such-flag',), '--no-such-flag'),

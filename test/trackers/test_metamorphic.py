@@ -287,7 +287,7 @@ def note(system, how, moved, tolerance, given):
 # -- divers ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda'])
 @pytest.mark.parametrize('name', MOTIONS)
 def test_divers(name, association):
     motion = MOTIONS[name]

@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import re
-from typing import Any
+from typing import Any, cast
 
 from attrs import evolve, fields, frozen
 
 from ...acoustics.geodesy import Origin
-from ...parameters import inherited, live, MODELS, parameter
+from ...parameters import Config, constant, inherited, live, MODELS, parameter, ParameterSpec
 from ..model_checks import chain_problems
 from ..own_models import diver_models
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
@@ -77,12 +78,17 @@ of it. A boat is tracked no other way, and it costs a diver nothing."""
 
 ADAPTATIONS = ('counts', 'fixed')
 SYSTEMATIC = ('mixed', 'consider', 'estimate', 'exact')
-ASSOCIATIONS = ('gnn', 'jipda', 'kbest')
-NAMED_TRACKS = ('share', 'alone')
+ASSOCIATIONS = ('gnn', 'jipda')
 VESSELS = ('moving', 'fixed')
 RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
-SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density', 'coverage_file')
-"""Parameters that may differ from sensor to sensor, as `coverage_sector` may."""
+OF_SENSOR = (
+    'fix_std',
+    'detection_probability',
+    'clutter_density',
+    'coverage_sector',
+    'coverage_file',
+)
+"""Parameters that may differ from sensor to sensor."""
 
 CLUTTER = 1e-6
 """False fixes per square metre and scan where nobody says how many there are."""
@@ -95,8 +101,10 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 @frozen(kw_only=True)
 class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
-    """All parameters of the diver tracker. The defaults are the `families` of the
-    docs."""
+    """All parameters of the diver tracker. The defaults are the `families` of the docs.
+
+    own: values that sensors have of their own, by names as ``radar.fix_std``.
+    """
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
@@ -109,22 +117,22 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         choices=tuple(TARGETS))
     directions: int = parameter(16, '',
         'number of headings (heading_speed, families)', range=(4, 64))
-    hover: bool = parameter(True, '',
+    hover: bool = constant(True, '',
         'add a model for standing still (heading_speed, families)')
-    reference_step: float = parameter(1.0, 's',
+    reference_step: float = constant(1.0, 's',
         'time step for which the probabilities and noises of the models are stated; values for '
         'other steps are derived from them', range=(1e-3, 3600.0))
-    longest_step: float = parameter(2.0, 's',
+    longest_step: float = constant(2.0, 's',
         'longer gaps are crossed in steps of this length, so that the diver may turn within them',
         range=(1e-3, 3600.0))
     stay_probability: float = parameter(0.86, '',
         'probability of keeping the heading over a reference step', range=(0.0, 1.0))
-    heading_concentration: float = parameter(3.0, '',
+    heading_concentration: float = constant(3.0, '',
         'kappa: a turn by an angle a has a probability proportional to exp(kappa cos a); 0: all '
         'turns are alike', range=(0.0, 50.0))
-    hover_enter: float = parameter(0.02, '',
+    hover_enter: float = constant(0.02, '',
         'probability of stopping over a reference step', range=(0.0, 1.0))
-    hover_stay: float = parameter(0.9, '',
+    hover_stay: float = constant(0.9, '',
         'probability of staying stopped over a reference step', range=(0.0, 1.0))
     transition_matrix: tuple[float, ...] = parameter((), '',
         'whole transition matrix over a reference step, row-major, row = from; empty: built from '
@@ -132,19 +140,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
-    family_switch_rate: float = parameter(0.001, '1/s',
+    family_switch_rate: float = constant(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
         'families: factors by which copies of the filter multiply the covariances of all '
-        'measurements; with dimensions 3: one copy, times 1',
+        'measurements; those below 1 say where the diver is, but not how well that is known; with '
+        'dimensions 3: one copy, times 1',
         range=(0.01, 1e4), kind='float[]')
-    least_covariance_scale: float = parameter(1.0, '',
-        'families: copies with a lower scale say where the diver is, but not how well that is '
-        'known; lower it only where errors are known not to last', range=(0.01, 1.0))
-    adaptation: str = parameter('counts', '',
+    adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
         choices=ADAPTATIONS)
-    adaptation_prior: float = parameter(2.0, '',
+    adaptation_prior: float = constant(2.0, '',
         'adaptation counts: weight of the prior matrix, in transitions per row', range=(1e-3, 1e6))
 
     # -- how divers move -------------------------------------------------------------------------
@@ -153,19 +159,19 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     speed_std: float = parameter(0.4, 'm/s',
         'standard deviation of the speed of a new track around speed_mean (heading_speed, '
         'families)', range=(1e-3, 20.0))
-    velocity_std: float = parameter(0.7, 'm/s',
+    velocity_std: float = constant(0.7, 'm/s',
         'families: standard deviation on each axis of the velocity of a new track, around zero; '
         '2 at a fix of a diver', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
         'random walk of the speed over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
-    brisk_speed_noise: float = parameter(0.07, 'm/s',
+    brisk_speed_noise: float = constant(0.07, 'm/s',
         'families: random walk of the speed over a reference step in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
-    lateral_noise: float = parameter(0.24, 'm',
+    lateral_noise: float = constant(0.24, 'm',
         'random walk sideways over a reference step (heading_speed, families)',
         range=(0.0, 10.0))
-    hover_noise: float = parameter(0.05, 'm',
+    hover_noise: float = constant(0.05, 'm',
         'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
         'families: acceleration noise of lively_calm, lively_sharp and quiet over a reference '
@@ -177,9 +183,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         range=(1e-4, 1e5))
     covariance_scale: float = live(1.0, '',
         'factor by which measurement covariances are multiplied before use', range=(1e-4, 1e4))
-    estimate_covariance_scale: bool = parameter(False, '',
-        'estimate a further factor of the measurement covariances from the innovations, for '
-        'sensors whose stated covariances are optimistic')
     sound_speed: float = live(1500.0, 'm/s',
         'speed of sound with which arrival times become distances', range=(1300.0, 1700.0))
     toa_std: float = live(1e-3, 's',
@@ -188,14 +191,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'standard deviation of a bearing that comes without variance', range=(1e-3, 90.0))
     target_z: float = live(0.0, 'm',
         'z of the diver that is assumed when arrival times are used', range=(-12000.0, 12000.0))
-    fixes_are_scans: bool = live(True, '',
-        'fixes of one stamp are a whole scan, in which a diver without a fix was missed; false '
-        'for transponders polled in turn')
-
     scan_period: float = parameter(0.0, 's',
         'time in which a sensor that rotates or polls looks at everyone once: fixes without a '
-        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are',
-        range=(0.0, 3600.0))
+        'name between two multiples of it are one scan, at the middle; 0: those of one stamp are '
+        'a scan, in which a diver without a fix was missed; -1: fixes are no scans, of '
+        'transponders polled in turn', range=(-1.0, 3600.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
@@ -215,24 +215,27 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'least depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
     depth_max: float = parameter(20.0, 'm',
         'greatest depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
-    vertical_speed_std: float = parameter(0.1, 'm/s',
+    vertical_speed_std: float = constant(0.1, 'm/s',
         'standard deviation of the vertical speed (dimensions 3)', range=(1e-4, 10.0))
-    vertical_speed_time: float = parameter(10.0, 's',
+    vertical_speed_time: float = constant(10.0, 's',
         'time over which the vertical speed is correlated (dimensions 3)', range=(1e-2, 1e5))
 
     # -- systematic errors of instruments --------------------------------------------------------
     receiver_position_std: float = parameter(0.0, 'm',
         'standard deviation on each horizontal axis of the stated positions of receivers; a '
-        'receiver at the place of the transmitter has no such error', range=(0.0, 1e3))
+        'receiver at the place of the transmitter has no such error. Where this, '
+        'receiver_clock_std and sound_speed_std are 0, 0.3 m, 0.1 ms and 2 m/s are part of the '
+        'covariance of tracks from arrivals alone; exact instruments: 1e-6', range=(0.0, 1e3))
     receiver_clock_std: float = parameter(0.0, 's',
-        "standard deviation of the error of a receiver's clock", range=(0.0, 1.0))
+        "standard deviation of the error of a receiver's clock; 0: see receiver_position_std",
+        range=(0.0, 1.0))
     sound_speed_std: float = parameter(0.0, 'm/s',
-        'standard deviation of sound_speed', range=(0.0, 100.0))
+        'standard deviation of sound_speed; 0: see receiver_position_std', range=(0.0, 100.0))
     bearing_bias_std_deg: float = parameter(0.0, 'deg',
         'standard deviation of a lasting error of the bearings of a sensor (a heading or a mount '
         'that is off): of relative fixes, of bearings of arrivals, and of fixes of sensors whose '
         'place coverage_sector states', range=(0.0, 45.0))
-    systematic_errors: str = parameter('mixed', '',
+    systematic_errors: str = constant('mixed', '',
         'treatment of errors of receivers, clocks, sound speed and bearings: consider (in the '
         'covariance, never estimated), estimate, mixed (clocks and sound speed estimated, the '
         'rest considered) or exact (nothing is off); where none is stated, 0.3 m, 0.1 ms and 2 '
@@ -242,35 +245,32 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     fix_bias_std: float = parameter(0.0, 'm',
         'standard deviation on each axis of a lasting error of the fixes, on top of their '
         'covariance', range=(0.0, 1e4))
-    fix_bias_time: float = parameter(60.0, 's',
+    fix_bias_time: float = constant(60.0, 's',
         'time over which the lasting error of the fixes (fix_bias_std) is correlated',
         range=(1e-2, 1e6))
 
     # -- association -----------------------------------------------------------------------------
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         range=(0.0, 1e4),
-        description='number of false fixes expected in a scan, per square metre; 0: jipda and '
-        'kbest learn it from the fixes that are no track of theirs, else 1e-6')
+        description='number of false fixes expected in a scan, per square metre; 0: jipda '
+        'learns it from the fixes that belong to no track, gnn takes 1e-6')
     association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
-        'jipda (all pairings weighed, tracks confirmed by existence), kbest (the most probable '
-        'histories of pairings, for divers side by side) or auto (jipda with model_set families, '
-        'else gnn)',
+        'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
+        'model_set families, else gnn)',
         choices=('auto', *ASSOCIATIONS))
-    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
-        description='number of hits within confirm_window that confirm a track, with association '
-        'gnn and of raw arrivals')
-    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5,
-        description='number of consecutive scans without a hit that cover a confirmed target and '
-        'so end its track, with association gnn and of raw arrivals')
-    hypotheses: int = parameter(30, '',
-        'kbest: largest number of histories of pairings that are kept of divers near each other',
-        range=(1, 1000))
+    gate_probability: float = inherited(
+        DetectionParameters, 'gate_probability', 0.999, constant=True)
+    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
+    confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
+    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
+    max_gap: float = inherited(StreamParameters, 'max_gap', 3600.0, constant=True)
+    restart_after: int = inherited(StreamParameters, 'restart_after', 5, constant=True)
     birth_density: float = live(1.2e-5, '1/m^2',
-        'jipda and kbest: number of new divers expected in a scan, per square metre',
+        'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
-    survival_time: float = live(500.0, 's',
-        'jipda and kbest: time for which a diver is expected to stay', range=(1.0, 1e7))
+    survival_time: float = constant(500.0, 's',
+        'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 
     # -- what the sensor covers ------------------------------------------------------------------
     coverage_sector: tuple[float, ...] = live((), 'm, deg',
@@ -288,32 +288,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
         'that name, belongs to this diver and goes to his own track without association',
         kind='str[]')
-    named_tracks: str = parameter('share', '',
-        'what a track with a name does with fixes without one: share (it takes part in the '
-        'association, and a track never seen together with it is the same diver) or alone (it '
-        'takes only its own)', choices=NAMED_TRACKS)
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '
         'counted; 0: use them', range=(0.0, 3600.0))
 
     # -- sensors ---------------------------------------------------------------------------------
     sensors: tuple[str, ...] = parameter((), '',
-        'names of sensors with parameters of their own (sensor_...): they apply to what comes on '
-        '<name>/fix, <name>/fixes or <name>/relative, or in a frame of that name', kind='str[]')
-    sensor_fix_std: tuple[float, ...] = parameter((), 'm',
-        'fix_std of each of the sensors; empty: as fix_std', range=(1e-4, 1e5), kind='float[]')
-    sensor_detection_probability: tuple[float, ...] = parameter((), '',
-        'detection_probability of each of the sensors; empty: as detection_probability',
-        range=(0.01, 0.9999), kind='float[]')
-    sensor_coverage_sector: tuple[float, ...] = live((), 'm, deg',
-        'coverage_sector of each of the sensors, six numbers each; a width of 360 and a range '
-        'from 0 to 1e6 is everywhere; empty: as coverage_sector', kind='float[]')
-    sensor_coverage_file: tuple[str, ...] = parameter((), '',
-        "coverage_file of each of the sensors, '' for none; empty: as coverage_file",
+        'names of sensors, of which fix_std, detection_probability, clutter_density, '
+        'coverage_sector and coverage_file may be stated as <name>.fix_std and so on: they apply '
+        'to what comes on <name>/fix, <name>/fixes or <name>/relative, or in a frame of that name',
         kind='str[]')
-    sensor_clutter_density: tuple[float, ...] = parameter((), '1/m^2',
-        'clutter_density of each of the sensors; empty: as clutter_density', range=(0.0, 1e4),
-        kind='float[]')
+    own: tuple[tuple[str, Any], ...] = ()
 
     # -- latitude and longitude ------------------------------------------------------------------
     origin_latitude: float = parameter(0.0, 'deg',
@@ -325,8 +310,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     origin_height: float = parameter(0.0, 'm',
         'height of the origin of the frame of the tracks above the ellipsoid',
         range=(-12000.0, 12000.0))
-    map_frame: str = parameter('map', '',
-        'name of the frame of positions that come as latitude and longitude')
+    frame_id: str = parameter('', '',
+        'frame that the input must be in, and the frame of positions given in latitude and '
+        'longitude; empty: the frame of the first message accepted, and map')
 
     # -- relative to a transceiver ---------------------------------------------------------------
     vessel: str = parameter('moving', '',
@@ -336,7 +322,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     transceiver_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
         'vector from the reference of nav, or the antenna of nav_fix, to the transceiver: x '
         'forward, y port, z up', range=(-1e4, 1e4))
-    transceiver_lever_std: float = parameter(0.0, 'm',
+    transceiver_lever_std: float = constant(0.0, 'm',
         'standard deviation of transceiver_lever on each axis', range=(0.0, 100.0))
     transceiver_mount_rpy_deg: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg',
         'roll, pitch, yaw of the transceiver on the vessel (forward, port, up: pitch positive '
@@ -360,13 +346,13 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     magnetic_declination_deg: float = parameter(0.0, 'deg',
         'angle from true to magnetic north, positive east, for headings (input heading) and '
         'relative fixes levelled by a compass; 0: they are from true north', range=(-180.0, 180.0))
-    vessel_attitude_std_deg: float = live(0.5, 'deg',
+    vessel_attitude_std_deg: float = constant(0.5, 'deg',
         "standard deviation of the vessel's roll and pitch where its message states none",
         range=(0.0, 45.0))
-    vessel_max_gap: float = parameter(2.0, 's',
+    vessel_max_gap: float = constant(2.0, 's',
         'longest time between two poses of the vessel that is interpolated; relative fixes in a '
         'longer gap are left out and counted', range=(0.01, 600.0))
-    vessel_max_extrapolation: float = parameter(0.0, 's',
+    vessel_max_extrapolation: float = constant(0.0, 's',
         'time by which a relative fix may be newer than the newest pose of the vessel; later '
         'ones wait for the next pose', range=(0.0, 60.0))
     # fmt: on
@@ -399,7 +385,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         """These parameters with those of the kind of target where they are at their defaults."""
         if self.model_set != 'families':
             return self
-        defaults = {spec.name: spec.default for spec in self.specs()}
+        defaults = {field.name: field.default for field in fields(type(self))}
         own = {
             name: value
             for name, value in TARGETS[self.target].items()
@@ -416,28 +402,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
 
     def _sensor_problems(self) -> list[str]:
         problems = []
-        for name in SENSOR_NUMBERS:
-            given = getattr(self, f'sensor_{name}')
-            if len(given) not in (0, len(self.sensors)):
-                problems.append(
-                    f'sensor_{name} needs one value for each of the {len(self.sensors)} sensors, '
-                    f'got {len(given)}'
-                )
-        places = 'coverage_sector', 'sensor_coverage_sector'
-        for name, count in zip(places, (1, len(self.sensors))):
-            sectors = getattr(self, name)
-            if len(sectors) not in (0, SECTOR * count):
-                each = f' for each of the {count} sensors' if name != places[0] else ''
-                problems.append(f'{name} needs {SECTOR} values{each}, got {len(sectors)}')
+        for name, sector in [('coverage_sector', self.coverage_sector), *self.own]:
+            if not name.endswith('coverage_sector') or not sector:
                 continue
-            for first in range(0, len(sectors), SECTOR):
-                width, least, greatest = sectors[first + 3 : first + SECTOR]
-                if not 0.0 < width <= 360.0:
-                    problems.append(f'{name}: a width of {width:g} is not between 0 and 360')
-                if not 0.0 <= least < greatest:
-                    problems.append(
-                        f'{name}: a range from {least:g} to {greatest:g} holds nothing'
-                    )
+            if len(sector) != SECTOR:
+                problems.append(f'{name} needs {SECTOR} values, got {len(sector)}')
+                continue
+            width, least, greatest = sector[3:]
+            if not 0.0 < width <= 360.0:
+                problems.append(f'{name}: a width of {width:g} is not between 0 and 360')
+            if not 0.0 <= least < greatest:
+                problems.append(f'{name}: a range from {least:g} to {greatest:g} holds nothing')
         for name in ('tags', 'sensors'):
             if bad := [word for word in getattr(self, name) if not _WORD.fullmatch(word)]:
                 problems.append(
@@ -445,25 +420,63 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                 )
         return problems
 
+    @property
+    def fixes_are_scans(self) -> bool:
+        """Whether a diver without a fix among those of a stamp was missed."""
+        return self.scan_period >= 0.0
+
+    @property
+    def map_frame(self) -> str:
+        """The frame of positions that come as latitude and longitude."""
+        return self.frame_id or 'map'
+
     def origin(self) -> Origin | None:
         """The origin that is stated, None for none."""
         if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
             return None
         return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
+    @classmethod
+    def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
+        """`specs`, and those of `OF_SENSOR` that `values` state of one of its `sensors`."""
+        found = {spec.name: spec for spec in cls.specs()}
+        sensors = values.get('sensors', ())
+        names = [
+            f'{sensor}.{name}'
+            for sensor in (sensors if isinstance(sensors, (list, tuple)) else ())
+            for name in OF_SENSOR
+        ]
+        own = [
+            evolve(found[name.rpartition('.')[2]], name=name) for name in names if name in values
+        ]
+        return (*found.values(), *own)
+
+    @classmethod
+    def attributes(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        own = {spec.name: spec for spec in cls.specs_with(values) if '.' in spec.name}
+        plain = {name: value for name, value in values.items() if name not in own}
+        return plain | {
+            'own': tuple((name, spec.convert(values[name])) for name, spec in own.items())
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        stated = {name: list(v) if isinstance(v, tuple) else v for name, v in self.own}
+        return super().as_dict() | stated
+
+    def require_changeable(self, other: Config) -> None:
+        super().require_changeable(other)
+        for sensor in self.sensors:
+            of_other = cast(DiverConfig, other).of_sensor(sensor)
+            super(DiverConfig, self.of_sensor(sensor)).require_changeable(of_other)
+
     def of_sensor(self, sensor: str) -> DiverConfig:
         """These parameters with those of a sensor in place."""
-        if sensor not in self.sensors:
-            return self
-        place = self.sensors.index(sensor)
         own = {
-            name: values[place]
-            for name in SENSOR_NUMBERS
-            if (values := getattr(self, f'sensor_{name}'))
+            name.rpartition('.')[2]: value
+            for name, value in self.own
+            if name.rpartition('.')[0] == sensor
         }
-        if sectors := self.sensor_coverage_sector:
-            own['coverage_sector'] = sectors[SECTOR * place : SECTOR * (place + 1)]
-        return evolve(self, **own)
+        return evolve(self, **own) if own else self
 
     @property
     def pairing(self) -> str:

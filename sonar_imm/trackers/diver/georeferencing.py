@@ -146,7 +146,7 @@ class Georeferencer:
     def georeference(self, measurement: Measurement) -> list[Measurement]:
         """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
         ready = self._placed(measurement)
-        return [self._gathered(item) for item in ready] if self.config.scan_period else ready
+        return [self._gathered(item) for item in ready] if self.config.scan_period > 0.0 else ready
 
     def _gathered(self, item: Measurement) -> Measurement:
         """A fix without a name at the stamp of its scan, in the middle of its period: that is the

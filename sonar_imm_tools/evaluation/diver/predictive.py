@@ -46,13 +46,8 @@ from ..tuning import Scores, Tunable
 
 
 def for_tuning(config: DiverConfig) -> DiverConfig:
-    """One copy: the scale is what is fitted. One density of false fixes, that it can be too; and a
-    single history, which `Scored` can follow."""
-    association = 'gnn' if config.pairing == 'kbest' else config.pairing
-    density = config.usual_clutter
-    return evolve(
-        config, covariance_scales=(1.0,), clutter_density=density, association=association
-    )
+    """One copy: the scale is what is fitted. One density of false fixes, that it can be too."""
+    return evolve(config, covariance_scales=(1.0,), clutter_density=config.usual_clutter)
 
 
 def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
@@ -71,18 +66,11 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             found.append(
                 Tunable(name='acceleration_noise', start=value, place=place, whole=tuple(noise))
             )
-        found.append(_of(config, 'velocity_std', usual=False))
     else:
         found.append(Tunable(name='stay_probability', start=config.stay_probability, kind='logit'))
         found.append(_of(config, 'speed_mean', std=0.7))
         found.append(_of(config, 'speed_std', std=0.7, usual=False))
         found.append(_of(config, 'speed_noise', usual=False))
-        found.append(_of(config, 'lateral_noise', std=1.0, usual=False))
-        for name in ('hover_enter', 'hover_stay'):
-            found.append(_of(config, name, kind='logit', usual=False))
-        if config.model_set == 'families':
-            found.append(_of(config, 'brisk_speed_noise', usual=False))
-            found.append(_of(config, 'family_switch_rate', usual=False))
     scans = any(isinstance(item, Fixes) and len(item) != 1 for item in measurements)
     found.append(_of(config, 'detection_probability', kind='logit', usual=scans))
     found.append(Tunable(name='clutter_density', start=config.usual_clutter, usual=scans))

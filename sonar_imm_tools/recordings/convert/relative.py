@@ -121,7 +121,7 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
             how.truth, report, how.truth_options, how.frame_id, origin if geodetic else None
         )
     known: dict[str, Any] = dict(origin_parameters(origin if geodetic else None))
-    known |= {'relative_axes': 'enu' if levelled else 'flu', 'map_frame': how.frame_id}
+    known |= {'relative_axes': 'enu' if levelled else 'flu', 'frame_id': how.frame_id}
     if tags:
         known['tags'] = list(dict.fromkeys(tags.values()))
     write_bag(

@@ -66,13 +66,8 @@ VARIANTS = {
             'tags': ['a'],
             'max_tracks': 4,
         },
-        {
-            'dimensions': 3,
-            'association': 'jipda',
-            'estimate_covariance_scale': True,
-            'max_tracks': 4,
-        },
-        {'association': 'kbest', 'model_set': 'heading_speed', 'tags': ['a'], 'max_tracks': 4},
+        {'dimensions': 3, 'association': 'jipda', 'max_tracks': 4},
+        {'association': 'jipda', 'model_set': 'heading_speed', 'tags': ['a'], 'max_tracks': 4},
     ),
     'fathometer': (
         {'particles': 40, 'order_max': 3, 'phones': 0, 'record_seconds': 0.2},

@@ -14,6 +14,7 @@
 
 """Tables of positions relative to a vessel, with its pose, and of range and bearing."""
 
+from attrs import evolve
 import numpy as np
 import pymap3d
 import pytest
@@ -55,7 +56,7 @@ def measured(report):
 
 def tracked(report):
     """The last estimate of the tracker, with what the recording says of its instruments."""
-    tracker = DiverTracker(DiverConfig.from_mapping(known(report) | EXACT))
+    tracker = DiverTracker(evolve(DiverConfig.from_mapping(known(report)), **EXACT))
     made = [item for measurement in measured(report) for item in tracker.process(measurement)]
     assert not tracker.counts['vessel_pose_gap']
     return made[-1]

@@ -24,8 +24,6 @@ from sonar_imm.trackers.diver.clutter import Clutter, LEAST, MOST
 from sonar_imm.trackers.diver.config import CLUTTER
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
-NEVER_NONE = ('jipda', 'kbest')
-
 
 def scans(count, false, half, seed=11, divers=((0.0, 0.0), (0.0, 2.0)), aspect=1.0):
     """Divers who swim along x, seen with .9 to .5 m, and false fixes in a rectangle."""
@@ -53,28 +51,26 @@ def learnt(items, **settings):
     return found.density, made
 
 
-@pytest.mark.parametrize('association', NEVER_NONE)
 @pytest.mark.parametrize(
     'false, half, aspect', [(2.0, 60.0, 1.0), (12.0, 80.0, 0.4), (5.0, 400.0, 1.0)]
 )
-def test_the_density_is_found(association, false, half, aspect):
+def test_the_density_is_found(false, half, aspect):
     items = scans(60, false, half, aspect=aspect)
-    density, made = learnt(items, association=association)
+    density, made = learnt(items, association='jipda')
     truth = max(false / (4.0 * half**2 * aspect), CLUTTER)
     assert 0.6 * truth < density < 1.6 * truth
     assert (made[-1].extras['track_state'] > 0).sum() == 2
 
 
-@pytest.mark.parametrize('association', NEVER_NONE)
-def test_divers_are_no_clutter(association):
-    density, made = learnt(scans(20, 0.0, 1.0), association=association)
+def test_divers_are_no_clutter():
+    density, made = learnt(scans(20, 0.0, 1.0), association='jipda')
     assert LEAST <= density < CLUTTER
     assert all((each.extras['track_state'] > 0).sum() == 2 for each in made[5:])
 
 
 def test_what_is_stated_stays_and_gnn_learns_nothing():
     items = scans(20, 4.0, 40.0)
-    config = DiverConfig(model_set='heading_speed', association='kbest', clutter_density=1e-4)
+    config = DiverConfig(model_set='heading_speed', association='jipda', clutter_density=1e-4)
     tracker = DiverTracker(config)
     for item in items:
         tracker.process(item)
@@ -88,12 +84,14 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
 
 def test_each_sensor_has_its_own():
     tracker = DiverTracker(
-        DiverConfig(
-            association='jipda',
-            model_set='heading_speed',
-            directions=4,
-            sensors=('left', 'right'),
-            sensor_clutter_density=(0.0, 3e-5),
+        DiverConfig.from_mapping(
+            {
+                'association': 'jipda',
+                'model_set': 'heading_speed',
+                'directions': 4,
+                'sensors': ['left', 'right'],
+                'right.clutter_density': 3e-5,
+            }
         )
     )
     for item in scans(10, 4.0, 40.0):
@@ -140,7 +138,7 @@ def test_densities_are_bounded():
     [
         (6.0, 60.0, {}, True),
         (6.0, 60.0, {'clutter_density': 4e-4}, False),
-        (6.0, 60.0, {'association': 'kbest'}, False),
+        (6.0, 60.0, {'association': 'jipda'}, False),
         (0.1, 60.0, {}, False),
         (1.0, 900.0, {}, False),
     ],

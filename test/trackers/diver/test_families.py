@@ -222,21 +222,19 @@ def test_scale_of_the_stated_covariances(stated):
         assert 1.0 <= scale < 1.6 and 'times as far as they state' not in warned
 
 
-def test_scales_below_one_find_out_what_is_stated_too_large():
-    """They say where the diver is; how well that is known only where errors are known not to last:
-    those of a source that filters look the same."""
+def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known():
+    """Errors of a source that filters look as covariances do that are stated too large."""
     items, found = path(150, speed=0.9, std=0.3, scale=10.0), []
     truth = np.column_stack([0.9 * np.arange(60, 150), np.zeros(90)])
-    for least in (1.0, 0.1):
-        tracker = DiverTracker(config(least_covariance_scale=least))
+    for scales in ((0.15, 1.0, 3.0, 10.0), (0.1,)):
+        tracker = DiverTracker(config(covariance_scales=scales))
         made = run(tracker, items)[60:]
         off = np.array([e.state[0, :2] for e in made]) - truth
         nees = [d @ np.linalg.solve(e.covariance[0, :2, :2], d) for d, e in zip(off, made)]
         scale = np.mean([e.extras['covariance_scale'][0] for e in made])
         found.append((np.mean(nees), scale, np.square(off).sum()))
-    (cautious, one, error), (bold, small, same) = found
-    assert error == pytest.approx(same, rel=1e-2) and 1.0 <= one < 1.6 and 0.1 < small < 0.35
-    assert cautious < 0.6 * bold < 1.8
+    (cautious, scale, error), (bold, _, least) = found
+    assert error < 1.1 * least and 1.0 <= scale < 1.6 and cautious < 0.6 * bold
 
 
 def test_what_is_stated_and_how_far_the_copies_are_apart():
@@ -437,7 +435,7 @@ def boat(speed, dt, count, std, name=NOBODY):
 
 
 @pytest.mark.parametrize('name', [NOBODY, 7], ids=['no name', 'name'])
-@pytest.mark.parametrize('association', ['gnn', 'jipda', 'kbest'])
+@pytest.mark.parametrize('association', ['gnn', 'jipda'])
 @pytest.mark.parametrize(('speed', 'dt', 'std'), [(8.0, 1.0, 0.3), (12.0, 1.0, 1.0)])
 def test_what_is_faster_than_any_diver_is_tracked_from_its_third_fix(
     association, name, speed, dt, std

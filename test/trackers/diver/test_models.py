@@ -101,7 +101,7 @@ def test_headings_and_the_velocity_they_put_out():
     ('values', 'says'),
     [
         ({'model_set': 'heading_sped'}, 'did you mean'),
-        ({'confirm_hits': 6}, 'cannot exceed'),
+        ({'depth_min': 30.0}, 'cannot exceed'),
         ({'transition_matrix': (0.5, 0.5)}, '37 x 37'),
         ({'model_set': 'heading_speed', 'transition_matrix': (0.5, 0.5)}, '17 x 17'),
         ({**TWO, 'transition_matrix': (0.9, 0.2, 0.5, 0.5)}, 'row 0 .* 1.1'),

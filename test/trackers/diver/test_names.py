@@ -204,14 +204,19 @@ def test_a_tag_without_a_number_is_as_before():
 
 
 def test_sensors_have_numbers_of_their_own():
-    config = DiverConfig(
-        sensors=('radar', 'lidar'),
-        sensor_fix_std=(4.0, 0.5),
-        sensor_detection_probability=(0.5, 0.95),
-        sensor_clutter_density=(1e-3, 1e-7),
-    )
+    stated = {
+        'sensors': ['radar', 'lidar'],
+        'radar.fix_std': 4,
+        'lidar.fix_std': 0.5,
+        'radar.detection_probability': 0.5,
+        'radar.clutter_density': 1e-3,
+    }
+    config = DiverConfig.from_mapping(stated)
+    assert stated.items() <= config.as_dict().items()
+    assert DiverConfig.from_mapping(config.as_dict()) == config
     radar = config.of_sensor('radar')
     assert (radar.fix_std, radar.detection_probability, radar.clutter_density) == (4.0, 0.5, 1e-3)
+    assert config.of_sensor('lidar').detection_probability == config.detection_probability
     assert config.of_sensor('') is config
     spread = {}
     for sensor in ('radar', 'lidar', ''):
@@ -224,10 +229,12 @@ def test_sensors_have_numbers_of_their_own():
 
 
 def test_the_detection_probability_of_a_sensor_decides_how_soon_existence_fades():
-    config = DiverConfig(
-        association='jipda',
-        sensors=('weak', 'strong'),
-        sensor_detection_probability=(0.2, 0.95),
+    config = DiverConfig.from_mapping(
+        {
+            'sensors': ['weak', 'strong'],
+            'weak.detection_probability': 0.2,
+            'strong.detection_probability': 0.95,
+        }
     )
     existence = {}
     for sensor in config.sensors:
@@ -243,12 +250,24 @@ def test_the_detection_probability_of_a_sensor_decides_how_soon_existence_fades(
 @pytest.mark.parametrize(
     'values, words',
     [
-        ({'sensors': ('a',), 'sensor_fix_std': (1.0, 2.0)}, 'one value for each of the 1 sensors'),
-        ({'sensor_fix_std': (1.0,)}, 'one value for each of the 0 sensors'),
+        ({'sensors': ['a'], 'a.fix_std': -1.0}, "'a.fix_std' must be between"),
+        ({'sensors': ['a'], 'b.fix_std': 1.0}, "unknown parameter 'b.fix_std'"),
+        ({'sensors': ['a'], 'a.max_tracks': 1}, "unknown parameter 'a.max_tracks'"),
+        ({'sensors': 5, 'a.fix_std': 1.0}, "'sensors' must be a list"),
         ({'tags': ('a/b',)}, "'a/b' cannot be part of a topic"),
         ({'transceiver_lever': (1.0,)}, 'needs three values'),
     ],
 )
 def test_lists_that_do_not_fit_are_named(values, words):
     with pytest.raises(ValueError, match=words.replace('(', r'\(')):
-        DiverConfig(**values)
+        DiverConfig.from_mapping(values)
+
+
+def test_what_a_sensor_has_of_its_own_changes_as_what_all_have():
+    """`fix_std` may change while a tracker runs, `coverage_file` may not."""
+    config = {'sensors': ['a'], 'a.fix_std': 4.0}
+    tracker = DiverTracker(DiverConfig.from_mapping(config))
+    tracker.reconfigure(DiverConfig.from_mapping({**config, 'a.fix_std': 2.0}))
+    assert tracker.config.of_sensor('a').fix_std == 2.0
+    with pytest.raises(ValueError, match='coverage_file'):
+        tracker.reconfigure(DiverConfig.from_mapping({**config, 'a.coverage_file': 'x.csv'}))

@@ -207,7 +207,7 @@ def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
     exact = DiverConfig(systematic_errors='exact')
     assert found.widened(mean, nothing, exact) is nothing
     with pytest.raises(ConfigError, match='receiver_clock_std'):
-        DiverConfig.from_mapping({'systematic_errors': 'exact', 'receiver_clock_std': 1e-4})
+        DiverConfig(systematic_errors='exact', receiver_clock_std=1e-4)
     for name in offsets.STDS:
         assert found.widened(mean, nothing, DiverConfig(**{name: 1e-6})) is nothing
 

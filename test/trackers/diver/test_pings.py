@@ -212,7 +212,7 @@ def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
         for item in models.new_tracks((origin + at)[None, :2] + 1e-4, std**2 * np.eye(2)[None])
     )
     after = PingUpdate(*before, np.ones(len(numbers.row)), 0.0, 0)
-    taking = taking_of(before, after, numbers, config, layout, 1.0)
+    taking = taking_of(before, after, numbers, config, layout)
     assert taking.dof == len(numbers.row)
     assert 0.0 <= taking.nis <= taking.dof
 

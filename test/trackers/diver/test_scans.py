@@ -28,7 +28,7 @@ from sonar_imm.trackers.diver import fix_kernels, jipda
 from sonar_imm.trackers.diver import tracker as tracker_module
 from sonar_imm.trackers.diver.scan import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, ROWS, SCALE_MEMORY
+from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, ROWS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -212,21 +212,12 @@ def test_named_fixes_make_a_track_each_though_they_cross_and_come_in_turn():
 
 
 @pytest.mark.parametrize('association', ASSOCIATIONS)
-def test_a_named_track_alone_is_not_missed_by_scans_and_takes_no_other_fix(association):
-    tracker = DiverTracker(DiverConfig(association=association, named_tracks='alone'))
+def test_a_named_track_goes_on_while_another_name_is_heard(association):
+    tracker = DiverTracker(DiverConfig(association=association))
     for second in range(1, 6):
         tracker.process(scan(second, (0.0, 0.0), ids=[9]))
-    for second in range(6, 25):
-        (estimate,) = tracker.process(scan(second, (0.1, 0.0)))
-    named = estimate.extras['target_id'] == 9
-    assert named.sum() == 1 and len(estimate) == 2
-    assert estimate.extras['nis_dof'][named].tolist() == [0]
-    alone = DiverTracker(DiverConfig(association=association))
-    for second in range(1, 6):
-        alone.process(scan(second, (0.0, 0.0), ids=[9]))
-    row = alone.process(scan(24, (50.0, 0.0), ids=[5]))[0]
-    own = row.extras['target_id'] == 9
-    assert own.sum() == 1
+    (estimate,) = tracker.process(scan(24, (50.0, 0.0), ids=[5]))
+    assert (estimate.extras['target_id'] == 9).sum() == 1
 
 
 def test_a_named_track_ends_after_max_coast():
@@ -294,15 +285,6 @@ def test_tracks_whose_numbers_are_not_finite_end_and_are_counted(monkeypatch):
     assert 2 not in ids_of(estimate) and tracker.health()['broken_tracks'] == 1
 
 
-def test_the_learnt_scale_is_that_of_the_last_fixes():
-    tracker = DiverTracker(DiverConfig(estimate_covariance_scale=True, history=0.0))
-    for second in range(1, int(SCALE_MEMORY)):
-        tracker.process(scan(second, (0.0, 0.0)))
-    total, count = tracker._stream.state.scale[0]
-    assert count == SCALE_MEMORY and 0.0 < total < count
-    assert not tracker._stream.state.scale[1].any()  # of arrivals nothing is known
-
-
 def ping(second):
     """The echoes of a diver at (20, 30, -2) at four receivers."""
     rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -324,12 +306,10 @@ def ping(second):
 @pytest.mark.parametrize('association', ASSOCIATIONS)
 def test_a_scan_changes_nothing_of_the_state_before_it(association):
     """States are values: those in the history are what a late measurement is replayed from."""
-    tracker = DiverTracker(
-        DiverConfig(association=association, estimate_covariance_scale=True, target_z=-2.0)
-    )
+    tracker = DiverTracker(DiverConfig(association=association, target_z=-2.0))
     for second in range(1, 10):
         before = tracker._stream.state
-        kept = {name: np.copy(getattr(before, name)) for name in (*ROWS, 'scale')}
+        kept = {name: np.copy(getattr(before, name)) for name in ROWS}
         seen = scan(second, (20.0, 30.0), (30.0, 5.0 + second), ids=[NOBODY, 7])
         tracker.process(ping(second) if second % 3 == 0 else seen)
         assert tracker._stream.state is not before

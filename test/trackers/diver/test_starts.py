@@ -56,7 +56,7 @@ def run(measurements, **options):
     [
         {},
         {'association': 'jipda'},
-        {'association': 'kbest'},
+        {'association': 'gnn'},
         {'dimensions': 3},
         {'max_tracks': 1},
     ],
