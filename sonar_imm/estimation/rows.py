@@ -33,6 +33,7 @@ No array in a table is ever written again: tables of earlier scans share them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 from attrs import evolve, field, frozen
@@ -51,7 +52,7 @@ ROW_LOST, ROW_AGAIN = 1e-4, 1e-3
 again."""
 
 
-@frozen(eq=False)
+@frozen(eq=False, slots=False)
 class Rows:
     """N rows of M models each, of T targets, each of which has at least one.
 
@@ -72,12 +73,12 @@ class Rows:
     def __len__(self) -> int:
         return len(self.mu)
 
-    @property
+    @cached_property
     def first(self) -> IndexArray:
         """(T,) the first row of each target."""
-        return np.flatnonzero(np.diff(self.target, prepend=-1))
+        return _first(self.target)
 
-    @property
+    @cached_property
     def weight(self) -> FloatArray:
         """(N,) the weights of the rows of each target; they sum to one."""
         return self.weights_of(np.ones(len(self), np.bool_))
@@ -184,12 +185,19 @@ class Rows:
         return evolve(self, **changes)
 
 
+def _first(target: IntArray) -> IndexArray:
+    """Return where each target begins, of targets (A,) in rising order."""
+    changes = np.ones(len(target), np.bool_)
+    np.not_equal(target[1:], target[:-1], out=changes[1:])
+    return changes.nonzero()[0]
+
+
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
     """Return ln sum exp (T, ...) of what belongs to each target: log (A, ...), target (A,) in
     rising order, each of T there."""
     if not len(log):
         return np.empty((0, *log.shape[1:]))
-    first = np.flatnonzero(np.diff(target, prepend=-1))
+    first = _first(target)
     top = np.maximum.reduceat(log, first)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):

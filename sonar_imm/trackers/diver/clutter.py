@@ -150,7 +150,7 @@ def without_first_fixes(known: Known, scan: Scan) -> Known:
         return known
     life, before = known.life, scan.before.life
     firm = life.track_id[(life.status != TENTATIVE) & (known['target_id'] == NOBODY)]
-    new = len(np.setdiff1d(firm, before.track_id[before.status != TENTATIVE]))
+    new = len(set(firm.tolist()) - set(before.track_id[before.status != TENTATIVE].tolist()))
     if not new:
         return known
     after = own[sensor]._replace(false=max(own[sensor].false - new, 0.0))

@@ -48,7 +48,7 @@ from ...estimation.bank import Innovations
 from ...estimation.rows import Borrowed, log_sum, revived, ROW_AGAIN, Rows, thinned, LEAST_LOG
 from ...measurements import NOBODY
 from .innovations import FixConsistency, watch
-from .known import Feature, Known, outputs, repaired
+from .known import Feature, Known, of_rows, repaired
 from .models import ModelSet
 from .scan import Group
 
@@ -463,7 +463,7 @@ def _watched(known: Known, group: Group, found: Association, models: ModelSet) -
         return known
     fix = found.fix[tracks]
     seen = tuple(part.seen for part in models.parts)
-    mean, covariance = outputs(known.rows, seen, stated_weight(known.rows))
+    mean, covariance = known.rows.combine(*of_rows(known.rows, seen), stated_weight(known.rows))
     scale = scale_of(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]

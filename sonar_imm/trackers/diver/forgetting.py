@@ -165,6 +165,8 @@ def judge(
     if not looked.any():
         return Judged(status, alive, known['near_to'], known['near_for'])
     nameless = [group for group in groups if group.target_id is None]
+    if len(known) < 2:
+        return Judged(status, alive, np.zeros(len(known), np.int64), np.zeros(len(known), np.int64))
     near_to, near_for = coalescence(known, was, *places(known, models), nameless)
     before = np.where(near_to == known['near_to'], known['near_for'], 0)
     near_for = np.where(looked, near_for, before)

@@ -157,17 +157,19 @@ class Known:
         return np.bincount(self.rows.target[~good], minlength=len(self)) == 0
 
 
-def outputs(
-    rows: Rows, maps: tuple[FloatArray, ...], weight: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, q) and covariance (T, q, q) of outputs of the motion, `maps` (q, n', m) of
-    each block; weight (N,): of the rows, their own if not given."""
+def of_rows(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (N, q) and covariance (N, q, q) of outputs of the motion under each row, `maps`
+    (q, n', m) of each block."""
     blocks = [
         Gaussians(block.x[:, : E.shape[1]], block.P[:, : E.shape[1], : E.shape[1]])
         for block, E in zip(rows.blocks, maps)
     ]
-    mean, covariance = bank.combine(blocks, rows.mu, maps)
-    return rows.combine(mean, covariance, rows.weight if weight is None else weight)
+    return bank.combine(blocks, rows.mu, maps)
+
+
+def outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, q) and covariance (T, q, q) of outputs of the motion, as in `of_rows`."""
+    return rows.combine(*of_rows(rows, maps), rows.weight)
 
 
 def places(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
@@ -180,7 +182,7 @@ def repaired(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]
     changes no other (`estimation.covariance`)."""
     found, count = [], 0
     for block in blocks:
-        P = np.moveaxis(block.P, 0, 2)
+        P = block.P.transpose(1, 2, 0, 3)
         bad = ~are_sound(P)
         if bad.any():
             covariance = block.P.copy()
