@@ -42,7 +42,7 @@ Source: docs/diver.md, 'Families'.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 import math
 from typing import NamedTuple
 
@@ -89,13 +89,22 @@ class Gaussians(NamedTuple):
         return Gaussians(self.x[chosen], self.P[chosen])
 
 
-class Moves(NamedTuple):
+@frozen(eq=False, slots=False)
+class Moves:
     """One step of a block, x <- F x + B + N(0, Q): F, Q (n, n, m), B (n, m). Components of the
     state behind the first n are constants."""
 
     F: FloatArray
     Q: FloatArray
     B: FloatArray
+
+    @cached_property
+    def changing(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
+        """The components that F changes, and those of which each is then made."""
+        n = len(self.B)
+        rows = [tuple(k for k in range(n) if self.F[i, k].any()) for i in range(n)]
+        still = [(self.F[i, i] == 1.0).all() for i in range(n)]
+        return tuple((i, row) for i, row in enumerate(rows) if row != (i,) or not still[i])
 
 
 @frozen(eq=False)
@@ -350,22 +359,15 @@ def predict(block: Gaussians, moves: Moves) -> Gaussians:
     Most entries of F are 0 or on the diagonal, so that only the others cost anything. What stands
     behind the components of `moves` is constant.
     """
-    n = len(moves.B)
-    entries = [
-        (i, k)
-        for i in range(n)
-        for k in range(n)
-        if (i != k and moves.F[i, k].any()) or (i == k and (moves.F[i, i] != 1.0).any())
-    ]
+    n, F, changing = len(moves.B), moves.F, moves.changing
     x, left = block.x.copy(), block.P.copy()
-    changed = {i for i, _ in entries}
-    for i in changed:
-        x[:, i] = sum(moves.F[i, k] * block.x[:, k] for k in range(n) if moves.F[i, k].any())
-        left[:, i] = sum(moves.F[i, k] * block.P[:, k] for k in range(n) if moves.F[i, k].any())
+    for i, row in changing:
+        x[:, i] = sum(F[i, k] * block.x[:, k] for k in row)
+        left[:, i] = sum(F[i, k] * block.P[:, k] for k in row)
     x[:, :n] += moves.B
     P = left.copy()
-    for j in changed:
-        P[:, :, j] = sum(moves.F[j, k] * left[:, :, k] for k in range(n) if moves.F[j, k].any())
+    for j, row in changing:
+        P[:, :, j] = sum(F[j, k] * left[:, :, k] for k in row)
     P[:, :n, :n] += moves.Q
     return Gaussians(x, P)
 

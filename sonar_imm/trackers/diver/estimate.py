@@ -39,7 +39,8 @@ def estimate_of(
     # Of tracks whose hits are counted the existence is NaN.
     known = known.only(~(known['existence'] <= PUBLISHES))
     mean, covariance = published(known, models)
-    covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
+    if known.memory['recent'].pairs:
+        covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]

@@ -50,6 +50,7 @@ from ...measurements import NOBODY
 from .innovations import FixConsistency, watch
 from .known import Feature, Known, of_rows, repaired
 from .models import ModelSet
+from .offsets import RecentPairs
 from .scan import Group
 
 FEATURES = {
@@ -476,4 +477,5 @@ def _watched(known: Known, group: Group, found: Association, models: ModelSet) -
     columns['white'][tracks] = white
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
-    return known.put(**columns).remember(fixes=after)
+    # Where fixes say where divers are, nothing is assumed of the instruments.
+    return known.put(**columns).remember(fixes=after, recent=RecentPairs())

@@ -145,7 +145,7 @@ class RecentPairs(NamedTuple):
 class Offsets(NamedTuple):
     """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
     = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
-    square and freedom: of all t, and how many there were; recent: the pairs of the last pings."""
+    square and freedom: of all t, and how many there were."""
 
     pairs: tuple[tuple[int, int], ...] = ()
     score: FloatArray = np.zeros(CAUSES)
