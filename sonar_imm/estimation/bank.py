@@ -384,8 +384,8 @@ POSITION: Measured = ((X,), (Y,))
 class Innovations(NamedTuple):
     """What p pairs of a row and a measurement of two values say of each of m models.
 
-    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log (p,
-    m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
+    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log
+    (p, m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
     """
 
     v: FloatArray

@@ -256,9 +256,7 @@ def thinned(
     return evolve(rows.take(left), parent=rows.parent[left]), new, left
 
 
-def revived(
-    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
-) -> tuple[Rows, Borrowed]:
+def revived(rows: Rows, borrowed: Borrowed, name: str, again: BoolArray) -> tuple[Rows, Borrowed]:
     """Return rows and list after assumptions `again` (B,) got a row, a copy of their lender."""
     if not again.any():
         return rows, borrowed

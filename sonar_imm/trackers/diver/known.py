@@ -16,8 +16,8 @@
 
 `Known` is one immutable value. A track is a weighted set of rows (`estimation.rows`): a row is one
 interacting multiple model filter under one assumption, a scale of the covariances of measurements
-or a depth at which the track began. What a stage of the tracker notes of each track is a *feature*,
-what it remembers of no track stands in the *memory*; this module knows neither by name.
+or a depth at which the track began. What a stage of the tracker notes of each track is a
+*feature*, what it remembers of no track stands in the *memory*; this module knows neither by name.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MOST_STEPS = 300
 
 
 class Feature(NamedTuple):
-    """What is noted of each track: the value of a track that begins, the shape of one, its type."""
+    """What is noted of each track: the value for one that begins, its shape and its type."""
 
     birth: Any
     shape: tuple[int, ...] = ()
@@ -75,7 +75,7 @@ class Known:
         none = np.empty((0, models.copies, len(models.names), size))
         empty = np.empty((*none.shape, size))
         rows = models.rows(none, empty, none[..., 0], none[..., 0, 0])
-        columns = {
+        columns: dict[str, np.ndarray] = {
             name: np.empty((0, *feature.shape), feature.kind) for name, feature in features.items()
         }
         return cls(0, life, rows, Borrowed.none(), columns, {}, {})
@@ -122,8 +122,7 @@ class Known:
         count = len(life) - len(self)
         rows = self.rows.append(evolve(new, target=new.target + len(self)))
         features = {
-            name: with_rows(column, count, columns[name])
-            for name, column in self.features.items()
+            name: with_rows(column, count, columns[name]) for name, column in self.features.items()
         }
         return evolve(self, life=life, rows=rows, features=features)
 

@@ -14,8 +14,8 @@
 
 """Tracks whose name is known, and what to do when a diver is also seen without one.
 
-A named track takes its part of the fixes that have no name, so that a diver with a transponder on a
-sonar is one track. A second track can stand beside it all the same:
+A named track takes its part of the fixes that have no name, so that a diver with a transponder on
+a sonar is one track. A second track can stand beside it all the same:
 the sonar may have seen the diver before the transponder was heard. Two divers that swim together
 are seen together, now and then at least; a single diver never is. So a nameless track that stays
 beside a named one, for so many scans that two divers would have been seen together once but for a
@@ -51,7 +51,8 @@ MISTAKEN = 1e-3
 
 
 def patience(detection_probability: float) -> int:
-    """Return the scans after which a track never seen together with the one beside it is the same diver."""
+    """Return after how many scans a track never seen together with the one beside it is the same
+    diver."""
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
@@ -122,8 +123,8 @@ def merged(known: Known, scan: Scan, models: ModelSet) -> Known:
 
 
 def _prefer(known: Known, row: int, other: int) -> bool:
-    """Return whether of two tracks of one diver the first goes on: confirmed before tentative, then
-    older."""
+    """Return whether of two tracks of one diver the first goes on: confirmed before tentative,
+    then older."""
     tentative = known.life.status == TrackStatus.TENTATIVE
     if tentative[row] != tentative[other]:
         return bool(tentative[other])
@@ -140,5 +141,6 @@ def near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
 
 
 def squared(apart: FloatArray, S: FloatArray) -> FloatArray:
-    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2, 2)."""
+    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2,
+    2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

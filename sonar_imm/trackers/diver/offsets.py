@@ -47,8 +47,8 @@ from ...acoustics.arrivals_3d import arrival_paths
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
-from .scan import Ping
 from .instruments import AT_TRANSMITTER
+from .scan import Ping
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...estimation.association import Tracks
+from ...estimation.bank import Gaussians
 from ...estimation.consistency import NisMemory
 from ...estimation.rows import Borrowed, Rows
-from ...estimation.bank import Gaussians
 from ...intake.stream import REPLAY_TYPES
 from ...measurements import (
     Arrivals,
@@ -49,6 +49,16 @@ STATE_TYPES = (
     *(Arrivals, Fix, Fixes, Start),
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
-    *(Known, Rows, Borrowed, Gaussians, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments),
+    *(
+        Known,
+        Rows,
+        Borrowed,
+        Gaussians,
+        Tracks,
+        NisMemory,
+        FixConsistency,
+        HeightCounts,
+        Instruments,
+    ),
     *(Offsets, RecentPairs, clutter.Clutter),
 )

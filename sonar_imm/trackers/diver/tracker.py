@@ -27,9 +27,9 @@ The measurements of a stamp, a `Scan`, go through stages, each a function of wha
             -> learn -> forget -> begin
 
 The stages are put together once, from the parameters. What is known after a scan is one immutable
-value, `Known`, so that a late measurement is put in its place by computing the scans after it again
-(`intake.stream`). Positions that are not metres in the frame of the tracks are brought into it
-first (`georeferencing`).
+value, `Known`, so that a late measurement is put in its place by computing the scans after it
+again (`intake.stream`). Positions that are not metres in the frame of the tracks are brought into
+it first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -59,7 +59,7 @@ from .georeferencing import Georeferencer
 from .innovations import FixConsistency
 from .instruments import Instruments, Layout
 from .known import crossed, Feature, Known
-from .models import build_models
+from .models import build_models, ModelSet
 from .offsets import Offsets, RecentPairs
 from .scan import Group, Scan
 
@@ -285,7 +285,7 @@ def wanted(*stages: object) -> tuple:
 
 
 def turning(
-    models: object, layout: Callable[[Instruments], Layout], *, back: bool = False
+    models: ModelSet, layout: Callable[[Instruments], Layout], *, back: bool = False
 ) -> OfGroup:
     """Return the stage that turns the tracks as a sensor shows them whose bearings may all be off,
     or back."""
