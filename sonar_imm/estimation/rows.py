@@ -42,7 +42,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'revived', 'Rows', 'thinned']
+__all__ = ['Borrowed', 'log_sum', 'of_targets', 'revived', 'Rows', 'thinned']
 
 LEAST_LOG = -345.0
 """Logarithm of the weight, 1e-150, that a row keeps: it may become true later."""
@@ -190,6 +190,14 @@ def _first(target: IntArray) -> IndexArray:
     changes = np.ones(len(target), np.bool_)
     np.not_equal(target[1:], target[:-1], out=changes[1:])
     return changes.nonzero()[0]
+
+
+def of_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
+    """Return what a verb such as ``np.maximum`` makes of all that belongs to each target, (T,
+    ...): values (A, ...), target (A,) in rising order, each of T there."""
+    if not len(values):
+        return values
+    return np.asarray(verb.reduceat(values, _first(target)))
 
 
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:

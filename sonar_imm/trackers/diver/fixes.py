@@ -45,7 +45,16 @@ from ...estimation import bank, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
 from ...estimation.bank import Innovations
-from ...estimation.rows import Borrowed, LEAST_LOG, log_sum, revived, ROW_AGAIN, Rows, thinned
+from ...estimation.rows import (
+    Borrowed,
+    LEAST_LOG,
+    log_sum,
+    of_targets,
+    revived,
+    ROW_AGAIN,
+    Rows,
+    thinned,
+)
 from ...measurements import NOBODY
 from .innovations import FixConsistency, watch
 from .known import Feature, Known, of_rows, repaired
@@ -66,7 +75,7 @@ track explained the last ten scans or so, a log-likelihood ratio; white: whitene
 last fix; existence: probability that there is a diver, NaN where hits are counted instead;
 evidence: sum of the probabilities of its detections."""
 
-FAR = 100.0
+FAR = 80.0
 """Normalised distance squared along an axis, from what every model expects, beyond which a density
 is nothing but small: what counts is which one is nearer."""
 
@@ -173,9 +182,11 @@ def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs
     among = Assumptions.of(rows, known.borrowed)
     expected = [bank.expected(b, part.measured) for b, part in zip(rows.blocks, models.parts)]
     off = _off(expected, among, z, R)
-    near = off <= 1.0
+    # All rows of a track see what one of them may: else one would stay where it is for ever.
+    near = of_targets(np.logical_or, off <= 1.0, among.target)
     if group.target_id is not None:
-        near = (known['target_id'][:, None] == group.target_id)[among.target]
+        near = known['target_id'][:, None] == group.target_id
+    near = near[among.target]
     assumption, fix = np.nonzero(near)
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)

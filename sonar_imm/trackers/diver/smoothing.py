@@ -83,8 +83,9 @@ class _Smoothed(NamedTuple):
 
 
 def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
-    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and
-    the transitions (K, M, M) into each step; of all models together what they weigh at the end."""
+    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M)
+    and the transitions (K, M, M) into each step; of all models together what they weigh at the
+    end."""
     filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)
     if len(blocks) == 1:
         return np.broadcast_to(filtered[-1], filtered.shape)
