@@ -47,8 +47,9 @@ from ...acoustics.arrivals_3d import arrival_paths
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
-from .scan import Ping
 from .instruments import AT_TRANSMITTER
+from .known import Known
+from .scan import Group, Ping
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""
@@ -303,6 +304,14 @@ def watched(
             echoes[echo[members[off[members].argmin()]]] = True
         found = found.after(seen, echoes, ids, place, config)
     return found, recent
+
+
+def forget_heard(known: Known, group: Group) -> Known:
+    """Assume nothing of instruments where a fix says where a diver is. A stage of the tracker."""
+    assert group.found is not None
+    if not known.memory['recent'].pairs or not group.found.hit.any():
+        return known
+    return known.remember(recent=RecentPairs())
 
 
 def widened(

@@ -53,14 +53,24 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from ..protocol import WarmStep
-from . import births, clutter, coverage, depth, estimate, fixes, forgetting, names, restart
+from . import (
+    births,
+    clutter,
+    coverage,
+    depth,
+    estimate,
+    fixes,
+    forgetting,
+    names,
+    offsets,
+    restart,
+)
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .innovations import FixConsistency
 from .instruments import Instruments, Layout
 from .known import crossed, Feature, Known
 from .models import build_models
-from .offsets import Offsets, RecentPairs
 from .scan import Group, Scan
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
@@ -119,6 +129,7 @@ class DiverTracker:
             models.families and restart.restarting(models, self._chain, layouts, associate),
             fixes.updating(models, lambda known: layouts(known).estimated(models)),
             config.dimensions == 3 and depth.updating(models, layouts, config),
+            offsets.forget_heard,
             clutter.count,
             covered and coverage.missing(models, lambda known: bool(layouts(known).mask.all())),
             turn and turning(models, layout, back=True),
@@ -152,8 +163,8 @@ class DiverTracker:
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
-            offsets=Offsets(),
-            recent=RecentPairs(),
+            offsets=offsets.Offsets(),
+            recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=(),
             last_named={},
