@@ -479,10 +479,11 @@ def update(
     none = np.where(alive, missed[rows, None] / scale, 1.0)
     shift, after = _conditioned(block, pairs, row, measured, estimated)
     mean = np.add.reduceat(share[:, None] * shift, first)
-    spread = after + shift[:, :, None] * shift[:, None]
-    P = none[:, None, None] * block.P[rows]
+    # About the new mean: what a sharp measurement leaves is lost beside the square of a shift.
+    apart = shift - mean[at]
+    spread = after + apart[:, :, None] * apart[:, None]
+    P = none[:, None, None] * (block.P[rows] + mean[:, :, None] * mean[:, None])
     P += np.add.reduceat(share[:, None, None] * spread, first)
-    P -= mean[:, :, None] * mean[:, None]
     x1, P1 = block.x.copy(), block.P.copy()
     x1[rows] += mean
     P1[rows] = 0.5 * (P + np.swapaxes(P, 1, 2))

@@ -24,9 +24,21 @@ from oracles.adaptation import (
 import pytest
 
 from sonar_imm.estimation import markov
-from sonar_imm.estimation.adaptation import AdaptiveChain, counts_transition, learn_counts
+from sonar_imm.estimation.adaptation import AdaptiveChain
 
 PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
+
+
+class Constant:
+    """A chain with the same matrix at every step."""
+
+    step = 1.0
+
+    def __init__(self, matrix):
+        self.matrix = matrix
+
+    def transition(self, dt):
+        return self.matrix
 
 
 def simplex(rng, *shape):
@@ -35,7 +47,7 @@ def simplex(rng, *shape):
 
 def test_counts_at_a_constant_step_are_the_dirichlet_posterior_mean():
     rng = np.random.default_rng(1)
-    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'counts', weight=3.0)
+    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=3.0)
     learnt, counts, P = chain.fresh(1), np.zeros((3, 3)), PRIOR
     for _ in range(20):
         before, after = simplex(rng, 1), simplex(rng, 1)
@@ -52,7 +64,7 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
     true one though not one transition was seen over that step."""
     rng = np.random.default_rng(2)
     truth = markov.RateChain([[0.6, 0.3, 0.1], [0.1, 0.8, 0.1], [0.05, 0.35, 0.6]], 1.0)
-    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'counts', weight=2.0)
+    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=2.0)
     learnt, model = chain.fresh(1), 0
     for dt in rng.uniform(0.4, 0.9, 20_000):
         after = rng.choice(3, p=truth.transition(dt)[model])
@@ -66,7 +78,7 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
 
 
 def test_fixed_learns_nothing():
-    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'fixed')
+    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), learns=False)
     learnt = chain.learn(
         chain.fresh(4), PRIOR[None], np.ones((4, 3)) / 3, np.ones((4, 3)) / 3, 1.0
     )
@@ -75,9 +87,7 @@ def test_fixed_learns_nothing():
 
 def test_impossible_transitions_stay_impossible():
     prior = np.array([[0.9, 0.1, 0.0], [0.0, 0.9, 0.1], [0.1, 0.0, 0.9]])
-    chain = AdaptiveChain(markov.RateChain(np.eye(3), 1.0), 'counts')
-    chain.chain.matrix = prior
-    chain.chain.transition = lambda dt: prior
+    chain = AdaptiveChain(Constant(prior))
     rng = np.random.default_rng(3)
     learnt = chain.fresh(2)
     for _ in range(10):
@@ -95,28 +105,32 @@ def test_the_posterior_of_transitions_has_the_right_margins():
     np.testing.assert_allclose(posterior.sum(axis=1), after, atol=1e-14)
 
 
-def test_an_unknown_form_is_named():
-    with pytest.raises(ValueError, match='sticky'):
-        AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'sticky')
-
-
 @pytest.mark.parametrize('shared', [False, True])
-@pytest.mark.parametrize('M', [3, 8, 17])
-def test_the_kernels_of_counts_are_the_plain_forms(M, shared):
+@pytest.mark.parametrize('M, families', [(3, 1), (8, 1), (17, 1), (6, 3), (17, 4)])
+def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):
+    """Of the transitions inside of families; the others stay, and the sums over families."""
     rng = np.random.default_rng(M)
     nominal = rng.dirichlet(np.ones(M), M)
-    prior = rng.dirichlet(np.ones(M), M)
-    prior[0, 1] = nominal[0, 1] = 0.0
-    learnt = rng.uniform(0.0, 3.0, (5, 2, M, M))
-    learnt[:, :, 0, 1] = 0.0
-    want = corrected(nominal, counts_correction(learnt[:, 0], learnt[:, 1], prior, 2.0))
-    transition = counts_transition(nominal, learnt, prior, 2.0)
-    np.testing.assert_allclose(transition, want, rtol=1e-13)
+    nominal[0, 1] = 0.0
+    nominal /= nominal.sum(axis=1, keepdims=True)
+    family = np.arange(M) % families
+    chain = AdaptiveChain(Constant(nominal), weight=2.0, family=family)
+    inside = family[:, None] == family[None]
+    learnt = chain.fresh(5)
+    learnt += rng.uniform(0.0, 3.0, learnt.shape) * (nominal[inside] > 0.0)
+    whole = np.zeros((5, 2, M, M))
+    whole[:, :, inside] = learnt
+    factor = counts_correction(whole[:, 0], whole[:, 1], nominal, 2.0)
+    own = np.where(inside, nominal, 0.0)
+    kept = own.sum(axis=1, keepdims=True)
+    want = np.where(inside, corrected(own / kept, factor) * kept, nominal)
+    transition = chain.transition(learnt, 1.0)
+    np.testing.assert_allclose(transition, want, rtol=1e-12)
     transition = transition[:1] if shared else transition
     before, after = rng.dirichlet(np.ones(M), (2, 5))
     hit = np.array([0, 3])
-    found = learn_counts(learnt, hit, transition, before, after, nominal)
+    found = chain.learn(learnt, transition, before, after, 1.0, hit)
     posterior = transition_posterior(transition, before, after)
-    want = np.stack(adapt_counts(learnt[:, 0], learnt[:, 1], posterior, nominal), axis=1)
-    np.testing.assert_allclose(found[hit], want[hit], rtol=1e-13)
+    want = np.stack(adapt_counts(whole[:, 0], whole[:, 1], posterior, nominal), axis=1)
+    np.testing.assert_allclose(found[hit], want[hit][:, :, inside], rtol=1e-12)
     np.testing.assert_array_equal(found[[1, 2, 4]], learnt[[1, 2, 4]])

@@ -261,7 +261,8 @@ def test_a_run_of_scaled_filters_is_that_of_the_prototype():
     for k in range(1, len(RUN['t'])):
         dt = RUN['t'][k] - RUN['t'][k - 1]
         F, Q, B = (np.moveaxis(part, 0, -1) for part in models.motion(dt))
-        rows = rows.spread(float(RUN['share']))
+        share = float(RUN['share'])
+        rows = rows.replace(logw=np.log((1.0 - share) * rows.weight + share / len(scales)))
         blocks, c = verbs.mix(BANK, rows.blocks, rows.mu, expm(generator * dt)[None])
         blocks = [
             verbs.predict(blocks[0], Moves(F[:3, :3, :A], Q[:3, :3, :A], B[:3, :A])),
@@ -281,86 +282,14 @@ def test_a_run_of_scaled_filters_is_that_of_the_prototype():
         mu = c * np.concatenate([weight for _, weight in updated], axis=1)
         total = mu.sum(axis=1)
         rows = rows.replace(
-            blocks=tuple(block for block, _ in updated), mu=mu / total[:, None]
-        ).reweighed(np.log(total))[0]
-        mean, covariance = rows.combine(*verbs.combine(rows.blocks, rows.mu, outputs))
+            blocks=tuple(block for block, _ in updated),
+            mu=mu / total[:, None],
+            logw=rows.logw + np.log(total),
+        )
+        means = verbs.combine(rows.blocks, rows.mu, outputs)
+        mean, covariance = rows.combine(*means, rows.weight)
         # The prototype rounds its steps to a microsecond.
         np.testing.assert_allclose(mean[0], RUN['out_x'][k], atol=1e-5)
         np.testing.assert_allclose(covariance[0], RUN['out_P'][k], atol=1e-5)
         np.testing.assert_allclose(rows.weight, RUN['out_scale_probability'][k], atol=1e-5)
         np.testing.assert_allclose(whole[0], RUN['out_log_likelihood'][k], atol=1e-5)
-
-
-def table(seed=0):
-    """Rows of three targets, two, one and three of them."""
-    rng = np.random.default_rng(seed)
-    x, P, mu, *_ = one_block(seed, N=6)
-    target = np.array([0, 0, 1, 2, 2, 2])
-    logw = rng.normal(size=6)
-    rows = Rows((model_last(x, P),), mu, logw, target, np.full(6, -1), {'scale': np.arange(6.0)})
-    return rows.pruned(0.0)
-
-
-def test_weights_of_the_rows_of_a_target_sum_to_one():
-    rows = table()
-    np.testing.assert_allclose(np.add.reduceat(rows.weight, rows.first), 1.0)
-    after, total = rows.reweighed(np.log([0.1, 0.2, 0.5, 1.0, 2.0, 4.0]))
-    np.testing.assert_allclose(np.add.reduceat(after.weight, after.first), 1.0)
-    np.testing.assert_allclose(total[1], np.log(0.5))
-    np.testing.assert_allclose(np.exp(total[0]), rows.weight[:2] @ [0.1, 0.2], rtol=1e-12)
-
-
-def test_a_target_that_no_row_explains_keeps_its_weights():
-    rows = table()
-    after, total = rows.reweighed(np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0]))
-    assert total[0] == -np.inf
-    np.testing.assert_allclose(after.weight, rows.weight)
-
-
-def test_the_heaviest_row_of_a_target_always_stays():
-    rows = table()
-    alone = rows.pruned(1.1)
-    assert alone.target.tolist() == [0, 1, 2]
-    np.testing.assert_allclose(alone.weight, 1.0)
-    heaviest = [
-        rows.logw[rows.target == t].argmax() + np.argmax(rows.target == t) for t in range(3)
-    ]
-    assert alone.parent.tolist() == heaviest
-    assert np.array_equal(alone.key['scale'], rows.key['scale'][heaviest])
-    assert len(rows.pruned(0.0, most=2)) == 5
-
-
-def test_targets_that_go_are_numbered_anew_with_their_rows():
-    rows = table()
-    left = rows.of_targets(np.array([False, True, True]))
-    assert left.target.tolist() == [0, 1, 1, 1] and left.parent.tolist() == [2, 3, 4, 5]
-    assert np.array_equal(left.blocks[0].x, rows.blocks[0].x[2:])
-
-
-def test_new_rows_stand_beside_those_of_their_target():
-    rows = table()
-    both = rows.append(rows.take(np.array([2, 5])))
-    assert both.target.tolist() == [0, 0, 1, 1, 2, 2, 2, 2]
-    assert both.parent.tolist() == [-1, -1, -1, -1, -1, -1, -1, -1]
-    assert np.array_equal(both.key['scale'], [0, 1, 2, 2, 3, 4, 5, 5])
-    with pytest.raises(ValueError, match='rows with .* do not fit'):
-        rows.append(rows.take(np.array([0])).replace(key={}))
-
-
-def test_the_mixture_of_rows_is_that_of_all_their_models():
-    rows = table()
-    outputs = [np.repeat(np.eye(2, 3)[..., None], 5, axis=2)]
-    mean, covariance = rows.combine(*verbs.combine(rows.blocks, rows.mu, outputs))
-    x, P = rows.blocks[0]
-    for target in range(3):
-        own = np.flatnonzero(rows.target == target)
-        weight = (rows.weight[own, None] * rows.mu[own]).ravel()
-        points = np.moveaxis(x[own, :2], 1, -1).reshape(-1, 2)
-        spread = np.moveaxis(P[own, :2, :2], -1, 1).reshape(-1, 2, 2)
-        due = weight @ points
-        d = points - due
-        np.testing.assert_allclose(mean[target], due)
-        np.testing.assert_allclose(
-            covariance[target], np.einsum('k,kab->ab', weight, spread + d[:, :, None] * d[:, None])
-        )
-    np.testing.assert_allclose(rows.models().sum(axis=1), 1.0)

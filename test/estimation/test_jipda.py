@@ -24,19 +24,14 @@ import numpy as np
 from oracles import jipda as oracle
 import pytest
 
-from sonar_imm.estimation import imm, jipda
+from sonar_imm.estimation import bank, jipda
+from sonar_imm.estimation.bank import Gaussians
 
 VECTORS = np.load(
     Path(__file__).parents[1] / 'vectors' / 'diver_sea' / 'association.npz', allow_pickle=False
 )
 CASES = ('jipda_2x2', 'jipda_3x3', 'jipda_1x2', 'jipda_2x0')
 FORMS = (oracle.associate, jipda.associate)
-EVERYWHERE = 1.0
-
-
-def inside(ratio):
-    """A NIS (T, D) that makes every pair with a likelihood possible."""
-    return np.where(ratio > 0.0, 0.0, np.inf)
 
 
 def brute_force(ratio, existence, pd):
@@ -67,7 +62,7 @@ def brute_force(ratio, existence, pd):
 @pytest.mark.parametrize('form', FORMS)
 def test_the_sums_over_events_are_those_of_the_prototype(case, form):
     ratio, existence, pd = (VECTORS[f'{case}/{name}'] for name in ('ratio', 'existence', 'pd'))
-    beta, missed, after = form(ratio, inside(ratio), existence, pd, EVERYWHERE)
+    beta, missed, after = form(ratio, ratio > 0.0, existence, pd)
     np.testing.assert_allclose(beta, VECTORS[f'{case}/out_beta'], rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(missed, VECTORS[f'{case}/out_missed_exists'], rtol=1e-10)
     np.testing.assert_allclose(after, VECTORS[f'{case}/out_existence'], rtol=1e-10)
@@ -89,14 +84,14 @@ def test_both_forms_agree_with_brute_force_over_existence_and_pairings(seed):
     existence, pd = rng.uniform(0.01, 0.999, T), rng.uniform(0.1, 0.99, T)
     beta, exists = brute_force(ratio, existence, pd)
     for form in FORMS:
-        ours = form(ratio, inside(ratio), existence, pd, EVERYWHERE)
+        ours = form(ratio, ratio > 0.0, existence, pd)
         np.testing.assert_allclose(ours[0], beta, rtol=1e-9, atol=1e-14)
         np.testing.assert_allclose(ours[2], exists, rtol=1e-9)
 
 
 def test_one_track_in_a_scan_with_nothing_is_the_bayes_rule_of_a_miss():
     none = np.empty((1, 0))
-    _, _, after = jipda.associate(none, none, np.array([0.5]), np.array([0.7]), 9.0)
+    _, _, after = jipda.associate(none, none > 0.0, np.array([0.5]), np.array([0.7]))
     np.testing.assert_allclose(after, 0.5 * 0.3 / (0.5 * 0.3 + 0.5))
 
 
@@ -104,90 +99,54 @@ def problem(seed, T=3, D=4, M=3, n=3, m=2):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(T, M, n, n))
     P = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(n)
-    c = rng.dirichlet(np.ones(M), T)
-    H = np.ascontiguousarray(np.broadcast_to(np.eye(m, n), (1, M, m, n)))
     noise = rng.normal(size=(D, m, m))
     R = noise @ np.swapaxes(noise, -1, -2) + 0.1 * np.eye(m)
-    x = rng.normal(size=(T, M, n))
-    return x, P, c, np.ascontiguousarray(x[..., :m]), H, rng.normal(size=(D, m)), R
+    return rng.normal(size=(T, M, n)), P, rng.dirichlet(np.ones(M), T), rng.normal(size=(D, m)), R
+
+
+def updated(x, P, c, z, R, beta, missed):
+    """x, P and mu of tracks by the detections that are theirs with `beta` (T, D), by the bank."""
+    block = Gaussians(np.moveaxis(x, 1, -1), np.moveaxis(P, 1, -1))
+    row, d = (each.ravel() for each in np.indices(beta.shape))
+    pairs = bank.weigh(block, row, z[d], R[d])
+    density = np.exp(pairs.log)
+    f = (c[row] * density).sum(axis=1, keepdims=True)
+    after, weight = bank.update(block, pairs, row, beta.ravel()[:, None] * density / f, missed)
+    return np.moveaxis(after.x, -1, 1), np.moveaxis(after.P, -1, 1), c * weight, density
 
 
 def test_the_update_is_that_of_the_prototype():
     names = ('X', 'P', 'mu', 'Z', 'R', 'beta', 'beta0', 'H')
     X, P, mu, Z, R, beta, beta0, H = (VECTORS[f'imm_pda/{name}'] for name in names)
-    h = X @ H.T
-    big_R = np.tile(R, (len(Z), 1, 1))
-    ours = oracle.update(
-        X, P, mu, Z[:, None] - h, np.tile(H, (3, 1, 1)), big_R, beta, float(beta0)
-    )
-    arrays = (X, P, mu, h, np.tile(H, (3, 1, 1)))
-    kernel = jipda.update(
-        *(np.ascontiguousarray(each[None]) for each in arrays),
-        Z,
-        big_R,
-        beta[None],
-        np.reshape(beta0, 1),
-        np.zeros(3, bool),
-    )
-    for found, single, name in zip(kernel, ours, ('out_X', 'out_P', 'out_mu')):
+    many = np.tile(R, (len(Z), 1, 1))
+    innovation, H = Z[:, None] - X @ H.T, np.tile(H, (3, 1, 1))
+    plain = oracle.update(X, P, mu, innovation, H, many, beta, float(beta0))
+    ours = updated(X[None], P[None], mu[None], Z, many, beta[None], np.reshape(beta0, 1))
+    for found, single, name in zip(ours, plain, ('out_X', 'out_P', 'out_mu')):
         np.testing.assert_allclose(single, VECTORS[f'imm_pda/{name}'], rtol=1e-10)
         np.testing.assert_allclose(found[0], VECTORS[f'imm_pda/{name}'], rtol=1e-10)
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_both_forms_of_likelihoods_and_update_are_equal(seed):
-    x, P, c, h, H, z, R = problem(seed)
-    ours = oracle.likelihoods(h, H, P, c, z, R)
-    mixture, nis = jipda.likelihoods(h, H, P, c, z, R)
-    np.testing.assert_allclose(mixture, ours.mixture, rtol=1e-10)
-    np.testing.assert_allclose(nis, ours.nis, rtol=1e-10)
-    existence = np.full(3, 0.7)
-    beta, missed, after = jipda.associate(mixture / 1e-3, nis, existence, np.full(3, 0.9), 13.8)
-    considered = np.array([False, False, seed % 2 == 1])
-    found = jipda.update(x, P, c, h, H, z, R, beta, missed, considered)
+def test_a_scan_is_the_plain_one(seed):
+    """Densities, sums over events and update of three tracks, in numpy and by their definition."""
+    x, P, c, z, R = problem(seed)
+    H = np.broadcast_to(np.eye(2, 3), (1, 3, 2, 3))
+    density = oracle.densities(x[..., :2], H, P, z, R)
+    ratio = np.einsum('tj,tdj->td', c, density) / 1e-3
+    part = np.full(ratio.shape, True), np.full(3, 0.7), np.full(3, 0.9)
+    beta, missed, after = jipda.associate(ratio, *part)
+    beta, missed = beta / after[:, None], missed / after
+    *found, log = updated(x, P, c, z, R, beta, missed)
+    np.testing.assert_allclose(log, density.reshape(log.shape), rtol=1e-10)
+    for ours, due in zip((beta, missed), oracle.associate(ratio, *part)[:2]):
+        np.testing.assert_allclose(ours.T * after, due.T, rtol=1e-10)
     for t in range(3):
         single = oracle.update(
-            x[t],
-            P[t],
-            c[t],
-            z[:, None] - h[t],
-            H[0],
-            R,
-            beta[t] / after[t],
-            missed[t] / after[t],
-            considered,
+            x[t], P[t], c[t], z[:, None] - x[t, :, :2], H[0], R, beta[t], float(missed[t])
         )
         for ours, other in zip(found, single):
             np.testing.assert_allclose(ours[t], other, rtol=1e-9, atol=1e-12)
-
-
-def test_a_single_certain_detection_is_the_update_of_the_imm_filter():
-    x, P, c, h, H, z, R = problem(7, T=2, D=1)
-    beta, missed = np.ones((2, 1)), np.zeros(2)
-    found = jipda.update(x, P, c, h, H, z, R, beta, missed, np.zeros(3, bool))
-    plain = imm.update(x, P, c, z[0] - h, H, R)
-    for ours, theirs in zip(found, (plain.x, plain.P, plain.mu)):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
-
-
-def test_without_a_detection_nothing_changes():
-    x, P, c, h, H, z, R = problem(8, D=0)
-    found = jipda.update(x, P, c, h, H, z, R, np.empty((3, 0)), np.full(3, 0.4), np.zeros(3, bool))
-    assert all(np.array_equal(ours, theirs) for ours, theirs in zip(found, (x, P, c)))
-
-
-def test_pairs_outside_of_the_gate_are_left_out_alone():
-    """With a threshold the kernel gives what it gives without, wherever the nis is below."""
-    rng = np.random.default_rng(3)
-    x, P, c, h, H, z, R = problem(rng)
-    every, nis = jipda.likelihoods(h, H, P, c, z, R)
-    threshold = float(np.median(nis[np.isfinite(nis)]))
-    some, near = jipda.likelihoods(h, H, P, c, z, R, threshold)
-    inside = nis <= threshold
-    assert inside.any() and not inside.all()
-    np.testing.assert_array_equal(some[inside], every[inside])
-    np.testing.assert_array_equal(near[inside], nis[inside])
-    assert (near[~inside] > threshold).all()
 
 
 def test_the_nearest_older_track():

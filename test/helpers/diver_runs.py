@@ -14,6 +14,7 @@
 
 """Helpers of the diver tests: fixes, runs, errors."""
 
+from attrs import fields
 import numpy as np
 
 from sonar_imm.measurements import Fix
@@ -36,6 +37,27 @@ def run(tracker, measurements):
     for measurement in measurements:
         final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(measurement))
     return [final[stamp] for stamp in sorted(final)]
+
+
+def arrays(known):
+    """Every array of a `Known`, by name."""
+    yield from known.features.items()
+    for name, part in (('life', known.life), ('rows', known.rows), ('borrowed', known.borrowed)):
+        for field in fields(type(part)):
+            value = getattr(part, field.name)
+            if isinstance(value, np.ndarray):
+                yield f'{name}.{field.name}', value
+    yield from known.rows.key.items()
+    for number, block in enumerate(known.rows.blocks):
+        yield from ((f'{name}_{number}', part) for name, part in zip('xP', block))
+
+
+def read_only(known):
+    """Let nobody write into a `Known`, and count its arrays."""
+    found = [array for _, array in arrays(known)]
+    for array in found:
+        array.flags.writeable = False
+    return len(found)
 
 
 def errors(estimates, track):

@@ -28,6 +28,7 @@ from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
+from sonar_imm.trackers.diver.known import places
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.obstacle import simulator as ahead
@@ -143,13 +144,13 @@ def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, t
     first.end()
     again = Life(make_bench, DiverNode, tmp_path / 'state', *more)
     again.send(*fix_at('/fix', 2.0, 'odom', 5.5, 7.0))
-    state = again.node.tracker._stream.state
+    tracker = again.node.tracker
+    known = tracker._stream.state
     assert not again.node._meter.refused
-    assert len(state.x) == 1
-    assert state.mu[0] @ state.x[0, :, 0] == pytest.approx(105.4, abs=0.3)
-    assert state.life.track_id.tolist() == [1] and state.life.status.tolist() == [1]
+    assert places(known, tracker.models)[0][:, 0] == pytest.approx([105.4], abs=0.3)
+    assert known.life.track_id.tolist() == [1] and known.life.status.tolist() == [1]
     again.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
-    assert len(again.node.tracker._stream.state.x) == 1
+    assert len(tracker._stream.state) == 1
 
 
 def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(make_bench, capfd):

@@ -20,16 +20,6 @@ import numpy as np
 
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.estimation.covariance import add_jitter
-from sonar_imm.estimation.jipda import OPENS_GATE
-
-
-class Likelihoods(NamedTuple):
-    """density (T, D, M): ``N(z_i; h_j, S_j)``; mixture (T, D): f; nis (T, D): the least of the
-    models that open a gate, infinite where there is none."""
-
-    density: FloatArray
-    mixture: FloatArray
-    nis: FloatArray
 
 
 class Association(NamedTuple):
@@ -40,44 +30,34 @@ class Association(NamedTuple):
     existence: FloatArray
 
 
-def likelihoods(
-    h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray
-) -> Likelihoods:
-    """How each detection (D, m) with covariance R (D, m, m) fits each model of
-    each track.
+def densities(
+    h: FloatArray, H: FloatArray, P: FloatArray, z: FloatArray, R: FloatArray
+) -> FloatArray:
+    """Return ``N(z_i; h_j, S_j)``, (T, D, M), of detections z (D, m) with covariances R (D, m, m).
 
-    h (T, M, m): what the models expect; H (T or 1, M, m, n); P (T, M, n, n) and c (T, M),
-    predicted.
+    h (T, M, m): what the models expect; H (T or 1, M, m, n); P (T, M, n, n), predicted.
     """
     S, _ = add_jitter((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
     v = z[None, :, None] - h[:, None]
     nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
     m = h.shape[-1]
-    density = np.exp(-0.5 * (nis + m * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1]))
-    opens = (c > OPENS_GATE)[:, None]
-    return Likelihoods(
-        density,
-        np.einsum('tj,tdj->td', c, density),
-        np.where(opens, nis, np.inf).min(axis=-1, initial=np.inf),
-    )
+    return np.asarray(np.exp(-0.5 * (nis + m * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])))
 
 
 def associate(
     ratio: FloatArray,
-    nis: FloatArray,
+    possible: BoolArray,
     existence: FloatArray,
     detection_probability: FloatArray,
-    threshold: float,
 ) -> Association:
     """The sums over all joint events.
 
-    ratio (T, D): f / lambda; nis (T, D): a pair is possible where it is below `threshold`;
-    existence, detection_probability (T,).
+    ratio (T, D): f / lambda; possible (T, D); existence, detection_probability (T,).
     """
     T, D = ratio.shape
     detected = existence * detection_probability
     beta, none, total = np.zeros((T, D)), np.zeros(T), 0.0
-    for event in events(nis <= threshold):
+    for event in events(possible):
         weight = 1.0
         for t, d in enumerate(event):
             weight *= 1.0 - detected[t] if d < 0 else detected[t] * ratio[t, d]

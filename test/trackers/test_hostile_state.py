@@ -124,7 +124,7 @@ GADGETS = [
     ('test_hostile_state', 'Trap'),
     ('sonar_imm', ''),
     ('', ''),
-    ('sonar_imm.trackers.diver.state', ['DiverState']),
+    ('sonar_imm.trackers.diver.known', ['Known']),
     (5, None),
 ]
 """Classes and more that the modules of the package lead to, and that are no part of a state."""

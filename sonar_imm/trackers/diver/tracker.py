@@ -53,7 +53,18 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from ..protocol import WarmStep
-from . import births, clutter, coverage, depth, estimate, fixes, forgetting, names, restart
+from . import (
+    births,
+    clutter,
+    coverage,
+    depth,
+    estimate,
+    fixes,
+    forgetting,
+    names,
+    offsets,
+    restart,
+)
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .innovations import FixConsistency
@@ -152,8 +163,8 @@ class DiverTracker:
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
-            offsets=Offsets(),
-            recent=RecentPairs(),
+            offsets=offsets.Offsets(),
+            recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=(),
             last_named={},

@@ -21,8 +21,8 @@ import pytest
 
 from sonar_imm.acoustics.arrivals_3d import BEARING, observe
 from sonar_imm.measurements import Arrivals, RelativeFix, VesselPose
+from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.state_space import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
@@ -307,13 +307,12 @@ def last(config, measurements):
     return made[-1], tracker._stream.state
 
 
-def layout_of(config):
-    models = build_models(config)
-    return Instruments().with_sensor('').layout(config, models)
-
-
 def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
-    layout = layout_of(DiverConfig(model_set='linear', bearing_bias_std_deg=2.0))
+    config = DiverConfig(
+        model_set='linear', acceleration_noise=(0.1, 0.1, 0.1), bearing_bias_std_deg=2.0
+    )
+    models = build_models(config)
+    layout = Instruments().with_sensor('').layout(config, models)
     rng, place = np.random.default_rng(1), np.array([5.0, -3.0])
     x = rng.normal(size=(2, 3, 5)) * [20.0, 20.0, 1.0, 1.0, 0.05]
     root = rng.normal(size=(2, 3, 5, 5))
@@ -324,14 +323,16 @@ def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
         arm = state[:2] - place
         return np.append(place + [c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]], state[2:])
 
-    seen, covariance = layout.as_seen(x, P, '', place)
+    rows = models.rows(x[:, None], P[:, None], np.ones((2, 1, 3)) / 3.0, np.zeros((2, 1)))
+    rows = layout.turned(rows, models, '', place)
+    seen, covariance = models.common(rows.blocks)
     for row in np.ndindex(2, 3):
         np.testing.assert_allclose(seen[row], turned(x[row]), atol=1e-12)
         T = np.stack(
             [(turned(x[row] + h) - turned(x[row] - h)) / 2e-6 for h in 1e-6 * np.eye(5)], axis=1
         )
         np.testing.assert_allclose(covariance[row], T @ P[row] @ T.T, rtol=1e-6, atol=1e-6)
-    again = layout.as_seen(seen, covariance, '', place, back=True)
+    again = models.common(layout.turned(rows, models, '', place, back=True).blocks)
     np.testing.assert_allclose(again[0], x, atol=1e-12)
     np.testing.assert_allclose(again[1], P, atol=1e-9)
 
@@ -342,14 +343,15 @@ def test_a_considered_bearing_widens_the_ellipse_across_and_moves_no_estimate(as
     which an error of the bearing moves the diver, as in closed form."""
     config = {**SINGLE, 'association': association}
     plain, _ = last(config, path())
-    wide, state = last({**config, 'bearing_bias_std_deg': 2.0}, path())
+    wide, known = last({**config, 'bearing_bias_std_deg': 2.0}, path())
     np.testing.assert_allclose(wide.state[0, :2], plain.state[0, :2], atol=1e-3)
     x, y = plain.state[0, :2]
     across = STD**2 * np.outer([-y, x], [-y, x])
     added = wide.covariance[0, :2, :2] - plain.covariance[0, :2, :2]
     np.testing.assert_allclose(added, across, atol=0.03 * np.abs(across).max())
-    assert (state.x[..., 4] == 0.0).all()
-    np.testing.assert_allclose(state.P[..., 4, 4], STD**2, rtol=1e-9)
+    (block,) = known.rows.blocks
+    assert (block.x[:, 4] == 0.0).all()
+    np.testing.assert_allclose(block.P[:, 4, 4], STD**2, rtol=1e-9)
 
 
 def test_where_nobody_knows_where_a_sensor_stands_nothing_is_added():
@@ -389,8 +391,8 @@ def test_a_vessel_that_moves_tells_how_its_transceiver_is_turned():
     config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
     ignored, _ = last(config, measured)
     stated = {'bearing_bias_std_deg': 3.0, 'systematic_errors': 'estimate'}
-    found, state = last({**config, **stated}, measured)
-    assert abs(state.x[0, 0, 4] - off) < np.radians(0.6)
+    found, known = last({**config, **stated}, measured)
+    assert abs(known.rows.blocks[0].x[0, 4, 0] - off) < np.radians(0.6)
     error = [np.hypot(*(each.state[0, :2] - where[:2])) for each in (ignored, found)]
     assert error[1] < 0.3 * error[0]
     considered, _ = last({**config, 'bearing_bias_std_deg': 3.0}, measured)
@@ -425,12 +427,12 @@ def test_a_sonar_of_range_and_bearing_states_what_its_mount_does():
     ]
     config = {'max_tracks': 1, 'model_set': 'linear', 'acceleration_noise': (0.02,)}
     plain, _ = last(config, pings)
-    wide, state = last({**config, 'bearing_bias_std_deg': 2.0}, pings)
+    wide, known = last({**config, 'bearing_bias_std_deg': 2.0}, pings)
     across = np.array([-0.8, 0.6])
     assert across @ plain.covariance[0, :2, :2] @ across < 0.5
     assert across @ wide.covariance[0, :2, :2] @ across > 0.9 * (50.0 * STD) ** 2
     np.testing.assert_allclose(wide.state[0, :2], place[:2], atol=0.1)
-    assert [what for _, what in state.instruments.known] == ['bearings']
+    assert [what for _, what in known.memory['instruments'].known] == ['bearings']
 
 
 def test_instruments_beyond_the_most_are_taken_as_they_are():
@@ -438,10 +440,11 @@ def test_instruments_beyond_the_most_are_taken_as_they_are():
     known = Instruments()
     for k in range(MOST_RECEIVERS + 2):
         known = known.with_sensor(f'sensor_{k}')
-    layout = known.layout(config, build_models(config))
-    x, P = np.zeros((1, layout.size)), np.eye(layout.size)[None]
-    for each, before in zip(layout.as_seen(x, P, 'sensor_65', np.ones(2)), (x, P)):
-        np.testing.assert_array_equal(each, before)
+    models = build_models(config)
+    layout = known.layout(config, models)
+    x, P = np.zeros((1, 1, 1, layout.size)), np.eye(layout.size)[None, None, None]
+    rows = models.rows(x, P, np.ones((1, 1, 1)), np.zeros((1, 1)))
+    assert layout.turned(rows, models, 'sensor_65', np.ones(2)) is rows
 
 
 @pytest.mark.statistics

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Arrivals, Fixes
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver import coverage
@@ -155,24 +156,25 @@ def test_what_is_left_of_a_track_by_a_half_plane_is_the_truncated_normal(edge):
     )
     tracker = DiverTracker(config)
     tracker.process(scan(1, (0.0, 0.0)))
-    state = tracker._stream.state
+    known = tracker._stream.state
     P = np.diag([4.0, 1.0, 1.0, 1.0])
     P[0, 2] = P[2, 0] = 1.2
-    life = evolve(state.life, status=np.ones(1, np.uint8))
-    state = state._replace(x=np.zeros((1, 1, 4)), P=P[None, None], life=life)
-    covered = coverage.stated(config)['']
-    seen = coverage.seen(state, covered, 0.9, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    after = coverage.missed(state, seen, np.ones(1), np.ones(4, bool))
+    block = Gaussians(np.zeros((1, 4, 1)), P[None, ..., None])
+    life = evolve(known.life, status=np.ones(1, np.uint8))
+    known = known.replace(rows=known.rows.replace(blocks=(block,)), life=life)
+    seen = coverage.seen(known, tracker.models, coverage.stated(config)[''], 0.9)
+    after = coverage.missed(known, tracker.models, seen, np.ones(1), True)
+    x, P = (part[0, ..., 0] for part in after.rows.blocks[0])
     a = edge / 2.0
     inside = norm.cdf(a)
     assert seen.tracks[0] == pytest.approx(0.9 * inside, abs=0.07)
     left = 1.0 - 0.9 * inside
     mean = 2.0 * 0.9 * norm.pdf(a) / left
     square = 4.0 * (1.0 - 0.9 * (inside - a * norm.pdf(a))) / left
-    assert after.x[0, 0, 0] == pytest.approx(mean, abs=0.25)
-    assert after.P[0, 0, 0, 0] == pytest.approx(square - mean**2, abs=0.7)
-    assert after.x[0, 0, 2] == pytest.approx(1.2 / 4.0 * after.x[0, 0, 0], abs=1e-9)
-    assert np.linalg.eigvalsh(after.P[0, 0]).min() > 0.0
+    assert x[0] == pytest.approx(mean, abs=0.25)
+    assert P[0, 0] == pytest.approx(square - mean**2, abs=0.7)
+    assert x[2] == pytest.approx(1.2 / 4.0 * x[0], abs=1e-9)
+    assert np.linalg.eigvalsh(P).min() > 0.0
 
 
 def test_tables_are_read_between_their_points(tmp_path):

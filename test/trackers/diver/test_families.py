@@ -22,12 +22,12 @@ from helpers.diver_runs import fix, SECOND
 import numpy as np
 import pytest
 
+from sonar_imm.estimation import bank, rows
 from sonar_imm.measurements import Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver import families, family_kernels
+from sonar_imm.trackers.diver import models as sets
 from sonar_imm.trackers.diver.config import TARGETS
-from sonar_imm.trackers.diver.families import FAMILIES
-from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.models import build_models, FAMILIES
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -58,13 +58,14 @@ def test_chain_and_models_are_those_of_the_prototype(models):
         np.testing.assert_allclose(models.chain.generator, vectors['generator'], atol=1e-12)
         for name, dt in (('transition_1s', 1.0), ('transition_07s', 0.7)):
             np.testing.assert_allclose(models.chain.transition(dt), vectors[name], atol=1e-12)
-        np.testing.assert_array_equal(models.mixing.kind, vectors['kind'])
-        assert models.mixing.sector_variance == pytest.approx(vectors['sector_variance'])
+        np.testing.assert_array_equal(models.families.kind, vectors['kind'])
+        assert models.families.sector == pytest.approx(vectors['sector_variance'])
 
 
 def mixed(models, x, P, mu, transition):
-    speed = models.mixing._replace(speed=0.75, speed_variance=0.16)
-    return (part[0] for part in family_kernels.mix(x[None], P[None], mu[None], transition, speed))
+    law = evolve(models.bank, speed=0.75, speed_variance=0.16)
+    blocks, c = bank.mix(law, models.blocks(x[None], P[None]), mu[None], transition)
+    return (part[0] for part in (*models.common(tuple(blocks)), c))
 
 
 def test_mixing_is_that_of_the_prototype(models):
@@ -72,8 +73,14 @@ def test_mixing_is_that_of_the_prototype(models):
         assert vectors['speed_mean'] == 0.75 and vectors['speed_variance'] == pytest.approx(0.16)
         parts = (vectors[name] for name in ('x', 'P', 'mu'))
         x, P, c = mixed(models, *parts, vectors['transition_1s'][None])
-        for ours, name in ((x, 'out_x'), (P, 'out_P'), (c, 'out_c')):
-            np.testing.assert_allclose(ours, vectors[name], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(c, vectors['out_c'], rtol=1e-12)
+        for kind, mean, covariance, due_x, due_P in zip(
+            vectors['kind'], x, P, vectors['out_x'], vectors['out_P']
+        ):
+            own = used(kind)
+            square = np.ix_(own, own)
+            np.testing.assert_allclose(mean[own], due_x[own], rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(covariance[square], due_P[square], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +94,7 @@ def test_image_of_one_model_in_the_components_of_another(models, pair):
         only[source] = 1.0
         everywhere = np.full((1, 37, 37), 1.0 / 37.0)
         x, P, _ = mixed(models, vectors['x'], vectors['P'], only, everywhere)
-        own = used(models.mixing.kind[target])
+        own = used(models.families.kind[target])
         np.testing.assert_allclose(x[target][own], vectors[f'{pair}/x'][own], atol=1e-12)
         covariance = vectors[f'{pair}/P'][np.ix_(own, own)]
         np.testing.assert_allclose(P[target][np.ix_(own, own)], covariance, atol=1e-12)
@@ -102,8 +109,8 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
         transition = vectors['transition_1s'][None]
         _, _, c = mixed(models, vectors['x'], 0.01 * vectors['P'], only, transition)
         velocity = vectors['x'][source, 2:]
-        headings = models.mixing.kind == 0
-        likeliest = models.mixing.units[models.mixing.direction[headings][c[headings].argmax()]]
+        headings = models.families.kind == 0
+        likeliest = models.families.units[headings][c[headings].argmax()]
         assert likeliest @ velocity > 0.9 * np.hypot(*velocity)
         np.testing.assert_allclose(c[headings].sum(), transition[0, source, headings].sum())
         np.testing.assert_allclose(c[~headings], transition[0, source, ~headings], atol=1e-15)
@@ -111,8 +118,9 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
 
 def test_a_run_is_that_of_the_prototype(monkeypatch):
     """Its transitions are taken at a step rounded to a microsecond, and are not learnt; who stands
-    keeps his pace."""
-    monkeypatch.setattr(families, 'PACE_TIME', 1e12)
+    keeps his pace; every scale keeps its row."""
+    monkeypatch.setattr(sets, 'PACE_TIME', 1e12)
+    monkeypatch.setattr(rows, 'ROW_LOST', 1e-300)
     tracker = DiverTracker(
         config(
             association='gnn',
@@ -133,14 +141,15 @@ def test_a_run_is_that_of_the_prototype(monkeypatch):
                 covariance=run['R'][k],
             )
             estimate = tracker.process(place)[-1]
-            mu = tracker._stream.state.mu.reshape(3, 37)
-            weight = mu.sum(axis=1)
+            known = tracker._stream.state.rows
             np.testing.assert_allclose(estimate.state[0], run['out_x'][k], atol=TOLERANCE)
             np.testing.assert_allclose(estimate.covariance[0], run['out_P'][k], atol=TOLERANCE)
-            np.testing.assert_allclose(weight, run['out_scale_probability'][k], atol=TOLERANCE)
+            np.testing.assert_allclose(
+                known.weight, run['out_scale_probability'][k], atol=TOLERANCE
+            )
             for copy in range(3):
                 np.testing.assert_allclose(
-                    mu[copy] / weight[copy], run[f'copy{copy}/mu'][k], atol=TOLERANCE
+                    known.mu[copy], run[f'copy{copy}/mu'][k], atol=TOLERANCE
                 )
 
 
@@ -164,7 +173,7 @@ def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
         return out
 
     found = errors()
-    monkeypatch.setattr(families, 'PACE_TIME', 1e12)
+    monkeypatch.setattr(sets, 'PACE_TIME', 1e12)
     assert max(found[25:]) < 0.75 * max(errors()[25:])
 
 
@@ -211,7 +220,7 @@ def test_columns_of_the_contract():
 
 @pytest.mark.parametrize('stated', [1.0, 1.0 / 6.0, 6.0])
 def test_scale_of_the_stated_covariances(stated):
-    """Copies find out what is stated too small, and never take a covariance for too large."""
+    """Rows find out what is stated too small, and never take a covariance for too large."""
     tracker = DiverTracker(config())
     estimates = run(tracker, path(300, std=1.0, scale=stated))
     scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
@@ -237,9 +246,10 @@ def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known(
     assert error < 1.1 * least and 1.0 <= scale < 1.6 and cautious < 0.6 * bold
 
 
-def test_what_is_stated_and_how_far_the_copies_are_apart():
-    """With a copy below 1 the published covariance is that of the tracker without it, and the
+def test_what_is_stated_and_how_far_the_rows_are_apart(monkeypatch):
+    """With a row below 1 the published covariance is that of the tracker without it, and the
     square of how far the two means are apart; NIS and scale are those without it."""
+    monkeypatch.setattr(rows, 'ROW_LOST', 1e-300)
     items, runs = path(60, std=0.4, scale=6.0), []
     for scales in ((0.15, 1.0, 3.0, 10.0), (1.0, 3.0, 10.0)):
         settings = {'association': 'gnn', 'adaptation': 'fixed', 'covariance_scales': scales}
@@ -322,9 +332,9 @@ def test_nobody_coasts_while_his_fixes_are_refused():
 def test_transitions_are_learnt_inside_families_only():
     tracker = DiverTracker(config())
     run(tracker, path(200))
-    state, family = tracker._stream.state, tracker.models.mixing.family
+    family = tracker.models.families.family
     nominal = tracker.models.chain.transition(1.0)
-    learnt = tracker._chain.transition(state.learnt, 1.0)[0]
+    learnt = tracker._chain.transition(tracker._stream.state['learnt'], 1.0)[0]
     inside = family[:, None] == family[None]
     np.testing.assert_allclose(learnt[~inside], nominal[~inside], atol=1e-15)
     np.testing.assert_allclose(learnt.sum(axis=1), 1.0)
@@ -408,7 +418,7 @@ def test_bad_parameters_get_a_sentence(values, says):
         config(**values)
 
 
-def test_one_copy_and_no_hover():
+def test_one_row_and_no_hover():
     tracker = DiverTracker(config(covariance_scales=(1.0,), hover=False, directions=8))
     assert len(tracker.models.names) == 19
     estimate = run(tracker, path(30))[-1]

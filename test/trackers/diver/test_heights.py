@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong; copies of
-the models that are spread over depth."""
+"""z of fixes, against linear Kalman filters, in its statistics and where it is wrong; rows of
+a track that are spread over depth."""
 
 import math
 
@@ -21,10 +21,13 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.estimation.gauss_markov import gauss_markov
+from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.heights import ambiguous, spread
+from sonar_imm.trackers.diver.depth import ambiguous, spread
+from sonar_imm.trackers.diver.known import outputs
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -92,7 +95,7 @@ def test_correlated_with_x_and_y_it_is_the_kalman_filter_of_all_three():
         estimate = last(tracker, [Fix(stamp_ns=second * 10**9, position=z, covariance=R)])
         if mean is None:
             x0, P0, _ = models.new_tracks(z[None, :2], R[None, :2, :2])
-            mean, P = x0[0, 0], P0[0, 0]
+            mean, P = x0[0, 0, 0], P0[0, 0, 0]
             h = models.height
             mean[h], P[h, h], P[h, :2], P[:2, h] = z[2], R[2, 2], R[2, :2], R[2, :2]
         else:
@@ -211,9 +214,9 @@ def test_a_wild_height_is_refused_and_one_that_is_said_again_believed():
     )
     assert wild == pytest.approx(-10.0, abs=1.0) and back == pytest.approx(-10.0, abs=1.0)
     assert first == pytest.approx(-10.0, abs=1.0) and again == pytest.approx(-30.2, abs=0.1)
-    assert tracker._stream.state.heights[:2] == (23, 2)
+    assert tracker._stream.state.memory['heights'][:2] == (23, 2)
     tracker.reset()
-    assert tracker._stream.state.heights == (0, 0, 0)
+    assert tracker._stream.state.memory['heights'] == (0, 0, 0)
 
 
 def test_heights_that_are_wild_all_the_time_are_said():
@@ -283,17 +286,18 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
 
 
 def banked(means, variances, weights, **settings):
-    """A state of one diver whose copies have these z, and its models."""
+    """One diver whose rows have these z, and its models."""
     config = DiverConfig(dimensions=3, model_set='heading_speed', **settings)
     tracker = DiverTracker(config)
     last(tracker, [fix(1.0, 0.0, np.eye(2), 20.0, 5.0)])
-    state, models = tracker._stream.state, tracker.models
-    M, h = len(models.names), models.height
-    x, P = state.x.copy(), state.P.copy()
-    x[0, :, h], P[0, :, h, h] = np.repeat(means, M), np.repeat(variances, M)
-    P[0, :, 0, h] = P[0, :, h, 0] = 0.3 * np.sqrt(P[0, :, 0, 0] * P[0, :, h, h])
-    mu = np.repeat(weights, M)[None] / M
-    return state._replace(x=x, P=P, mu=mu), models, tracker
+    known, h = tracker._stream.state, tracker.models.height
+    (block,), mu = known.rows.blocks, np.full_like(known.rows.mu, 1.0 / known.rows.mu.shape[1])
+    x, P = block.x.copy(), block.P.copy()
+    x[:, h], P[:, h, h] = np.array(means)[:, None], np.array(variances)[:, None]
+    P[:, 0, h] = P[:, h, 0] = 0.3 * np.sqrt(P[:, 0, 0] * P[:, h, h])
+    logw = np.log(np.maximum(weights, np.exp(LEAST_LOG)))
+    rows = known.rows.replace(blocks=(Gaussians(x, P),), mu=mu, logw=logw)
+    return known.replace(rows=rows), tracker.models, tracker
 
 
 def pings(path_std=0.3):
@@ -313,21 +317,22 @@ def pings(path_std=0.3):
 
 
 def after_spread(state, models, tracker, path_std=0.3):
-    layout = tracker._layout(state.instruments)
-    seen = ping_measurements(pings(path_std), np.arange(1), tracker.config, 1.0, models, layout)
+    layout = tracker._layouts(state)
+    seen = ping_measurements(pings(path_std), np.arange(1), tracker.config, models, layout)
     return spread(state, seen, layout, models)
 
 
 def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
     state, models, tracker = banked([-9.5, -9.6, -2.0], [4.0, 3.5, 0.1], [0.6, 0.4, 0.0])
     after = after_spread(state, models, tracker)
-    for before, now in zip(state.positions(models.E), after.positions(models.E)):
+    maps = tuple(part.outputs for part in models.parts)
+    for before, now in zip(outputs(state.rows, maps), outputs(after.rows, maps)):
         assert now == pytest.approx(before, abs=1e-9)
-    M, h = len(models.names), models.height
-    assert np.diff(after.x[0, ::M, h]) == pytest.approx([2.0, 2.0], abs=0.1)
-    assert after.mu[0].reshape(3, M).sum(axis=1) == pytest.approx(np.full(3, 1 / 3))
-    assert models.by_model(after.mu) == pytest.approx(models.by_model(state.mu))
-    assert (np.linalg.eigvalsh(after.P[0]) > 0.0).all() and after.spreads.tolist() == [1]
+    x, P = models.common(after.rows.blocks)
+    assert np.diff(x[:, 0, models.height]) == pytest.approx([2.0, 2.0], abs=0.1)
+    assert after.rows.weight == pytest.approx(np.full(3, 1 / 3))
+    assert after.rows.models() == pytest.approx(state.rows.models())
+    assert (np.linalg.eigvalsh(P) > 0.0).all() and after['spreads'].tolist() == [1]
 
 
 @pytest.mark.parametrize(
@@ -341,7 +346,7 @@ def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
 def test_other_copies_stay(means, variances, path_std):
     state, models, tracker = banked(means, variances, [0.4, 0.3, 0.3])
     after = after_spread(state, models, tracker, path_std)
-    assert after.x.tobytes() == state.x.tobytes() and not after.spreads.any()
+    assert after.rows is state.rows and not after['spreads'].any()
 
 
 @pytest.mark.parametrize(
@@ -384,7 +389,7 @@ def errors(estimates, places, settled):
 
 @pytest.mark.parametrize('seed', [1017, 1035])
 def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
-    # Copies that had met went to the wrong side here: NEES 877 and 725.
+    # Rows that had met went to the wrong side here: NEES 877 and 725.
     scene, places = past_the_transmitter(seed)
     settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
     tracker = SmoothingDiverTracker(DiverConfig(**settings))

@@ -35,7 +35,7 @@ def test_every_set_is_consistent(model_set):
     models = build_models(config)
     M, n = len(models.names), models.n
     assert M == config.model_count() and len(set(models.names)) == M
-    assert models.E.shape == (models.copies * M, 4, n) and models.initial.shape == (M,)
+    assert models.E.shape == (M, 4, n) and models.initial.shape == (M,)
     np.testing.assert_allclose(models.initial.sum(), 1.0)
     for dt in (0.0, 1e-3, 0.3, 1.0, 29.0, 600.0):
         F, Q, B = models.motion(dt)
@@ -44,9 +44,11 @@ def test_every_set_is_consistent(model_set):
         assert np.linalg.eigvalsh(Q).min() > -1e-9 * max(Q.max(), 1e-9)
         np.testing.assert_allclose(models.chain.transition(dt).sum(axis=1), 1.0)
     x, P, mu = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
-    mean, covariance = imm.combine(x[None], P[None], mu[None], models.E)
-    np.testing.assert_allclose(mean[0, :2], CENTRE)
-    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD * np.mean(models.scales))
+    mean, covariance = imm.combine(x, P, mu, models.E)
+    assert len(mean) == models.copies
+    np.testing.assert_allclose(mean[:, :2], np.tile(CENTRE, (models.copies, 1)))
+    for row, scale in zip(covariance, models.scales):
+        np.testing.assert_allclose(row[:2, :2], scale * SPREAD)
 
 
 @pytest.mark.parametrize('model_set', MODEL_SETS)
@@ -55,8 +57,8 @@ def test_ten_short_steps_are_one_long_step(model_set):
         DiverConfig(model_set=model_set, speed_noise=0.2, covariance_scales=(1.0,))
     )
     x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
-    long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
-    short_x, short_P = x[None], P[None]
+    long_x, long_P, _ = imm.predict(x, P, *models.motion(1.0))
+    short_x, short_P = x, P
     for _ in range(10):
         short_x, short_P, _ = imm.predict(short_x, short_P, *models.motion(0.1))
     np.testing.assert_allclose(short_x, long_x, atol=1e-12)

@@ -117,7 +117,7 @@ def test_names_without_a_track_are_not_kept():
         ids = [1, *range(1000 * second, 1000 * second + 50)]
         places = [(float(k), 0.0) for k in range(len(ids))]
         tracker.process(scan(second, *places, target_id=ids))
-    assert len(tracker._stream.state.last_named) < 100
+    assert len(tracker._stream.state.memory['last_named']) < 100
 
 
 @pytest.mark.parametrize('association', BOTH)

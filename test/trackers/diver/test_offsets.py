@@ -21,12 +21,12 @@ import pytest
 
 from sonar_imm.measurements import Arrivals
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver import families, offsets
+from sonar_imm.trackers.diver import estimate, offsets
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.offsets import most, Offsets
+from sonar_imm.trackers.diver.offsets import most, Offsets, RecentPairs
 from sonar_imm.trackers.diver.scan import ping_measurements
-from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -59,7 +59,7 @@ def evidence(places, received, errors, tag=False, **stated):
             bearing=np.full(n, np.nan),
             var_bearing=np.full(n, np.nan),
         )
-        seen = ping_measurements(ping, np.arange(n), config, 1.0, models, layout)
+        seen = ping_measurements(ping, np.arange(n), config, models, layout)
         ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
         found = found.after(seen, seen.echo, ids, place + [0.3, -0.2], config)
     return found, config
@@ -146,8 +146,8 @@ def test_pings_that_any_place_explains_say_nothing():
 # -- what is assumed where nothing is stated -----------------------------------------------------
 
 
-def evidence_of(config, place, tag=False):
-    """The evidence after one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
+def heard(config, place, tag=False):
+    """The pairs heard in one ping, all of whose echoes were taken, of a diver at `place` (2,)."""
     models, everyone = build_models(config), np.ones(4, bool)
     ping = Arrivals(
         stamp_ns=1,
@@ -161,9 +161,10 @@ def evidence_of(config, place, tag=False):
         var_bearing=np.full(4, np.nan),
     )
     layout = Instruments().layout(config, models)
-    seen = ping_measurements(ping, np.arange(4), config, 1.0, models, layout)
+    seen = ping_measurements(ping, np.arange(4), config, models, layout)
     at = np.asarray(place, float)
-    return offsets.watched(Offsets(), {0: at}, {0: everyone}, ping, seen, config)
+    nothing = Offsets(), RecentPairs()
+    return offsets.watched(*nothing, {0: at}, {0: everyone}, ping, seen, config)[1]
 
 
 def placed(path, guess, receivers, tag):
@@ -184,9 +185,8 @@ def placed(path, guess, receivers, tag):
 def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag):
     """Against draws of receivers, clocks and sound speeds, and least squares of each."""
     config, place = DiverConfig(), np.array([20.0, 30.0])
-    wide = evidence_of(config, place, tag).widened(
-        np.array([[*place, 0.0, 0.0]]), np.zeros((1, 4, 4)), config
-    )
+    mean, nothing = np.array([[*place, 0.0, 0.0]]), np.zeros((1, 4, 4))
+    wide = offsets.widened(heard(config, place, tag), mean, nothing, config)
     rng, found = np.random.default_rng(2), []
     off, late, slow = offsets.ASSUMED.values()
     for _ in range(1500):
@@ -202,33 +202,33 @@ def test_what_is_assumed_of_instruments_moves_the_place_of_a_ping_as_it_says(tag
 def test_nothing_is_assumed_where_something_is_stated_or_nobody_was_heard():
     mean, nothing = np.array([[20.0, 30.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
     config = DiverConfig()
-    found = evidence_of(config, mean[0, :2])
-    assert Offsets().widened(mean, nothing, config) is nothing
+    found = heard(config, mean[0, :2])
+    assert offsets.widened(RecentPairs(), mean, nothing, config) is nothing
     exact = DiverConfig(systematic_errors='exact')
-    assert found.widened(mean, nothing, exact) is nothing
+    assert offsets.widened(found, mean, nothing, exact) is nothing
     with pytest.raises(ConfigError, match='receiver_clock_std'):
         DiverConfig(systematic_errors='exact', receiver_clock_std=1e-4)
     for name in offsets.STDS:
-        assert found.widened(mean, nothing, DiverConfig(**{name: 1e-6})) is nothing
+        assert offsets.widened(found, mean, nothing, DiverConfig(**{name: 1e-6})) is nothing
 
 
 def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
     made = simulate(scenario('multistatic', {'duration': 20.0}), 1)
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     assumed = run(tracker, (item.measurement for item in made.measurements))[-1]
-    mean, inside = families.positions(tracker._stream.state, tracker.models)
+    mean, inside = estimate.published(tracker._stream.state, tracker.models)
     np.testing.assert_array_equal(assumed.state, mean)
     ratio = np.diag(assumed.covariance[0])[:2] / np.diag(inside[0])[:2]
     assert (ratio > 1.5).all() and (ratio < 30.0).all()
     last = made.measurements[-1].measurement.stamp_ns * 1e-9
     after = tracker.process(fix(last + 1.0, *mean[0, :2]))[-1]
-    inside = families.positions(tracker._stream.state, tracker.models)[1]
+    inside = estimate.published(tracker._stream.state, tracker.models)[1]
     np.testing.assert_array_equal(after.covariance, inside)
 
 
 def test_pairs_that_fell_silent_are_forgotten():
     config = DiverConfig()
-    found = evidence_of(config, np.array([20.0, 30.0])).recent
+    found = heard(config, np.array([20.0, 30.0]))
     nobody = found
     for _ in range(offsets.RECENT):
         nobody = nobody._replace(age=nobody.age + 1.0)
@@ -245,6 +245,6 @@ def test_pairs_that_fell_silent_are_forgotten():
         bearing=[np.nan],
         var_bearing=[np.nan],
     )
-    seen = ping_measurements(ping, np.arange(1), config, 1.0, models, layout)
+    seen = ping_measurements(ping, np.arange(1), config, models, layout)
     left = nobody.after(seen, np.ones(1, bool), np.array([[1, 2]]))
     assert left.pairs == ((1, 2),) and len(found.pairs) == 4

@@ -24,18 +24,27 @@ import pytest
 from msg_adapters.arrivals import MAX_PAIRS
 from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.acoustics.localisation import localise
-from sonar_imm.estimation.covariance import is_psd
+from sonar_imm.estimation.covariance import are_sound
 from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.trackers.diver.arrivals import (
+    _starts,
+    Mixture,
+    optima,
+    PingUpdate,
+    Taking,
+    taking_of,
+    update_by_ping,
+    with_takings,
+)
 from sonar_imm.trackers.diver.explanations import (
     PingMeasurements,
     student_t_ping,
     subset_ping,
 )
+from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.state_space import each_kept, Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -178,6 +187,14 @@ def test_the_order_of_arrivals_changes_no_bit(passive, many):
     assert np.hypot(*(item.state[0, :2] - place[:2])) < 2.0
 
 
+def begun(models, position, covariance, from_fix=True):
+    """The hypotheses of a diver who is first seen."""
+    x, P, mu = models.new_tracks(position[None], covariance[None], from_fix)
+    N, n = x[0, ..., 0].size, x.shape[-1]
+    scale = np.repeat(np.resize(models.scales, models.copies), N // models.copies)
+    return Mixture(x.reshape(N, n), P.reshape(N, n, n), mu.ravel() / models.copies, scale)
+
+
 def test_many_good_arrivals_outvote_any_prior():
     """A track that is ten standard deviations off comes to where nine receivers hear the tag."""
     config = DiverConfig(max_tracks=1)
@@ -186,11 +203,9 @@ def test_many_good_arrivals_outvote_any_prior():
     rng = np.random.default_rng(4)
     receivers = rng.uniform(-80.0, 80.0, (9, 3)) * [1.0, 1.0, 0.0]
     measurement = ping_of(np.array([20.0, 35.0, 0.0]), receivers, (np.nan,) * 3, rng=rng)
-    numbers = ping_measurements(measurement, np.arange(9), config, 1.0, models, layout)
-    x, P, mu = (
-        item[0] for item in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None])
-    )
-    after = update_by_ping(x, P, mu, numbers, config, layout)
+    numbers = ping_measurements(measurement, np.arange(9), config, models, layout)
+    before = begun(models, np.array([-30.0, 10.0]), 25.0 * np.eye(2))
+    after = update_by_ping(before, numbers, config, layout).after
     assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
     assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
 
@@ -206,28 +221,29 @@ def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
     twins = origin + np.repeat(RECEIVERS, 2, axis=0)
     measurement = ping_of(origin + at, twins, tuple(twins[0]))
     measurement = evolve(measurement, var_toa=np.full(len(twins), 1e-30))
-    numbers = ping_measurements(measurement, np.arange(len(twins)), config, 1.0, models, layout)
-    before = tuple(
-        item[0]
-        for item in models.new_tracks((origin + at)[None, :2] + 1e-4, std**2 * np.eye(2)[None])
-    )
-    after = PingUpdate(*before, np.ones(len(numbers.row)), 0.0, 0)
-    taking = taking_of(before, after, numbers, config, layout)
+    numbers = ping_measurements(measurement, np.arange(len(twins)), config, models, layout)
+    before = begun(models, (origin + at)[:2] + 1e-4, std**2 * np.eye(2))
+    after = PingUpdate(before, np.log(before.mu), np.ones(len(numbers.row)), 0.0, 0)
+    taking = taking_of(before, after, numbers, config)
     assert taking.dof == len(numbers.row)
     assert 0.0 <= taking.nis <= taking.dof
 
 
-def test_each_copy_keeps_a_weight_whatever_the_arrivals_say():
-    """One copy e^900 times as probable as another, and one that nothing explains."""
-    log_weight = np.array([-1.0, -2.0, -901.0, -900.0, -np.inf, -np.inf])
-    share = np.exp(log_weight - log_weight.max())
-    kept = each_kept(log_weight, share / share.sum(), 3).reshape(3, 2)
-    np.testing.assert_allclose(kept.sum(), 1.0)
-    np.testing.assert_allclose(kept[0, 0] / kept[0, 1], np.exp(1.0))
-    np.testing.assert_allclose(kept[1, 0] / kept[1, 1], np.exp(-1.0))
-    assert (kept.sum(axis=1) >= 0.99e-150).all()
-    few = np.array([0.2, 0.3, 0.4, 0.1])
-    assert each_kept(np.log(few), few, 2) is few
+def test_each_row_keeps_a_weight_whatever_the_arrivals_say():
+    """One row e^900 times as probable as another, and one that nothing explains."""
+    tracker = DiverTracker(
+        DiverConfig(model_set='linear', acceleration_noise=(0.1, 0.2), dimensions=3)
+    )
+    tracker.process(Fix(stamp_ns=10**9, position=np.zeros(3)))
+    known, log = tracker._stream.state, np.array([-1.0, -2.0, -901.0, -900.0, -np.inf, -np.inf])
+    before = Mixture(*(np.zeros((6, *shape)) for shape in ((6,), (6, 6), (), ())))
+    taking = Taking(PingUpdate(before, log, np.ones(4), 0.0, 0), np.ones(4, bool), 0.0, 0)
+    rows = with_takings(known, {0: taking}, tracker.models).rows
+    np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
+    np.testing.assert_allclose(rows.mu[0, 0] / rows.mu[0, 1], np.exp(1.0))
+    np.testing.assert_allclose(rows.mu[1, 0] / rows.mu[1, 1], np.exp(-1.0))
+    np.testing.assert_array_equal(rows.mu[2], known.rows.mu[2])
+    assert (rows.weight >= 0.99e-150).all() and rows.weight[0] == pytest.approx(1.0)
 
 
 def test_wild_echoes_only_leave_the_prediction():
@@ -236,17 +252,15 @@ def test_wild_echoes_only_leave_the_prediction():
     layout = Instruments().layout(config, models)
     measurement = ping_of(np.array([20.0, 35.0, 0.0]))
     measurement = evolve(measurement, toa=measurement.toa + [0.02, 0.03, 0.025, 0.022])
-    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
-    x, P, mu = (
-        item[0] for item in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None])
-    )
-    after = update_by_ping(x, P, mu, numbers, config, layout)
-    assert (after.good < 1e-3).all()
-    np.testing.assert_allclose(after.x, x, atol=0.01)
-    np.testing.assert_allclose(after.P, P, atol=0.05)
+    numbers = ping_measurements(measurement, np.arange(4), config, models, layout)
+    before = begun(models, np.array([20.0, 35.0]), 0.25 * np.eye(2))
+    found = update_by_ping(before, numbers, config, layout)
+    assert (found.good < 1e-3).all()
+    np.testing.assert_allclose(found.after.x, before.x, atol=0.01)
+    np.testing.assert_allclose(found.after.P, before.P, atol=0.05)
 
 
-def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
+def test_the_rows_at_three_depths_are_near_the_posterior_by_quadrature():
     v = vectors('depth_one_ping')
     low, high = (float(item) for item in v['depth_range'])
     config = DiverConfig(
@@ -257,14 +271,9 @@ def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
     sigma = float(v['sigma'])
     measurement = ping_of(v['truth'], v['rx'], tuple(v['tx']), sigma / 1500.0)
     measurement = evolve(measurement, toa=v['path'] / 1500.0)
-    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
-    x, P, mu = (
-        item[0]
-        for item in models.new_tracks(
-            v['prior_mean'][None], float(v['prior_var']) * np.eye(2)[None], False
-        )
-    )
-    after = update_by_ping(x, P, mu, numbers, config, layout)
+    numbers = ping_measurements(measurement, np.arange(4), config, models, layout)
+    before = begun(models, v['prior_mean'], float(v['prior_var']) * np.eye(2), False)
+    after = update_by_ping(before, numbers, config, layout).after
     mean = after.mu @ after.x
     spread = after.x - mean
     covariance = np.einsum('j,jab->ab', after.mu, after.P + spread[:, :, None] * spread[:, None])
@@ -283,7 +292,7 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
     beside = {'depth': np.full(4, 11.0), 'var_depth': np.full(4, 0.04)}
     beside |= {'elevation': np.full(4, -0.2), 'var_elevation': np.full(4, 1e-4)}
     numbers = ping_measurements(
-        ping_of(place, **beside), np.arange(4), config, 1.0, models, layout
+        ping_of(place, **beside), np.arange(4), config, models, layout
     ).measured
     assert numbers.kind.tolist() == [4, 0, 3, 0, 3, 0, 3, 0, 3]
     assert numbers.value[0] == -11.0
@@ -293,7 +302,6 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
         ping_of(place, **beside),
         np.arange(4),
         flat,
-        1.0,
         models,
         Instruments().layout(flat, models),
     ).measured
@@ -309,7 +317,7 @@ def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
     at, tx = np.array([60.0, 35.0, 0.0]), (-40.0, -20.0, 0.0)
     measurement = ping_of(at, RECEIVERS, tx)
     every = np.arange(len(RECEIVERS))
-    measured = ping_measurements(measurement, every, config, 1.0, models, layout).measured
+    measured = ping_measurements(measurement, every, config, models, layout).measured
     starts = _starts(measured, passive=False)
     first = np.argmin(measured.value)
     ways = [
@@ -460,6 +468,10 @@ def config(model_set, noise, seed=0):
     )
 
 
+def all_sound(known):
+    return all(are_sound(np.moveaxis(P, 0, 2)).all() for _, P in known.rows.blocks)
+
+
 def least_eigenvalue(covariance):
     scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return np.linalg.eigvalsh(covariance / (scale[..., :, None] * scale[..., None, :]))[..., 0]
@@ -476,7 +488,7 @@ def test_covariances_stay_positive_definite(model_set, noise):
                 assert np.isfinite(estimate.state).all()
                 assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
                 np.testing.assert_allclose(estimate.probabilities.sum(axis=1), 1.0, rtol=1e-12)
-            assert is_psd(tracker._stream.state.P).all()
+            assert all_sound(tracker._stream.state)
         health = tracker.health()
         assert health['broken_tracks'] == 0
         repairs += health['covariance_repairs']
@@ -545,5 +557,5 @@ def test_covariances_stay_sound_after_sharp_pings(parameters, passive):
             for estimate in tracker.process(ping):
                 assert np.isfinite(estimate.state).all()
                 assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
-            assert is_psd(tracker._stream.state.P).all()
+            assert all_sound(tracker._stream.state)
         assert tracker.health()['broken_tracks'] == 0

@@ -14,21 +14,20 @@
 
 """Scans: empty ones, soft association, and fixes that say whose they are."""
 
-from types import SimpleNamespace
-
 from attrs import evolve
-from helpers.diver_runs import fix, run, SECOND
+from helpers.diver_runs import fix, read_only, run, SECOND
 from helpers.estimates import same
 import numpy as np
 import pytest
 
 from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
-from sonar_imm.trackers.diver import fix_kernels, jipda
+from sonar_imm.trackers.diver import fixes, forgetting
 from sonar_imm.trackers.diver import tracker as tracker_module
-from sonar_imm.trackers.diver.scan import position_groups
+from sonar_imm.trackers.diver.innovations import FixConsistency, MEMORY
+from sonar_imm.trackers.diver.known import Known
+from sonar_imm.trackers.diver.scan import position_groups, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, ROWS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -111,7 +110,7 @@ def test_a_false_fix_in_clutter_is_not_published():
     tracker = DiverTracker(DiverConfig(association='jipda', clutter_density=4e-4))
     (estimate,) = tracker.process(scan(1, (0.0, 0.0)))
     assert len(estimate) == 0
-    (row,) = tracker._stream.state.existence
+    (row,) = tracker._stream.state['existence']
     assert row == pytest.approx(1.2e-5 / (1.2e-5 + 4e-4))
 
 
@@ -122,13 +121,13 @@ def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
     config = DiverConfig(max_tracks=most, covariance_scales=(1.0, 3.0, 10.0), **densities)
     tracker = DiverTracker(config)
     run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
-    now, _ = tracker._predict(tracker._stream.state, 11 * SECOND)
-    (fixes,) = tracker._scan(now, [scan(11, (7.5, 1.9))]).fixes
-    found = tracker._associate(now, fixes)
-    p, r = config.detection_probability, now.existence[0]
-    seen = r * p * np.exp(found.densities.whole[0, 0]) / (1e-5 + (most - 1) * 1e-4)
-    assert 0.01 < found.weights.beta[0, 0] < 0.99
-    assert found.weights.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
+    now = Scan.of([scan(11, (7.5, 1.9))], tracker.config)
+    known, (group,) = tracker._predict(tracker._stream.state, now, 11 * SECOND), now.fixes
+    fixes.associating(tracker.models, 'jipda')(known, group)
+    p, r = config.detection_probability, known['existence'][0]
+    seen = r * p * np.exp(group.pairs.whole[0, 0]) / (1e-5 + (most - 1) * 1e-4)
+    assert 0.01 < group.found.beta[0, 0] < 0.99
+    assert group.found.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
 
 
 def test_a_diver_is_confirmed_by_existence_and_evidence():
@@ -245,20 +244,25 @@ def test_the_column_of_fixes_may_be_mixed_with_single_fixes():
 
 
 def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
-    status = np.array([TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED])
-    known = jipda.known_existence(np.array([np.nan, np.nan, 0.3]), status)
-    assert known.tolist() == [0.5, 0.9, 0.3]
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(scan(1, (0.0, 0.0), (20.0, 0.0), (40.0, 0.0)))
+    known, (group,) = tracker._stream.state, Scan.of([scan(2)], tracker.config).fixes
+    status = [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
+    known = known.replace(life=evolve(known.life, status=np.array(status, np.uint8)))
+    known = known.put(existence=np.array([np.nan, np.nan, 0.3]))
+    fixes.associating(tracker.models, 'jipda')(known, group)
+    r, missed = np.array([0.5, 0.9, 0.3]), 1.0 - tracker.config.detection_probability
+    np.testing.assert_allclose(group.found.exists, r * missed / (r * missed + 1.0 - r))
 
 
 def test_what_is_stated_is_scaled_in_scans_as_in_single_fixes():
-    config = DiverConfig(fix_std=2.0)
+    config = DiverConfig(fix_std=2.0, covariance_scale=3.0)
     places = (0.0, 0.0), (9.0, 0.0), (0.0, 9.0)
     stated = np.array([0.25, np.nan, 1.0])[:, None, None] * np.eye(2)
     expected = 3.0 * np.array([0.25, 4.0, 1.0])[:, None, None] * np.eye(2)
     for ids in (None, [6, 7, 8], [NOBODY] * 3):
         item = evolve(scan(1, *places, ids=ids), covariance=stated)
-        (group,) = position_groups([item], config, 3.0)
-        assert group.factor == 3.0
+        (group,) = position_groups([item], config)
         assert group.R == pytest.approx(expected)
 
 
@@ -278,7 +282,7 @@ def test_tracks_whose_numbers_are_not_finite_end_and_are_counted(monkeypatch):
     for second in range(1, 6):
         tracker.process(scan(second, (0.1 * second, 0.0), (40.0, 0.0)))
     with monkeypatch.context() as patch:
-        patch.setattr(fix_kernels, 'finite', lambda x, P: np.arange(len(x)) != 1)
+        patch.setattr(Known, 'finite', lambda known: np.arange(len(known)) != 1)
         (estimate,) = tracker.process(scan(6, (0.6, 0.0), (40.0, 0.0)))
     assert ids_of(estimate) == [1] and tracker.health()['broken_tracks'] == 1
     (estimate,) = tracker.process(scan(7, (0.7, 0.0), (40.0, 0.0)))
@@ -303,18 +307,27 @@ def ping(second):
     )
 
 
+@pytest.mark.parametrize('dimensions', [2, 3])
 @pytest.mark.parametrize('association', ASSOCIATIONS)
-def test_a_scan_changes_nothing_of_the_state_before_it(association):
+def test_a_scan_changes_nothing_of_the_state_before_it(association, dimensions):
     """States are values: those in the history are what a late measurement is replayed from."""
-    tracker = DiverTracker(DiverConfig(association=association, target_z=-2.0))
-    for second in range(1, 10):
-        before = tracker._stream.state
-        kept = {name: np.copy(getattr(before, name)) for name in ROWS}
-        seen = scan(second, (20.0, 30.0), (30.0, 5.0 + second), ids=[NOBODY, 7])
+    config = DiverConfig(
+        association=association,
+        target_z=-2.0,
+        dimensions=dimensions,
+        coverage_sector=(0.0, 0.0, 0.0, 360.0, 0.0, 60.0),
+        bearing_bias_std_deg=1.0,
+        fix_bias_std=0.2,
+    )
+    tracker = DiverTracker(config)
+    for second in range(1, 40):
+        assert read_only(tracker._stream.state) > 20
+        jump = 40.0 * (second > 25)
+        places = (20.0 + jump, 30.0), (30.0, 5.0 + second), (4.0 * second, 2.0)
+        covariance = np.tile(0.25 * np.eye(3), (3, 1, 1))
+        seen = evolve(scan(second, *places, ids=[NOBODY, 7, NOBODY]), covariance=covariance)
         tracker.process(ping(second) if second % 3 == 0 else seen)
-        assert tracker._stream.state is not before
-        for name, value in kept.items():
-            np.testing.assert_array_equal(getattr(before, name), value, err_msg=name)
+    tracker.process(scan(41))
 
 
 def test_arrivals_are_judged_where_no_fix_says_the_same():
@@ -338,7 +351,7 @@ def test_the_score_of_a_track_is_that_of_its_last_scans():
     tracker, scores = DiverTracker(DiverConfig(association='gnn', history=0.0)), []
     for second in range(1, 101):
         tracker.process(scan(second, (0.0, 0.0)))
-        scores.append(tracker._stream.state.score[0])
+        scores.append(tracker._stream.state['score'][0])
     assert scores[9] > 5.0 * scores[1] > 0.0
     assert scores[-1] == pytest.approx(scores[-2], rel=1e-3)  # it does not grow with the dive
 
@@ -347,32 +360,32 @@ def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
     tracker = DiverTracker(DiverConfig(history=0.0))
     for second in (1, 2):
         tracker.process(scan(second, (0.0, 0.0)))
-    real, crossed = tracker_module.cross, []
+    real, steps = tracker_module.crossed, 0
 
-    def cross(*arguments):
-        for step in real(*arguments):
-            crossed.append(step)
-            yield step._replace(repairs=len(crossed))
+    def crossed(*arguments):
+        nonlocal steps
+        made = real(*arguments)
+        steps = len(made)
+        return [step._replace(repairs=k) for k, step in enumerate(made, start=1)]
 
-    monkeypatch.setattr(tracker_module, 'cross', cross)
+    monkeypatch.setattr(tracker_module, 'crossed', crossed)
     tracker.process(scan(8, (0.0, 0.0)))
-    steps = len(crossed)
     assert steps > 2
     assert tracker.health()['covariance_repairs'] == steps * (steps + 1) // 2
 
 
 def test_scans_near_another_track_are_counted_for_each_partner_alone():
     """1 and 2 lie apart, 3 beside 2, 4 beside 1; who each was near before, and for how long."""
-    names = DiverTracker(DiverConfig())._stream.state.life
+    nobody = DiverTracker(DiverConfig())._stream.state
     mean = np.array([[0.0, 0.0], [50.0, 0.0], [50.1, 0.0], [0.1, 0.0]])
-    now = SimpleNamespace(
-        life=evolve(names, track_id=np.array([1, 2, 3, 4], np.uint32)),
+    now = nobody.replace(life=evolve(nobody.life, track_id=np.array([1, 2, 3, 4], np.uint32)))
+    now = now.put(
         target_id=np.full(4, NOBODY),
         near_to=np.array([0, 1, 1, 1]),
         near_for=np.array([0, 5, 5, 5]),
     )
     tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
-    near_to, near_for = jipda.coalescence(now, tentative, mean, wide, [])
+    near_to, near_for = forgetting.coalescence(now, tentative, mean, wide, [])
     assert near_to.tolist() == [0, 0, 2, 1]
     assert near_for.tolist() == [0, 0, 1, 6]
 

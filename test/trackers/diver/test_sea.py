@@ -22,9 +22,9 @@ import pytest
 
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -104,18 +104,19 @@ def test_what_is_considered_is_the_same_in_all_models_and_times():
     made = simulate(scenario('misplaced_receivers', {'duration': 30.0}), 1)
     for scan in made.measurements:
         tracker.process(scan.measurement)
-    state = tracker._stream.state
-    layout = state.instruments.layout(config, tracker.models)
+    known = tracker._stream.state
+    x, P = tracker.models.common(known.rows.blocks)
+    layout = known.memory['instruments'].layout(config, tracker.models)
     assert layout.size == 4 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
     considered = slice(tracker.models.n, layout.size)
-    assert (state.x[..., considered] == 0.0).all()
+    assert (x[..., considered] == 0.0).all()
     np.testing.assert_allclose(
-        state.P[..., considered, considered],
-        np.broadcast_to(np.diag(layout.variances), (*state.mu.shape, 11, 11)),
+        P[..., considered, considered],
+        np.broadcast_to(np.diag(layout.variances), (*x.shape[:2], 11, 11)),
         rtol=1e-9,
         atol=1e-12,
     )
-    assert np.abs(state.P[..., :2, considered]).max() > 0.1
+    assert np.abs(P[..., :2, considered]).max() > 0.1
 
 
 def test_receivers_that_come_later_bring_their_prior():
@@ -239,15 +240,16 @@ def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
         for scan in simulate(scenario('table1', {}), seed).measurements:
             tracker.process(scan.measurement)
             assert tracker.warnings() == []
-            farthest = max(farthest, float(np.sum(tracker._stream.state.white[:1] ** 2)))
+            farthest = max(farthest, float(np.sum(tracker._stream.state['white'][:1] ** 2)))
     assert farthest > 50.0
 
 
 def test_without_anything_stated_no_state_is_added():
     tracker = DiverTracker(DiverConfig())
     tracker.process(simulate(scenario('multistatic'), 1).measurements[0].measurement)
-    assert tracker.models.n == 4 and tracker._stream.state.x.shape[1:] == (4 * 37, 4)
-    assert tracker._stream.state.instruments == Instruments()
+    known = tracker._stream.state
+    assert [block.x.shape[1:] for block in known.rows.blocks] == [(3, 34), (4, 3)]
+    assert known.memory['instruments'] == Instruments()
 
 
 def test_depths_that_do_not_fit_are_refused():
