@@ -140,10 +140,10 @@ def fit_each(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the likelihood and the NIS of each measurement under each hypothesis, (L, C) each."""
     nu, gradient = _residuals(x.T, measured, height)
-    cross = sum(gradient[:, a, None] * _last(P)[:, a] for a in _active(gradient))
-    S = _variances(measured) + (cross * gradient).sum(axis=1)
-    nis = nu * nu / S
-    return (np.exp(-0.5 * nis) / np.sqrt(2.0 * math.pi * S)).T, nis.T
+    G = np.ascontiguousarray(np.moveaxis(gradient, -1, 0))
+    S = measured.variance + ((G @ P) * G).sum(axis=2)
+    nis = nu.T**2 / S
+    return np.exp(-0.5 * nis) / np.sqrt(2.0 * math.pi * S), nis
 
 
 def fit_measurements(
@@ -176,11 +176,6 @@ def expect_measurements(
     apart = nu - residual[:, None]
     covariance = inside + (apart * mu) @ apart.T
     return residual, 0.5 * (covariance + covariance.T)
-
-
-def _active(gradient: FloatArray) -> IndexArray:
-    """Return the components on which some of the measurements depend; gradient (C, n, L)."""
-    return np.flatnonzero(gradient.any(axis=(0, 2)))
 
 
 # -- all subsets ---------------------------------------------------------------------------------
@@ -230,8 +225,10 @@ def subset_ping(
     share /= total[now.of]
     mean = np.add.reduceat(share * now.x, starts, axis=1)
     apart = now.x - _pick(mean, now.of)
-    second = now.P + apart[:, None] * apart
-    covariance = np.add.reduceat(share * second, starts, axis=2)
+    covariance = np.empty((len(mean), len(mean), L))
+    for a, own in enumerate(apart):
+        second = share * (now.P[a] + own * apart)
+        covariance[a] = np.add.reduceat(second, starts, axis=1)
     taken = np.add.reduceat(share * now.good, starts, axis=1)
     return mean.T, np.moveaxis(covariance, -1, 0), best + np.log(total), taken.T
 
@@ -272,8 +269,9 @@ def _grow(
     cross = np.where(took, np.ascontiguousarray(cross[taken, :, old].T), 0.0)
     nu = nu[taken, old]
     S = np.where(took, S[taken, old], 1.0)
-    grown = apply_gain(_pick(now.x, old), _pick(now.P, old), cross, S, nu, estimated)
-    return _Explanations(now.of[old], *grown, good, score[old, option])
+    x, P = _pick(now.x, old), _pick(now.P, old)
+    apply_gain(x, P, cross, S, nu, estimated)
+    return _Explanations(now.of[old], x, P, good, score[old, option])
 
 
 def _best(now: _Explanations, most: int) -> _Explanations:
@@ -360,12 +358,24 @@ def _look(prior: _Prior, of: IntArray, u: FloatArray, square: FloatArray) -> _Se
     root = _pick(prior.root[: len(u), : len(u)], of)
     x = _pick(prior.mean, of) + np.einsum('abs,bs->as', root, u)
     residual, gradient = _residuals(x, prior.measured, prior.height)
-    slope = np.einsum('cas,abs->cbs', gradient, root)
+    slope = _whitened(gradient, root, prior.measured.columns)
     misfit = residual * residual / _pick(prior.variance, of)
     weight = (prior.degrees + 1.0) / (prior.degrees + misfit)
     tails = np.log1p(misfit / prior.degrees).sum(axis=0)
     value = -0.5 * ((u * u).sum(axis=0) + square + (prior.degrees + 1.0) * tails)
     return _Searches(of, u, square, value, residual, slope, weight)
+
+
+def _whitened(gradient: FloatArray, root: FloatArray, columns: IntArray) -> FloatArray:
+    """Return gradients (C, a, S) by the whitened state; root (a, a, S)."""
+    if len(root) <= FEW:
+        return np.einsum('cas,abs->cbs', gradient, root)
+    slope = np.zeros(gradient.shape)
+    for each, own, row in zip(slope, gradient, columns.tolist()):
+        used = {*row, row[OFFSET] + 1} if row[OFFSET] >= 0 else {*row}
+        for k in used - {-1}:
+            each[: k + 1] += own[k] * root[k, : k + 1]
+    return slope
 
 
 def _start(prior: _Prior, of: IntArray, positions: FloatArray | None) -> _Searches:
@@ -391,23 +401,32 @@ def _start(prior: _Prior, of: IntArray, positions: FloatArray | None) -> _Search
     return _look(prior, of, u[:a], (u[a:] * u[a:]).sum(axis=0))
 
 
-def _normal_equations(prior: _Prior, now: _Searches) -> tuple[FloatArray, FloatArray]:
-    """Return the information A (a, a, S) and b (a, S) of the weighted least squares ``A du = b``
-    that each search solves next."""
-    a = len(now.u)
+def _step(prior: _Prior, now: _Searches) -> FloatArray:
+    """Return the steps (a, S) to the weighted least squares."""
     heavy = now.slope * (now.weight / _pick(prior.noise, now.of))[:, None]
-    A = np.einsum('cas,cbs->abs', heavy, now.slope)
-    A[range(a), range(a)] += 1.0
-    return A, np.einsum('cas,cs->as', heavy, now.residual) - now.u
+    A = _information(now.slope, heavy)
+    if len(A) == len(now.u):
+        return _solve(A, np.einsum('cas,cs->as', heavy, now.residual) - now.u)
+    there = now.residual + np.einsum('cas,as->cs', now.slope, now.u)
+    return np.einsum('cas,cs->as', heavy, _solve(A, there)) - now.u
 
 
-def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solve positive definite A (a, a, S) for b (a, S); also the logarithm (S,) of its
-    determinant."""
+def _information(slope: FloatArray, heavy: FloatArray) -> FloatArray:
+    """Return ``1 + H' W H`` (a, a, S) of slopes H (C, a, S) and W H, or, where that is smaller,
+    ``1 + H H' W`` (C, C, S), which has the same determinant."""
+    if len(slope) < slope.shape[1]:
+        A = np.einsum('cas,das->cds', slope, heavy)
+    else:
+        A = np.einsum('cas,cbs->abs', heavy, slope)
+    A[range(len(A)), range(len(A))] += 1.0
+    return A
+
+
+def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve A (a, a, S), positive definite but for a scale of its columns, for b (a, S)."""
     if len(A) > FEW:
-        each = np.moveaxis(A, -1, 0)
-        solution = np.linalg.solve(each, b.T[..., None])[..., 0]
-        return np.asarray(solution.T), np.linalg.slogdet(each)[1]
+        solution = np.linalg.solve(np.moveaxis(A, -1, 0), b.T[..., None])[..., 0]
+        return np.ascontiguousarray(solution.T)
     A, b = A.copy(), b.copy()
     for k in range(len(A)):
         for i in range(k + 1, len(A)):
@@ -416,7 +435,7 @@ def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
             A[i, k + 1 :] -= share * A[k, k + 1 :]
     for k in range(len(A) - 1, -1, -1):
         b[k] = (b[k] - (A[k, k + 1 :] * b[k + 1 :]).sum(axis=0)) / A[k, k]
-    return b, np.log(A[range(len(A)), range(len(A))]).sum(axis=0)
+    return b
 
 
 def _shortened(prior: _Prior, old: _Searches, step: FloatArray) -> tuple[_Searches, FloatArray]:
@@ -424,7 +443,8 @@ def _shortened(prior: _Prior, old: _Searches, step: FloatArray) -> tuple[_Search
     shortest, and their gains (S,)."""
     every, many = np.repeat(np.arange(len(old.of)), len(SHORTER)), len(old.of)
     share = np.tile(SHORTER, many)
-    u, square = old.u[:, every] + share * step[:, every], old.square[every] * (1.0 - share) ** 2
+    u = _pick(old.u, every) + share * _pick(step, every)
+    square = old.square[every] * (1.0 - share) ** 2
     tried = _look(prior, old.of[every], u, square)
     gain = (tried.value - old.value[every]).reshape(many, -1)
     climbs = gain >= 0.0
@@ -437,7 +457,7 @@ def _climb(prior: _Prior, now: _Searches) -> tuple[FloatArray, FloatArray]:
     """Return the maxima uphill of the searches, u (a, S), and their log-densities (S,)."""
     u, value, live = now.u.copy(), now.value.copy(), np.arange(len(now.of))
     for _ in range(MOST_ITERATIONS):
-        step, _ = _solve(*_normal_equations(prior, now))
+        step = _step(prior, now)
         trial = _look(prior, now.of, now.u + step, np.zeros(len(live)))
         gain = trial.value - now.value
         lost = np.flatnonzero(~(gain >= 0.0))
@@ -507,7 +527,8 @@ def student_t_ping(
         better = value[k] > best + SMALLEST_GAIN
         at, best = np.where(better, u[:, k], at), np.where(better, value[k], best)
     now = _look(prior, own, at, np.zeros(len(own)))
-    evidence[known] = best - 0.5 * _solve(*_normal_equations(prior, now))[1]
+    information = _information(now.slope, now.slope * (now.weight / prior.noise)[:, None])
+    evidence[known] = best - 0.5 * np.linalg.slogdet(np.moveaxis(information, -1, 0))[1]
     weights[known] = now.weight.T
     place = prior.mean + np.einsum('abs,bs->as', prior.root[: len(at), : len(at)], at)
     mean = x[known].T.copy()
@@ -524,8 +545,6 @@ def student_t_ping(
     for c in range(C):
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
-        means, covariances, _ = consider_scalar(
-            means, covariances, gradient[c], noise, innovation, estimated
-        )
+        consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
     x1[known], P1[known] = means[:, : len(own)].T, np.moveaxis(covariances[..., len(own) :], -1, 0)
     return x1, P1, evidence, weights
