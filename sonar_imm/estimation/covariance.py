@@ -200,8 +200,7 @@ def semidefinite_roots(S: FloatArray) -> FloatArray:
         root = np.sqrt(np.where(known, 0.0, pivot))
         L[b, b] = root
         inverse = np.where(known, 0.0, 1.0 / np.where(known, 1.0, root))
-        for a in range(b + 1, len(S)):
-            L[a, b] = (S[a, b] - (L[a, :b] * L[b, :b]).sum(axis=0)) * inverse
+        L[b + 1 :, b] = (S[b + 1 :, b] - (L[b + 1 :, :b] * L[b, :b]).sum(axis=1)) * inverse
     return L
 
 

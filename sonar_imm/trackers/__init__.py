@@ -170,8 +170,8 @@ SYSTEMS = {
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
             node_config='TracksNodeConfig',
-            kernels={'fixes': (32, 880), 'echoes': (28, 810), 'tags': (35, 899)},
-            all_kernels=(50, 1410),
+            kernels={'fixes': (29, 823), 'echoes': (15, 424), 'tags': (15, 424)},
+            all_kernels=(29, 823),
         ),
         System(
             name='fathometer',
