@@ -39,6 +39,7 @@ TARGETS: dict[str, dict[str, Any]] = {
         'hover_enter': 0.05,
         'hover_stay': 0.95,
         'acceleration_noise': (0.05, 0.4, 0.02),
+        'vertical_speed_std': 0.3,
     },
     'fish': {
         'speed_mean': 0.6,
@@ -47,6 +48,7 @@ TARGETS: dict[str, dict[str, Any]] = {
         'brisk_speed_noise': 0.2,
         'stay_probability': 0.7,
         'acceleration_noise': (0.1, 1.0, 0.05),
+        'vertical_speed_std': 0.3,
     },
     'boat': {
         'speed_mean': 6.0,
@@ -126,18 +128,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'longer gaps are crossed in steps of this length, so that the diver may turn within them',
         range=(1e-3, 3600.0))
     stay_probability: float = parameter(0.86, '',
-        'probability of keeping the heading over a reference step', range=(0.0, 1.0))
+        'probability of keeping the heading over 1 s', range=(0.0, 1.0))
     heading_concentration: float = constant(3.0, '',
         'kappa: a turn by an angle a has a probability proportional to exp(kappa cos a); 0: all '
         'turns are alike', range=(0.0, 50.0))
     hover_enter: float = constant(0.02, '',
-        'probability of stopping over a reference step', range=(0.0, 1.0))
+        'probability of stopping over 1 s', range=(0.0, 1.0))
     hover_stay: float = constant(0.9, '',
-        'probability of staying stopped over a reference step', range=(0.0, 1.0))
+        'probability of staying stopped over 1 s', range=(0.0, 1.0))
     transition_matrix: tuple[float, ...] = parameter((), '',
-        'whole transition matrix over a reference step, row-major, row = from; empty: built from '
-        'stay_probability, heading_concentration, hover_enter and hover_stay', range=(0.0, 1.0),
-        kind='float[]')
+        'whole transition matrix over 1 s, row-major, row = from; empty: built from '
+        'stay_probability', range=(0.0, 1.0), kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
     family_switch_rate: float = constant(0.001, '1/s',
@@ -163,19 +164,19 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families: standard deviation on each axis of the velocity of a new track, around zero; '
         '2 at a fix of a diver', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
-        'random walk of the speed over a reference step (heading_speed, families)',
+        'random walk of the speed over 1 s (heading_speed, families)',
         range=(0.0, 10.0))
     brisk_speed_noise: float = constant(0.07, 'm/s',
-        'families: random walk of the speed over a reference step in the brisk family, in place '
+        'families: random walk of the speed over 1 s in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
     lateral_noise: float = constant(0.24, 'm',
-        'random walk sideways over a reference step (heading_speed, families)',
+        'random walk sideways over 1 s (heading_speed, families)',
         range=(0.0, 10.0))
     hover_noise: float = constant(0.05, 'm',
-        'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
+        'random walk of the position over 1 s while stopped', range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
-        'families: acceleration noise of lively_calm, lively_sharp and quiet over a reference '
-        'step; empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
+        'families: acceleration noise of lively_calm, lively_sharp and quiet over 1 s; '
+        'empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
 
     # -- measurements ----------------------------------------------------------------------------
     fix_std: float = live(1.0, 'm',

@@ -156,7 +156,7 @@ class FixConsistency(NamedTuple):
             return [
                 f'the errors of the fixes last, or their covariances are too large (mean NIS '
                 f'{self.mean_nis:.2g} for each coordinate, correlation {self.lag_1:.2g} from fix '
-                'to fix); the data cannot tell which: state fix_bias_std and fix_bias_time'
+                'to fix); the data cannot tell which: state fix_bias_std'
             ]
         return []
 
@@ -183,7 +183,7 @@ class HeightCounts(NamedTuple):
         if self.refused > DOUBTED * self.seen:
             found.append(
                 f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
-                'than it states, or the divers go up and down faster than vertical_speed_std'
+                'than it states, or the divers go up and down faster than target says'
             )
         return found
 
