@@ -62,6 +62,10 @@ GONE: dict[str, str] = {
     },
     'choice adaptation paper': _LEARNT,
     'choice adaptation ratio': _LEARNT,
+    **{
+        f'parameter origin_{part}': 'was removed: give origin [latitude, longitude, height]'
+        for part in ('latitude', 'longitude', 'height')
+    },
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',
     **{
         f'parameter {name}': 'was removed: the printed form is in benchmarks/fathometer_paper.py'

@@ -23,6 +23,7 @@ from msg_adapters.inputs import inputs_of, InputTopic
 from .acoustics.geodesy import Origin
 from .parameters import Config, inherited, live, parameter, ParameterSpec
 from .trackers import System
+from .trackers.shared_parameters import OriginParameters
 
 
 @frozen(kw_only=True)
@@ -64,7 +65,7 @@ class NodeConfig(Config):
         'this from the first measurement', range=(0.0, 1e6))
     # fmt: on
 
-    def origin(self) -> Origin | None:
+    def stated_origin(self) -> Origin | None:
         """Where the frame of the navigation lies on Earth, None where that is not stated."""
         return None
 
@@ -99,25 +100,8 @@ class TracksNodeConfig(PlacedNodeConfig):
 
 
 @frozen(kw_only=True)
-class ObstacleNodeConfig(TracksNodeConfig):
-    """Besides, where the frame of the navigation lies on Earth."""
-
-    # fmt: off
-    origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of nav, for exports; with both latitude and '
-        'longitude 0: not known', range=(-90.0, 90.0))
-    origin_longitude: float = parameter(0.0, 'deg',
-        'longitude of the origin of the frame of nav, see origin_latitude',
-        range=(-180.0, 180.0))
-    origin_height: float = parameter(0.0, 'm',
-        'height of the origin of the frame of nav above the ellipsoid', range=(-12000.0, 9000.0))
-    # fmt: on
-
-    def origin(self) -> Origin | None:
-        """The origin that is stated, None for none."""
-        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
-            return None
-        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
+class ObstacleNodeConfig(OriginParameters, TracksNodeConfig):
+    """Besides, where the frame of the navigation lies on Earth, for exports."""
 
 
 @frozen(kw_only=True)

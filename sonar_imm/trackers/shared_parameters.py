@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from attrs import frozen
 
+from ..acoustics.geodesy import Origin
 from ..parameters import Config, live, parameter
 
 
@@ -61,6 +62,34 @@ class MountingParameters(Config):
         if bool(self.vehicle_frame) != bool(self.sonar_frame):
             problems.append('vehicle_frame and sonar_frame need each other')
         return problems
+
+
+@frozen(kw_only=True, slots=False)
+class OriginParameters(Config):
+    """Where the origin of the frame of the tracks lies on Earth."""
+
+    # fmt: off
+    origin: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg, deg, m',
+        'latitude, longitude and height above the ellipsoid of the origin of the frame of the '
+        'tracks; with both latitude and longitude 0: not known')
+    # fmt: on
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if len(self.origin) != 3:
+            problems.append(f'origin needs three values, got {len(self.origin)}')
+        for value, what, most in zip(
+            self.origin, ('latitude', 'longitude', 'height'), (90.0, 360.0, 12000.0)
+        ):
+            if abs(value) > most:
+                problems.append(
+                    f'origin: {what} must be between {-most:g} and {most:g}, got {value:g}'
+                )
+        return problems
+
+    def stated_origin(self) -> Origin | None:
+        """Return the origin that is stated, None for none."""
+        return Origin(*self.origin) if any(self.origin[:2]) else None
 
 
 @frozen(kw_only=True, slots=False)

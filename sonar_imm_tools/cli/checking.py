@@ -159,7 +159,7 @@ def play_recording(
         frame_id=node.frame_id,
         use_tf_static=hears_transforms(node),
         world_frame=node.world_frame_convention,
-        origin=node.origin(),
+        origin=node.stated_origin(),
         detector=load_detector(SYSTEMS[system], used, {}),
     )
     run = track_one(

@@ -216,7 +216,7 @@ class Plan:
                     frame_id=node.frame_id,
                     use_tf_static=hears_transforms(node),
                     world_frame=node.world_frame_convention,
-                    origin=node.origin(),
+                    origin=node.stated_origin(),
                     smooth=self.smooth,
                     detector=detector,
                 ),

@@ -53,9 +53,7 @@ OF_FRAMES = (
     'frame_id',
     'world_frame_convention',
     'use_tf_static',
-    'origin_latitude',
-    'origin_longitude',
-    'origin_height',
+    'origin',
 )
 """Parameters of a node that a recording may state: in what frames it was measured."""
 _HEADS = {

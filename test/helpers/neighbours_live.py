@@ -225,7 +225,7 @@ def dave_dvl(step):
     return make('dave_interfaces/msg/DVL', header=header(step), target=target)
 
 
-GEODETIC = {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
+GEODETIC = {'origin': [ORIGIN.latitude, ORIGIN.longitude, 0.0]}
 FIXED = {'vessel': 'fixed'}
 CASES = {
     'geographic_msgs/msg/GeoPointStamped': (DiverNode, 'fix', point_stamped, GEODETIC),

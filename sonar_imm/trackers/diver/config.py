@@ -21,11 +21,15 @@ from typing import Any
 
 from attrs import evolve, fields, frozen
 
-from ...acoustics.geodesy import Origin
 from ...parameters import inherited, live, MODELS, parameter
 from ..model_checks import chain_problems
 from ..own_models import diver_models
-from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from ..shared_parameters import (
+    DetectionParameters,
+    OriginParameters,
+    StreamParameters,
+    TrackLifeParameters,
+)
 
 MODEL_SETS = ('families', 'heading_speed')
 
@@ -94,7 +98,7 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 
 @frozen(kw_only=True)
-class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, StreamParameters):
     """All parameters of the diver tracker. The defaults are the `families` of the
     docs."""
 
@@ -316,15 +320,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         kind='float[]')
 
     # -- latitude and longitude ------------------------------------------------------------------
-    origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of the tracks; with both latitude and longitude 0: '
-        'the first position given in latitude and longitude', range=(-90.0, 90.0))
-    origin_longitude: float = parameter(0.0, 'deg',
-        'longitude of the origin of the frame of the tracks, see origin_latitude',
-        range=(-360.0, 360.0))
-    origin_height: float = parameter(0.0, 'm',
-        'height of the origin of the frame of the tracks above the ellipsoid',
-        range=(-12000.0, 12000.0))
+    origin: tuple[float, ...] = inherited(OriginParameters, 'origin', (0.0, 0.0, 0.0),
+        description='latitude, longitude and height above the ellipsoid of the origin of the '
+        'frame of the tracks; with both latitude and longitude 0: the first position given in '
+        'latitude and longitude, at that height')
     map_frame: str = parameter('map', '',
         'name of the frame of positions that come as latitude and longitude')
 
@@ -444,12 +443,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
                     f"{name}: '{bad[0]}' cannot be part of a topic; letters, digits and _ can"
                 )
         return problems
-
-    def origin(self) -> Origin | None:
-        """The origin that is stated, None for none."""
-        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
-            return None
-        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
     def of_sensor(self, sensor: str) -> DiverConfig:
         """These parameters with those of a sensor in place."""

@@ -114,7 +114,7 @@ class Georeferencer:
 
     def __init__(self, config: DiverConfig, counts: Counter[str]):
         self.config = config
-        self.origin = config.origin()
+        self.origin = config.stated_origin()
         self._counts = counts
         self._stated = self.origin is not None
         self._first: Origin | None = None
@@ -133,8 +133,7 @@ class Georeferencer:
         if self._counts['no_origin']:
             sentences.append(
                 f'{self._counts["no_origin"]} positions cannot be used: those in metres and those '
-                'in latitude and longitude need origin_latitude and origin_longitude to stand '
-                'beside each other'
+                'in latitude and longitude need the parameter origin to stand beside each other'
             )
         if len(self._waiting) > 1 and not self._vessel_known():
             sentences.append(
@@ -167,8 +166,8 @@ class Georeferencer:
             return self._after(self._headings, _turned(measurement))
         if isinstance(measurement, GeodeticFix):
             if self._first is None:
-                height = self.config.origin_height
-                self._first = Origin(measurement.latitude, measurement.longitude, height)
+                latitude, longitude = measurement.latitude, measurement.longitude
+                self._first = Origin(latitude, longitude, self.config.origin[2])
             if isinstance(measurement, VesselFix):
                 return self._after(self._places, self._moved(measurement))
             return [self._fix_of(measurement)] if self._on_earth() else []

@@ -190,7 +190,7 @@ class HeightCounts(NamedTuple):
             found.append(
                 f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
                 f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
-                'origin_height for positions in latitude and longitude'
+                'the height of origin for positions in latitude and longitude'
             )
         if self.refused > DOUBTED * self.seen:
             found.append(

@@ -60,8 +60,7 @@ VARIANTS = {
     'diver': (
         {'max_tracks': 4},
         {
-            'origin_latitude': 3.0,
-            'origin_longitude': 3.0,
+            'origin': [3.0, 3.0, 0.0],
             'fix_bias_std': 0.5,
             'tags': ['a'],
             'max_tracks': 4,
