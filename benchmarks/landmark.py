@@ -176,7 +176,8 @@ class Landmark:
         self.config = config
         self.model = config.azimuth_model
         self._beam = beam_of(config)
-        self._noise = (config.position_noise**2, config.depth_noise**2)
+        position, _, depth = config.drift()
+        self._noise = (position**2, depth**2)
 
     def ready(self, sonar: Sonar) -> bool:
         return True

@@ -52,6 +52,8 @@ PROOF = 100
 """Measurements after which a state that was loaded is taken for sound."""
 _ENOUGH = 3
 """First measurements that have to be far from a state before it is given up; one may be wrong."""
+STATE_INTERVAL = 10.0
+"""Seconds between saves; the last state is saved in any case."""
 
 
 class SavedState:
@@ -76,7 +78,6 @@ class SavedState:
             self._path = Path(settings.state_file).expanduser() if settings.state_file else None
         except RuntimeError as error:
             raise ConfigError(f"state_file: '~' stands for no folder ({error})") from None
-        self._period = settings.state_interval
         self._refused = self._others = False
         self._loaded_ns: int | None = None
         self._newest_ns: int | None = None
@@ -110,7 +111,7 @@ class SavedState:
         """`save` with the parameters `given()`, each time something new came."""
         if self._path:
             self._node.create_timer(
-                self._period,
+                STATE_INTERVAL,
                 lambda: self.save(given()),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )

@@ -26,7 +26,7 @@ from __future__ import annotations
 from attrs import frozen
 
 from ..acoustics.geodesy import Origin
-from ..parameters import Config, live, parameter
+from ..parameters import Config, constant, live, parameter
 
 
 @frozen(kw_only=True, slots=False)
@@ -124,10 +124,10 @@ class StampParameters(Config):
     """Which stamps are believed."""
 
     # fmt: off
-    max_gap: float = parameter(3600.0, 's',
+    max_gap: float = constant(3600.0, 's',
         'a stamp further ahead of the last one than this is not trusted until the following '
         'stamps agree with it', range=(1.0, 1e8))
-    restart_after: int = parameter(5, '',
+    restart_after: int = constant(5, '',
         'number of consecutive agreeing stamps that count as a restarted clock: further ahead '
         'than max_gap, more than five minutes late, or a repeated beginning; 20 times as many '
         'where late messages may be the reason', range=(2, 1000))

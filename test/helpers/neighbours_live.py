@@ -255,18 +255,19 @@ CASES = {
     ),
     'marine_interfaces/msg/SonarInfo': (
         *(FlsDetectorNode, 'sonar_info', sonar_info),
-        {'image_type': 'sensor_msgs/msg/Image'},
+        {'input_types': ['image=sensor_msgs/msg/Image']},
     ),
 }
 
 
 def run(type_name, kind, name, message_of, settings):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
-    settings = {f'{name}_type': type_name, **settings}
+    types = [f'{name}={type_name}', *settings.get('input_types', [])]
     quality = lockstep_qos()
     if name == 'sonar_info':
         quality = transforms_qos()
-        del settings['sonar_info_type']
+        del types[0]
+    settings = {**settings, 'input_types': types}
     bench = Bench()
     try:
         overrides = [Parameter(key, value=value) for key, value in settings.items()]

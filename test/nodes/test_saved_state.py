@@ -89,8 +89,9 @@ def test_a_node_that_is_started_again_goes_on(start, tmp_path):
     assert again.node.tracker.counts['duplicate'] == 1
 
 
+@pytest.mark.usefixtures('quick')
 def test_states_are_saved_while_running_and_only_when_something_was_heard(start, tmp_path):
-    rig = start('state_interval:=0.1')
+    rig = start()
     rig.bench.spin_until(lambda: rig.node._saved_state._taken == 0)
     rig.send(a_fix(1.0))
     rig.bench.spin_until((tmp_path / 'state').exists)

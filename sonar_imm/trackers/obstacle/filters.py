@@ -159,11 +159,7 @@ class DepthSlices:
         vertical, horizontal, reach = self._beam
         edge = np.radians(config.sector_edge_deg)
         self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
-        self._noise = (
-            config.position_noise**2,
-            np.radians(config.yaw_noise_deg) ** 2,
-            config.depth_noise**2,
-        )
+        self._noise = tuple(walk**2 for walk in config.drift())
 
     def ready(self, sonar: Sonar) -> bool:
         """Whether a target can begin: the sea floor has to be known for `seafloor`."""
@@ -357,9 +353,8 @@ def _outlier_density(config: ObstacleConfig) -> float:
     """Of a detection that passed the gate but is not the target's: uniform over a gate as wide as
     the sonar's own error makes it."""
     threshold = gate_threshold(config.gate_probability, 2)
-    range_std = np.sqrt(config.range_std**2 + config.range_step**2 / 12.0)
-    bearing_std = np.radians(np.hypot(config.bearing_std_deg, config.bearing_step_deg / 12.0**0.5))
-    return float(1.0 / (np.pi * threshold * range_std * bearing_std))
+    bearing_std = np.radians(config.bearing_std_deg)
+    return float(1.0 / (np.pi * threshold * config.range_std * bearing_std))
 
 
 def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:

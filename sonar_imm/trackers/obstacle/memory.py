@@ -34,9 +34,9 @@ half. While nobody looks, the probability falls with `landmark_time`.
 
 **Drift.** The errors of navigation between two stamps are those between two pings, only more of
 them: coming back is one step of the prediction (`filters`), from the pose of the sonar when the
-track ended to that of now. Navigation that walks by `position_noise` makes a landmark uncertain
-by 0.6 m in an hour at the default. A landmark stays where it is: components that move are left
-out, and what mostly moves is not kept. Moored ones swing on.
+track ended to that of now. The grade `ins` makes a landmark uncertain by 0.6 m in an hour. A
+landmark stays where it is: components that move are left out, and what mostly moves is not kept.
+Moored ones swing on.
 
 Source: docs/obstacle.md, section Memory; Musicki, Evans, Stankovic 1994, 'Integrated probabilistic
 data association', for the existence.
@@ -106,7 +106,8 @@ class Landmark(NamedTuple):
     def spread(self, stamp_ns: int, config: ObstacleConfig) -> FloatArray:
         """Covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation drifted."""
         age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
-        drift = np.square([config.position_noise, config.position_noise, config.depth_noise])
+        position, _, depth = config.drift()
+        drift = np.square([position, position, depth])
         return self.covariance + np.diag(drift * age)
 
     def row(self, stamp_ns: int, config: ObstacleConfig) -> dict[str, float]:
@@ -151,7 +152,7 @@ def in_view(memory: Memory, stamp_ns: int, sonar: Sonar, config: ObstacleConfig)
     away = np.linalg.norm(m, axis=1)
     reach = np.array([3.0 * math.sqrt(np.trace(each.covariance[:2, :2])) for each in memory])
     age = np.array([max(stamp_ns - each.stamp_ns, 0) * 1e-9 for each in memory])
-    reach += 3.0 * config.position_noise * np.sqrt(age)
+    reach += 3.0 * config.drift()[0] * np.sqrt(age)
     sector = np.radians(0.5 * config.horizontal_fov_deg) + reach / np.maximum(away, 1e-6)
     seen = (np.abs(np.arctan2(m[:, 1], m[:, 0])) <= sector) & (m[:, 0] >= RETURNS * away)
     seen &= away <= config.max_range + reach

@@ -96,7 +96,6 @@ class ObstacleTracker:
         self.filter = build_filter(config)
         self.rules = track_rules(config)
         own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
-        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
         self._own_variance = own
 
     def reset(self) -> None:
@@ -336,7 +335,7 @@ class ObstacleTracker:
         tentative = now.life.status == TENTATIVE
         usual = config.detection_probability
         weighed = fit
-        if config.detection_ranges:  # as probable as it is at the range of each track
+        if config.detection_profile:  # as probable as it is at the range of each track
             p = self._chance(now.mixture)
             weighed = fit + np.log(p / (1.0 - p) * (1.0 - usual) / usual)[:, None]
         chosen = assign_fits(weighed, tentative, usual, config.clutter_density)
@@ -376,7 +375,7 @@ class ObstacleTracker:
 
     def _chance(self, mixture: Mixture) -> FloatArray:
         """Probability (T,) that a ping shows obstacles that the beam holds."""
-        if not self.config.detection_ranges:
+        if not self.config.detection_profile:
             return np.full(len(mixture.mu), self.config.detection_probability)
         return self.config.detection_at(np.einsum('tk,tk->t', mixture.mu, mixture.x[..., 0]))
 
@@ -387,7 +386,7 @@ class ObstacleTracker:
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
         p = self._chance(now.mixture)
         probable = in_beam * p > IN_BEAM * self.config.detection_probability
-        looked = tentative | (probable if self.config.detection_ranges else in_beam > IN_BEAM)
+        looked = tentative | (probable if self.config.detection_profile else in_beam > IN_BEAM)
         life, stays = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
         now = now._replace(
             existence=now.existence.after(hit, fit, in_beam, p, self.config.clutter_density)

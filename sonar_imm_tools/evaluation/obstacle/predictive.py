@@ -54,7 +54,7 @@ def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunabl
     p = config.detection_probability
     found.append(Tunable(name='detection_probability', start=p, kind='logit'))
     found.append(Tunable(name='clutter_density', start=config.clutter_density))
-    for name in ('sway_std', 'max_speed', 'speed_noise', 'position_noise', 'yaw_noise_deg'):
+    for name in ('sway_std', 'max_speed'):
         if (start := getattr(config, name)) > 0.0:
             found.append(Tunable(name=name, start=start, usual=False))
     return found

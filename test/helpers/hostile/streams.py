@@ -98,7 +98,7 @@ VARIANTS = {
             'max_tracks': 4,
             'history': 1.0,
         },
-        {'method': 'seafloor', 'behaviours': ['fixed'], 'max_tracks': 4},
+        {'behaviours': ['fixed'], 'max_tracks': 4},
     ),
 }
 """Parameters of the trackers under test; small, since speed is not what is tried."""

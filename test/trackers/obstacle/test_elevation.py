@@ -38,13 +38,11 @@ IDEAL = {
 }
 FAITHFUL = {
     'scale_std': 0.0,
-    'position_noise': 0.0,
-    'yaw_noise_deg': 0.0,
-    'depth_noise': 0.0,
+    'navigation_noise': (0.0, 0.0, 0.0),
     'range_scale_std': 0.0,
     'outlier_probability': 0.0,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
+    'range_std': 0.15,
+    'bearing_std_deg': 0.25,
 }
 POSE = geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.05, -0.08, 0.7))
 

@@ -26,7 +26,7 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 P_D, OTHER = 0.9, 1e-4
-STILL = {'scale_std': 0.0, 'position_noise': 0.0, 'yaw_noise_deg': 0.0, 'depth_noise': 0.0}
+STILL = {'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0)}
 DEPTH = 20.0
 HALF = np.radians(7.5)
 R = np.diag([0.15**2, np.radians(0.25) ** 2])
