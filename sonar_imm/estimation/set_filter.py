@@ -511,11 +511,11 @@ class LagSmoother:
         knows of it what its descendant does, against its own places: those of the descendant have
         since been moved by what was drawn of it.
         """
-        if not step.ok:
+        if not step.ok or not self.lag:
             self._steps.clear()
             return None
         self._steps.append(step)
-        if len(self._steps) <= self.lag or not self.lag:
+        if len(self._steps) <= self.lag:
             return None
         steps = list(self._steps)
         line, drawn = np.arange(len(step.w)), np.zeros(len(step.w))

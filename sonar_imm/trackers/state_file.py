@@ -113,7 +113,7 @@ def state_of(intake: Intake) -> dict[str, Attributes]:
 
 def write_state(path: Path, saved: Saved) -> int:
     """Write a state; gives the bytes written. Raises OSError; the old file is there then."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     header = {
         'version': __version__,
         'system': saved.system,

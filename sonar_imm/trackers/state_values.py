@@ -118,7 +118,7 @@ def encoded(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     """Return a frozen state as JSON; its large arrays are put into `arrays`.
 
     Raises TypeError for what is no data: a fault of the tracker that holds it."""
-    kind = type(value)
+    kind: Any = type(value)
     if kind in _PLAIN:
         return value
     if kind is np.ndarray and value.dtype.kind in _KINDS:
@@ -161,7 +161,7 @@ def _fields(cls: Any) -> dict[str, str]:
 
 
 @cache
-def _hints(cls: type) -> dict[str, Any]:
+def _hints(cls: Any) -> dict[str, Any]:
     return get_type_hints(cls, include_extras=True)
 
 
@@ -190,7 +190,8 @@ class Decoder:
         """Replace the state of an object that is there."""
         if type(data) is not dict or set(data) != set(owner.STATE):
             raise StateError('it belongs to another tracker, or to another version')
-        hints = _hints(type(owner))
+        cls: Any = type(owner)
+        hints = _hints(cls)
         for name in owner.STATE:
             there, hint = getattr(owner, name), hints.get(name, Any)
             setattr(owner, name, self._read(data[name], hint, f'{path}/{name}', there))
@@ -254,7 +255,7 @@ class Decoder:
 
     def _value(self, data: Any, kind: type, path: str, lengths: Lengths | None) -> Any:
         """Make a value by its class, which checks it, too."""
-        cls = self._types.get(data['class'])
+        cls: Any = self._types.get(data['class'])
         if cls is None or not issubclass(cls, kind):
             raise ValueError(f'{path} is of no class that fits')
         names, hints = _fields(cls), _hints(cls)
