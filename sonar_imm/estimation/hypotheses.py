@@ -45,7 +45,7 @@ All arrays are float64, int64 or bool and C-contiguous.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -204,10 +204,10 @@ class Hypotheses(NamedTuple):
     """G hypotheses over T rows: cluster (G,) of each; log_weight (G,), of which the exponentials
     sum to one in a cluster; shown (G,): one in each cluster; member (G, T): its rows."""
 
-    cluster: IntArray
-    log_weight: FloatArray
-    shown: BoolArray
-    member: BoolArray
+    cluster: Annotated[IntArray, 'h']
+    log_weight: Annotated[FloatArray, 'h']
+    shown: Annotated[BoolArray, 'h']
+    member: Annotated[BoolArray, 'ht']
 
     @classmethod
     def none(cls) -> Hypotheses:

@@ -38,13 +38,12 @@ from ..node_config import NodeConfig
 from ..parameters import Config, ConfigError
 from ..trackers import SYSTEMS
 from ..trackers.state_file import (
-    frozen_state,
+    intake_from,
     json_parameters,
     read_state,
-    restore,
     Saved,
+    state_of,
     StateError,
-    tracker_from,
     write_state,
 )
 
@@ -171,8 +170,8 @@ class SavedState:
             parameters=json_parameters(given),
             saved_ns=time.time_ns(),
             newest_ns=self._newest_ns,
-            state=frozen_state(self.intake.tracker),
-            extras={'conventions': self._conventions, 'intake': frozen_state(self.intake)},
+            state=state_of(self.intake),
+            extras=self._conventions,
         )
         if wait:
             self._write(self._path, saved)
@@ -208,10 +207,9 @@ class SavedState:
         if abs(age) > self._max_age:
             when = f'{age:.0f} s ago' if age > 0 else f'{-age:.0f} s ahead of the clock'
             raise StateError(f'it was saved {when}, state_max_age is {self._max_age:g} s')
-        intake = Intake(tracker_from(saved, self._system, config), self._frame_id)
-        if saved.extras.get('conventions') != self._conventions:
+        if saved.extras != self._conventions:
             raise StateError('it was saved with another frame_id or world_frame_convention')
-        restore(intake, saved.extras.get('intake', {}))
+        intake = intake_from(saved, self._system, config, self._frame_id)
         self._loaded_ns = self._newest_ns = saved.newest_ns
         self._unproven = PROOF
         self._node.get_logger().info(f"goes on from the state in '{path}', {age:.1f} s old")

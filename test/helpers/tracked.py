@@ -17,9 +17,17 @@ import functools
 from pathlib import Path
 
 from msg_adapters.estimates import write_estimate
+from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import frozen_state, json_parameters, Saved
+from sonar_imm.trackers.state_file import (
+    intake_from,
+    json_parameters,
+    read_state,
+    Saved,
+    state_of,
+    write_state,
+)
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
@@ -84,10 +92,19 @@ class Tracked:
             'parameters': json_parameters(self.config),
             'saved_ns': 5,
             'newest_ns': 7,
-            'state': frozen_state(tracker),
-            'extras': {},
+            'state': state_of(Intake(tracker)),
         }
         return Saved(**(fields | changes))
+
+    def again(self, path, tracker=None):
+        """Load a tracker, after it was saved."""
+        if tracker is not None:
+            write_state(path, self.saved(tracker))
+        return tracker_from(read_state(path), self.system, self.config)
+
+
+def tracker_from(saved, system, config):
+    return intake_from(saved, system, config).tracker
 
 
 def published(tracker, measurement):

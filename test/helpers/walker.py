@@ -52,6 +52,10 @@ class WalkerTracker:
 
     STATE = ('counts', 'fixes', 'frames')
 
+    counts: Counter[str]
+    fixes: dict[int, Fix]
+    frames: KnownFrames
+
     def __init__(self, config):
         self.config = config
         self.counts = Counter()
@@ -116,7 +120,7 @@ class WalkerSystem(System):
         return WalkerTracker(config)
 
     def state_types(self):
-        return (Fix, KnownFrames)
+        return (Fix,)
 
 
 def register(set_item):

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -231,26 +231,26 @@ class DiverState(NamedTuple):
 
     stamp_ns: int
     life: Tracks
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    learnt: FloatArray
-    nis: FloatArray
-    nis_dof: np.ndarray
-    score: FloatArray
-    white: FloatArray
-    existence: FloatArray
-    evidence: FloatArray
-    target_id: IntArray
-    near_to: IntArray
-    near_for: IntArray
-    refused: FloatArray
-    refused_z: FloatArray
-    spreads: IntArray
-    history: IntArray
-    came_from: IntArray
-    looks: FloatArray
-    scale: FloatArray
+    x: Annotated[FloatArray, 'TMn']
+    P: Annotated[FloatArray, 'TMnn']
+    mu: Annotated[FloatArray, 'TM']
+    learnt: Annotated[FloatArray, 'Tall']
+    nis: Annotated[FloatArray, 'T']
+    nis_dof: Annotated[np.ndarray, 'T']
+    score: Annotated[FloatArray, 'T']
+    white: Annotated[FloatArray, 'T2']
+    existence: Annotated[FloatArray, 'T']
+    evidence: Annotated[FloatArray, 'T']
+    target_id: Annotated[IntArray, 'T']
+    near_to: Annotated[IntArray, 'T']
+    near_for: Annotated[IntArray, 'T']
+    refused: Annotated[FloatArray, 'T6']
+    refused_z: Annotated[FloatArray, 'T3']
+    spreads: Annotated[IntArray, 'T']
+    history: Annotated[IntArray, 'Tw']
+    came_from: Annotated[IntArray, 'T']
+    looks: Annotated[FloatArray, 'T']
+    scale: Annotated[FloatArray, '22']
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
     excess: float = 0.0

@@ -37,7 +37,7 @@ navigation problems', for considered errors.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -54,8 +54,8 @@ class Bodies(NamedTuple):
     """Of T tracks: number (T,) of echoes with an extent, and their mean standard deviation (T, 2),
     m, in range and across it; zeros as long as there was none."""
 
-    number: FloatArray
-    std: FloatArray
+    number: Annotated[FloatArray, 'T']
+    std: Annotated[FloatArray, 'T2']
 
     @staticmethod
     def unknown(T: int) -> Bodies:

@@ -31,7 +31,7 @@ Everything is in NED and FRD; T targets, K components. Component weights mu (T, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -80,7 +80,7 @@ class Sonar(NamedTuple):
     late: Pose | None = None
     late_by: float = 0.0
     reference: float = 0.0
-    course: FloatArray = NOWHERE
+    course: Annotated[FloatArray, '3'] = NOWHERE
 
     def seabed_below(self) -> float:
         """Depth of the sea floor below the sonar, m, NaN when unknown."""
@@ -100,9 +100,9 @@ class Hints(NamedTuple):
 class Mixture(NamedTuple):
     """x (T, K, n), P (T, K, n, n), mu (T, K)."""
 
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
+    x: Annotated[FloatArray, 'TKS']
+    P: Annotated[FloatArray, 'TKSS']
+    mu: Annotated[FloatArray, 'TK']
 
     def rows(self, which: np.ndarray) -> Mixture:
         return Mixture(self.x[which], self.P[which], self.mu[which])

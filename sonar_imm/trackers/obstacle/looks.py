@@ -45,7 +45,7 @@ Bayesian inference', for the moments.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -64,10 +64,10 @@ class Looks(NamedTuple):
     `silent` (T,), whether the newest ping had none; `shown`: the mixture with what the last echo
     and the misses since say."""
 
-    seen: FloatArray
-    due: FloatArray
-    missed: FloatArray
-    silent: BoolArray
+    seen: Annotated[FloatArray, 'T']
+    due: Annotated[FloatArray, 'T']
+    missed: Annotated[FloatArray, 'T']
+    silent: Annotated[BoolArray, 'T']
     shown: Mixture
 
     @staticmethod

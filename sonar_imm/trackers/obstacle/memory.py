@@ -45,7 +45,7 @@ data association', for the existence.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -79,13 +79,13 @@ class Landmark(NamedTuple):
     seen_ns: int
     log_odds: float
     sonar: Pose
-    which: np.ndarray
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
+    which: Annotated[np.ndarray, 'k']
+    x: Annotated[FloatArray, 'kn']
+    P: Annotated[FloatArray, 'knn']
+    mu: Annotated[FloatArray, 'k']
     body: tuple[float, FloatArray]
-    place: FloatArray
-    covariance: FloatArray
+    place: Annotated[FloatArray, '3']
+    covariance: Annotated[FloatArray, '33']
     low: float
     high: float
 
@@ -164,10 +164,10 @@ class Existence(NamedTuple):
     since that may have held them; held (T,): their probability of that, summed; silence (T,): log
     probability of no echo in all these pings of what was held."""
 
-    log_odds: FloatArray
-    pings: FloatArray
-    held: FloatArray
-    silence: FloatArray
+    log_odds: Annotated[FloatArray, 'T']
+    pings: Annotated[FloatArray, 'T']
+    held: Annotated[FloatArray, 'T']
+    silence: Annotated[FloatArray, 'T']
 
     @staticmethod
     def of(log_odds: FloatArray) -> Existence:

@@ -17,7 +17,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import frozen
 import numpy as np
@@ -44,7 +44,7 @@ class PingState(NamedTuple):
     sonar: Sonar
     life: Tracks
     mixture: Mixture
-    nis: FloatArray
+    nis: Annotated[FloatArray, 'T']
     bodies: Bodies
     looks: Looks
     existence: Existence

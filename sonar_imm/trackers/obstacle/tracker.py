@@ -84,6 +84,8 @@ class ObstacleTracker:
 
     STATE = ('_stream',)
 
+    _stream: ReplayStream[ObstacleState]
+
     def __init__(self, config: ObstacleConfig):
         self._settle(config)
         self.mount = Mount(config)
@@ -109,16 +111,17 @@ class ObstacleTracker:
         self.counts = self._stream.counts
 
     def restored(self) -> None:
-        """Raise ValueError for states, put in, that are none of these models."""
-        K, n = self.filter.K, self.filter.n
-        for state in self._stream.kept:
-            for ping in (*state.done, *filter(None, [state.last])):
-                if ping.mixture.x.shape[1:] != (K, n):
-                    raise ValueError('states are of another filter')
-                for landmark in ping.memory:
-                    which = landmark.which
-                    if landmark.x.shape[1:] != (n,) or not ((which >= 0) & (which < K)).all():
-                        raise ValueError('landmarks are of another filter')
+        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
+        is none of these models."""
+        K, n, base = self.filter.K, self.filter.n, self._stream.base
+        for ping in (*base.done, *filter(None, [base.last])):
+            if ping.mixture.x.shape[1:] != (K, n):
+                raise ValueError('states are of another filter')
+            for landmark in ping.memory:
+                which = landmark.which
+                if landmark.x.shape[1:] != (n,) or not ((which >= 0) & (which < K)).all():
+                    raise ValueError('landmarks are of another filter')
+        self._stream.restored()
 
     @property
     def frames(self) -> KnownFrames:
