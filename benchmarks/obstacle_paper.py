@@ -79,7 +79,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.navigation import Mount
+from sonar_imm.trackers.obstacle.pings import Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length

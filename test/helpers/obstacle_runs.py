@@ -21,9 +21,8 @@ import numpy as np
 
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
-from sonar_imm.trackers.obstacle.behaviours import build_filter
-from sonar_imm.trackers.obstacle.filters import Sonar
-from sonar_imm.trackers.obstacle.navigation import Mount
+from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
+from sonar_imm.trackers.obstacle.pings import Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 

@@ -22,16 +22,17 @@ from ...estimation.consistency import NisMemory
 from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Detections, Ground, Navigation
 from ..navigation import NavigationBuffer
+from .beam import MissEvidence
 from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
-from .looks import Looks
 from .memory import Existence, Landmark
-from .state import ObstacleState, PingState
+from .pings import Inbox
+from .state import Known, Obstacles, ObstacleState
 
 STATE_TYPES = (
     *STREAM_TYPES,
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
-    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Looks),
-    *(Existence, Landmark, GroundMap, Cells),
+    *(ObstacleState, Inbox, Known, Obstacles, Tracks, NisMemory, Mixture, Sonar, Bodies),
+    *(MissEvidence, Existence, Landmark, GroundMap, Cells),
 )

@@ -22,9 +22,8 @@ from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.trackers.obstacle import mixtures
 from sonar_imm.trackers.obstacle import unscented as behave
-from sonar_imm.trackers.obstacle.behaviours import BehaviourSlices
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.filters import Sonar
+from sonar_imm.trackers.obstacle.filters import BehaviourSlices, Sonar
 
 MODELS = {'plane': False, 'cone': True}
 

@@ -337,7 +337,7 @@ def test_at_the_edge_of_the_sector_nothing_is_missed(edge, counted):
     sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)))
     z = np.array([[30.0, np.radians(21.5)], [30.0, np.radians(20.0)]])
     mixture = filter_.begin(z, np.tile(np.diag([0.02, 2e-5]), (2, 1, 1)), sonar)
-    in_beam, ahead = filter_.outlook(mixture, sonar)
+    in_beam, ahead = filter_.beam_probability(mixture, sonar)
     assert (in_beam[0] > 0.3) == counted and in_beam[1] > 0.3 and ahead.all()
 
 
