@@ -241,8 +241,8 @@ class Decoder:
         self, data: Any, kind: Any, arguments: tuple[Any, ...], path: str, there: Any
     ) -> Any:
         of_key, of_item = arguments if kind is dict else (*arguments, int)
-        if of_key is not str and len(data) > _KEYS:
-            raise ValueError(f'{path} has more keys than any')
+        if type(data) is not list or (of_key is not str and len(data) > _KEYS):
+            raise ValueError(f'{path} is no mapping like that')
         pairs = {
             _plain(key, of_key, path): self._read(item, of_item, f'{path}/{_step(key, k)}')
             for k, (key, item) in enumerate(data)
