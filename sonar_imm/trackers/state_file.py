@@ -12,17 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The state of a tracker in a file, and back: what goes on afterwards is bit for bit the same.
+"""The state of a tracker in a file, and back. The tracker then goes on bit for bit as before.
 
-A file is one line that says what it is, the SHA-256 of the rest, and the rest: an npz, not
-compressed, of ``header`` (JSON) and of the larger arrays, named by their path in it, see
-`state_values`. Whatever happens, there is a whole file, the old or the new one.
+A file is one line with its format and the SHA-256 of the rest. The rest is an uncompressed npz of
+``header`` (JSON) and of the larger arrays, named by their path in the header, see `state_values`.
+After any failure the old or the new file is there, whole.
 
-The checksum finds damage. Whoever makes a file on purpose makes one that fits: so nothing that
-it says is looked up, called, or believed before it is compared with what is there.
+The checksum finds damage. A forged file has a correct checksum: so sizes are compared with the
+bytes that are there, and types and shapes with those of the tracker.
 
-A tracker with a window for late measurements keeps the state before it and the measurements in it.
-The states in it are computed anew, with the parameters of now.
+A tracker with a window for late measurements saves the state before the window and the
+measurements in it. The states in the window are computed again, with the present parameters.
 """
 
 from __future__ import annotations
@@ -101,13 +101,13 @@ class Saved:
 
 
 def types_of(system: System) -> tuple[type, ...]:
-    """The classes of values that a state of a tracker of `system`, and of the intake before it,
-    may hold."""
+    """Return the classes of values that a state of a tracker of `system`, and of the intake before
+    it, may hold."""
     return tuple(dict.fromkeys((*intake.STATE_TYPES, *system.state_types())))
 
 
 def state_of(intake: Intake) -> dict[str, Attributes]:
-    """Return what a tracker and the intake before it know now."""
+    """Return a copy of the state of a tracker and of the intake before it."""
     return {'intake': frozen_state(intake), 'tracker': frozen_state(intake.tracker)}
 
 
@@ -164,7 +164,7 @@ def read_state(path: Path) -> Saved:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a regular file, as many as a state can have. Raises OSError, `StateError`."""
+    """Read a regular file, as large as a state can be. Raises OSError, `StateError`."""
     # Without O_NONBLOCK to open a pipe waits for somebody who writes.
     handle = os.open(path, os.O_RDONLY | getattr(os, 'O_NONBLOCK', 0) | getattr(os, 'O_BINARY', 0))
     with os.fdopen(handle, 'rb') as stream:
@@ -180,8 +180,8 @@ def _content(path: Path) -> bytes:
 
 
 def _arrays(body: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an npz by name. What it says of its sizes is compared with the bytes that are
-    there."""
+    """Return the arrays of an npz by name. Raises ValueError where its sizes are not those of the
+    bytes that are there."""
     # The end first: zipfile reads the whole directory, however long it is.
     if len(body) < _END.size:
         raise ValueError('it has no end')
@@ -204,7 +204,7 @@ def _arrays(body: bytes) -> dict[str, np.ndarray]:
 
 
 def _array(content: bytes) -> np.ndarray:
-    """The array of an npy file."""
+    """Return the array of an npy file."""
     stream = io.BytesIO(content)
     if np.lib.format.read_magic(stream) != (1, 0):
         raise ValueError('a part of another form')
@@ -213,7 +213,7 @@ def _array(content: bytes) -> np.ndarray:
 
 
 def _saved(header: Any, arrays: dict[str, np.ndarray]) -> Saved:
-    """What a header says. Raises what `understood` takes."""
+    """Return the contents of a header. Raises the exceptions of `understood`."""
     if header['version'] != __version__:
         version = str(header['version'])[:_SHORT]
         raise StateError(f'it was saved by version {version}, not {__version__}')
@@ -237,8 +237,8 @@ def _saved(header: Any, arrays: dict[str, np.ndarray]) -> Saved:
 
 
 def intake_from(saved: Saved, system: System, config: Config, frame_id: str = '') -> Intake:
-    """Return a tracker of `config`, behind its intake, that goes on from what `read_state` gave;
-    `saved` is of no use afterwards. Raises `StateError` when the state is of another system, or of
+    """Return the intake of a tracker of `config` that goes on from a state of `read_state`, which
+    cannot be used twice. Raises `StateError` when the state is of another system, or of
     other parameters than those that may change while a tracker runs."""
     if saved.system != system.name:
         raise StateError(f'it is of a {saved.system} tracker')
@@ -261,7 +261,7 @@ def intake_from(saved: Saved, system: System, config: Config, frame_id: str = ''
     intake = Intake(system.build(then), frame_id)
     tracker = intake.tracker
     # Odd numbers are refused, or lived with: numpy need not warn of them.
-    with understood(AssertionError), np.errstate(all='ignore'):
+    with understood(Exception), np.errstate(all='ignore'):
         types = types_of(system)
         Decoder(types, saved.arrays, then).put(intake, saved.state['intake'], 'intake')
         intake.restored()  # now the tracker knows where the sonar is

@@ -14,21 +14,22 @@
 
 """The state of a tracker as JSON and arrays, and back.
 
-A state is made of two kinds of objects. One that *changes*, such as a tracker or a stream, names
-the attributes that it learns in ``STATE``. It is there when a state is put in: its attributes are
-replaced. A *value*, a frozen attrs class or a named tuple, is made anew of its fields. Functions,
-parameters and all that follows from them are no state: the fresh tracker has its own.
+A state has two kinds of objects. An object that *changes*, such as a tracker or a stream, lists
+the attributes that it learns in ``STATE``. Loading a state replaces these attributes of an object
+that already exists. A *value*, a frozen attrs class or a named tuple, is made anew from its
+fields. Functions, parameters and everything that follows from them are not saved.
 
-JSON has an object of the attributes for the first kind, and for a value one of its fields and of
-the name of its ``class``. Tuples, lists and queues are lists, mappings lists of pairs. An array of
-many numbers is an empty object: its name in the file is the path to it, such as
+In JSON an object that changes is an object of its attributes. A value is an object of its fields
+and of the name of its ``class``. Tuples, lists and queues are lists; mappings are lists of pairs.
+A large array is an empty object: its name in the file is the path to it, such as
 ``tracker/_stream/_history/_base/x``.
 
-What is read may come from anybody. The annotations of attributes and fields say what may stand
-where; a name in the data only chooses among the classes of ``STATE_TYPES`` that fit there. Nothing
-is looked up, imported or called by name. Shapes of arrays stand in annotations as in
+The file may come from anybody. Annotations of attributes and fields determine which types fit; a
+name in the file only selects one of the classes in ``STATE_TYPES`` that fit there. Nothing is
+looked up, imported or called by name. Shapes of arrays are part of the annotation, such as
 ``Annotated[FloatArray, 'Tw3']``: a capital letter is a length that a value shares with the values
-in its fields, a small one is a length of its own, a digit that length; ``*`` any axes before.
+in its fields, a small letter is a length of this value alone, a digit is that length, and ``*``
+stands for any axes before.
 """
 
 from __future__ import annotations
@@ -51,13 +52,14 @@ _PLAIN = (bool, int, float, str, NoneType)
 _KINDS = 'biufcU'
 """Kinds of the numbers, and of the text, of arrays."""
 _SMALL = 64
-"""Arrays of at most so many numbers stand in the JSON: thousands of poses have four each."""
+"""Arrays of at most so many numbers stand in the JSON: a buffer has thousands of poses with four
+arrays each, and a part of the archive takes ten times as long."""
 _LONGEST = 200
-"""Characters of what a file says that are repeated in a sentence."""
+"""Most characters of a file that are repeated in a sentence."""
 _WORD = 1 << 63
 _KEYS = 10_000
-"""Keys of one mapping that are no text: whoever chooses numbers can make all of them fall into
-one place of the table, which takes the square of their number."""
+"""Most keys of one mapping that are not text: numbers can be chosen so that all of them have the
+same hash, which takes time with the square of their number."""
 _UNFIT = (
     ArithmeticError,
     AttributeError,
@@ -67,10 +69,10 @@ _UNFIT = (
     TypeError,
     ValueError,
 )
-"""What data that say something else than a tracker would have written raise."""
+"""Exceptions raised by data that no tracker has written."""
 
 Lengths = tuple[dict[str, int], dict[str, int]]
-"""Lengths by letter: shared with the values around, and of one value."""
+"""Lengths by letter: those shared with the values around, and those of one value."""
 
 
 class StateError(ValueError):
@@ -82,7 +84,7 @@ class StateError(ValueError):
 
 @contextlib.contextmanager
 def understood(*more: type[Exception]) -> Iterator[None]:
-    """Raise `StateError` in place of what data raise that do not fit, `more` included."""
+    """Raise `StateError` in place of the exceptions of data that do not fit, `more` included."""
     try:
         yield
     except StateError:
@@ -97,12 +99,12 @@ class Attributes(dict[str, Any]):
 
 
 def frozen_state(owner: Any) -> Attributes:
-    """Return what `owner` knows now; it stays as it is while the owner goes on."""
+    """Return a copy of the state of `owner`, which does not change while the owner goes on."""
     return Attributes({name: _frozen(getattr(owner, name)) for name in owner.STATE})
 
 
 def _frozen(value: Any) -> Any:
-    """Copy what can change. Values need no copy."""
+    """Copy objects, containers and arrays that can change; values need no copy."""
     if hasattr(value, 'STATE'):
         return frozen_state(value)
     if type(value) is np.ndarray:
@@ -115,9 +117,9 @@ def _frozen(value: Any) -> Any:
 
 
 def encoded(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a frozen state as JSON; its large arrays are put into `arrays`.
+    """Return a frozen state as JSON; put its large arrays into `arrays`.
 
-    Raises TypeError for what is no data: a fault of the tracker that holds it."""
+    Raises TypeError for an object that is neither: an error in the tracker."""
     kind: Any = type(value)
     if kind in _PLAIN:
         return value
@@ -148,13 +150,13 @@ def encoded(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _step(key: Any, row: int) -> Any:
-    """What stands for the item of a mapping in a path."""
+    """Return the name of an item of a mapping in a path."""
     return key if isinstance(key, str) and key.isidentifier() else row
 
 
 @cache
 def _fields(cls: Any) -> dict[str, str]:
-    """The names of the fields of a class of values, and what they are called when it is made."""
+    """Return the names of the fields of a class of values, with the names of its arguments."""
     if attrs.has(cls):
         return {field.name: field.alias for field in attrs.fields(cls) if field.init}
     return {name: name for name in cls._fields}
@@ -167,7 +169,7 @@ def _hints(cls: Any) -> dict[str, Any]:
 
 @cache
 def _form(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """The kind of an annotation, and its arguments; `object` for any."""
+    """Return the kind of an annotation and its arguments; `object` for any value."""
     if isinstance(hint, TypeVar) or hint is Any:
         return object, ()
     origin = get_origin(hint) or hint
@@ -175,11 +177,11 @@ def _form(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 class Decoder:
-    """The way back, for states of these types. Raises ValueError and others of `understood` for
-    what `encoded` did not write.
+    """The inverse of `encoded`. Raises ValueError, and others of `understood`, for data that
+    `encoded` has not written.
 
-    arrays: by path; those that were read are taken out. config: of the tracker, which stands for
-    all parameters in its state.
+    types: classes of values. arrays: by path; each is taken out when it is read. config: stands
+    for all parameters in the state.
     """
 
     def __init__(self, types: Iterable[type], arrays: dict[str, np.ndarray], config: Config):
@@ -199,7 +201,7 @@ class Decoder:
     def _read(
         self, data: Any, hint: Any, path: str, there: Any = None, lengths: Lengths | None = None
     ) -> Any:
-        """Return what stands at a path, of an annotated kind; there: what it replaces."""
+        """Return the value at a path, of an annotated kind; there: the value that it replaces."""
         kind, arguments = _form(hint)
         if hasattr(there, 'STATE'):
             self.put(there, data, path)
@@ -234,27 +236,27 @@ class Decoder:
             arguments = arguments[:1] * len(data)
         both = enumerate(zip(data, arguments, strict=True))
         items = [self._read(item, hint, f'{path}/{k}') for k, (item, hint) in both]
-        # How long a queue may be follows from the parameters.
+        # The length of a queue follows from the parameters.
         return deque(items, there.maxlen) if kind is deque else kind(items)
 
     def _mapping(
         self, data: Any, kind: Any, arguments: tuple[Any, ...], path: str, there: Any
     ) -> Any:
         of_key, of_item = arguments if kind is dict else (*arguments, int)
-        if of_key is not str and len(data) > _KEYS:
-            raise ValueError(f'{path} has more keys than any')
+        if type(data) is not list or (of_key is not str and len(data) > _KEYS):
+            raise ValueError(f'{path} is no mapping like that')
         pairs = {
             _plain(key, of_key, path): self._read(item, of_item, f'{path}/{_step(key, k)}')
             for k, (key, item) in enumerate(data)
         }
         if kind is dict:
             return pairs
-        there.clear()  # others may count with it, too
+        there.clear()  # other objects may count with it, too
         there.update(pairs)
         return there
 
     def _value(self, data: Any, kind: type, path: str, lengths: Lengths | None) -> Any:
-        """Make a value by its class, which checks it, too."""
+        """Make a value by its class, which may have checks of its own."""
         cls: Any = self._types.get(data['class'])
         if cls is None or not issubclass(cls, kind):
             raise ValueError(f'{path} is of no class that fits')
@@ -294,7 +296,7 @@ def array_of(content: bytes, dtype: Any, shape: Any, order: Any) -> np.ndarray:
 
 
 def _plain(data: Any, kind: Any, path: str) -> Any:
-    """A text, a truth or a number; a whole number may stand for one with a fraction."""
+    """Return a text, a truth value or a number; a whole number fits a float, too."""
     fits = type(data) is kind or kind is object or (kind is float and type(data) is int)
     if not fits or (type(data) is int and not -_WORD <= data < 2 * _WORD):
         raise ValueError(f'{path} cannot be a {type(data).__name__} like that')

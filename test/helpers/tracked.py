@@ -86,25 +86,30 @@ class Tracked:
             tracker.process(measurement)
         return tracker
 
-    def saved(self, tracker, **changes):
-        fields = {
-            'system': self.system.name,
-            'parameters': json_parameters(self.config),
-            'saved_ns': 5,
-            'newest_ns': 7,
-            'state': state_of(Intake(tracker)),
-        }
-        return Saved(**(fields | changes))
+    def saved(self, tracker):
+        return saved(Intake(tracker), self.system)
 
-    def again(self, path, tracker=None):
-        """Load a tracker, after it was saved."""
-        if tracker is not None:
-            write_state(path, self.saved(tracker))
-        return tracker_from(read_state(path), self.system, self.config)
+
+def saved(intake, system):
+    """The state of a tracker of a system, and of the intake before it."""
+    return Saved(
+        system=system.name,
+        parameters=json_parameters(intake.tracker.config),
+        saved_ns=5,
+        newest_ns=7,
+        state=state_of(intake),
+    )
 
 
 def tracker_from(saved, system, config):
+    """The tracker that goes on from a state as it was read."""
     return intake_from(saved, system, config).tracker
+
+
+def resumed(path, tracker, name):
+    """The tracker that goes on from the file to which a tracker of a system is saved."""
+    write_state(path, saved(Intake(tracker), SYSTEMS[name]))
+    return tracker_from(read_state(path), SYSTEMS[name], tracker.config)
 
 
 def published(tracker, measurement):

@@ -16,6 +16,7 @@
 
 from collections import Counter
 import sys
+from typing import Any
 
 import attrs
 import numpy as np
@@ -53,7 +54,7 @@ class WalkerTracker:
     STATE = ('counts', 'fixes', 'frames')
 
     counts: Counter[str]
-    fixes: dict[int, Fix]
+    fixes: dict[int, Any]
     frames: KnownFrames
 
     def __init__(self, config):

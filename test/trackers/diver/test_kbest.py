@@ -21,23 +21,15 @@ import math
 from attrs import evolve
 from helpers.diver_runs import run, SECOND
 from helpers.estimates import same
+from helpers.tracked import resumed
 import numpy as np
 import pytest
 
 from sonar_imm.estimation import hypotheses as rules
 from sonar_imm.measurements import Fix, Fixes, Start
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver import jipda, kbest
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm.trackers.state_file import (
-    frozen_state,
-    json_parameters,
-    read_state,
-    Saved,
-    tracker_from,
-    write_state,
-)
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 
@@ -277,16 +269,7 @@ def test_a_tracker_goes_on_from_its_state(tmp_path, density):
     for item in scans[:25]:
         tracker.process(item)
     assert len(tracker._stream.state.hypotheses.cluster) > 4
-    saved = Saved(
-        system='diver',
-        parameters=json_parameters(config),
-        saved_ns=1,
-        newest_ns=scans[24].stamp_ns,
-        state=frozen_state(tracker),
-        extras={},
-    )
-    write_state(tmp_path / 'state', saved)
-    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['diver'], config)
+    again = resumed(tmp_path / 'state', tracker, 'diver')
     for item in scans[25:]:
         first, other = tracker.process(item), again.process(item)
         assert len(first) == len(other) and all(map(same, first, other))
