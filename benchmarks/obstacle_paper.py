@@ -79,7 +79,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.navigation import Mount
+from sonar_imm.trackers.obstacle.pings import Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length
@@ -186,11 +186,7 @@ def _residuals(
         Pose(start.position + travelled * scale, poses.R), geometry.to_world(start, m)[:, None]
     )
     d, delta = geometry.project(seen, config.azimuth_model)
-    pixel = (
-        (config.range_step or config.range_std),
-        np.radians(config.bearing_step_deg or config.bearing_std_deg),
-    )
-    parts = (d - z[:, 0]) / pixel[0], wrap_angle(delta - z[:, 1]) / pixel[1]
+    parts = (d - z[:, 0]) / STEP[0], wrap_angle(delta - z[:, 1]) / STEP[1]
     prior = first[:, 2:] / max(config.scale_std, 1e-9)
     return np.concatenate([*parts, prior], axis=1)
 

@@ -22,11 +22,15 @@ from typing import Any, cast
 
 from attrs import evolve, fields, frozen
 
-from ...acoustics.geodesy import Origin
 from ...parameters import Config, constant, inherited, live, MODELS, parameter, ParameterSpec
 from ..model_checks import chain_problems
 from ..own_models import diver_models
-from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from ..shared_parameters import (
+    DetectionParameters,
+    OriginParameters,
+    StreamParameters,
+    TrackLifeParameters,
+)
 
 MODEL_SETS = ('families', 'heading_speed')
 
@@ -102,7 +106,7 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 
 @frozen(kw_only=True)
-class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, StreamParameters):
     """All parameters of the diver tracker. The defaults are the `families` of the docs.
 
     own: values that sensors have of their own, by names as ``radar.fix_std``.
@@ -265,8 +269,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
-    max_gap: float = inherited(StreamParameters, 'max_gap', 3600.0, constant=True)
-    restart_after: int = inherited(StreamParameters, 'restart_after', 5, constant=True)
     birth_density: float = live(1.2e-5, '1/m^2',
         'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
@@ -302,15 +304,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     own: tuple[tuple[str, Any], ...] = ()
 
     # -- latitude and longitude ------------------------------------------------------------------
-    origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of the tracks; with both latitude and longitude 0: '
-        'the first position given in latitude and longitude', range=(-90.0, 90.0))
-    origin_longitude: float = parameter(0.0, 'deg',
-        'longitude of the origin of the frame of the tracks, see origin_latitude',
-        range=(-360.0, 360.0))
-    origin_height: float = parameter(0.0, 'm',
-        'height of the origin of the frame of the tracks above the ellipsoid',
-        range=(-12000.0, 12000.0))
+    origin: tuple[float, ...] = inherited(OriginParameters, 'origin', (0.0, 0.0, 0.0),
+        description='latitude, longitude and height above the ellipsoid of the origin of the '
+        'frame of the tracks; with both latitude and longitude 0: the first position given in '
+        'latitude and longitude, at that height')
     frame_id: str = parameter('', '',
         'frame that the input must be in, and the frame of positions given in latitude and '
         'longitude; empty: the frame of the first message accepted, and map')
@@ -430,12 +427,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     def map_frame(self) -> str:
         """The frame of positions that come as latitude and longitude."""
         return self.frame_id or 'map'
-
-    def origin(self) -> Origin | None:
-        """The origin that is stated, None for none."""
-        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
-            return None
-        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
     @classmethod
     def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:

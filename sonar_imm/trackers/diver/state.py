@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -178,7 +178,7 @@ class HeightCounts(NamedTuple):
             found.append(
                 f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
                 f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
-                'origin_height for positions in latitude and longitude'
+                'the height of origin for positions in latitude and longitude'
             )
         if self.refused > DOUBTED * self.seen:
             found.append(
@@ -215,23 +215,23 @@ class DiverState(NamedTuple):
 
     stamp_ns: int
     life: Tracks
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    learnt: FloatArray
-    nis: FloatArray
-    nis_dof: np.ndarray
-    score: FloatArray
-    white: FloatArray
-    existence: FloatArray
-    evidence: FloatArray
-    target_id: IntArray
-    near_to: IntArray
-    near_for: IntArray
-    refused: FloatArray
-    refused_z: FloatArray
-    spreads: IntArray
-    looks: FloatArray
+    x: Annotated[FloatArray, 'TMn']
+    P: Annotated[FloatArray, 'TMnn']
+    mu: Annotated[FloatArray, 'TM']
+    learnt: Annotated[FloatArray, 'Tall']
+    nis: Annotated[FloatArray, 'T']
+    nis_dof: Annotated[np.ndarray, 'T']
+    score: Annotated[FloatArray, 'T']
+    white: Annotated[FloatArray, 'T2']
+    existence: Annotated[FloatArray, 'T']
+    evidence: Annotated[FloatArray, 'T']
+    target_id: Annotated[IntArray, 'T']
+    near_to: Annotated[IntArray, 'T']
+    near_for: Annotated[IntArray, 'T']
+    refused: Annotated[FloatArray, 'T6']
+    refused_z: Annotated[FloatArray, 'T3']
+    spreads: Annotated[IntArray, 'T']
+    looks: Annotated[FloatArray, 'T']
     fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
     excess: float = 0.0

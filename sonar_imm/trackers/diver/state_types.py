@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The classes that a saved state of this tracker may hold, see `state_file`."""
+"""The classes of values that a saved state of this tracker may hold, see `state_file`."""
 
 from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from ...intake.stream import REPLAY_TYPES
+from ...intake.stream import STREAM_TYPES
 from ...measurements import (
     Arrivals,
     Fix,
@@ -34,17 +34,15 @@ from ...measurements import (
 )
 from ..navigation import NavigationBuffer
 from . import clutter
-from .config import DiverConfig
-from .georeferencing import Georeferencer, Samples
 from .offsets import Offsets, RecentPairs
 from .state import DiverState, FixConsistency, HeightCounts
 from .state_space import Instruments
 
 STATE_TYPES = (
-    *REPLAY_TYPES,
+    *STREAM_TYPES,
     *(Arrivals, Fix, Fixes, Start),
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
-    *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
+    *(NavigationBuffer, Origin),
     *(DiverState, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments),
     *(Offsets, RecentPairs, clutter.Clutter),
 )

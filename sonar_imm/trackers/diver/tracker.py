@@ -73,6 +73,9 @@ class DiverTracker:
 
     STATE = ('_stream', '_georeferencer')
 
+    _stream: ReplayStream[DiverState]
+    _georeferencer: Georeferencer
+
     def __init__(self, config: DiverConfig):
         self.models = build_models(config := config.for_target())
         self._position = np.ascontiguousarray(self.models.E[:, :2])
@@ -109,10 +112,11 @@ class DiverTracker:
         return DiverState.of_nobody(life, self.models, self._chain.fresh(0))
 
     def restored(self) -> None:
-        """Raise ValueError for states, put in, that are none of these models."""
-        nobody = self._nobody(Tracks.none(self.rules))
-        for state in self._stream.kept:
-            state.require_like(nobody, self._layout(state.instruments).size)
+        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
+        is none of these models."""
+        base, nobody = self._stream.base, self._nobody(Tracks.none(self.rules))
+        base.require_like(nobody, self._layout(base.instruments).size)
+        self._stream.restored()
 
     @property
     def origin(self) -> Origin | None:

@@ -51,8 +51,8 @@ def test_variances_of_the_detections_win():
         return tracker.process(ping)[0].covariance[0]
 
     own = first()
-    assert own[0, 0] == pytest.approx(0.15**2 + 0.17**2 / 12.0)
-    assert own[1, 1] == pytest.approx(np.radians(0.25) ** 2 + np.radians(0.18) ** 2 / 12.0)
+    assert own[0, 0] == pytest.approx(0.15782**2)
+    assert own[1, 1] == pytest.approx(np.radians(0.25534) ** 2)
     stated = first(var_range=[0.5], var_bearing=[1e-4])
     assert stated[0, 0] == pytest.approx(0.5)
     assert stated[1, 1] == pytest.approx(1e-4)

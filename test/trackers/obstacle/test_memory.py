@@ -19,23 +19,15 @@ from typing import NamedTuple
 
 from attrs import evolve
 from helpers.estimates import same
+from helpers.tracked import resumed
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.memory import Existence, kept, SUREST
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
-from sonar_imm.trackers.state_file import (
-    frozen_state,
-    json_parameters,
-    read_state,
-    Saved,
-    tracker_from,
-    write_state,
-)
 
 # A vehicle that comes by the same obstacles again and again, for the tests of memory.
 
@@ -270,16 +262,7 @@ def test_the_oldest_and_least_certain_landmarks_are_given_up_first():
 
 def test_landmarks_are_saved_with_the_state(tmp_path):
     tracker, rest = remembered()
-    saved = Saved(
-        system='obstacle',
-        parameters=json_parameters(tracker.config),
-        saved_ns=0,
-        newest_ns=None,
-        state=frozen_state(tracker),
-        extras={},
-    )
-    write_state(tmp_path / 'state', saved)
-    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['obstacle'], tracker.config)
+    again = resumed(tmp_path / 'state', tracker, 'obstacle')
     assert [each.track_id for each in again.landmarks] == [
         each.track_id for each in tracker.landmarks
     ]
