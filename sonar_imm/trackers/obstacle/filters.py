@@ -52,7 +52,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, take
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import gate_threshold
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
@@ -526,19 +526,21 @@ def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) 
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
     if len(which) < ALIKE_AT_LEAST:
         return False
-    v, covariance = _velocity(take(mixture, which), filter_.moves)
+    v, covariance = _velocity(mixture, which, filter_.moves)
     off = v - np.median(v, axis=0)
     variance = np.trace(covariance, axis1=-2, axis2=-1)
     alike = np.einsum('ti,ti->t', off, off) <= 9.0 * variance + ALIKE**2
     return bool(alike.sum() >= ALIKE_AT_LEAST and alike.sum() > 0.5 * confirmed.sum())
 
 
-def _velocity(mixture: Mixture, moves: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (T, 2) and covariance (T, 2, 2) of the velocity; what does not move has 0, without
-    spread."""
-    x, P = mixture.x[..., COMMON:].copy(), mixture.P[..., COMMON:, COMMON:].copy()
+def _velocity(
+    mixture: Mixture, which: IndexArray, moves: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (q, 2) and covariance (q, 2, 2) of the velocity of some obstacles; what does not move
+    has 0, without spread."""
+    x, P = mixture.x[which, :, COMMON:], mixture.P[which, :, COMMON:, COMMON:]
     x[:, ~moves], P[:, ~moves] = 0.0, 0.0
-    return mixtures.moment_match(x, P, mixture.mu, 2)
+    return mixtures.moment_match(x, P, mixture.mu[which], 2)
 
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:
