@@ -179,9 +179,6 @@ class Landmark:
         position, _, depth = config.drift()
         self._noise = (position**2, depth**2)
 
-    def ready(self, sonar: Sonar) -> bool:
-        return True
-
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:

@@ -17,7 +17,7 @@
     python -m benchmarks.obstacle_calibration --out docs/results/obstacle_calibration.json
 
 All runs are of the whole tracker, with its defaults, of which `--tracker name=value` replaces
-some. `misses` changes what is published and not the filter (`looks`), so one run shows both.
+some. `misses` changes what is published and not the filter (`beam`), so one run shows both.
 
 Each scene has `OBSTACLES` one behind the other, for as many runs from a third of the time.
 

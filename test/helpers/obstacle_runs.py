@@ -22,7 +22,7 @@ import numpy as np
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
-from sonar_imm.trackers.obstacle.pings import Mount
+from sonar_imm.trackers.obstacle.pings import Echoes, Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -154,14 +154,15 @@ def mean_nis(final):
 def follow(measurements, config):
     """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
     view."""
-    tracker, mount = ObstacleTracker(config), Mount(config)
+    mount = Mount(config)
     filter_, mixture, before, nis = build_filter(config), None, None, []
     for i in range(0, len(measurements), 3):
         altitude, pose, ping = measurements[i : i + 3]
         sonar = Sonar(
             mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
         )
-        z, R, *_ = tracker._detections(ping)
+        echoes = Echoes.of(ping, config)
+        z, R = echoes.z, echoes.R
         if mixture is None:
             mixture = filter_.begin(z, R, sonar)
         else:

@@ -34,7 +34,6 @@ from ..shared_parameters import (
     TrackLifeParameters,
 )
 
-METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 MISSES = ('ignored', 'evidence')
 GRADES = {
@@ -56,16 +55,13 @@ class ObstacleConfig(
     AUV."""
 
     # fmt: off
-    method: str = constant('gaussian_sum', '',
-        'treatment of the vertical offset: gaussian_sum (estimated, over depth slices) or '
-        'seafloor (assumed on the sea floor, as in the paper)', choices=METHODS)
-    components: int = constant(9, '', 'number of depth slices of gaussian_sum', range=(1, 201))
+    components: int = constant(9, '', 'number of depth slices', range=(1, 201))
 
-    # -- what an obstacle may do, gaussian_sum only ----------------------------------------------
+    # -- what an obstacle may do -----------------------------------------------------------------
     behaviours: tuple[str, ...] = parameter(BEHAVIOURS, '',
-        'behaviours of an obstacle that gaussian_sum considers: fixed, swaying (on its mooring), '
-        'moving, seabed (lying on the sea floor); seabed is left out while no altitude is known, '
-        'and needs another beside it; also behaviours that other packages register',
+        'behaviours of an obstacle that are considered: fixed, swaying (on its mooring), moving, '
+        'seabed (lying on the sea floor); seabed is left out while no altitude is known, and '
+        'needs another beside it; also behaviours that other packages register',
         choices=BEHAVIOURS, group=MODELS)
     sway_std: float = parameter(0.5, 'm',
         'behaviour swaying: standard deviation of the position along each axis; twice as much is '
@@ -148,8 +144,8 @@ class ObstacleConfig(
         'width at either edge of the sector in which an obstacle without an echo is not missed',
         range=(0.0, 45.0))
     misses: str = parameter('ignored', '',
-        'what pings without an echo say of the height of an obstacle, gaussian_sum only: nothing '
-        '(ignored), or that it is less probable in the beam (evidence)', choices=MISSES)
+        'what pings without an echo say of the height of an obstacle: nothing (ignored), or that '
+        'it is less probable in the beam (evidence)', choices=MISSES)
     # -- what is believed of depth and navigation ------------------------------------------------
     max_offset: float = constant(0.0, 'm',
         'largest vertical offset of a new obstacle; 0: what beam, surface and altitude allow',

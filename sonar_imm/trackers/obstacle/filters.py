@@ -20,8 +20,7 @@ closes more slowly the further off the course in the vertical it lies, whether a
 are so weak at first, and the second so ambiguous, that no single Gaussian holds what is known. So
 the vertical reach of the beam is cut into slices, each an unscented Kalman filter over (d, delta,
 z, s), and their likelihoods say in which of them the obstacle is. What stays constant is the
-obstacle's own depth z; its offset follows from it and the vehicle's depth. With one slice that is
-clamped to the sea floor below the vehicle the same filter is the paper's (`seafloor`).
+obstacle's own depth z; its offset follows from it and the vehicle's depth.
 
 **Behaviour.** Inside each slice runs an interacting multiple model filter over what the obstacle
 does; two more states e say how:
@@ -52,7 +51,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, take
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import gate_threshold
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
@@ -161,12 +160,10 @@ class DepthSlices:
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
-        self.seafloor = config.method == 'seafloor'
-        self.K = 1 if self.seafloor else config.components
+        self.K = config.components
         self.moves = np.zeros(self.K, np.bool_)
         self._still = Motion.none(self.K)
         self.cone = config.azimuth_model == 'cone'
-        self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
         self._beam = beam_of(config)
         vertical, horizontal, reach = self._beam
@@ -174,31 +171,20 @@ class DepthSlices:
         self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
         self._noise = tuple(walk**2 for walk in config.drift())
 
-    def ready(self, sonar: Sonar) -> bool:
-        """Whether a target can begin: the sea floor has to be known for `seafloor`."""
-        return not self.seafloor or bool(np.isfinite(sonar.altitude))
-
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
-        fresh = self._begin(z, R, sonar, self.K, height)
-        return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
-
-    def _begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, height: HeightPrior | None
-    ) -> Mixture:
-        """New targets in K slices of equal weight, four states."""
-        B = len(z)
+        B, K = len(z), self.K
         x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.scale**2
+        P[..., 3, 3] = self.config.scale_std**2
         span = depth_span(z, sonar, self.config, height)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
         P[..., 2, 2] = np.square(sigma)[:, None]
-        return Mixture(x, P, np.full((B, K), 1.0 / K))
+        return self._unshift(Mixture(x, P, np.full((B, K), 1.0 / K)), z, sonar)
 
     def _unshift(self, fresh: Mixture, z: FloatArray, sonar: Sonar) -> Mixture:
         """Two-way timing: the state at the transmission of which z would be measured."""
@@ -211,7 +197,6 @@ class DepthSlices:
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
-        mixture = self._clamp_to_seafloor(mixture, before)
         return self.predict_unchanged(mixture, before.pose, after.pose, dt)
 
     def predict_unchanged(
@@ -242,7 +227,7 @@ class DepthSlices:
 
     def apply_echo(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
         """With what an echo in this ping says of the height, or one in the ping before, of the
-        sonar `last` (`looks`)."""
+        sonar `last` (`beam`)."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
@@ -306,16 +291,6 @@ class DepthSlices:
         out = unscented.points(mixture.x, *sonar.pose, self.cone)
         return two_way_echo(out, sonar, self.config)
 
-    def _clamp_to_seafloor(self, mixture: Mixture, sonar: Sonar) -> Mixture:
-        """For `seafloor`: the depth is the sea floor's, whatever was measured."""
-        if not self.seafloor or not np.isfinite(sonar.altitude):
-            return mixture
-        x, P = mixture.x.copy(), mixture.P.copy()
-        x[..., 2] = sonar.pose.position[2] + sonar.altitude
-        P[..., 2, :] = P[..., :, 2] = 0.0
-        P[..., 2, 2] = self.config.altitude_std**2
-        return Mixture(x, P, mixture.mu)
-
 
 class BehaviourSlices(DepthSlices):
     """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
@@ -373,7 +348,7 @@ class BehaviourSlices(DepthSlices):
         x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.scale**2
+        P[..., 3, 3] = self.config.scale_std**2
         x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
         P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
         mu = np.zeros((B, self.K))
@@ -512,9 +487,8 @@ def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatA
 
 
 def build_filter(config: ObstacleConfig) -> DepthSlices:
-    """The filter `config.method` names, for the behaviours it asks for."""
-    alone = config.method == 'seafloor' or set(config.behaviours) == {'fixed'}
-    return DepthSlices(config) if alone else BehaviourSlices(config)
+    """The filter for the behaviours that are asked for."""
+    return (DepthSlices if set(config.behaviours) == {'fixed'} else BehaviourSlices)(config)
 
 
 def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
@@ -526,19 +500,21 @@ def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) 
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
     if len(which) < ALIKE_AT_LEAST:
         return False
-    v, covariance = _velocity(take(mixture, which), filter_.moves)
+    v, covariance = _velocity(mixture, which, filter_.moves)
     off = v - np.median(v, axis=0)
     variance = np.trace(covariance, axis1=-2, axis2=-1)
     alike = np.einsum('ti,ti->t', off, off) <= 9.0 * variance + ALIKE**2
     return bool(alike.sum() >= ALIKE_AT_LEAST and alike.sum() > 0.5 * confirmed.sum())
 
 
-def _velocity(mixture: Mixture, moves: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (T, 2) and covariance (T, 2, 2) of the velocity; what does not move has 0, without
-    spread."""
-    x, P = mixture.x[..., COMMON:].copy(), mixture.P[..., COMMON:, COMMON:].copy()
+def _velocity(
+    mixture: Mixture, which: IndexArray, moves: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (q, 2) and covariance (q, 2, 2) of the velocity of some obstacles; what does not move
+    has 0, without spread."""
+    x, P = mixture.x[which, :, COMMON:], mixture.P[which, :, COMMON:, COMMON:]
     x[:, ~moves], P[:, ~moves] = 0.0, 0.0
-    return mixtures.moment_match(x, P, mixture.mu, 2)
+    return mixtures.moment_match(x, P, mixture.mu[which], 2)
 
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:

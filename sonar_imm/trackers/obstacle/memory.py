@@ -275,7 +275,7 @@ def recall(known: Known, filter_: DepthSlices, rules: TrackRules, config: Obstac
     if memory and memory[-1].stamp_ns > known.stamp_ns:
         memory = kept(memory, known.stamp_ns, config)
         known = known._replace(memory=memory)
-    if not memory or not filter_.ready(known.sonar):
+    if not memory:
         return known
     back = in_view(memory, known.stamp_ns, known.sonar, config)
     back = back[: max(0, config.max_tracks - len(known.life))]

@@ -69,11 +69,13 @@ class Mount:
 @frozen(eq=False)
 class Echoes:
     """The echoes of one ping: range and azimuth z (D, 2), m and rad positive to starboard, with
-    covariance R (D, 2, 2); extended (D,): whether an extent is stated."""
+    covariance R (D, 2, 2); extended (D,): whether an extent is stated; heights: their elevations,
+    None where none is measured."""
 
     z: FloatArray
     R: FloatArray
     extended: BoolArray
+    heights: Elevations | None = None
 
     @staticmethod
     def of(ping: Detections, config: ObstacleConfig) -> Echoes:
@@ -86,29 +88,24 @@ class Echoes:
         real = np.isfinite(z[:, 0]) & (np.abs(z[:, 1]) < 0.5 * np.pi)
         real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
         R, extended = variance[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
-        echoes = Echoes(z, R, extended).rows(real)
         heights = Elevations.of(ping.elevation[real], ping.var_elevation[real], config)
-        if heights is None:
-            return echoes
-        return EchoesInHeight(echoes.z, echoes.R, echoes.extended, heights)
+        return Echoes(z[real], R[real], extended[real], heights)
 
     def __len__(self) -> int:
         return len(self.z)
 
     def rows(self, which: IndexArray | BoolArray) -> Echoes:
         """Return some of the echoes."""
-        return Echoes(self.z[which], self.R[which], self.extended[which])
+        heights = self.heights and take(self.heights, which)
+        return Echoes(self.z[which], self.R[which], self.extended[which], heights)
 
     def fits(
-        self,
-        mixture: Mixture,
-        h: FloatArray,
-        C: FloatArray,
-        pose: Pose,
-        config: ObstacleConfig,
+        self, mixture: Mixture, h: FloatArray, C: FloatArray, pose: Pose, config: ObstacleConfig
     ) -> FloatArray:
         """Return how well each echo fits each obstacle (T, D), see `imm.gate`; h (T, K, 2), C (T,
         K, 2, 2): what is expected."""
+        if self.heights:
+            return elevation_fits(mixture, h, pose, self.z, self.R, self.heights, config)
         threshold = gate_threshold(config.gate_probability, 2)
         return imm.gate(h, _H, C, mixture.mu, self.z, self.R, threshold)
 
@@ -116,10 +113,10 @@ class Echoes:
         self, sonar: Sonar, ground: GroundMap, config: ObstacleConfig
     ) -> HeightPrior | None:
         """Return what is known of the height of obstacles that begin at these echoes."""
-        if not ground:
+        if not (self.heights or ground):
             return None
-        nothing = np.full((len(self), 2), np.nan)
-        return HeightPrior(nothing, *ground.below(self.z, sonar, config))
+        ends = self.heights.ends() if self.heights else np.full((len(self), 2), np.nan)
+        return HeightPrior(ends, *ground.below(self.z, sonar, config))
 
     def update_height(
         self,
@@ -131,47 +128,13 @@ class Echoes:
         """Return the obstacles after the elevation of one echo each. before: the mixture before
         their range and azimuth, what was expected of these and the covariance R (T, 2, 2) used;
         None for obstacles that begin."""
-        return mixture
-
-
-@frozen(eq=False)
-class EchoesInHeight(Echoes):
-    """Echoes of which some have an elevation."""
-
-    heights: Elevations
-
-    def rows(self, which: IndexArray | BoolArray) -> EchoesInHeight:
-        plain = self.z[which], self.R[which], self.extended[which]
-        return EchoesInHeight(*plain, take(self.heights, which))
-
-    def fits(
-        self,
-        mixture: Mixture,
-        h: FloatArray,
-        C: FloatArray,
-        pose: Pose,
-        config: ObstacleConfig,
-    ) -> FloatArray:
-        return elevation_fits(mixture, h, pose, self.z, self.R, self.heights, config)
-
-    def height_prior(
-        self, sonar: Sonar, ground: GroundMap, config: ObstacleConfig
-    ) -> HeightPrior | None:
-        return HeightPrior(self.heights.ends(), *ground.below(self.z, sonar, config))
-
-    def update_height(
-        self,
-        mixture: Mixture,
-        before: tuple[Mixture, FloatArray, FloatArray] | None,
-        filter_: DepthSlices,
-        pose: Pose,
-    ) -> Mixture:
+        if not self.heights:
+            return mixture
         doubt: FloatArray | float = filter_.config.outlier_probability
         if before is not None:
             old, h, R = before
-            doubt = outlier_probability(
-                old, h, self.z, R, filter_.config.outlier_probability, filter_.outlier_density
-            )
+            density = filter_.outlier_density
+            doubt = outlier_probability(old, h, self.z, R, float(doubt), density)
         return apply_elevations(mixture, self.heights, doubt, pose, filter_.config)
 
 

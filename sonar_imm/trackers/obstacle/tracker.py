@@ -320,7 +320,7 @@ class ObstacleTracker:
         free = np.ones(len(ping.echoes), np.bool_)
         free[ping.match.chosen[ping.match.hit]] = False
         which = np.flatnonzero(free)[: max(0, self.config.max_tracks - len(known.life))]
-        if not len(which) or not self.filter.ready(ping.sonar):
+        if not len(which):
             return known
         echoes = ping.echoes.rows(which)
         bodies, R = Bodies.unknown(len(which)).with_echoes(

@@ -244,9 +244,9 @@ def test_it_takes_three_and_more_than_half_of_all_to_doubt_the_navigation(
     v[:moving] = (0.4, 0.0)
     v[moving:] = np.arange(other)[:, None] * 30.0 - 100.0
     monkeypatch.setattr(
-        filters, '_velocity', lambda rows, moves: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
+        filters, '_velocity', lambda *_: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
     )
     filter_ = SimpleNamespace(moves=np.array([False, True]), behaviours=('fixed', 'moving'))
-    mixture = SimpleNamespace(mu=mu, rows=lambda which: which)
+    mixture = SimpleNamespace(mu=mu)
     known = np.arange(confirmed + 1) < confirmed  # the last one is tentative
     assert filters.moving_alike(filter_, mixture, known) == alike

@@ -218,17 +218,17 @@ def test_existence_is_that_of_an_obstacle_that_the_beam_holds_always_or_never():
     no, yes = np.zeros(4, bool), np.array([False, False, False, True])
     in_beam, p = np.array([1.0, 0.6, 0.0, 1.0]), np.full(4, 0.8)
     for _ in range(3):
-        existence = existence.after(no, np.zeros(4), in_beam, p, 0.1)
+        existence = existence.with_ping(no, np.zeros(4), in_beam, p, 0.1)
     odds = np.exp(0.5) * np.array([0.2**3, 0.4 + 0.6 * 0.2**3, 1.0, 0.2**3])
     np.testing.assert_allclose(existence.now(), np.log(odds))
-    far = existence.after(no, np.zeros(4), in_beam, np.full(4, 0.5), 0.1)
+    far = existence.with_ping(no, np.zeros(4), in_beam, np.full(4, 0.5), 0.1)
     assert far.now()[0] == pytest.approx(np.log(np.exp(0.5) * 0.2**3 * 0.5))
-    existence = existence.after(yes, np.full(4, np.log(0.02)), in_beam, p, 0.1)
+    existence = existence.with_ping(yes, np.full(4, np.log(0.02)), in_beam, p, 0.1)
     odds = odds[3] * 0.8 * 0.02 / 0.1
     assert existence.now()[3] == pytest.approx(np.log(odds))
     assert existence.pings.tolist() == [4.0, 4.0, 0.0, 0.0]
     for _ in range(20):
-        existence = existence.after(yes, np.full(4, 5.0), in_beam, p, 0.1)
+        existence = existence.with_ping(yes, np.full(4, 5.0), in_beam, p, 0.1)
     assert existence.now()[3] == SUREST
 
 
