@@ -44,7 +44,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import field, frozen
 import numpy as np
@@ -81,8 +81,8 @@ LOG_2PI = math.log(2.0 * math.pi)
 class Gaussians(NamedTuple):
     """Means x (N, n, m) and covariances P (N, n, n, m) of one block of models."""
 
-    x: FloatArray
-    P: FloatArray
+    x: Annotated[FloatArray, 'Nnm']
+    P: Annotated[FloatArray, 'Nnnm']
 
     def rows(self, chosen: IndexArray | BoolArray) -> Gaussians:
         """Return the `chosen` rows."""

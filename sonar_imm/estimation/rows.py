@@ -32,9 +32,8 @@ No array in a table is ever written again: tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 from attrs import evolve, field, frozen
 import numpy as np
@@ -64,11 +63,11 @@ class Rows:
     """
 
     blocks: tuple[Gaussians, ...]
-    mu: FloatArray
-    logw: FloatArray
-    target: IntArray
-    parent: IntArray
-    key: Mapping[str, np.ndarray] = field(factory=dict)
+    mu: Annotated[FloatArray, 'NM']
+    logw: Annotated[FloatArray, 'N']
+    target: Annotated[IntArray, 'N']
+    parent: Annotated[IntArray, 'N']
+    key: dict[str, np.ndarray] = field(factory=dict)
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -217,9 +216,9 @@ class Borrowed:
     """Assumptions without a row of their own: target (B,), the `key` (B,) they are known by, and
     the logarithms of their weights (B,)."""
 
-    target: IntArray
-    key: FloatArray
-    logw: FloatArray
+    target: Annotated[IntArray, 'b']
+    key: Annotated[FloatArray, 'b']
+    logw: Annotated[FloatArray, 'b']
 
     @classmethod
     def none(cls) -> Borrowed:

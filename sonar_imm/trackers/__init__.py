@@ -141,7 +141,7 @@ class System:
         return self.build(config).warm_steps()
 
     def state_types(self) -> tuple[type, ...]:
-        """The classes that a saved state of the tracker may hold: a literal table."""
+        """Return the classes of values that a saved state of the tracker may hold."""
         types: tuple[type, ...] = self._own('state_types.STATE_TYPES')
         return types
 

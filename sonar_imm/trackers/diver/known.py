@@ -63,9 +63,9 @@ class Known:
     life: Tracks
     rows: Rows
     borrowed: Borrowed
-    features: Mapping[str, np.ndarray]
-    memory: Mapping[str, Any]
-    counts: Mapping[str, int]
+    features: dict[str, np.ndarray]
+    memory: dict[str, Any]
+    counts: dict[str, int]
 
     @classmethod
     def nobody(
@@ -136,17 +136,35 @@ class Known:
         return np.flatnonzero(self.rows.target == track)
 
     def require_like(self, other: Known, constants: int) -> None:
-        """Raise ValueError where this is no value of the models of `other`, with so many constants
-        behind their components."""
-        shapes = [
-            (len(known.rows.blocks), *(block.x.shape[2] for block in known.rows.blocks))
-            + tuple((name, column.shape[1:]) for name, column in sorted(known.features.items()))
-            for known in (self, other)
-        ]
-        size = [known.rows.blocks[0].x.shape[1] for known in (self, other)]
-        seen = self.life.seen.shape[1:] == other.life.seen.shape[1:]
-        if shapes[0] != shapes[1] or size[0] not in (size[1], size[1] + constants) or not seen:
+        """Raise ValueError where this is no value of the models of `other`, which has no track,
+        with so many constants behind their components."""
+        rows, T = self.rows, len(self)
+        sizes = {
+            block.x.shape[1] - there.x.shape[1]
+            for block, there in zip(rows.blocks, other.rows.blocks)
+        }
+        good = (
+            self._form == other._form
+            and sizes in ({0}, {constants})
+            and all(len(column) == T for column in self.features.values())
+            and all(len(column) == len(rows) for column in rows.key.values())
+            and np.array_equal(np.unique(rows.target), np.arange(T))
+            and bool((np.diff(rows.target) >= 0).all() and (rows.parent >= -1).all())
+            and bool(np.isin(self.borrowed.target, rows.target).all())
+        )
+        if not good:
             raise ValueError('states are of other models')
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        """Names, types and shapes, but for the numbers of tracks, rows and constants."""
+        columns = sorted({**self.features, **self.rows.key}.items())
+        return (
+            [(name, column.shape[1:], column.dtype) for name, column in columns],
+            [(name, type(value)) for name, value in sorted(self.memory.items())],
+            [block.x.shape[2] for block in self.rows.blocks],
+            self.life.seen.shape[1],
+        )
 
     def finite(self) -> BoolArray:
         """Return which tracks (T,) have finite numbers only."""

@@ -28,8 +28,9 @@ still is seen goes on without its name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,12 @@ MISTAKEN = 1e-3
 """Probability that two divers side by side are taken for one."""
 
 
+class LastNamed(NamedTuple):
+    """The stamp of the last measurement of each name."""
+
+    stamps: dict[int, int] = {}
+
+
 def patience(detection_probability: float) -> int:
     """Return after how many scans a track never seen together with the one beside it is the same
     diver."""
@@ -61,10 +68,10 @@ def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
     for `max_coast` seconds."""
 
     def remember(known: Known, scan: Scan) -> Known:
-        last: Mapping[int, int] = known.memory['last_named']
-        if not scan.names and not last:
+        named: LastNamed = known.memory['last_named']
+        if not scan.names and not named.stamps:
             return known
-        last = {**last, **dict.fromkeys(scan.names, known.stamp_ns)}
+        last = {**named.stamps, **dict.fromkeys(scan.names, known.stamp_ns)}
         tracked = set(known['target_id'].tolist())
         last = {
             name: stamp_ns
@@ -74,7 +81,7 @@ def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
         }
         kept = np.isin(known['target_id'], np.array(list(last), np.int64))
         target_id = np.where(kept, known['target_id'], NOBODY)
-        return known.put(target_id=target_id).remember(last_named=last)
+        return known.put(target_id=target_id).remember(last_named=LastNamed(last))
 
     return remember
 
@@ -84,7 +91,7 @@ def merging(models: ModelSet) -> Callable[[Known, Scan], Known]:
     name where it belongs."""
 
     def merge(known: Known, scan: Scan) -> Known:
-        return merged(known, scan, models) if known.memory['last_named'] else known
+        return merged(known, scan, models) if known.memory['last_named'].stamps else known
 
     return merge
 

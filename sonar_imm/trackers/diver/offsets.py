@@ -39,7 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -99,10 +99,10 @@ class RecentPairs(NamedTuple):
     of tags, rx (R, 3), variance (R,) of the path, m^2, and age (R,) in pings."""
 
     pairs: tuple[tuple[int, int], ...] = ()
-    tx: FloatArray = np.zeros((0, 3))
-    rx: FloatArray = np.zeros((0, 3))
-    variance: FloatArray = np.zeros(0)
-    age: FloatArray = np.zeros(0)
+    tx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    rx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    variance: Annotated[FloatArray, 'p'] = np.zeros(0)
+    age: Annotated[FloatArray, 'p'] = np.zeros(0)
 
     def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
         """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
@@ -148,9 +148,9 @@ class Offsets(NamedTuple):
     square and freedom: of all t, and how many there were."""
 
     pairs: tuple[tuple[int, int], ...] = ()
-    score: FloatArray = np.zeros(CAUSES)
-    variance: FloatArray = np.zeros((CAUSES, CAUSES))
-    length: FloatArray = np.zeros(0)
+    score: Annotated[FloatArray, 's'] = np.zeros(CAUSES)
+    variance: Annotated[FloatArray, 'ss'] = np.zeros((CAUSES, CAUSES))
+    length: Annotated[FloatArray, 'p'] = np.zeros(0)
     square: float = 0.0
     freedom: float = 0.0
 

@@ -182,14 +182,14 @@ class Scan:
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
-        clutter: Clutters = (),
+        clutter: Clutters,
     ) -> Scan:
         """The scan of `items`; clutter: of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config), []
-        known = dict(clutter) if config.pairing != 'gnn' else {}
-        for at, group in enumerate(fixes):
-            if group.target_id is None and group.sensor in known:
-                fixes[at] = evolve(group, learnt=known[group.sensor].density)
+        for group in fixes if config.pairing != 'gnn' else ():
+            found = clutter.of(group.sensor)
+            if group.target_id is None and found is not None:
+                group.learnt = found.density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()

@@ -71,7 +71,6 @@ from .innovations import FixConsistency
 from .instruments import Instruments, Layout
 from .known import crossed, Feature, Known
 from .models import build_models, ModelSet
-from .offsets import Offsets, RecentPairs
 from .scan import Group, Scan
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
@@ -88,6 +87,9 @@ class DiverTracker:
     `Start`, and what `georeferencing` makes fixes of."""
 
     STATE = ('_stream', '_georeferencer')
+
+    _stream: ReplayStream[Known]
+    _georeferencer: Georeferencer
 
     def __init__(self, config: DiverConfig):
         self.models = build_models(config := config.for_target())
@@ -166,15 +168,16 @@ class DiverTracker:
             offsets=offsets.Offsets(),
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
-            clutter=(),
-            last_named={},
+            clutter=clutter.Clutters(),
+            last_named=names.LastNamed(),
         )
 
     def restored(self) -> None:
-        """Raise ValueError for states, put in, that are none of these models."""
-        nobody = self._nobody(Tracks.none(self.rules))
-        for known in self._stream.kept:
-            known.require_like(nobody, self._layouts(known).size - self.models.n)
+        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
+        is none of these models."""
+        base, nobody = self._stream.base, self._nobody(Tracks.none(self.rules))
+        base.require_like(nobody, len(self._layouts(base).variances))
+        self._stream.restored()
 
     @property
     def origin(self) -> Origin | None:
