@@ -26,11 +26,8 @@ from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, observe
 from sonar_imm.acoustics.localisation import localise
 from sonar_imm.estimation.covariance import is_psd
 from sonar_imm.measurements import Arrivals, Fix
-from sonar_imm.trackers.diver.explanations import (
-    PingMeasurements,
-    student_t_ping,
-    subset_ping,
-)
+from sonar_imm.trackers.diver.explanations import PingMeasurements, subset_ping
+from sonar_imm.trackers.diver.heavy_tails import student_t_ping
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
