@@ -15,7 +15,7 @@
 """What becomes of the divers by a ping: which measurements are whose, and the update by them.
 
 Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets, more of them by heavy tails (`ping_kernels`). So are the arrivals of a tag,
+outlier subsets (`explanations`), more of them by `heavy_tails`. So are the arrivals of a tag,
 however few: its time of emission is unknown, so that among three or four receivers no subset is
 refuted by the others, and what decides is whether the whole lies where the ping by itself would
 put it.
@@ -46,17 +46,15 @@ from . import coverage, offsets
 from .config import DiverConfig
 from .depth import spread, with_rows
 from .explanations import (
-    DEGREES,
     expect_measurements,
     expect_residuals,
     fit_measurements,
     MOST_EXPLANATIONS,
     PingMeasurements,
-    student_t_maxima,
-    student_t_ping,
     subset_ping,
 )
 from .fixes import STATED
+from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
