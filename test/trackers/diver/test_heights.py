@@ -25,10 +25,13 @@ from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
+from sonar_imm.trackers.diver.births import begun_anew
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous, spread
+from sonar_imm.trackers.diver.estimate import published
+from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.known import outputs
-from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.models import build_models, START_DEPTHS
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
@@ -399,15 +402,21 @@ def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
     assert np.square(smoothed[:, 0]).mean() < 1.1 * np.square(filtered[:, 0]).mean()
 
 
-def test_a_track_that_was_somewhere_else_begins_anew_with_the_whole_bank():
-    # A ghost of two receivers, confirmed first, takes a ping 20 m away: z was then off by 6 m.
+def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
+    """An update that is all but impossible tells nothing of the depth: the ping alone does."""
     scene, places = past_the_transmitter(1043)
-    settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
-    tracker = DiverTracker(DiverConfig(**settings))
-    pings = [item.measurement for item in scene.measurements][:31]
-    found = [estimate for ping in pings for estimate in tracker.process(ping)]
-    nis = [float(np.nan_to_num(each.extras['nis']).max()) for each in found if len(each.state)]
-    lost = int(np.argmax(nis))
-    assert nis[lost] > 100.0
-    after = errors(found, places, lost)
-    assert after[:, 1].mean() < 8.0 and np.abs(after[:, 0]).max() < 2.5
+    config = DiverConfig(model_set='heading_speed', max_tracks=1, dimensions=3)
+    tracker = DiverTracker(config)
+    pings = [item.measurement for item in scene.measurements][:20]
+    for ping in pings:
+        tracker.process(ping)
+    known, ping = tracker._stream.state, pings[-1]
+    free, layout = np.zeros(len(ping), bool), Instruments().layout(config, tracker.models)
+    for nis, again in ((10.0, 0), (1e3, 1)):
+        known = known.put(nis=np.array([nis]), nis_dof=np.array([4], np.uint16))
+        after = begun_anew(known, ping, free, tracker.models, layout, config)
+        assert after['spreads'][0] - known['spreads'][0] == again
+    assert len(after.rows) == START_DEPTHS and (after.rows.parent == -1).all()
+    mean, covariance = published(after, tracker.models)
+    error = mean[0, :3] - places[ping.stamp_ns][:3]
+    assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0
