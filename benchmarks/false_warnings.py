@@ -63,7 +63,7 @@ SCALED = {
     Trace: ('sigma',),
 }
 """What a measurement states of its noise; variances, but for `sigma`."""
-STATED = {'obstacle': ('range_std', 'range_step', 'bearing_std_deg', 'bearing_step_deg')}
+STATED = {'obstacle': ('range_std', 'bearing_std_deg')}
 """Parameters that state noise where the measurements of the scenes do not."""
 MEASURED = ('fathometer_array', 'fathometer_pressure')
 """Scenes where nobody states the noise, because the tracker measures it."""

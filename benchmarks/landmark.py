@@ -49,7 +49,7 @@ from sonar_imm.trackers.obstacle.filters import (
     BAND,
     beam_of,
     depth_span,
-    Hints,
+    HeightPrior,
     Mixture,
     Sonar,
     two_way_echo,
@@ -176,13 +176,11 @@ class Landmark:
         self.config = config
         self.model = config.azimuth_model
         self._beam = beam_of(config)
-        self._noise = (config.position_noise**2, config.depth_noise**2)
-
-    def ready(self, sonar: Sonar) -> bool:
-        return True
+        position, _, depth = config.drift()
+        self._noise = (position**2, depth**2)
 
     def begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
         lowest, highest = depth_span(z, sonar, self.config)
         seen = np.zeros((len(z), 4))
@@ -251,7 +249,7 @@ class Landmark:
             seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
         )
 
-    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+    def beam_probability(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         m = geometry.to_body(sonar.pose, mixture.x[..., :3])
         spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
         return mixtures.beam_probability(m, spread, mixture.mu, *self._beam)
@@ -266,6 +264,6 @@ class Landmark:
 class LandmarkTracker(ObstacleTracker):
     """The obstacle tracker with `Landmark` as its filter; its behaviours are not used."""
 
-    def _settle(self, config: ObstacleConfig) -> None:
-        super()._settle(config)
+    def _apply_config(self, config: ObstacleConfig) -> None:
+        super()._apply_config(config)
         self.filter = Landmark(config)  # type: ignore[assignment]

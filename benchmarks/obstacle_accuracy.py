@@ -125,7 +125,7 @@ def case(
     for seed in range(runs):
         setting = scenario(name, {**LEVER, **scene_values})
         scene = simulate(setting, seed)
-        final = track(scene, config_of(setting, method='gaussian_sum', **tracker_values))
+        final = track(scene, config_of(setting, **tracker_values))
         truth = truths(scene, TrueObstacle)[0]
         rows.append([offset_at(truth, final, at) for at in RANGES])
     return {f'{name}, gaussian_sum': summary(rows)}

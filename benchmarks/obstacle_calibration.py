@@ -17,7 +17,7 @@
     python -m benchmarks.obstacle_calibration --out docs/results/obstacle_calibration.json
 
 All runs are of the whole tracker, with its defaults, of which `--tracker name=value` replaces
-some. `misses` changes what is published and not the filter (`looks`), so one run shows both.
+some. `misses` changes what is published and not the filter (`beam`), so one run shows both.
 
 Each scene has `OBSTACLES` one behind the other, for as many runs from a third of the time.
 
@@ -54,7 +54,7 @@ from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, MISSES, ObstacleConfig
-from sonar_imm.trackers.obstacle.state import PingState
+from sonar_imm.trackers.obstacle.state import Known
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
@@ -95,7 +95,7 @@ class _Both(ObstacleTracker):
         self.ignoring = ObstacleTracker(evolve(config, misses='ignored'))
         self.found: Found = {misses: {} for misses in MISSES}
 
-    def _estimate(self, ping: PingState) -> Estimate:
+    def _estimate(self, ping: Known) -> Estimate:
         evidence = super()._estimate(ping)
         self.found['ignored'][ping.stamp_ns] = self.ignoring._estimate(ping)
         self.found['evidence'][ping.stamp_ns] = evidence

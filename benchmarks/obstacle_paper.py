@@ -79,7 +79,8 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.navigation import Mount
+from sonar_imm.trackers.obstacle.filters import DepthSlices, HeightPrior, Mixture, Sonar
+from sonar_imm.trackers.obstacle.pings import Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.obstacle.scoring import score, tether_length
@@ -186,11 +187,7 @@ def _residuals(
         Pose(start.position + travelled * scale, poses.R), geometry.to_world(start, m)[:, None]
     )
     d, delta = geometry.project(seen, config.azimuth_model)
-    pixel = (
-        (config.range_step or config.range_std),
-        np.radians(config.bearing_step_deg or config.bearing_std_deg),
-    )
-    parts = (d - z[:, 0]) / pixel[0], wrap_angle(delta - z[:, 1]) / pixel[1]
+    parts = (d - z[:, 0]) / STEP[0], wrap_angle(delta - z[:, 1]) / STEP[1]
     prior = first[:, 2:] / max(config.scale_std, 1e-9)
     return np.concatenate([*parts, prior], axis=1)
 
@@ -219,6 +216,40 @@ def _refit(
 
 
 # -- methods: errors on the way ------------------------------------------------------------------
+
+
+class Seafloor(DepthSlices):
+    """The paper's filter: one Gaussian as deep as the sea floor below the vehicle, whatever was
+    measured."""
+
+    def __init__(self, config: ObstacleConfig):
+        super().__init__(evolve(config, components=1, scale_std=0.0))
+
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
+    ) -> Mixture:
+        return self._clamped(super().begin(z, R, sonar, height), sonar)
+
+    def advance(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
+        return super().advance(self._clamped(mixture, before), before, after, dt)
+
+    def _clamped(self, mixture: Mixture, sonar: Sonar) -> Mixture:
+        x, P = mixture.x.copy(), mixture.P.copy()
+        x[..., 2] = sonar.pose.position[2] + sonar.altitude
+        P[..., 2, :] = P[..., :, 2] = 0.0
+        P[..., 2, 2] = self.config.altitude_std**2
+        return Mixture(x, P, mixture.mu)
+
+
+class SeafloorTracker(ObstacleTracker):
+    """The obstacle tracker with `Seafloor` as its filter; needs an altitude with each ping."""
+
+    def _apply_config(self, config: ObstacleConfig) -> None:
+        super()._apply_config(config)
+        self.filter = Seafloor(config)
+
 
 METHODS = {
     'approach': ('landmark', 'seafloor', 'deferred', 'refit'),
@@ -269,9 +300,8 @@ def method_errors(name: str, runs: int) -> dict[str, dict[str, float]]:
                 config, refit = config_of(setting), method == 'refit'
                 found.append([deferred_at(scene, config, at, refit) for at in RANGES])
             else:
-                kind = LandmarkTracker if method == 'landmark' else ObstacleTracker
-                parameters = {} if method == 'landmark' else {'method': method}
-                final = track(scene, config_of(setting, **parameters), kind)
+                kind = LandmarkTracker if method == 'landmark' else SeafloorTracker
+                final = track(scene, config_of(setting), kind)
                 truth = truths(scene, TrueObstacle)[0]
                 found.append([offset_at(truth, final, at) for at in RANGES])
     return {f'{name}, {method}': summary(found) for method, found in rows.items()}

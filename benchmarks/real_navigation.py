@@ -163,7 +163,7 @@ def judged(path: Path3D, start: float, seed: int, altimeter: bool) -> dict[str, 
     offset = float(rng.uniform(*reach))
     measurements, place = encounter(path, start, offset, seed, altimeter)
     tracker = ObstacleTracker(
-        ObstacleConfig(range_step=0.0, bearing_step_deg=0.0, behaviours=('fixed',))
+        ObstacleConfig(range_std=0.15, bearing_std_deg=0.25, behaviours=('fixed',))
     )
     known = [
         estimate

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What keeping the state of a tracker costs: the time between two messages, the writing, the size.
+"""Cost of a saved state: the time between two messages, writing, size, and loading.
 
     python -m benchmarks.state_cost
 
 Every shipped recording is tracked to its end, then its state is saved twenty times. CPU time, the
-median; the first column is all that the node waits for, the rest is done by another thread.
+median; the first column is all that the node waits for, writing is done by another thread.
 """
 
 from __future__ import annotations
@@ -29,9 +29,17 @@ import time
 import numpy as np
 
 from benchmarks.study import Parts, study
+from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import frozen_state, json_parameters, Saved, write_state
+from sonar_imm.trackers.state_file import (
+    intake_from,
+    json_parameters,
+    read_state,
+    Saved,
+    state_of,
+    write_state,
+)
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.own_files import own_parameters
@@ -41,18 +49,18 @@ TIMES = 20
 
 
 def row(bag: Path, path: Path) -> dict[str, float]:
-    """Milliseconds of taking and of writing the state, and its size."""
+    """Measure milliseconds of taking, writing and loading the state, and its size."""
     system = SYSTEMS[bag.name.split('_')[0]]
     config = load_config(system, own_parameters(bag), {})[0]
-    tracker = system.build(config)
+    intake = Intake(system.build(config))
     with BagReader(bag) as reader:
         for item in measurements_of(reader, system.name, settings=config.as_dict()):
             if item.measurement is not None and not isinstance(item.measurement, Rejection):
-                tracker.process(item.measurement)
-    taking, writing, size = [], [], 0
+                intake.tracker.process(item.measurement)
+    taking, writing, loading, size = [], [], [], 0
     for _ in range(TIMES):
         begin = time.process_time()
-        state = frozen_state(tracker)
+        state = state_of(intake)
         taken = time.process_time()
         saved = Saved(
             system=system.name,
@@ -60,15 +68,18 @@ def row(bag: Path, path: Path) -> dict[str, float]:
             saved_ns=time.time_ns(),
             newest_ns=None,
             state=state,
-            extras={},
         )
         size = write_state(path, saved)
         taking.append(1e3 * (taken - begin))
-        writing.append(1e3 * (time.process_time() - taken))
+        written = time.process_time()
+        writing.append(1e3 * (written - taken))
+        intake_from(read_state(path), system, config)
+        loading.append(1e3 * (time.process_time() - written))
     return {
         'taken, ms': float(np.median(taking)),
         'written, ms': float(np.median(writing)),
         'kB': size / 1000,
+        'loaded, ms': float(np.median(loading)),
     }
 
 

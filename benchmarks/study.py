@@ -53,7 +53,6 @@ from attrs import evolve, field, frozen
 import numpy as np
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.node_config import hears_transforms
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.truth import Scene
@@ -289,7 +288,6 @@ def planned(system: str, scenario: str, overrides: dict[str, str]) -> Plan:
         config=evolve(config, **unusual(scene.instruments(), type(config))),
         options=InputOptions(
             frame_id=node.frame_id,
-            use_tf_static=hears_transforms(node),
             world_frame=node.world_frame_convention,
             detector=scene.feeder_instruments(),
         ),

@@ -26,7 +26,7 @@ import textwrap
 
 import yaml
 
-from sonar_imm.node_config import DetectorNodeConfig, node_config_type, type_specs
+from sonar_imm.node_config import DetectorNodeConfig, node_config_type
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
@@ -99,7 +99,7 @@ MATTER = {
         'range_std': 'detections state no variance; `bearing_std_deg` likewise',
         'clutter_density': 'false echoes in a ping per metre of range and radian of bearing',
         'detection_probability': 'what is seen close by in fewer than nine of ten pings',
-        'sound_speed': 'the sonar assumed another one than your water has',
+        'navigation_grade': 'nav is worse than an inertial system with a DVL',
         'safety_radius': 'which distance a collision is counted from; with `safety_height`',
     },
     'bathymetry': {
@@ -159,7 +159,7 @@ def generated() -> dict[str, str]:
             node=markdown_table(spec for spec in node_specs(system) if spec not in shared),
         )
     detector = DetectorConfig.specs()
-    node = (*type_specs('fls_detector'), *DetectorNodeConfig.specs())
+    node = DetectorNodeConfig.specs()
     files['config/fls_detector.yaml'] = _parameter_file('fls_detector', (*detector, *node))
     files['docs/parameters/fls_detector.md'] = MARKDOWN.format(
         name='fls_detector',
@@ -195,15 +195,12 @@ def _parameter_file(name: str, specs: tuple[ParameterSpec, ...]) -> str:
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     """Give the parameters of the live node of `system` besides the parameters of its tracker."""
     own = {spec.name for spec in system.config_type().specs()}
-    specs = (*type_specs(system.name), *node_config_type(system).specs())
-    return tuple(spec for spec in specs if spec.name not in own)
+    return tuple(spec for spec in node_config_type(system).specs() if spec.name not in own)
 
 
 def shared_specs() -> tuple[ParameterSpec, ...]:
     """Give the parameters that the live nodes of all systems have alike."""
-    first, *others = (
-        (*type_specs(name), *node_config_type(system).specs()) for name, system in SYSTEMS.items()
-    )
+    first, *others = (node_config_type(system).specs() for system in SYSTEMS.values())
     return tuple(spec for spec in first if all(spec in other for other in others))
 
 

@@ -38,12 +38,8 @@ NODES = {
     'fls_detector': 'FlsDetectorNode',
     'obstacle': 'ObstacleNode',
 }
-# So that the nodes start, and hear the same, where messages of others are not installed.
-FRAMES = ['-p', 'tf_static_type:=geometry_msgs/msg/TransformStamped']
-EXTRA = {
-    'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image'],
-    **dict.fromkeys(('bathymetry', 'diver', 'obstacle'), FRAMES),
-}
+# So that the node starts where messages of others are not installed.
+EXTRA = {'fls_detector': ['-p', "input_types:=['image=sensor_msgs/msg/Image']"]}
 RULES = (
     ('topics', 'publish', 'topic'),
     ('topics', 'subscribe', 'topic'),

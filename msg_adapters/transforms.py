@@ -109,7 +109,7 @@ TYPES = ('tf2_msgs/msg/TFMessage', 'geometry_msgs/msg/TransformStamped')
 
 TF_STATIC = InputTopic(
     'tf_static',
-    'frames that are fixed to each other, with use_tf_static or sonar_frame',
+    'frames that are fixed to each other, e.g. of instruments',
     measurement=StaticTransforms,
     readers=dict.fromkeys(TYPES, read_transforms),
     write=write_transforms,
@@ -117,5 +117,4 @@ TF_STATIC = InputTopic(
     prefix='/',
     latched=True,
     by_name=frozenset(TYPES),
-    wanted=lambda settings: bool(settings.get('use_tf_static') or settings.get('sonar_frame')),
 )

@@ -32,6 +32,7 @@ _OF_TARGET = (
     'was removed: a preset has it (parameter target); a set of your own models may differ, see '
     'docs/howto/own_model.md'
 )
+_TYPE = 'was removed: name it in input_types, e.g. "fix=geometry_msgs/msg/PointStamped"'
 _RAW_FILE = 'was removed: convert the file to npz (kind snapshots) or to XTF'
 _LIVE_VIEW = (
     'was removed: view opens the report; show live topics with foxglove_bridge and '
@@ -71,6 +72,21 @@ GONE: dict[str, str] = {
         )
     },
     **{
+        f'parameter origin_{part}': 'was removed: give origin [latitude, longitude, height]'
+        for part in ('latitude', 'longitude', 'height')
+    },
+    'parameter publish_revisions': 'was removed: max_revisions 0 leaves revisions out',
+    'parameter diagnostics_period': _CONSTANT,
+    'parameter state_interval': _CONSTANT,
+    'parameter use_tf_static': 'was removed: remap /tf_static for a node that must not hear it',
+    **{
+        f'parameter {name}_type': _TYPE
+        for name in (
+            *('fix', 'fixes', 'relative', 'nav_fix', 'heading', 'altitude', 'detections'),
+            *('array_depth', 'tf_static', 'image'),
+        )
+    },
+    **{
         f'parameter {name}': _CONSTANT
         for name in (
             *('adaptation', 'adaptation_prior', 'adaptation_guard', 'reference_step'),
@@ -78,6 +94,10 @@ GONE: dict[str, str] = {
             *('vessel_max_gap', 'vessel_max_extrapolation', 'fix_bias_time', 'survival_time'),
             *('confirm_hits', 'confirm_window', 'delete_misses', 'gate_probability'),
             *('max_gap', 'restart_after'),
+            *('components', 'sway_time', 'speed_noise', 'behaviour_time', 'seabed_std'),
+            *('ground_std', 'ground_radius', 'sector_edge_deg', 'max_offset', 'altitude_std'),
+            *('max_altitude_age', 'scale_std', 'course_window', 'landmark_time'),
+            'max_navigation_gap',
         )
     },
     'parameter systematic_errors': (
@@ -102,6 +122,18 @@ GONE: dict[str, str] = {
     'choice association kbest': (
         'was removed: jipda, the default, weighs all joint events of a scan exactly'
     ),
+    'parameter method': 'was removed: behaviours [fixed, seabed] keeps what lies on the sea floor',
+    'parameter seed': 'was removed: this tracker draws no random numbers',
+    'parameter range_step': 'was removed: it is part of range_std',
+    'parameter bearing_step_deg': 'was removed: it is part of bearing_std_deg',
+    **{
+        f'parameter {name}': 'was removed: give detection_profile [range, share, range, share]'
+        for name in ('detection_ranges', 'detection_factors')
+    },
+    **{
+        f'parameter {name}': 'was removed: choose navigation_grade (ins, dvl or dead_reckoning)'
+        for name in ('position_noise', 'yaw_noise_deg', 'depth_noise')
+    },
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',
     **{
         f'parameter {name}': 'was removed: the printed form is in benchmarks/fathometer_paper.py'

@@ -16,13 +16,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from attrs import frozen
 
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of
 
 from .acoustics.geodesy import Origin
-from .parameters import Config, inherited, live, parameter, ParameterSpec
+from .parameters import Config, ConfigError, did_you_mean, inherited, live, parameter
 from .trackers import System
+from .trackers.shared_parameters import OriginParameters
 
 
 @frozen(kw_only=True)
@@ -41,47 +44,34 @@ class NodeConfig(Config):
         'axes of the input: enu (world x east, y north, z up; vehicle x forward, y port, z up) or '
         'ned (world x north, y east, z down; vehicle x forward, y starboard, z down); the output '
         'is always enu', choices=('enu', 'ned'))
-    publish_revisions: bool = live(True, '',
-        'publish estimates again that late input changed, oldest first; false: only the newest')
+    input_types: tuple[str, ...] = parameter((), '',
+        'message types of inputs that have several, as <input>=<type>, e.g. '
+        'fix=geometry_msgs/msg/PointStamped; an input that is not named: its first type in '
+        'docs/topics.md', kind='str[]')
     max_revisions: int = live(100, '',
-        'most estimates published again after one late message, the newest ones; others are '
-        'counted; 0: all', range=(0, 1_000_000))
+        'most estimates that one late message changed and that are published again, oldest '
+        'first; others are counted; 0: only the newest estimate is published',
+        range=(0, 1_000_000))
     autostart: bool = parameter(True, '',
         'configure and activate the node when it starts; false: a lifecycle manager or '
         '`ros2 lifecycle set` does')
-    diagnostics_period: float = parameter(1.0, 's',
-        'time between messages on /diagnostics', range=(0.05, 3600.0))
     stale_after: float = live(10.0, 's',
         'time after which diagnostics call an input stale', range=(0.01, 1e6))
     state_file: str = parameter('', '',
         'file that keeps the state of the tracker, so that a node started again continues its '
         'tracks; empty: none')
-    state_interval: float = parameter(10.0, 's',
-        'time between saves to state_file; the last state is saved in any case',
-        range=(0.1, 86400.0))
     state_max_age: float = parameter(300.0, 's',
         'the state in state_file is not used when saved longer ago than this, or further than '
         'this from the first measurement', range=(0.0, 1e6))
     # fmt: on
 
-    def origin(self) -> Origin | None:
+    def stated_origin(self) -> Origin | None:
         """Where the frame of the navigation lies on Earth, None where that is not stated."""
         return None
 
 
 @frozen(kw_only=True)
-class PlacedNodeConfig(NodeConfig):
-    """What is tracked has a place in the world."""
-
-    # fmt: off
-    use_tf_static: bool = parameter(True, '',
-        'listen to /tf_static, where its type is installed, and transform what comes in a frame '
-        'fixed to the expected one')
-    # fmt: on
-
-
-@frozen(kw_only=True)
-class BathymetryNodeConfig(PlacedNodeConfig):
+class BathymetryNodeConfig(NodeConfig):
     """A swath is looked at while it is surveyed, and no ping needs the one before."""
 
     # fmt: off
@@ -90,7 +80,7 @@ class BathymetryNodeConfig(PlacedNodeConfig):
 
 
 @frozen(kw_only=True)
-class TracksNodeConfig(PlacedNodeConfig):
+class TracksNodeConfig(NodeConfig):
     """A late message has its window computed again: up to a second, while others go on coming."""
 
     # fmt: off
@@ -99,25 +89,8 @@ class TracksNodeConfig(PlacedNodeConfig):
 
 
 @frozen(kw_only=True)
-class ObstacleNodeConfig(TracksNodeConfig):
-    """Besides, where the frame of the navigation lies on Earth."""
-
-    # fmt: off
-    origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of nav, for exports; with both latitude and '
-        'longitude 0: not known', range=(-90.0, 90.0))
-    origin_longitude: float = parameter(0.0, 'deg',
-        'longitude of the origin of the frame of nav, see origin_latitude',
-        range=(-180.0, 180.0))
-    origin_height: float = parameter(0.0, 'm',
-        'height of the origin of the frame of nav above the ellipsoid', range=(-12000.0, 9000.0))
-    # fmt: on
-
-    def origin(self) -> Origin | None:
-        """The origin that is stated, None for none."""
-        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
-            return None
-        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
+class ObstacleNodeConfig(OriginParameters, TracksNodeConfig):
+    """Besides, where the frame of the navigation lies on Earth, for exports."""
 
 
 @frozen(kw_only=True)
@@ -128,7 +101,9 @@ class DetectorNodeConfig(Config):
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 10,
         description='images that an input queue holds while the node is busy', range=(1, 1000))
     autostart: bool = inherited(NodeConfig, 'autostart', True)
-    diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
+    input_types: tuple[str, ...] = inherited(NodeConfig, 'input_types', (),
+        description='message type of the images, e.g. image=sensor_msgs/msg/Image; empty: '
+        'marine_acoustic_msgs/msg/ProjectedSonarImage')
     stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
     # fmt: on
 
@@ -139,27 +114,29 @@ def node_config_type(system: System) -> type[NodeConfig]:
     return found
 
 
-def hears_transforms(node: NodeConfig) -> bool:
-    """Whether the node listens to /tf_static for the frames of measurements."""
-    return isinstance(node, PlacedNodeConfig) and node.use_tf_static
+def chosen_types(system: str, given: Sequence[str]) -> dict[str, str]:
+    """Return the message type of each input of the node of `system` that can be one of several: in
+    ROS one topic name has one type, so the user has to say which.
 
-
-def type_specs(system: str) -> tuple[ParameterSpec, ...]:
-    """The parameters ``<input>_type`` of the node of `system`."""
-    return tuple(spec for topic in inputs_of(system) if (spec := type_spec(topic)) is not None)
-
-
-def type_spec(topic: InputTopic) -> ParameterSpec | None:
-    """``<input>_type``, needed where an input can be one of several message types; else None.
-
-    In ROS one topic name has one type, so the user has to say which.
+    :param given: parameter ``input_types``.
+    :returns: type by input name; the first type of an input that `given` does not name.
+    :raises ConfigError: with one sentence for each mistake.
     """
-    if len(topic.readers) == 1:
-        return None
-    return ParameterSpec(
-        name=f'{topic.name}_type',
-        kind='str',
-        default=next(iter(topic.readers)),
-        description=f"message type of the input '{topic.name}'",
-        choices=tuple(topic.readers),
-    )
+    several = {topic.name: topic.readers for topic in inputs_of(system) if len(topic.readers) > 1}
+    chosen, problems = {name: next(iter(readers)) for name, readers in several.items()}, []
+    for entry in given:
+        name, _, kind = entry.partition('=')
+        if name not in several:
+            problems.append(
+                f"input_types: '{entry}' is not <input>=<type> of one of "
+                f'{", ".join(several)}{did_you_mean(name, several)}'
+            )
+        elif kind not in several[name]:
+            problems.append(
+                f"input_types: {name} must be one of {', '.join(several[name])}, got '{kind}'"
+                f'{did_you_mean(kind, several[name])}'
+            )
+        chosen[name] = kind
+    if problems:
+        raise ConfigError(*problems)
+    return chosen

@@ -22,7 +22,7 @@ import sys
 import pytest
 
 from sonar_imm.gone import GONE
-from sonar_imm.node_config import node_config_type, type_specs
+from sonar_imm.node_config import node_config_type
 from sonar_imm.nodes import commands
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import COMMANDS, main
@@ -38,7 +38,17 @@ BAGS = {
 OF_SYSTEM = {
     'variant': 'bathymetry',
     **dict.fromkeys(('amplitude_prior', 'proposal'), 'fathometer'),
-    **dict.fromkeys(('vertical_beam_width_deg', 'fading_db', 'intensity_weight'), 'obstacle'),
+    **dict.fromkeys(
+        (
+            *('vertical_beam_width_deg', 'fading_db', 'intensity_weight', 'method', 'components'),
+            *('sway_time', 'speed_noise', 'behaviour_time', 'seabed_std', 'ground_std', 'seed'),
+            *('ground_radius', 'sector_edge_deg', 'max_offset', 'altitude_std', 'course_window'),
+            *('max_altitude_age', 'scale_std', 'landmark_time', 'max_navigation_gap', 'max_gap'),
+            *('range_step', 'bearing_step_deg', 'detection_ranges', 'detection_factors'),
+            *('position_noise', 'yaw_noise_deg', 'depth_noise'),
+        ),
+        'obstacle',
+    ),
 }
 """Systems of removed parameters; all others are of the diver."""
 
@@ -58,13 +68,12 @@ def answer(capsys, *arguments):
     return said[0]
 
 
-def known_parameters(systems=tuple(SYSTEMS)):
+def known_parameters(systems=SYSTEMS):
     return {
         spec.name
         for system in map(SYSTEMS.get, systems)
         for specs in (
             system.config_type().specs(),
-            type_specs(system.name),
             node_config_type(system).specs(),
         )
         for spec in specs

@@ -120,7 +120,7 @@ class InputTopic:
     prefix: ``'~/'`` for a topic below the name of the node, ``'/'`` for one that no namespace
     changes; '' for a relative topic.
     latched: whether messages wait for listeners that come later, and none may be lost.
-    wanted: whether it is heard at all, by the parameters of tracker and node.
+    wanted: whether it is heard at all, by the parameters of the tracker.
     words: words in a topic's name, any of which says that it is this input rather than the one of
     the same last name: ``/sidescan_port/snapshot`` is a ``port/snapshot``.
     makes: the input of a tracker that a node before it makes of this one; '' for an input of the

@@ -133,8 +133,7 @@ def observe(
     value = np.empty((len(kind), x.shape[1]))
     gradient = np.zeros((len(kind), *x.shape))
     ix, iy, iz = columns[0, :3].tolist() if len(kind) else (0, 0, 0)
-    place = np.empty((3, x.shape[1]))
-    place[0], place[1], place[2] = x[ix], x[iy], x[iz] if iz >= 0 else height
+    place = x[ix], x[iy], x[iz] if iz >= 0 else np.array([height])
     for each in set(kind.tolist()):
         rows = np.flatnonzero(kind == each)
         if each == HEIGHT:
@@ -142,72 +141,83 @@ def observe(
             if iz >= 0:
                 gradient[rows, iz] = 1.0
             continue
-        apart = place - rx[rows, :, None]
+        dx, dy, dz = _apart(place, rx[rows])
         if each <= ONE_WAY:
-            leaving = place - tx[rows, :, None] if each == PATH else None
-            value[rows] = _paths(x, columns[rows], apart, leaving, gradient, rows)
+            leaving = _apart(place, tx[rows]) if each == PATH else None
+            value[rows] = _paths(x, columns[rows], (dx, dy, dz), leaving, gradient, rows)
             continue
-        level2 = apart[:, 0] ** 2 + apart[:, 1] ** 2
+        level2 = dx * dx + dy * dy
         if each == BEARING:
             slope = 1.0 / np.where(level2 > NEAREST**2, level2, np.inf)
-            gradient[rows, ix], gradient[rows, iy] = -apart[:, 1] * slope, apart[:, 0] * slope
-            value[rows] = np.arctan2(apart[:, 1], apart[:, 0])
-            value[rows] += _clocks(x, columns[rows], gradient, rows)
+            gradient[rows, ix], gradient[rows, iy] = -dy * slope, dx * slope
+            value[rows] = np.arctan2(dy, dx) + _clocks(x, columns[rows], gradient, rows)
         else:
             level = np.sqrt(level2)
-            slope = 1.0 / np.where(level > NEAREST, level2 + apart[:, 2] ** 2, np.inf)
-            sine = apart[:, 2] / np.maximum(level, NEAREST) * slope
-            gradient[rows, ix], gradient[rows, iy] = -apart[:, 0] * sine, -apart[:, 1] * sine
+            slope = 1.0 / np.where(level > NEAREST, level2 + dz * dz, np.inf)
+            sine = dz / np.maximum(level, NEAREST) * slope
+            gradient[rows, ix], gradient[rows, iy] = -dx * sine, -dy * sine
             if iz >= 0:
                 gradient[rows, iz] = level * slope
-            value[rows] = np.arctan2(apart[:, 2], level)
+            value[rows] = np.arctan2(dz, level)
     return value, gradient
+
+
+Vectors = tuple[FloatArray, FloatArray, FloatArray]
+"""x, y and z of (R, L) vectors; those of one z have (R, 1) of it."""
+
+
+def _apart(place: Vectors, points: FloatArray) -> Vectors:
+    """Return the vectors from points (R, 3) to places, (L,) each."""
+    x, y, z = place
+    return x - points[:, :1], y - points[:, 1:2], z - points[:, 2:]
 
 
 def _paths(
     x: FloatArray,
     columns: IntArray,
-    apart: FloatArray,
-    leaving: FloatArray | None,
+    apart: Vectors,
+    leaving: Vectors | None,
     gradient: FloatArray,
     rows: IndexArray,
 ) -> FloatArray:
     """Return path lengths (R, L) of `rows` (R,); write their gradients.
 
-    :param apart: (R, 3, L) from the receivers to the diver, changed by their offsets.
-    :param leaving: (R, 3, L) from the transmitters to the diver, None for a tag.
+    :param apart: from the receivers to the diver, changed by their offsets.
+    :param leaving: from the transmitters to the diver, None for a tag.
     """
     ix, iy, iz, _, _, iv, ie = columns[0].tolist()
     moved = np.flatnonzero(columns[:, OFFSET] >= 0)
     at = columns[moved, OFFSET]
     if len(moved):
-        apart[moved, 0] -= x[at]
-        apart[moved, 1] -= x[at + 1]
-    length, slope = _directions(apart)
+        apart[0][moved] -= x[at]
+        apart[1][moved] -= x[at + 1]
+    length, nearness = _lengths(apart)
     scale = 1.0 - x[iv] if iv >= 0 else 1.0
+    slopes = [each * nearness for each in (apart if iz >= 0 else apart[:2])]
     if len(moved):
-        gradient[rows[moved], at] = -scale * slope[moved, 0]
-        gradient[rows[moved], at + 1] = -scale * slope[moved, 1]
+        gradient[rows[moved], at] = -scale * slopes[0][moved]
+        gradient[rows[moved], at + 1] = -scale * slopes[1][moved]
     if leaving is not None:
-        first, onward = _directions(leaving)
-        length, slope = length + first, slope + onward
+        first, nearness = _lengths(leaving)
+        length += first
+        for slope, each in zip(slopes, leaving):
+            slope += each * nearness
+    for slope, column in zip(slopes, (ix, iy, iz)):
+        gradient[rows, column] = slope if iv < 0 else slope * scale
     if iv >= 0:
-        slope = slope * scale
         gradient[rows, iv] = -length
-        length = length * scale
-    gradient[rows, ix], gradient[rows, iy] = slope[:, 0], slope[:, 1]
-    if iz >= 0:
-        gradient[rows, iz] = slope[:, 2]
+        length *= scale
     if ie >= 0 and leaving is None:
         gradient[rows, ie] = 1.0
-        length = length + x[ie]
+        length += x[ie]
     return length + _clocks(x, columns, gradient, rows)
 
 
-def _directions(apart: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the lengths (R, L) and directions (R, 3, L) of vectors (R, 3, L)."""
-    distance = np.sqrt((apart * apart).sum(axis=1))
-    return distance, apart / np.where(distance > NEAREST, distance, np.inf)[:, None]
+def _lengths(apart: Vectors) -> tuple[FloatArray, FloatArray]:
+    """Return the lengths (R, L) of vectors, and one over them."""
+    dx, dy, dz = apart
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    return length, 1.0 / np.where(length > NEAREST, length, np.inf)
 
 
 def _clocks(

@@ -41,7 +41,7 @@ Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daura
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,8 +57,8 @@ _BODY = np.array([1.0, -1.0, -1.0])
 class Pose(NamedTuple):
     """Where a body is: position (..., 3) in the world, R (..., 3, 3) world from body."""
 
-    position: FloatArray
-    R: FloatArray
+    position: Annotated[FloatArray, '*3']
+    R: Annotated[FloatArray, '*33']
 
 
 # -- frames ------------------------------------------------------------------------------------

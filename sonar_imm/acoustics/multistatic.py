@@ -22,8 +22,8 @@ the range sum says nothing to first order: the singular baseline. A receiver wit
 measures the **bearing**.
 
 An acoustic tag emits by itself at an unknown time. Its one-way arrivals are **pseudo-ranges**:
-slant ranges plus an offset common to all receivers. `difference_projection` takes the offset out
-without choosing a reference receiver; `emission_time` estimates it once the position is known.
+slant ranges plus an offset common to all receivers; `emission_time` estimates it once the position
+is known.
 
 Conventions
     position (..., 2): x, y in metres, any leading axes (models, particles, starts of a search);
@@ -91,22 +91,6 @@ def bearing_jacobian(position: ArrayLike, rx: ArrayLike) -> FloatArray:
     squared = np.square(offset).sum(axis=-1)
     inverse = np.where(squared > COINCIDENT**2, 1.0 / np.maximum(squared, COINCIDENT**2), 0.0)
     return np.stack([-offset[..., 1] * inverse, offset[..., 0] * inverse], axis=-1)
-
-
-def difference_projection(variances: FloatArray) -> FloatArray:
-    """The projection T (n - 1, n) that turns ranges in metres with `variances` (n,) m^2 and a
-    common offset into n - 1 numbers without it, uncorrelated and in standard deviations.
-
-    With m = r(p) + b 1 + e and e ~ N(0, D), every T with T 1 = 0 and T D T' = I keeps exactly what
-    a flat prior on b leaves: the information D^-1 - D^-1 1 1' D^-1 / (1' D^-1 1). T is built from
-    the Householder reflection that sends D^-1/2 1 to the first axis, so no receiver is the
-    reference.
-    """
-    weight = 1.0 / np.sqrt(variances)
-    axis = weight / np.linalg.norm(weight)
-    axis[0] += 1.0
-    reflection = np.eye(len(weight)) - np.outer(axis, axis) * (2.0 / (axis @ axis))
-    return np.asarray(reflection[1:] * weight)
 
 
 def emission_time(

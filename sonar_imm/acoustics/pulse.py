@@ -26,6 +26,7 @@ A flat band f1 .. f2 gives, with the two-way time tau = 2 delta / c,
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 from attrs import frozen
 import numpy as np
@@ -41,8 +42,8 @@ Pulse = Callable[[FloatArray], FloatArray]
 class SampledPulse:
     """A pulse of `value` (k,) at `distance` (k,) m, rising from 0; interpolated, zero beyond."""
 
-    distance: FloatArray
-    value: FloatArray
+    distance: Annotated[FloatArray, 'd']
+    value: Annotated[FloatArray, 'd']
 
     def __call__(self, delta: FloatArray) -> FloatArray:
         away = np.abs(np.asarray(delta, np.float64))

@@ -30,8 +30,9 @@ from __future__ import annotations
 
 from collections import deque
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
+from attrs import define, field
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,19 +97,27 @@ def _noise_variance(window: str, overlap: float, length: int = 1024) -> FloatArr
     return total / total[0]
 
 
+@define(eq=False)
 class SnapshotStream:
     """Cuts pressure into windowed snapshots and transforms them.
 
     length: samples of a snapshot; hop: samples from one to the next; rows: which bins of the
-    transform are kept, a slice.
+    transform are kept, a slice. STATE: see `trackers.Tracker`.
     """
 
-    def __init__(self, length: int, hop: int, rows: slice, window: str = 'hann'):
-        if not 0 < hop <= length:
+    STATE: ClassVar = ('_left',)
+
+    length: int
+    hop: int
+    rows: slice
+    window: str = 'hann'
+    _column: NDArray[np.float32] = field(init=False)
+    _left: Annotated[NDArray[np.float32], 'nM'] | None = field(init=False, default=None)
+
+    def __attrs_post_init__(self) -> None:
+        if not 0 < self.hop <= self.length:
             raise ValueError('snapshots need 0 < hop <= length')
-        self.length, self.hop, self.rows = length, hop, rows
-        self._window = window_of(window, length).astype(np.float32)[:, None]
-        self._left: NDArray[np.float32] | None = None
+        self._column = window_of(self.window, self.length).astype(np.float32)[:, None]
 
     def push(self, pressure: NDArray) -> ComplexArray:
         """Spectra (k, F, M) complex64 of the snapshots that `pressure` (n, M) completes; k may be
@@ -139,7 +148,7 @@ class SnapshotStream:
         import scipy.fft  # unlike numpy's, it stays in single precision
 
         # One hydrophone after the other: transforms of contiguous rows are twice as fast.
-        rows = np.ascontiguousarray((snapshot * self._window).T)
+        rows = np.ascontiguousarray((snapshot * self._column).T)
         return np.asarray(scipy.fft.rfft(rows, axis=1).T[self.rows])
 
 
@@ -156,18 +165,21 @@ class Average(NamedTuple):
     snapshots: int
 
 
+@define(eq=False)
 class BlockAverage:
     """The mean of each `count` snapshots, of which `skip` are passed over after each mean: those
-    that overlap with it, so that no sample is in two means."""
+    that overlap with it, so that no sample is in two means. STATE: see `trackers.Tracker`."""
 
-    def __init__(self, count: int, skip: int = 0):
-        self.count, self.skip = count, skip
-        self.clear()
+    STATE: ClassVar = ('_sum', '_in', '_to_skip')
+
+    count: int
+    skip: int = 0
+    _sum: Annotated[ComplexArray, 'FMM'] | None = field(init=False, default=None)
+    _in: int = field(init=False, default=0)
+    _to_skip: int = field(init=False, default=0)
 
     def clear(self) -> None:
-        self._sum: ComplexArray | None = None
-        self._in = 0
-        self._to_skip = 0
+        self._sum, self._in, self._to_skip = None, 0, 0
 
     @property
     def waiting(self) -> int:
@@ -192,18 +204,25 @@ class BlockAverage:
         return done
 
 
+@define(eq=False)
 class SlidingAverage:
-    """The mean of the last `count` snapshots, after every `step` of them."""
+    """The mean of the last `count` snapshots, after every `step` of them. STATE: see
+    `trackers.Tracker`."""
 
-    def __init__(self, count: int, step: int):
-        if not 0 < step <= count:
+    STATE: ClassVar = ('_spectra', '_since')
+
+    count: int
+    step: int
+    _spectra: deque[Annotated[ComplexArray, 'FM']] = field(init=False)
+    _since: int = field(init=False, default=0)
+
+    def __attrs_post_init__(self) -> None:
+        if not 0 < self.step <= self.count:
             raise ValueError('a sliding average needs 0 < step <= count')
-        self.count, self.step = count, step
         self.clear()
 
     def clear(self) -> None:
-        self._spectra: deque[ComplexArray] = deque(maxlen=self.count)
-        self._since = 0
+        self._spectra, self._since = deque(maxlen=self.count), 0
 
     def push(self, spectra: ComplexArray) -> list[Average]:
         """The averages due after `spectra` (k, F, M)."""

@@ -48,6 +48,5 @@ __all__ = [
     'set_model',
     'set_scatter',
     'set_shifts',
-    'small_matrices',
     'smoothing',
 ]

@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, cast, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,42 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 IndexArray = NDArray[np.intp]
+
+Table = TypeVar('Table', bound='tuple[Any, ...]')
+"""A named tuple of arrays of one length, its columns; a column may be a table itself."""
+
+
+def take(table: Table, rows: IndexArray | BoolArray) -> Table:
+    """Return the `rows` of a table."""
+    return _made(table, (take(c, rows) if isinstance(c, tuple) else c[rows] for c in table))
+
+
+def append(table: Table, new: Table) -> Table:
+    """Return a table with the rows of another one behind its own."""
+    return _made(
+        table,
+        (
+            append(ours, theirs) if isinstance(ours, tuple) else np.concatenate([ours, theirs])
+            for ours, theirs in zip(table, new)
+        ),
+    )
+
+
+def replace_rows(table: Table, rows: IndexArray, new: Table) -> Table:
+    """Return a copy of a table with `new` in some of its rows."""
+
+    def replaced(ours: Any, theirs: Any) -> Any:
+        if isinstance(ours, tuple):
+            return replace_rows(ours, rows, theirs)
+        column = ours.copy()
+        column[rows] = theirs
+        return column
+
+    return _made(table, map(replaced, table, new))
+
+
+def _made(table: Table, columns: Iterable[Any]) -> Table:
+    return cast(Table, cast(Any, table)._make(columns))
 
 
 def with_rows(array: NDArray[Any], count: int, value: Any) -> NDArray[Any]:

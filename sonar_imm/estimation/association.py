@@ -40,6 +40,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 from functools import lru_cache
 import math
+from typing import Annotated
 
 from attrs import evolve, frozen
 import numpy as np
@@ -239,12 +240,12 @@ class Tracks:
     in a row; last_hit_ns: (T,); next_id: of the next track.
     """
 
-    track_id: NDArray[np.uint32]
-    status: NDArray[np.uint8]
-    age: IntArray
-    seen: BoolArray
-    misses: IntArray
-    last_hit_ns: IntArray
+    track_id: Annotated[NDArray[np.uint32], 'T']
+    status: Annotated[NDArray[np.uint8], 'T']
+    age: Annotated[IntArray, 'T']
+    seen: Annotated[BoolArray, 'Tw']
+    misses: Annotated[IntArray, 'T']
+    last_hit_ns: Annotated[IntArray, 'T']
     next_id: int = 1
 
     @classmethod

@@ -42,9 +42,9 @@ Source: docs/diver.md, 'Families'.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import field, frozen
 import numpy as np
@@ -81,21 +81,30 @@ LOG_2PI = math.log(2.0 * math.pi)
 class Gaussians(NamedTuple):
     """Means x (N, n, m) and covariances P (N, n, n, m) of one block of models."""
 
-    x: FloatArray
-    P: FloatArray
+    x: Annotated[FloatArray, 'Nnm']
+    P: Annotated[FloatArray, 'Nnnm']
 
     def rows(self, chosen: IndexArray | BoolArray) -> Gaussians:
         """Return the `chosen` rows."""
         return Gaussians(self.x[chosen], self.P[chosen])
 
 
-class Moves(NamedTuple):
+@frozen(eq=False, slots=False)
+class Moves:
     """One step of a block, x <- F x + B + N(0, Q): F, Q (n, n, m), B (n, m). Components of the
     state behind the first n are constants."""
 
     F: FloatArray
     Q: FloatArray
     B: FloatArray
+
+    @cached_property
+    def changing(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
+        """The components that F changes, and those of which each is then made."""
+        n = len(self.B)
+        rows = [tuple(k for k in range(n) if self.F[i, k].any()) for i in range(n)]
+        still = [(self.F[i, i] == 1.0).all() for i in range(n)]
+        return tuple((i, row) for i, row in enumerate(rows) if row != (i,) or not still[i])
 
 
 @frozen(eq=False)
@@ -277,26 +286,44 @@ def _as_headings(
     P1 = P - gain[:, :, None] * g[:, None]
     P1[:, VY + 1 :, VY + 1 :] = P[:, VY + 1 :, VY + 1 :]
     # From (.., vx, vy, ..) to (.., s, ..).
-    s = (ux * x1[:, VX] + uy * x1[:, VY])[:, None]
-    with_s = (ux * P1[:, :, VX] + uy * P1[:, :, VY])[:, :, None]
-    spread = ux * with_s[:, VX] + uy * with_s[:, VY]
-    kept = np.array([k for k in range(x.shape[1]) if k not in (VX, VY)])
-    x1 = np.insert(x1[:, kept], [S], s, axis=1)
-    P1 = np.insert(P1[:, kept][:, :, kept], [S], with_s[:, kept], axis=2)
-    row = np.insert(with_s[:, kept, 0], [S], spread, axis=1)[:, None]
-    P1 = np.insert(P1, [S], row, axis=1)
+    x2, P2 = _with_speed(x1, P1, ux, uy)
     fit = -0.5 * (across * across / variance + LOG_2PI + np.log(variance))
-    fit = fit + _log_positive_part(s[:, 0], spread[:, 0])
-    hover = _as_hover(bank, block, kept)
-    x1 = np.concatenate([x1, hover.x[..., None]], axis=-1)
-    P1 = np.concatenate([P1, hover.P[..., None]], axis=-1)
-    return _moments(Gaussians(x1, P1), centre[..., None, None]), fit
+    fit = fit + _log_positive_part(x2[:, S], P2[:, S, S])
+    hover = _as_hover(bank, block)
+    x2 = np.concatenate([x2, hover.x[..., None]], axis=-1)
+    P2 = np.concatenate([P2, hover.P[..., None]], axis=-1)
+    return _moments(Gaussians(x2, P2), centre[..., None, None]), fit
 
 
-def _as_hover(bank: Bank, block: Gaussians, kept: IndexArray) -> Gaussians:
+def _with_speed(
+    x: FloatArray, P: FloatArray, ux: FloatArray, uy: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return states (N, n', ...) and covariances (N, n', n', ...) with the speed along (ux, uy) in
+    place of the velocity."""
+    kept = _but_velocity(x.shape[1])
+    n, behind = x.shape[1] - 1, np.delete(np.arange(x.shape[1] - 1), S)
+    x1 = np.empty((len(x), n, *x.shape[2:]))
+    x1[:, behind], x1[:, S] = x[:, kept], ux * x[:, VX] + uy * x[:, VY]
+    P1 = np.empty((len(x), n, n, *x.shape[2:]))
+    P1[:, behind[:, None], behind] = P[:, kept[:, None], kept]
+    with_s = ux * P[:, :, VX] + uy * P[:, :, VY]
+    P1[:, behind, S] = P1[:, S, behind] = with_s[:, kept]
+    P1[:, S, S] = ux * with_s[:, VX] + uy * with_s[:, VY]
+    return x1, P1
+
+
+@lru_cache(maxsize=16)
+def _but_velocity(n: int) -> IndexArray:
+    return np.delete(np.arange(n), [VX, VY])
+
+
+def _as_hover(bank: Bank, block: Gaussians) -> Gaussians:
     """Return the velocities with the speed of the prior, uncorrelated with all else."""
-    x = np.insert(block.x[:, kept], S, bank.speed, axis=1)
-    P = np.insert(np.insert(block.P[:, kept][:, :, kept], S, 0.0, axis=1), S, 0.0, axis=2)
+    N, n, m = block.x.shape
+    kept, behind = _but_velocity(n), np.delete(np.arange(n - 1), S)
+    x, P = np.empty((N, n - 1, m)), np.zeros((N, n - 1, n - 1, m))
+    x[:, behind], x[:, S] = block.x[:, kept], bank.speed
+    P[:, behind[:, None], behind] = block.P[:, kept[:, None], kept]
     P[:, S, S] = bank.speed_variance
     return Gaussians(x, P)
 
@@ -332,22 +359,15 @@ def predict(block: Gaussians, moves: Moves) -> Gaussians:
     Most entries of F are 0 or on the diagonal, so that only the others cost anything. What stands
     behind the components of `moves` is constant.
     """
-    n = len(moves.B)
-    entries = [
-        (i, k)
-        for i in range(n)
-        for k in range(n)
-        if (i != k and moves.F[i, k].any()) or (i == k and (moves.F[i, i] != 1.0).any())
-    ]
+    n, F, changing = len(moves.B), moves.F, moves.changing
     x, left = block.x.copy(), block.P.copy()
-    changed = {i for i, _ in entries}
-    for i in changed:
-        x[:, i] = sum(moves.F[i, k] * block.x[:, k] for k in range(n) if moves.F[i, k].any())
-        left[:, i] = sum(moves.F[i, k] * block.P[:, k] for k in range(n) if moves.F[i, k].any())
+    for i, row in changing:
+        x[:, i] = sum(F[i, k] * block.x[:, k] for k in row)
+        left[:, i] = sum(F[i, k] * block.P[:, k] for k in row)
     x[:, :n] += moves.B
     P = left.copy()
-    for j in changed:
-        P[:, :, j] = sum(moves.F[j, k] * left[:, :, k] for k in range(n) if moves.F[j, k].any())
+    for j, row in changing:
+        P[:, :, j] = sum(F[j, k] * left[:, :, k] for k in row)
     P[:, :n, :n] += moves.Q
     return Gaussians(x, P)
 
@@ -364,8 +384,8 @@ POSITION: Measured = ((X,), (Y,))
 class Innovations(NamedTuple):
     """What p pairs of a row and a measurement of two values say of each of m models.
 
-    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log (p,
-    m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
+    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log
+    (p, m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
     """
 
     v: FloatArray
@@ -508,8 +528,10 @@ def combine(
     outputs: of each block (q, n, m), the outputs of each model in its components.
     """
     means = [np.einsum('qnm,Nnm->Nqm', E, b.x) for E, b in zip(outputs, blocks)]
+    # In two steps: numpy would look for the order at each call.
     spreads = [
-        np.einsum('qam,Nabm,rbm->Nqrm', E, b.P, E, optimize=True) for E, b in zip(outputs, blocks)
+        np.einsum('Nqbm,rbm->Nqrm', np.einsum('qam,Nabm->Nqbm', E, b.P), E)
+        for E, b in zip(outputs, blocks)
     ]
     mean, P = np.concatenate(means, axis=-1), np.concatenate(spreads, axis=-1)
     centre = (mean @ mu[..., None])[..., 0]

@@ -101,8 +101,8 @@ def consider_scalar(
     R: FloatArray | float,
     innovation: FloatArray,
     estimated: BoolArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`consider_update` of L filters at once, by one number each.
+) -> FloatArray:
+    """`consider_update` L filters at once in place, by one number each.
 
     :param x: (n, L) states.
     :param P: (n, n, L) covariances, symmetric.
@@ -110,8 +110,8 @@ def consider_scalar(
     :param R: (L,) the variance of the number, or one for all.
     :param innovation: (L,).
     :param estimated: (n,) False where a component is only considered.
-    :returns: x, P and the log-densities (L,) of the innovations. These are -inf where the variance
-        of the innovation is not positive and finite; x and P stay as they are there.
+    :returns: the log-densities (L,) of the innovations. These are -inf where the variance of the
+        innovation is not positive and finite; x and P stay as they are there.
     """
     crosses, variances = innovation_variances(P, h[None], R)
     cross, S = crosses[0], variances[0]
@@ -120,7 +120,8 @@ def consider_scalar(
         lost = np.isnan(S)
         cross, S = np.where(lost, 0.0, cross), np.where(lost, 1.0, S)
         innovation, fit = np.where(lost, 0.0, innovation), np.where(lost, -np.inf, fit)
-    return *apply_gain(x, P, cross, S, innovation, estimated), fit
+    apply_gain(x, P, cross, S, innovation, estimated)
+    return fit
 
 
 def apply_gain(
@@ -130,17 +131,15 @@ def apply_gain(
     S: FloatArray,
     innovation: FloatArray,
     estimated: BoolArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return x (n, L) and P (n, n, L) after `consider_scalar`, for known cross ``P h'`` (n, L) and
-    variances S (L,)."""
+) -> None:
+    """Update x (n, L) and P (n, n, L) in place as `consider_scalar` does, by known cross ``P h'``
+    (n, L) and variances S (L,)."""
     root = cross / np.sqrt(S)
-    # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain.
-    known = root[:, None] * root
-    moved = cross * (innovation / S)
-    if not estimated.all():
-        moved[~estimated] = 0.0
-        known[np.ix_(~estimated, ~estimated)] = 0.0
-    return x + moved, P - known
+    moved = root if estimated.all() else np.where(estimated[:, None], root, 0.0)
+    x += moved * (innovation / np.sqrt(S))
+    for a in range(len(x)):  # row by row: what one step needs stays at hand
+        # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain.
+        P[a] -= root[a] * (root if estimated[a] else moved)
 
 
 def consider_models(

@@ -200,8 +200,7 @@ def semidefinite_roots(S: FloatArray) -> FloatArray:
         root = np.sqrt(np.where(known, 0.0, pivot))
         L[b, b] = root
         inverse = np.where(known, 0.0, 1.0 / np.where(known, 1.0, root))
-        for a in range(b + 1, len(S)):
-            L[a, b] = (S[a, b] - (L[a, :b] * L[b, :b]).sum(axis=0)) * inverse
+        L[b + 1 :, b] = (S[b + 1 :, b] - (L[b + 1 :, :b] * L[b, :b]).sum(axis=1)) * inverse
     return L
 
 
@@ -209,19 +208,22 @@ def are_sound(S: FloatArray) -> BoolArray:
     """Return whether each covariance S (n, n, ...) keeps to the limit (...): `is_psd`, by pivots
     without square roots. Only lower triangles are read."""
     n = len(S)
-    L, D = np.zeros(S.shape), np.zeros(S.shape[1:])
+    left = np.array(S)
     good = np.ones(S.shape[2:], np.bool_)
     with np.errstate(invalid='ignore', over='ignore'):  # what is not finite is not sound
-        for a in range(n):
-            rest = S[a, a] - LIMIT * S[a, a]
-            for b in range(a):
-                value = S[a, b] - (L[a, :b] * L[b, :b] * D[:b]).sum(axis=0)
-                good &= ~((D[b] == 0.0) & (value != 0.0))
-                L[a, b] = np.divide(value, D[b], out=np.zeros_like(value), where=D[b] != 0.0)
-                rest = rest - value * L[a, b]
-            positive = (rest > 0.0) & (rest < np.inf)
-            good &= positive | ((S[a, a] == 0.0) & (rest == 0.0))
-            D[a] = np.where(positive, rest, 0.0)
+        for k in range(n):
+            pivot = left[k, k] - LIMIT * S[k, k]
+            positive = (pivot > 0.0) & (pivot < np.inf)
+            if positive.all():
+                if k + 1 < n:
+                    column = left[k + 1 :, k]
+                    left[k + 1 :, k + 1 :] -= column[:, None] * (column / pivot)
+                continue
+            # A component without variance must have no covariance either.
+            nothing = (S[k, k] == 0.0) & (pivot == 0.0) & ~left[k + 1 :, k].any(axis=0)
+            good &= positive | nothing
+            column = np.where(positive, left[k + 1 :, k], 0.0)
+            left[k + 1 :, k + 1 :] -= column[:, None] * (column / np.where(positive, pivot, 1.0))
     return good
 
 

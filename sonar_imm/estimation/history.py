@@ -53,9 +53,10 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Generic, Literal, TypeVar
+import operator
+from typing import ClassVar, Generic, Literal, TypeVar
 
-from attrs import frozen
+from attrs import define, field, frozen
 
 State = TypeVar('State')
 Item = TypeVar('Item')
@@ -102,14 +103,16 @@ class Held(Generic[Item]):
     late: bool
 
 
+@define(eq=False)
 class Run(Generic[Item]):
     """Items in a row that do not belong to the stream. held: the newest `hold` of them; stamps:
-    the distinct stamps of all, rising."""
+    the distinct stamps of all, rising. STATE: see `trackers.Tracker`."""
 
-    def __init__(self, hold: int):
-        self.hold = hold
-        self.held: list[Held[Item]] = []
-        self.stamps: list[int] = []
+    STATE: ClassVar = ('held', 'stamps')
+
+    hold: int
+    held: list[Held[Item]] = field(init=False, factory=list)
+    stamps: list[int] = field(init=False, factory=list)
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -134,6 +137,7 @@ class Run(Generic[Item]):
         return sum(not item.late for item in dropped)
 
 
+@define(eq=False)
 class StampGate(Generic[Item]):
     """Decides from the stamps alone what belongs to the stream. See the module's text.
 
@@ -141,30 +145,27 @@ class StampGate(Generic[Item]):
     is still believed; restart_after: distinct stamps in a row outside the stream that mean the
     clock was restarted, where nothing else explains them; max_late_ns: no message is later than
     this. A scan of many items with one outlying stamp is no restart. At most `hold` items are
-    held, the latest ones.
+    held, the latest ones. STATE: see `trackers.Tracker`.
     """
 
-    def __init__(
-        self,
-        window_ns: int,
-        max_gap_ns: int,
-        restart_after: int,
-        *,
-        max_late_ns: int = MAX_LATE_NS,
-        hold: int = 1000,
-    ):
-        if window_ns < 0 or max_gap_ns <= 0 or restart_after < 1 or hold < restart_after:
+    STATE: ClassVar = ('_first', '_newest', '_run')
+
+    window_ns: int
+    max_gap_ns: int
+    restart_after: int
+    max_late_ns: int = field(kw_only=True, default=MAX_LATE_NS)
+    hold: int = field(kw_only=True, default=1000)
+    _first: list[int] = field(init=False, factory=list)
+    _newest: list[int] = field(init=False, factory=list)
+    _run: Run[Item] = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        bounds = self.window_ns >= 0 and self.max_gap_ns > 0
+        if not (bounds and 1 <= self.restart_after <= self.hold):
             raise ValueError(
                 'a stamp gate needs window_ns >= 0, max_gap_ns > 0 and 1 <= restart_after <= hold'
             )
-        self.window_ns = window_ns
-        self.max_gap_ns = max_gap_ns
-        self.restart_after = restart_after
-        self.max_late_ns = max_late_ns
-        self.hold = hold
-        self._first: list[int] = []
-        self._newest: list[int] = []
-        self._run = Run[Item](hold)
+        self._run = Run(self.hold)
 
     @property
     def newest_ns(self) -> int | None:
@@ -255,41 +256,29 @@ class Inserted(Generic[State]):
     revised: list[tuple[int, State]]
 
 
-@frozen
-class Scan(Generic[Item]):
-    keys: list[bytes]
-    items: list[Item]
-
-    def holds(self, key: bytes) -> bool:
-        place = bisect_left(self.keys, key)
-        return place < len(self.keys) and self.keys[place] == key
-
-    def with_item(self, key: bytes, item: Item) -> Scan[Item]:
-        place = bisect_left(self.keys, key)
-        return Scan(
-            [*self.keys[:place], key, *self.keys[place:]],
-            [*self.items[:place], item, *self.items[place:]],
-        )
-
-
+@define(eq=False)
 class ReplayHistory(Generic[State, Item]):
     """Out-of-sequence history with replay, for any state and any step. See the module's text.
 
     initial: the state before the first scan. States must be values: `step` makes a new one and
     leaves the old one alone. window_ns: how late an item may be; 0 drops all late ones, and items
     of the newest stamp still join its scan. scan_limit: most items of one stamp, so that a clock
-    that stands still cannot eat the memory.
+    that stands still cannot eat the memory. STATE: see `trackers.Tracker`; `again` makes the rest.
     """
 
-    def __init__(self, initial: State, window_ns: int, *, scan_limit: int = 10_000):
-        if window_ns < 0 or scan_limit < 1:
+    STATE: ClassVar = ('_base', '_stamps', '_scans')
+
+    _base: State = field(alias='initial')
+    window_ns: int
+    scan_limit: int = field(kw_only=True, default=10_000)
+    _stamps: list[int] = field(init=False, factory=list)
+    _scans: list[list[Item]] = field(init=False, factory=list)
+    _keys: list[list[bytes]] = field(init=False, factory=list)
+    _states: list[State] = field(init=False, factory=list)
+
+    def __attrs_post_init__(self) -> None:
+        if self.window_ns < 0 or self.scan_limit < 1:
             raise ValueError('a history needs window_ns >= 0 and scan_limit >= 1')
-        self.window_ns = window_ns
-        self.scan_limit = scan_limit
-        self._base = initial
-        self._stamps: list[int] = []
-        self._scans: list[Scan[Item]] = []
-        self._states: list[State] = []
 
     def __len__(self) -> int:
         """How many scans are kept."""
@@ -328,28 +317,38 @@ class ReplayHistory(Generic[State, Item]):
             return Inserted('too_late', [])
         place = bisect_left(self._stamps, stamp_ns)
         merged = place < len(self._stamps) and self._stamps[place] == stamp_ns
-        scan = self._scans[place] if merged else Scan[Item]([], [])
-        if scan.holds(key):
+        keys, items = (self._keys[place], self._scans[place]) if merged else ([], [])
+        row = bisect_left(keys, key)
+        if keys[row : row + 1] == [key]:
             return Inserted('duplicate', [])
-        if len(scan.items) >= self.scan_limit:
+        if len(items) >= self.scan_limit:
             return Inserted('full', [])
-        later = place + 1 if merged else place
-        scans = [scan.with_item(key, item), *self._scans[later:]]
+        later = place + merged
         stamps = [stamp_ns, *self._stamps[later:]]
-        states = self._replay(
-            self._states[place - 1] if place else self._base, stamps, scans, step
-        )
+        scans = [[*items[:row], item, *items[row:]], *self._scans[later:]]
+        before = self._states[place - 1] if place else self._base
+        states = self._replay(before, stamps, scans, step)
         self._stamps[place:], self._scans[place:], self._states[place:] = stamps, scans, states
+        self._keys[place:later] = [[*keys[:row], key, *keys[row:]]]
         self._prune()
         return Inserted('used', list(zip(stamps, states)))
 
+    def again(self, key: Callable[[Item], bytes], step: Step[State, Item]) -> None:
+        """Compute the keys and the states of all scans, after a state was put in. Raises
+        ValueError where no history would have these scans."""
+        stamps, keys = self._stamps, [[key(item) for item in scan] for scan in self._scans]
+        rising = all(map(operator.lt, stamps, stamps[1:]))
+        if not rising or len(stamps) != len(keys) or any(scan != sorted(scan) for scan in keys):
+            raise ValueError('scans that are in no order')
+        self._keys, self._states = keys, self._replay(self._base, stamps, self._scans, step)
+
     @staticmethod
     def _replay(
-        state: State, stamps: list[int], scans: list[Scan[Item]], step: Step[State, Item]
+        state: State, stamps: list[int], scans: list[list[Item]], step: Step[State, Item]
     ) -> list[State]:
         states = []
         for stamp_ns, scan in zip(stamps, scans):
-            state = step(state, stamp_ns, tuple(scan.items))
+            state = step(state, stamp_ns, tuple(scan))
             states.append(state)
         return states
 
@@ -360,4 +359,4 @@ class ReplayHistory(Generic[State, Item]):
         old = bisect_left(self._stamps, self._stamps[-1] - self.window_ns)
         if old:
             self._base = self._states[old - 1]
-            del self._stamps[:old], self._scans[:old], self._states[:old]
+            del self._stamps[:old], self._keys[:old], self._scans[:old], self._states[:old]

@@ -32,8 +32,8 @@ No array in a table is ever written again: tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from functools import cached_property
+from typing import Annotated, Any
 
 from attrs import evolve, field, frozen
 import numpy as np
@@ -41,7 +41,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'revived', 'Rows', 'thinned']
+__all__ = ['Borrowed', 'log_sum', 'of_targets', 'revived', 'Rows', 'thinned']
 
 LEAST_LOG = -345.0
 """Logarithm of the weight, 1e-150, that a row keeps: it may become true later."""
@@ -51,7 +51,7 @@ ROW_LOST, ROW_AGAIN = 1e-4, 1e-3
 again."""
 
 
-@frozen(eq=False)
+@frozen(eq=False, slots=False)
 class Rows:
     """N rows of M models each, of T targets, each of which has at least one.
 
@@ -63,21 +63,21 @@ class Rows:
     """
 
     blocks: tuple[Gaussians, ...]
-    mu: FloatArray
-    logw: FloatArray
-    target: IntArray
-    parent: IntArray
-    key: Mapping[str, np.ndarray] = field(factory=dict)
+    mu: Annotated[FloatArray, 'NM']
+    logw: Annotated[FloatArray, 'N']
+    target: Annotated[IntArray, 'N']
+    parent: Annotated[IntArray, 'N']
+    key: dict[str, np.ndarray] = field(factory=dict)
 
     def __len__(self) -> int:
         return len(self.mu)
 
-    @property
+    @cached_property
     def first(self) -> IndexArray:
         """(T,) the first row of each target."""
-        return np.flatnonzero(np.diff(self.target, prepend=-1))
+        return _first(self.target)
 
-    @property
+    @cached_property
     def weight(self) -> FloatArray:
         """(N,) the weights of the rows of each target; they sum to one."""
         return self.weights_of(np.ones(len(self), np.bool_))
@@ -184,12 +184,27 @@ class Rows:
         return evolve(self, **changes)
 
 
+def _first(target: IntArray) -> IndexArray:
+    """Return where each target begins, of targets (A,) in rising order."""
+    changes = np.ones(len(target), np.bool_)
+    np.not_equal(target[1:], target[:-1], out=changes[1:])
+    return changes.nonzero()[0]
+
+
+def of_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
+    """Return what a verb such as ``np.maximum`` makes of all that belongs to each target, (T,
+    ...): values (A, ...), target (A,) in rising order, each of T there."""
+    if not len(values):
+        return values
+    return np.asarray(verb.reduceat(values, _first(target)))
+
+
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
     """Return ln sum exp (T, ...) of what belongs to each target: log (A, ...), target (A,) in
     rising order, each of T there."""
     if not len(log):
         return np.empty((0, *log.shape[1:]))
-    first = np.flatnonzero(np.diff(target, prepend=-1))
+    first = _first(target)
     top = np.maximum.reduceat(log, first)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):
@@ -201,9 +216,9 @@ class Borrowed:
     """Assumptions without a row of their own: target (B,), the `key` (B,) they are known by, and
     the logarithms of their weights (B,)."""
 
-    target: IntArray
-    key: FloatArray
-    logw: FloatArray
+    target: Annotated[IntArray, 'b']
+    key: Annotated[FloatArray, 'b']
+    logw: Annotated[FloatArray, 'b']
 
     @classmethod
     def none(cls) -> Borrowed:
@@ -248,9 +263,7 @@ def thinned(
     return evolve(rows.take(left), parent=rows.parent[left]), new, left
 
 
-def revived(
-    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
-) -> tuple[Rows, Borrowed]:
+def revived(rows: Rows, borrowed: Borrowed, name: str, again: BoolArray) -> tuple[Rows, Borrowed]:
     """Return rows and list after assumptions `again` (B,) got a row, a copy of their lender."""
     if not again.any():
         return rows, borrowed

@@ -60,9 +60,9 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 import math
-from typing import NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-from attrs import evolve, frozen
+from attrs import define, evolve, field, frozen
 import numpy as np
 
 from . import set_kernels as kernels
@@ -150,7 +150,7 @@ class Weighted(NamedTuple):
     sets that were propagated."""
 
     sets: Sets
-    log_weight: FloatArray
+    log_weight: Annotated[FloatArray, 'N']
     path: ShiftPath | None = None
     log_before: float = 0.0
 
@@ -167,14 +167,14 @@ class SetStep:
     """
 
     sets: Sets
-    w: FloatArray
-    amplitude: FloatArray
+    w: Annotated[FloatArray, 'N']
+    amplitude: Annotated[FloatArray, 'NJ']
     path: ShiftPath | None
     log_evidence: float
     effective: float
     ok: bool
     after: Weighted
-    source: IntArray
+    source: Annotated[IntArray, 'N']
     resampled: bool = False
 
 
@@ -484,13 +484,18 @@ class SetFilter:
         list(self._pool.map(work, edges[:-1], edges[1:]))
 
 
+@define(eq=False)
 class LagSmoother:
     """Fixed-lag smoothing by surviving lines: each of the newest particles is traced to its
-    ancestor `lag` records ago."""
+    ancestor `lag` records ago. STATE: see `trackers.Tracker`."""
 
-    def __init__(self, lag: int):
-        self.lag = lag
-        self._steps: deque[SetStep] = deque(maxlen=lag + 1)
+    STATE: ClassVar = ('_steps',)
+
+    lag: int
+    _steps: deque[SetStep] = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        self._steps = deque(maxlen=self.lag + 1)
 
     @property
     def steps(self) -> list[SetStep]:
@@ -506,11 +511,11 @@ class LagSmoother:
         knows of it what its descendant does, against its own places: those of the descendant have
         since been moved by what was drawn of it.
         """
-        if not step.ok:
+        if not step.ok or not self.lag:
             self._steps.clear()
             return None
         self._steps.append(step)
-        if len(self._steps) <= self.lag or not self.lag:
+        if len(self._steps) <= self.lag:
             return None
         steps = list(self._steps)
         line, drawn = np.arange(len(step.w)), np.zeros(len(step.w))

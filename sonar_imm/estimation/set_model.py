@@ -66,7 +66,7 @@ with multiple model particle filtering* (2012); the weights by first principles.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import Factory, field, frozen
 import numpy as np
@@ -292,12 +292,12 @@ class Sets(NamedTuple):
     (N, J) of the amplitudes, 1 or -1; shift (N,) plus pad: what is in cell z shows in the record's
     cell z + shift."""
 
-    order: IntArray
-    cell: IntArray
-    prior_mean: FloatArray
-    prior_variance: FloatArray
-    sign: NDArray[np.int8]
-    shift: IntArray
+    order: Annotated[IntArray, 'N']
+    cell: Annotated[IntArray, 'NJ']
+    prior_mean: Annotated[FloatArray, 'Na']
+    prior_variance: Annotated[FloatArray, 'Na']
+    sign: Annotated[NDArray[np.int8], 'NJ']
+    shift: Annotated[IntArray, 'N']
 
     @classmethod
     def empty(cls, model: SetModel, count: int) -> Sets:

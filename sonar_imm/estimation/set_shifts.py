@@ -43,7 +43,7 @@ models*, J. R. Statist. Soc. B 63 (2001).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import frozen
 import numpy as np
@@ -100,7 +100,7 @@ class ShiftPath(NamedTuple):
     """What the shifts of each particle so far say of an offset that all of them share: pull (N,)
     in 1 / cells and precision in 1 / cells^2, see the module's text."""
 
-    pull: FloatArray
+    pull: Annotated[FloatArray, 'N']
     precision: float
 
     @classmethod

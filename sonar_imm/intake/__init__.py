@@ -31,9 +31,9 @@ from __future__ import annotations
 
 from functools import singledispatch
 import hashlib
-from typing import Any
+from typing import Any, ClassVar
 
-from attrs import evolve
+from attrs import define, evolve, field
 import numpy as np
 
 from ..acoustics import geometry
@@ -77,6 +77,9 @@ class Intake:
     """
 
     STATE = ('repeats', 'transforms')
+
+    repeats: RepeatFilter
+    transforms: TransformTree
 
     def __init__(self, tracker: Any, frame_id: str = ''):
         """frame_id: the frame in which the measurements have to be, empty when the first one that
@@ -156,6 +159,7 @@ class Intake:
         self.tracker.remount(evolve(self.tracker.config, **self.mounting))
 
 
+@define(eq=False)
 class RepeatFilter:
     """Leaves out repeated polls: the same numbers once more, when a driver asks more often than it
     is answered.
@@ -165,18 +169,19 @@ class RepeatFilter:
     stamp is wrong. After `limit` the same numbers count again: a diver that rests on a coarse grid
     is there.
 
-    rows: how many rows of scans were left out so far.
+    limit: what is repeated within so many seconds is left out; 0: nothing. rows: how many rows of
+    scans were left out so far. STATE: see `trackers.Tracker`.
     """
 
-    def __init__(self, limit: float):
-        """Leave out what is repeated within `limit` seconds; 0: nothing."""
-        self._limit_ns = nanoseconds(limit)
-        self.reset()
+    STATE: ClassVar = ('rows', '_first')
+
+    _limit_ns: int = field(alias='limit', converter=nanoseconds)
+    rows: int = field(init=False, default=0)
+    _first: dict[str, int] = field(init=False, factory=dict)
 
     def reset(self) -> None:
         """Forget what came."""
-        self.rows = 0
-        self._first: dict[bytes, int] = {}
+        self.rows, self._first = 0, {}
 
     def fresh(self, measurement: Any) -> Any:
         """The measurement, of a scan of named positions the rows that are new.
@@ -223,13 +228,13 @@ class RepeatFilter:
     def _came(self, content: bytes, stamp_ns: int) -> bool:
         """Whether that content came with another stamp, not long ago; remembers it, by a digest
         since a scan may have thousands of positions."""
-        content = hashlib.blake2b(content, digest_size=16).digest()
-        first = self._first.get(content)
+        digest = hashlib.blake2b(content, digest_size=16).hexdigest()
+        first = self._first.get(digest)
         if first is not None and 0 < abs(stamp_ns - first) <= self._limit_ns:
             return True
         if first is None and len(self._first) >= MOST_KEPT:
             self._first.pop(next(iter(self._first)))
-        self._first[content] = stamp_ns
+        self._first[digest] = stamp_ns
         return False
 
 
@@ -243,11 +248,14 @@ MOST_FRAMES = 2000
 """Frames that are remembered, several times what a robot has. The oldest are forgotten."""
 
 
+@define(eq=False)
 class TransformTree:
-    """All that was said of frames that are fixed to each other; what is said again replaces."""
+    """All that was said of frames that are fixed to each other; what is said again replaces.
+    STATE: see `trackers.Tracker`."""
 
-    def __init__(self) -> None:
-        self._poses: dict[str, tuple[str, Pose]] = {}
+    STATE: ClassVar = ('_poses',)
+
+    _poses: dict[str, tuple[str, Pose]] = field(init=False, factory=dict)
 
     def add(self, transforms: StaticTransforms) -> None:
         """Take in what a message says."""
@@ -259,10 +267,7 @@ class TransformTree:
 
     def require(self) -> None:
         """Raise ValueError where it holds something else than frames."""
-        for frame, step in self._poses.items():
-            parent, pose = step
-            if not (isinstance(frame, str) and isinstance(parent, str) and type(pose) is Pose):
-                raise ValueError('a frame is none')
+        for _, pose in self._poses.values():
             turned = pose.R @ pose.R.T - np.eye(3)
             if pose.position.shape != (3,) or not np.abs(turned).max() < 1e-6:
                 raise ValueError('a frame is turned in no way')
@@ -409,5 +414,5 @@ def _after(yaw: float, q: FloatArray) -> FloatArray:
     return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
 
 
-STATE_TYPES = (RepeatFilter, TransformTree, Pose)
+STATE_TYPES = (Pose,)
 """The classes that a saved state of the intake may hold, see `trackers.state_file`."""

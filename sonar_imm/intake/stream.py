@@ -36,39 +36,42 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from operator import itemgetter
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
-from attrs import frozen
+from attrs import define, field, frozen
 
-from ..estimation.history import Held, MAX_LATE_NS, ReplayHistory, Run, Scan, StampGate, Step
+from ..estimation.history import Held, MAX_LATE_NS, ReplayHistory, StampGate, Step
 from ..measurements import nanoseconds, Rejection, VesselPose
 
 State = TypeVar('State')
 TRACKS = 'tracks'
 
 
-def frame_key(measurement: Any) -> Any:
-    """What has the frame of `measurement`: `TRACKS`; a sensor on board (its kind of measurement,
-    and side); or None, when it is the same in any frame. The class says so by `FRAME`: ``'own'``,
-    ``'none'``, or nothing."""
+def frame_key(measurement: Any) -> str | None:
+    """What has the frame of `measurement`: `TRACKS`; a sensor on board (the name of its kind of
+    measurement, and its side); or None, when it is the same in any frame. The class says so by
+    `FRAME`: ``'own'``, ``'none'``, or nothing."""
     role = getattr(type(measurement), 'FRAME', 'world')
     if role == 'own':
-        return type(measurement), getattr(measurement, 'side', '')
+        return f'{type(measurement).__name__} {getattr(measurement, "side", "")}'
     return TRACKS if role == 'world' else None
 
 
+@define(eq=False)
 class KnownFrames:
     """The frame of the tracks, and that of each sensor on board: each is that of the first
     measurement that was used.
 
     A measurement that is not used must not decide: `check` only compares, `settle` decides.
     kinds: the classes of which the tracker decides what is used, since it can refuse them for
-    their stamps; what is of another class is used whenever it comes.
+    their stamps; what is of another class is used whenever it comes. STATE: see
+    `trackers.Tracker`.
     """
 
-    def __init__(self, kinds: tuple[type, ...] = ()):
-        self.kinds = kinds
-        self._frames: dict[Any, str] = {TRACKS: ''}
+    STATE: ClassVar = ('_frames',)
+
+    kinds: tuple[type, ...] = ()
+    _frames: dict[str, str] = field(init=False, factory=lambda: {TRACKS: ''})
 
     @property
     def frame_id(self) -> str:
@@ -79,13 +82,13 @@ class KnownFrames:
         """The frame in which `measurement` has to be, `required` where it is that of the tracks;
         empty when any will do. The pose of a vessel places what is in the frame of the tracks."""
         key = TRACKS if isinstance(measurement, VesselPose) else frame_key(measurement)
-        return (required if key == TRACKS else '') or self._frames.get(key, '')
+        return (required if key == TRACKS else '') or self._frames.get(key or '', '')
 
     def check(self, measurement: Any, required: str = '') -> None:
         """Raise `Rejection` when `measurement` is in another frame, or, where it is in that of the
         tracks, not in `required`. One without a frame passes only until a frame is known."""
         key = frame_key(measurement)
-        for expected in (required if key == TRACKS else '', self._frames.get(key, '')):
+        for expected in (required if key == TRACKS else '', self._frames.get(key or '', '')):
             if expected and measurement.frame_id != expected:
                 whose = 'the tracks' if key == TRACKS else 'earlier ones'
                 raise Rejection(
@@ -129,21 +132,27 @@ class Admitted(NamedTuple):
     restarted: bool = False
 
 
+@define(eq=False)
 class Stream:
     """The gates that both streams share. accepts: the measurement classes a tracker takes; frames:
     those of what was used.
 
-    counts: what happened to the measurements, by reason; a tracker adds its own.
+    counts: what happened to the measurements, by reason; a tracker adds its own. STATE: see
+    `trackers.Tracker`.
     """
 
-    def __init__(
-        self, accepts: tuple[type, ...], rules: StreamRules, counts: Counter[str] | None = None
-    ):
-        self.counts: Counter[str] = Counter() if counts is None else counts
-        self.accepts = accepts
-        self.frames = KnownFrames(accepts)
-        self._rules = rules
-        self._gate: StampGate[Any] = StampGate(
+    STATE: ClassVar[tuple[str, ...]] = ('counts', 'frames', '_gate')
+
+    accepts: tuple[type, ...]
+    _rules: StreamRules
+    counts: Counter[str] = field(init=False, factory=Counter)
+    frames: KnownFrames = field(init=False)
+    _gate: StampGate[Any] = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        rules = self._rules
+        self.frames = KnownFrames(self.accepts)
+        self._gate = StampGate(
             rules.window_ns, rules.max_gap_ns, rules.restart_after, max_late_ns=rules.max_late_ns
         )
 
@@ -184,6 +193,7 @@ class Stream:
         return Admitted(tuple(used), decision.verdict == 'restart')
 
 
+@define(eq=False)
 class OnceStream(Stream):
     """A stream that hands out each measurement once, in rising order of stamps."""
 
@@ -202,6 +212,7 @@ class OnceStream(Stream):
         return Admitted(tuple(by_stamp[stamp] for stamp in sorted(by_stamp)), admitted.restarted)
 
 
+@define(eq=False, kw_only=True)
 class ReplayStream(Stream, Generic[State]):
     """A stream with history: what is late, but inside the window, gets its place in time.
 
@@ -210,19 +221,20 @@ class ReplayStream(Stream, Generic[State]):
     clock was restarted, such as the identities that are used up. Measurements have a ``key()``.
     """
 
-    def __init__(
-        self,
-        accepts: tuple[type, ...],
-        rules: StreamRules,
-        *,
-        step: Step[State, Any],
-        initial: State,
-        survivor: Callable[[State], State],
-    ):
-        super().__init__(accepts, rules)
-        self._step = step
-        self._survivor = survivor
-        self._history = ReplayHistory[State, Any](initial, rules.window_ns)
+    STATE: ClassVar[tuple[str, ...]] = (*Stream.STATE, '_history')
+
+    _step: Step[State, Any]
+    initial: State
+    _survivor: Callable[[State], State]
+    _history: ReplayHistory[State, Any] = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        Stream.__attrs_post_init__(self)
+        self._history = ReplayHistory(self.initial, self._rules.window_ns)
+
+    def restored(self) -> None:
+        """Compute the states anew, after the scans were put in. Raises ValueError."""
+        self._history.again(lambda item: item.key(), self._step)
 
     @property
     def state(self) -> State:
@@ -230,9 +242,9 @@ class ReplayStream(Stream, Generic[State]):
         return self._history.state
 
     @property
-    def kept(self) -> list[State]:
-        """All states that are kept."""
-        return [self._history.base, *self._history.states]
+    def base(self) -> State:
+        """The state before the oldest scan that is kept."""
+        return self._history.base
 
     def revise(self, measurement: Any) -> list[tuple[int, State]]:
         """Take a measurement in: every stamp with a new or a changed state, and that state, oldest
@@ -251,7 +263,6 @@ class ReplayStream(Stream, Generic[State]):
         return sorted(revised.items(), key=itemgetter(0))
 
 
-STREAM_TYPES = (Stream, OnceStream, StreamRules, KnownFrames, StampGate, Run, Held)
-REPLAY_TYPES = (*STREAM_TYPES, ReplayStream, ReplayHistory, Scan)
-"""The classes that the states of either stream may hold, see `trackers.state_file`; measurements
-besides."""
+STREAM_TYPES = (Held,)
+"""The classes of values that the state of a stream may hold, see `trackers.state_file`;
+measurements besides."""

@@ -47,12 +47,12 @@ from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
 from ..measurements import Rejection
-from ..node_config import node_config_type, type_spec, type_specs
+from ..node_config import chosen_types, node_config_type
 from ..parameters import Config
 from ..trackers import SYSTEMS, WarmStep
 from .diagnostics import Announcer, Meter, Reporter
 from .managed import DONE, FAILED, LOOK, ManagedNode, Warming
-from .messages import make, message_class
+from .messages import is_installed, make, message_class
 from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
 from .parameters import NodeParameters
 from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos, transforms_qos
@@ -60,6 +60,8 @@ from .saved_state import SavedState
 from .stopping import stopper
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
+DIAGNOSTICS_PERIOD = 1.0
+"""Seconds between messages on /diagnostics."""
 NO_WORK: dict[str, Any] = {'enabled': True, 'counts': {}, 'health': {}}
 """What a node reports before it is configured."""
 _UNKNOWN = {'received_timestamp': 0}
@@ -83,9 +85,10 @@ class BaseNode(ManagedNode):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(name, **options)
-        self._settings = NodeParameters(self, config_types, type_specs(name))
+        self._settings = NodeParameters(self, config_types)
         self._config_type, self._node_config_type = config_types
         self._node_config: Any = self._settings[self._node_config_type]
+        self._types = chosen_types(name, self._settings.values()['input_types'])
         self._name = name
         self._full_name = self.get_fully_qualified_name().lstrip('/')
         self._inputs: dict[str, tuple[InputTopic, str, Callable[[Any], Any]]] = {}
@@ -104,8 +107,7 @@ class BaseNode(ManagedNode):
             self._announcer = Announcer(self._endpoints, self._full_name)
         self._reporter = Reporter(self._full_name, {}, self._meter)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        period = self._node_config.diagnostics_period
-        self.create_timer(period, self._report, clock=self._steady)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._report, clock=self._steady)
         self._settings.on_change(self._reconfigure)
         if self._node_config.autostart:
             self.raises = True
@@ -285,16 +287,12 @@ class BaseNode(ManagedNode):
 
     def _wanted(self, topic: InputTopic, settings: Mapping[str, Any]) -> bool:
         """Whether to hear an input. What is latched is heard where its type is installed: PyPI has
-        neither tf2_msgs nor marine_interfaces. With `sonar_frame` frames have to be."""
+        no marine_interfaces. With `sonar_frame` frames have to be."""
         if not topic.wanted(settings):
             return False
         if not topic.latched or settings.get('sonar_frame'):
             return True
-        try:
-            message_class(self._type_name(topic))
-        except ImportError:
-            return False
-        return True
+        return is_installed(self._type_name(topic))
 
     def _input(
         self, topic: InputTopic, name: str, settings: Mapping[str, Any]
@@ -307,9 +305,12 @@ class BaseNode(ManagedNode):
         return evolve(topic, name=name), type_name, reader
 
     def _type_name(self, topic: InputTopic) -> str:
-        """The message type of an input."""
-        spec = type_spec(topic)
-        return self._settings.choice(spec.name) if spec else next(iter(topic.readers))
+        """The message type of an input; PyPI has no tf2_msgs, so that the first type of what is
+        latched need not be installed."""
+        chosen = self._types.get(topic.name, next(iter(topic.readers)))
+        if not topic.latched or is_installed(chosen):
+            return chosen
+        return next(filter(is_installed, topic.readers), chosen)
 
     def _connected(self) -> set[type] | None:
         """Measurements of the inputs that somebody publishes, None when nobody does."""
@@ -536,10 +537,8 @@ class TrackerNode(BaseNode):
     def _publish(self, estimates: list[Estimate]) -> None:
         """Publish the newest estimate, and before it the newest revised ones, as many as are
         wanted."""
-        wanted = 1
-        if self._node_config.publish_revisions:
-            wanted += self._node_config.max_revisions or len(estimates)
-            self._withheld += max(0, len(estimates) - wanted)
+        wanted = 1 + self._node_config.max_revisions
+        self._withheld += max(0, len(estimates) - wanted)
         for estimate in estimates[-wanted:]:
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1

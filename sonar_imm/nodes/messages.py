@@ -60,6 +60,15 @@ def message_class(type_name: str) -> type:
         raise ImportError(f'the message type {type_name} is not installed here') from None
 
 
+def is_installed(type_name: str) -> bool:
+    """Return whether the class of ``'package/msg/Name'`` can be had."""
+    try:
+        message_class(type_name)
+    except ImportError:
+        return False
+    return True
+
+
 def make(type_name: str, **fields: Any) -> Any:
     """Make a message of `type_name`; fields left out keep their defaults.
 

@@ -54,32 +54,19 @@ _TYPES = {
 class NodeParameters:
     """The parameters of one node, spread over several `Config` classes."""
 
-    def __init__(
-        self,
-        node: Node,
-        config_types: Iterable[type[Config]],
-        choices: Iterable[ParameterSpec] = (),
-    ):
-        """Read the overrides, check them, declare.
-
-        `choices` are further read-only parameters that no class knows. Raises `ConfigError` with
-        one sentence for each mistake.
-        """
+    def __init__(self, node: Node, config_types: Iterable[type[Config]]):
+        """Read the overrides, check them, declare. Raises `ConfigError` with one sentence for each
+        mistake."""
         self._node = node
         self._types = tuple(config_types)
-        self._choices = {spec.name: spec for spec in choices}
         given = {name: given.value for name, given in _overrides(node).items()}
         # Where two classes share a parameter, the first one, the tracker's, describes it.
         self._specs = {
             spec.name: spec
             for config_type in reversed(self._types)
             for spec in config_type.specs_with(given)
-        } | self._choices
-        values = self._start_values()
-        self._configs = self._build(values)
-        self._chosen = {
-            name: values.get(name, spec.default) for name, spec in self._choices.items()
         }
+        self._configs = self._build(self._start_values())
         for spec in self._specs.values():
             self._declare(spec)
         node.add_on_set_parameters_callback(self._check)
@@ -87,10 +74,6 @@ class NodeParameters:
     def __getitem__(self, config_type: type[C]) -> C:
         """Give the current, validated config of one class."""
         return self._configs[config_type]
-
-    def choice(self, name: str) -> Any:
-        """Give the value of one of the further parameters."""
-        return self._chosen[name]
 
     def values(self) -> dict[str, Any]:
         """The parameters of all classes by name; where two share one, the last one's."""
@@ -164,7 +147,7 @@ class NodeParameters:
         return built
 
     def _declare(self, spec: ParameterSpec) -> None:
-        value, described = (self.values() | self._chosen)[spec.name], descriptor(spec)
+        value, described = self.values()[spec.name], descriptor(spec)
         if value != []:
             self._node.declare_parameter(spec.name, value, described, ignore_override=True)
             return

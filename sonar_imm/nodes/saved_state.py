@@ -38,13 +38,12 @@ from ..node_config import NodeConfig
 from ..parameters import Config, ConfigError
 from ..trackers import SYSTEMS
 from ..trackers.state_file import (
-    frozen_state,
+    intake_from,
     json_parameters,
     read_state,
-    restore,
     Saved,
+    state_of,
     StateError,
-    tracker_from,
     write_state,
 )
 
@@ -52,6 +51,8 @@ PROOF = 100
 """Measurements after which a state that was loaded is taken for sound."""
 _ENOUGH = 3
 """First measurements that have to be far from a state before it is given up; one may be wrong."""
+STATE_INTERVAL = 10.0
+"""Seconds between saves; the last state is saved in any case."""
 
 
 class SavedState:
@@ -76,7 +77,6 @@ class SavedState:
             self._path = Path(settings.state_file).expanduser() if settings.state_file else None
         except RuntimeError as error:
             raise ConfigError(f"state_file: '~' stands for no folder ({error})") from None
-        self._period = settings.state_interval
         self._refused = self._others = False
         self._loaded_ns: int | None = None
         self._newest_ns: int | None = None
@@ -110,7 +110,7 @@ class SavedState:
         """`save` with the parameters `given()`, each time something new came."""
         if self._path:
             self._node.create_timer(
-                self._period,
+                STATE_INTERVAL,
                 lambda: self.save(given()),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
@@ -170,8 +170,8 @@ class SavedState:
             parameters=json_parameters(given),
             saved_ns=time.time_ns(),
             newest_ns=self._newest_ns,
-            state=frozen_state(self.intake.tracker),
-            extras={'conventions': self._conventions, 'intake': frozen_state(self.intake)},
+            state=state_of(self.intake),
+            extras=self._conventions,
         )
         if wait:
             self._write(self._path, saved)
@@ -207,10 +207,9 @@ class SavedState:
         if abs(age) > self._max_age:
             when = f'{age:.0f} s ago' if age > 0 else f'{-age:.0f} s ahead of the clock'
             raise StateError(f'it was saved {when}, state_max_age is {self._max_age:g} s')
-        intake = Intake(tracker_from(saved, self._system, config), self._frame_id)
-        if saved.extras.get('conventions') != self._conventions:
+        if saved.extras != self._conventions:
             raise StateError('it was saved with another frame_id or world_frame_convention')
-        restore(intake, saved.extras.get('intake', {}))
+        intake = intake_from(saved, self._system, config, self._frame_id)
         self._loaded_ns = self._newest_ns = saved.newest_ns
         self._unproven = PROOF
         self._node.get_logger().info(f"goes on from the state in '{path}', {age:.1f} s old")

@@ -141,7 +141,7 @@ class System:
         return self.build(config).warm_steps()
 
     def state_types(self) -> tuple[type, ...]:
-        """The classes that a saved state of the tracker may hold: a literal table."""
+        """Return the classes of values that a saved state of the tracker may hold."""
         types: tuple[type, ...] = self._own('state_types.STATE_TYPES')
         return types
 
@@ -170,8 +170,8 @@ SYSTEMS = {
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
             node_config='TracksNodeConfig',
-            kernels={'fixes': (32, 880), 'echoes': (28, 810), 'tags': (35, 899)},
-            all_kernels=(50, 1410),
+            kernels={'fixes': (29, 823), 'echoes': (15, 424), 'tags': (15, 424)},
+            all_kernels=(29, 823),
         ),
         System(
             name='fathometer',

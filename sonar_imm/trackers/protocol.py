@@ -32,9 +32,10 @@ class Tracker(Protocol):
     clock, no global state.
 
     counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``,
-    ``too_late``, ...). STATE: the attributes that hold all it knows, see `state_file`; a tracker
-    that keeps more, which follows from them, has a method ``restored`` that makes it again.
-    ``STATE_TYPES`` in `state_types` are the classes that they may hold.
+    ``too_late``, ...). STATE: the names of the attributes that hold the state, each with an
+    annotation in the class, see `state_file`; objects in them that change have a STATE, too. A
+    method ``restored`` makes again what follows from these attributes, and raises ValueError where
+    they do not fit each other. ``STATE_TYPES`` in `state_types` lists the classes of their values.
     """
 
     config: Any

@@ -25,7 +25,8 @@ from __future__ import annotations
 
 from attrs import frozen
 
-from ..parameters import Config, live, parameter
+from ..acoustics.geodesy import Origin
+from ..parameters import Config, constant, live, parameter
 
 
 @frozen(kw_only=True, slots=False)
@@ -64,6 +65,34 @@ class MountingParameters(Config):
 
 
 @frozen(kw_only=True, slots=False)
+class OriginParameters(Config):
+    """Where the origin of the frame of the tracks lies on Earth."""
+
+    # fmt: off
+    origin: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg, deg, m',
+        'latitude, longitude and height above the ellipsoid of the origin of the frame of the '
+        'tracks; with both latitude and longitude 0: not known')
+    # fmt: on
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if len(self.origin) != 3:
+            problems.append(f'origin needs three values, got {len(self.origin)}')
+        for value, what, most in zip(
+            self.origin, ('latitude', 'longitude', 'height'), (90.0, 360.0, 12000.0)
+        ):
+            if abs(value) > most:
+                problems.append(
+                    f'origin: {what} must be between {-most:g} and {most:g}, got {value:g}'
+                )
+        return problems
+
+    def stated_origin(self) -> Origin | None:
+        """Return the origin that is stated, None for none."""
+        return Origin(*self.origin) if any(self.origin[:2]) else None
+
+
+@frozen(kw_only=True, slots=False)
 class TrackLifeParameters(Config):
     """When tracks begin, are confirmed and end."""
 
@@ -95,10 +124,10 @@ class StampParameters(Config):
     """Which stamps are believed."""
 
     # fmt: off
-    max_gap: float = parameter(3600.0, 's',
+    max_gap: float = constant(3600.0, 's',
         'a stamp further ahead of the last one than this is not trusted until the following '
         'stamps agree with it', range=(1.0, 1e8))
-    restart_after: int = parameter(5, '',
+    restart_after: int = constant(5, '',
         'number of consecutive agreeing stamps that count as a restarted clock: further ahead '
         'than max_gap, more than five minutes late, or a repeated beginning; 20 times as many '
         'where late messages may be the reason', range=(2, 1000))

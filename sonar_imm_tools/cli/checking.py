@@ -27,7 +27,6 @@ from typing import Any
 
 from attrs import asdict, frozen
 
-from sonar_imm.node_config import hears_transforms
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import SYSTEMS
 
@@ -157,9 +156,8 @@ def play_recording(
     options = InputOptions(
         topics=topics,
         frame_id=node.frame_id,
-        use_tf_static=hears_transforms(node),
         world_frame=node.world_frame_convention,
-        origin=node.origin(),
+        origin=node.stated_origin(),
         detector=load_detector(SYSTEMS[system], used, {}),
     )
     run = track_one(
@@ -184,7 +182,7 @@ def play_recording(
             bag,
             system,
             params_file=given,
-            settings={**config.as_dict(), 'use_tf_static': hears_transforms(node)},
+            settings=config.as_dict(),
             topics=topics,
             progress=advance,
         )

@@ -28,7 +28,7 @@ from typing import Any
 import click
 
 from msg_adapters.inputs import FEEDERS
-from sonar_imm.node_config import DetectorNodeConfig, node_config_type, NodeConfig, type_specs
+from sonar_imm.node_config import chosen_types, DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import (
     Config,
     ConfigError,
@@ -205,10 +205,8 @@ def load_config(
     Raises `ConfigError` with one sentence for each mistake.
     """
     tracker, node = system.config_type(), node_config_type(system)
-    choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system, system.name, report=True) if params else {}
     specs = {spec.name: spec for spec in node.specs()} | specs_with(tracker, values, overrides)
-    specs |= choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
     unknown = [
@@ -216,18 +214,12 @@ def load_config(
         for name in values
         if name not in specs and name not in others
     ]
-    # The message types a live node subscribes to are checked too, though a recording has its own.
-    problems = unknown + [
-        trouble
-        for name, spec in choices.items()
-        if name in values and (trouble := spec.problem(values[name]))
-    ]
-    if problems:
-        raise ConfigError(*problems)
-    return (
-        tracker.from_mapping(values, ignore_unknown=True),
-        node.from_mapping(values, ignore_unknown=True),
-    )
+    if unknown:
+        raise ConfigError(*unknown)
+    given = node.from_mapping(values, ignore_unknown=True)
+    # Checked too, though a recording has its own.
+    chosen_types(system.name, given.input_types)
+    return tracker.from_mapping(values, ignore_unknown=True), given
 
 
 def load_detector(
@@ -290,7 +282,7 @@ def _taken(own: OwnParameters, system: System, node_name: str, report: bool) -> 
     node = {spec.name for spec in node_config_type(system).specs()}
     if detector:
         node |= {spec.name for spec in DetectorNodeConfig.specs()}
-    allowed = detector | {spec.name for spec in type_specs(node_name)}
+    allowed = {*detector, 'input_types'}
     if node_name == system.name:
         allowed |= {spec.name for spec in system.config_type().specs()}
         allowed |= node.intersection(OF_FRAMES)

@@ -100,7 +100,7 @@ def command(
     sections = {system: known}
     if fed := config.feeder_instruments():
         # A scene writes its images as the only type that needs no further package.
-        sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
+        sections[FEEDERS[system]] = {'input_types': ['image=sensor_msgs/msg/Image'], **fed}
     report = write_scene(
         scene,
         out_bag,

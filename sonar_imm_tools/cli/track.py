@@ -25,7 +25,6 @@ from typing import Any, TYPE_CHECKING
 from attrs import evolve, field, frozen
 import click
 
-from sonar_imm.node_config import hears_transforms
 from sonar_imm.trackers import System, SYSTEMS
 
 from .common import (
@@ -214,9 +213,8 @@ class Plan:
                     topics={t: entry.name for t, entry in inputs.items()} if several else wanted,
                     order=self.order,
                     frame_id=node.frame_id,
-                    use_tf_static=hears_transforms(node),
                     world_frame=node.world_frame_convention,
-                    origin=node.origin(),
+                    origin=node.stated_origin(),
                     smooth=self.smooth,
                     detector=detector,
                 ),

@@ -68,7 +68,6 @@ class InputOptions:
     order: str = 'recorded'
     world_frame: str = 'enu'
     frame_id: str = ''
-    use_tf_static: bool = True
     smooth: bool = False
     jobs: int = 1
     detector: Mapping[str, Any] = field(factory=dict)
@@ -146,7 +145,7 @@ class OfflineRun:
         self.bag = bag
         self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
-        settings = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
+        settings = config.as_dict()
         self.topics = {
             name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
         }

@@ -52,12 +52,11 @@ MOST_BYTES = 1_000_000
 OF_FRAMES = (
     'frame_id',
     'world_frame_convention',
-    'use_tf_static',
-    'origin_latitude',
-    'origin_longitude',
-    'origin_height',
+    'origin',
+    'input_types',
 )
-"""Parameters of a node that a recording may state: in what frames it was measured."""
+"""Parameters of a node that a recording may state: in what frames it was measured, and of which
+types its messages are."""
 _HEADS = {
     PARAMETERS: '# Parameters of the tracker that describe the instruments of this recording.\n',
     LIMIT: '# The largest error that `sonar-imm check` allows on this recording, and what makes\n'

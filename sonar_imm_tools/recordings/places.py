@@ -92,15 +92,9 @@ class LocalFrame:
         return east, north, up
 
 
-def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, float]:
-    """An origin by the names of the tracker's parameters; nothing for metres."""
-    names = ('origin_latitude', 'origin_longitude', 'origin_height')
-    return {} if origin is None else dict(zip(names, origin))
-
-
-def origin_of_detections(origin: tuple[float, ...]) -> dict[str, dict[str, float]]:
-    """`origin_parameters` of the tracker that takes detections, by its name."""
-    return {'obstacle': origin_parameters(origin)}
+def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, list[float]]:
+    """Give an origin as the tracker's parameter; nothing for metres."""
+    return {} if origin is None else {'origin': list(origin)}
 
 
 def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, float] | None:

@@ -109,7 +109,7 @@ def run_lockstep(
         stack.enter_context(local_discovery())
         arguments = _arguments(bag, system, direct, params_file)
         arguments += _losing_nothing(f'/{system}/estimate.publisher')
-        arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=0']
+        arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=1000000']
         for entry in fed.values():
             arguments += _losing_nothing(f'{entry.makes}.subscription')
         node = stack.enter_context(NodeProcess(system, domain_id=domain, arguments=arguments))
@@ -313,22 +313,22 @@ def _arguments(
     params_file: Path | str | None,
 ) -> list[str]:
     """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
-    parameters: dict[str, str] = {}
+    expected: dict[str, str] = {}
     inputs_lossless: list[str] = []
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
         inputs_lossless += _losing_nothing(f'{entry.full_name(node)}.subscription')
         if len(entry.readers) == 1:
             continue
-        known = parameters.setdefault(f'{entry.name.split("/")[-1]}_type', types[topic])
+        known = expected.setdefault(entry.name.split('/')[-1], types[topic])
         if known != types[topic]:
             raise LinkError(
                 f"the input '{entry.name}' would come as {known} and as "
                 f'{types[topic]}: a node can hear only one of them'
             )
     arguments = ['--params-file', str(params_file)] if params_file else []
-    return (
-        arguments
-        + inputs_lossless
-        + [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    )
+    arguments += inputs_lossless
+    if expected:
+        chosen = ', '.join(f"'{name}={kind}'" for name, kind in expected.items())
+        arguments += ['-p', f'input_types:=[{chosen}]']
+    return arguments

@@ -178,10 +178,10 @@ def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
 
 def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_path, capsys):
     params = tmp_path / 'diver.yaml'
-    params.write_text('fix_type: geometry_msgs/msg/PointStamped\nqueue_depth: 7\n')
+    params.write_text('input_types: [fix=geometry_msgs/msg/PointStamped]\nqueue_depth: 7\n')
     run = call('track', dive, tmp_path / 'out', '--params', params)
-    assert 'fix_type' not in run['parameters'] and run['estimates'] == 58
-    params.write_text('fix_type: geometry_msgs/msg/PointStampd\n')
+    assert 'input_types' not in run['parameters'] and run['estimates'] == 58
+    params.write_text('input_types: [fix=geometry_msgs/msg/PointStampd]\n')
     assert main(['track', str(dive), str(tmp_path / 'no'), '--params', str(params)]) == 2
     assert "did you mean 'geometry_msgs/msg/PointStamped'?" in capsys.readouterr().err
 

@@ -44,8 +44,8 @@ def test_numbers_one_by_one_equal_the_joint_update(mask):
         nu = value - h @ x
         expected = -0.5 * (nu**2 / (h @ P @ h + R) + np.log(2 * np.pi * (h @ P @ h + R)))
         # two filters at once, the same
-        both = np.stack([x, x], 1), np.stack([P, P], 2), np.stack([h, h], 1)
-        xs, Ps, fit = consider_scalar(*both, R, np.array([nu, nu]), mask)
+        xs, Ps = np.stack([x, x], 1), np.stack([P, P], 2)
+        fit = consider_scalar(xs, Ps, np.stack([h, h], 1), R, np.array([nu, nu]), mask)
         assert fit == pytest.approx([expected, expected])
         x, P = xs[:, 1], Ps[..., 1]
         plain_x, plain_P = consider_update(

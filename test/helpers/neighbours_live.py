@@ -225,7 +225,7 @@ def dave_dvl(step):
     return make('dave_interfaces/msg/DVL', header=header(step), target=target)
 
 
-GEODETIC = {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
+GEODETIC = {'origin': [ORIGIN.latitude, ORIGIN.longitude, 0.0]}
 FIXED = {'vessel': 'fixed'}
 CASES = {
     'geographic_msgs/msg/GeoPointStamped': (DiverNode, 'fix', point_stamped, GEODETIC),
@@ -255,18 +255,19 @@ CASES = {
     ),
     'marine_interfaces/msg/SonarInfo': (
         *(FlsDetectorNode, 'sonar_info', sonar_info),
-        {'image_type': 'sensor_msgs/msg/Image'},
+        {'input_types': ['image=sensor_msgs/msg/Image']},
     ),
 }
 
 
 def run(type_name, kind, name, message_of, settings):
     """Publish `STEPS` messages to a node of its own, each when the one before is answered."""
-    settings = {f'{name}_type': type_name, **settings}
+    types = [f'{name}={type_name}', *settings.get('input_types', [])]
     quality = lockstep_qos()
     if name == 'sonar_info':
         quality = transforms_qos()
-        del settings['sonar_info_type']
+        del types[0]
+    settings = {**settings, 'input_types': types}
     bench = Bench()
     try:
         overrides = [Parameter(key, value=value) for key, value in settings.items()]

@@ -21,9 +21,8 @@ import numpy as np
 
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
-from sonar_imm.trackers.obstacle.behaviours import build_filter
-from sonar_imm.trackers.obstacle.filters import Sonar
-from sonar_imm.trackers.obstacle.navigation import Mount
+from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
+from sonar_imm.trackers.obstacle.pings import Echoes, Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -35,9 +34,7 @@ FAITHFUL = {
     'components': 41,
     'max_offset': 12.0,
     'scale_std': 0.0,
-    'position_noise': 0.0,
-    'yaw_noise_deg': 0.0,
-    'depth_noise': 0.0,
+    'navigation_noise': (0.0, 0.0, 0.0),
     'outlier_probability': 0.0,
     'gate_probability': 0.9999999,
     'max_tracks': 1,
@@ -157,14 +154,15 @@ def mean_nis(final):
 def follow(measurements, config):
     """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
     view."""
-    tracker, mount = ObstacleTracker(config), Mount(config)
+    mount = Mount(config)
     filter_, mixture, before, nis = build_filter(config), None, None, []
     for i in range(0, len(measurements), 3):
         altitude, pose, ping = measurements[i : i + 3]
         sonar = Sonar(
             mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
         )
-        z, R, *_ = tracker._detections(ping)
+        echoes = Echoes.of(ping, config)
+        z, R = echoes.z, echoes.R
         if mixture is None:
             mixture = filter_.begin(z, R, sonar)
         else:

@@ -17,9 +17,17 @@ import functools
 from pathlib import Path
 
 from msg_adapters.estimates import write_estimate
+from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.trackers.state_file import frozen_state, json_parameters, Saved
+from sonar_imm.trackers.state_file import (
+    intake_from,
+    json_parameters,
+    read_state,
+    Saved,
+    state_of,
+    write_state,
+)
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
@@ -78,16 +86,30 @@ class Tracked:
             tracker.process(measurement)
         return tracker
 
-    def saved(self, tracker, **changes):
-        fields = {
-            'system': self.system.name,
-            'parameters': json_parameters(self.config),
-            'saved_ns': 5,
-            'newest_ns': 7,
-            'state': frozen_state(tracker),
-            'extras': {},
-        }
-        return Saved(**(fields | changes))
+    def saved(self, tracker):
+        return saved(Intake(tracker), self.system)
+
+
+def saved(intake, system):
+    """The state of a tracker of a system, and of the intake before it."""
+    return Saved(
+        system=system.name,
+        parameters=json_parameters(intake.tracker.config),
+        saved_ns=5,
+        newest_ns=7,
+        state=state_of(intake),
+    )
+
+
+def tracker_from(saved, system, config):
+    """The tracker that goes on from a state as it was read."""
+    return intake_from(saved, system, config).tracker
+
+
+def resumed(path, tracker, name):
+    """The tracker that goes on from the file to which a tracker of a system is saved."""
+    write_state(path, saved(Intake(tracker), SYSTEMS[name]))
+    return tracker_from(read_state(path), SYSTEMS[name], tracker.config)
 
 
 def published(tracker, measurement):

@@ -16,6 +16,7 @@
 
 from collections import Counter
 import sys
+from typing import Any
 
 import attrs
 import numpy as np
@@ -51,6 +52,10 @@ class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
     STATE = ('counts', 'fixes', 'frames')
+
+    counts: Counter[str]
+    fixes: dict[int, Any]
+    frames: KnownFrames
 
     def __init__(self, config):
         self.config = config
@@ -116,7 +121,7 @@ class WalkerSystem(System):
         return WalkerTracker(config)
 
     def state_types(self):
-        return (Fix, KnownFrames)
+        return (Fix,)
 
 
 def register(set_item):

@@ -38,7 +38,7 @@ from sonar_imm.measurements import (
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm.trackers.state_file import frozen_state
+from sonar_imm.trackers.state_values import frozen_state
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
@@ -232,8 +232,6 @@ def wandering(k, rng):
 
 def entries(value):
     """How many values a frozen state has, an array being one."""
-    if hasattr(value, 'attributes'):
-        value = value.attributes
     if attrs.has(type(value)):
         value = attrs.asdict(value, recurse=False)
     if isinstance(value, dict):

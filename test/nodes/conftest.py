@@ -15,3 +15,13 @@
 """One process, one executor and a small real system: see `helpers.node_bench`."""
 
 from helpers.node_bench import _walker, domain, link, make_bench  # noqa: F401
+import pytest
+
+from sonar_imm.nodes import base, saved_state
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Nodes that report and save every .05 and .1 s."""
+    monkeypatch.setattr(base, 'DIAGNOSTICS_PERIOD', 0.05)
+    monkeypatch.setattr(saved_state, 'STATE_INTERVAL', 0.1)

@@ -77,7 +77,7 @@ def test_late_input_revises_and_the_newest_comes_last(rig):
 
 
 def test_revisions_can_be_left_out(rig):
-    rig.node.set_parameters([Parameter('publish_revisions', value=False)])
+    rig.node.set_parameters([Parameter('max_revisions', value=0)])
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(3.0, 4.0, 4.0), a_fix(2.0, 2.0, 8.0))
     assert rig.means()[2:] == [(3.0, 2.0, 4.0)]
 
@@ -157,8 +157,9 @@ def test_disabled_input_is_answered_but_not_used(rig):
     assert rig.answer == (2, 0, 1)
 
 
+@pytest.mark.usefixtures('quick')
 def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench):
-    rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
+    rig = Rig(make_bench())
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     rig.bench.spin_until(lambda: rig.node.count_subscribers('/diagnostics'))
     rig.node.set_parameters([Parameter('max_revisions', value=1)])
@@ -209,7 +210,7 @@ def test_best_effort_publishers_are_heard(make_bench):
 
 
 def test_points_are_heard_when_asked_for(make_bench):
-    rig = Rig(make_bench('-p', f'fix_type:={POINT}'), publish=POINT)
+    rig = Rig(make_bench('-p', f"input_types:=['fix={POINT}']"), publish=POINT)
     rig.send(a_point(1.0, 1.0, 2.0))
     assert rig.means() == [(1.0, 1.0, 2.0)]
 
@@ -262,9 +263,9 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
     assert outputs['/walker/estimate'].depth == 3
 
 
+@pytest.mark.usefixtures('quick')
 def test_an_incompatible_publisher_is_named(make_bench, capfd):
-    given = '-p', 'diagnostics_period:=0.05'
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable', *given)
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable')
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)

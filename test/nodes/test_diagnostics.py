@@ -290,9 +290,10 @@ def test_internal_errors_and_disabling_show(desk):
     assert desk.tracker.level == DiagnosticStatus.ERROR
 
 
+@pytest.mark.usefixtures('quick')
 def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker):
     bench = make_bench(
-        '-p', 'diagnostics_period:=0.05', '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
+        '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
     )  # no /clock at all: still it reports
     received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     bench.add(TrackerNode('walker', context=bench.context))
@@ -418,8 +419,9 @@ def test_a_warning_is_the_same_one_when_its_numbers_change():
     assert levels == [0, 1, 1] and desk.tracker.message.startswith('9 %')
 
 
+@pytest.mark.usefixtures('quick')
 def test_health_waits_for_those_who_ask_later(make_bench, walker):
-    bench = make_bench('-p', 'diagnostics_period:=0.05')
+    bench = make_bench()
     node = bench.add(TrackerNode('walker', context=bench.context))
     fix = bench.peer.create_publisher(message_class(FIX), 'fix', 10)
     bench.spin_until(fix.get_subscription_count)
@@ -468,8 +470,9 @@ def test_stamps_of_one_clock_are_no_two(desk):
     assert {name: clock_offset(ages) for name, ages in others.items()} == dict.fromkeys(others, 0)
 
 
+@pytest.mark.usefixtures('quick')
 def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, walker):
-    rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
+    rig = Rig(make_bench())
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     other = rig.bench.peer.create_publisher(message_class(FIX), '/fix', 10)
     rig.bench.spin_until(other.get_subscription_count)

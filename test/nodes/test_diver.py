@@ -187,7 +187,7 @@ def received(node):
 
 
 def test_navsatfix_in_and_out(make_bench):
-    bench, node = start(make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix')
+    bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
     geo = bench.listen(NavSatFix, '/diver/geo')
     bench.spin_until(lambda: node.count_subscribers('/diver/geo'))
     fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
@@ -201,10 +201,9 @@ def test_navsatfix_in_and_out(make_bench):
     assert back.covariance[0, 0] < 0.04 < 1e5 < back.covariance[2, 2]
 
 
+@pytest.mark.usefixtures('quick')
 def test_what_has_no_fix_and_what_is_repeated_is_in_diagnostics(make_bench):
-    bench, node = start(
-        make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix', 'diagnostics_period:=0.1'
-    )
+    bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
     arrived = bench.listen(DiagnosticArray, '/diagnostics')
     fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
     for k, x, status in ((1, 0.0, 0), (2, 0.0, 0), (3, 0.5, -1), (4, 0.6, 0)):
@@ -218,7 +217,7 @@ def test_what_has_no_fix_and_what_is_repeated_is_in_diagnostics(make_bench):
 
 
 def test_after_a_reset_nothing_is_a_repetition(make_bench):
-    bench, node = start(make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix')
+    bench, node = start(make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']")
     fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
     for k in (1, 2):
         fixes.publish(on_earth(k, 0.0))
@@ -255,7 +254,9 @@ def test_relative_fixes_are_composed_with_nav(make_bench):
 
 
 def test_a_tag_has_a_topic_of_its_own(make_bench):
-    bench, node = start(make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix', "tags:=['amy','bob']")
+    bench, node = start(
+        make_bench, "input_types:=['fix=sensor_msgs/msg/NavSatFix']", "tags:=['amy','bob']"
+    )
     tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
     amy = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/amy/fix')
     bob = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/bob/fix')
@@ -270,7 +271,7 @@ def test_a_tag_has_a_topic_of_its_own(make_bench):
 
 def test_a_type_that_is_not_installed_is_one_sentence(make_bench):
     with pytest.raises(ConfigError, match='BeaconInfo is not installed here'):
-        start(make_bench, 'relative_type:=stonefish_ros2/msg/BeaconInfo')
+        start(make_bench, "input_types:=['relative=stonefish_ros2/msg/BeaconInfo']")
 
 
 # -- ``~/initial`` of the diver node: a track begins where somebody says that a diver is --

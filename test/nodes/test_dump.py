@@ -80,7 +80,9 @@ def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, sy
 
 
 def test_a_dump_of_the_detector_holds_all_and_loads_again(make_bench, tmp_path, capfd):
-    bench = make_bench('-p', 'image_type:=sensor_msgs/msg/Image', '-p', 'stale_after:=7.5')
+    bench = make_bench(
+        '-p', "input_types:=['image=sensor_msgs/msg/Image']", '-p', 'stale_after:=7.5'
+    )
     node = bench.add(FlsDetectorNode(context=bench.context))
     bench.spin_until(lambda: node.state == 'active')
     file = tmp_path / 'live.yaml'
@@ -132,12 +134,8 @@ def test_the_command_takes_a_dump_as_it_is(tmp_path, capsys):
 
 
 FOLDER = Path(__file__).resolve().parents[2] / 'config' / 'sros2'
-# So that the nodes start, and hear the same, where messages of others are not installed.
-FRAMES = ['-p', 'tf_static_type:=geometry_msgs/msg/TransformStamped']
-EXTRA = {
-    'fls_detector': ['-p', 'image_type:=sensor_msgs/msg/Image'],
-    **dict.fromkeys(('bathymetry', 'diver', 'obstacle'), FRAMES),
-}
+# So that the node starts where messages of others are not installed.
+EXTRA = {'fls_detector': ['-p', "input_types:=['image=sensor_msgs/msg/Image']"]}
 PROGRAMS = {
     'bathymetry': BathymetryNode,
     'diver': DiverNode,

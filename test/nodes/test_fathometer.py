@@ -265,8 +265,9 @@ def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
     assert not rig.node._meter.refused
 
 
+@pytest.mark.usefixtures('quick')
 def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
-    rig = rig_of(make_bench, *SMALL, 'loading:=0.0', 'diagnostics_period:=0.05')
+    rig = rig_of(make_bench, *SMALL, 'loading:=0.0')
     received = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     scene = simulate(scenario('small', {'records': 4, 'fading': (), 'depth_companion': False}), 2)
     records = [item.measurement for item in scene.measurements]

@@ -31,8 +31,8 @@ from sonar_imm.nodes.qos import latched_qos
 from sonar_imm.parameters import ConfigError
 
 PARAMETERS = (
-    '-p image_type:=sensor_msgs/msg/Image -p image_far_range:=50.0 -p image_fov_deg:=40.0 '
-    '-p diagnostics_period:=0.1'
+    "-p input_types:=['image=sensor_msgs/msg/Image'] -p image_far_range:=50.0 "
+    '-p image_fov_deg:=40.0'
 ).split()
 
 
@@ -186,7 +186,7 @@ def test_a_mistake_in_the_detector_ends_neither_node_nor_answers(make_bench, mon
     'argument, word',
     [
         ('image_order:=sideways', 'image_order'),
-        ('image_type:=sensor_msgs/msg/LaserScan', 'image_type'),
+        ("input_types:=['image=sensor_msgs/msg/LaserScan']", 'input_types: image must be one of'),
         ('false_alarm:=0.0', 'false_alarm'),
     ],
 )

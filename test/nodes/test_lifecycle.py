@@ -103,8 +103,9 @@ def test_a_node_starts_by_itself_unless_it_is_told_not_to(make_bench):
     assert events[-1].start_state.id == State.TRANSITION_STATE_DEACTIVATING
 
 
+@pytest.mark.usefixtures('quick')
 def test_the_life_of_a_managed_node(manage):
-    manager = manage('diagnostics_period:=0.05')
+    manager = manage()
     bench, node = manager.bench, manager.node
     estimates = bench.listen(message_class('sensor_msgs/msg/PointCloud2'), '/walker/estimate', 10)
     reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
@@ -145,10 +146,11 @@ def test_a_transition_that_the_state_does_not_have_is_refused_and_survived(manag
     assert not manager.ask('configure') and manager.state() == 'inactive'
 
 
+@pytest.mark.usefixtures('quick')
 def test_while_it_configures_the_node_answers_and_refuses_other_transitions(manage, monkeypatch):
     steps = Steps(fixes=Fix)
     monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
-    manager = manage('diagnostics_period:=0.05')
+    manager = manage()
     bench = manager.bench
     reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     client = bench.peer.create_client(ChangeState, '/walker/change_state')
@@ -323,10 +325,11 @@ def test_a_process_of_its_own_compiles_and_ends(kept, monkeypatch):
     assert done == (['fixes'] if kept else ['fixes', 'echoes'])
 
 
+@pytest.mark.usefixtures('quick')
 def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):
     steps = Steps(fixes=Fix)
     monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
-    bench = make_bench('-p', 'diagnostics_period:=0.05')
+    bench = make_bench()
     reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
     try:

@@ -147,11 +147,12 @@ def test_a_middleware_without_numbers_is_believed_what_it_says_was_lost(make_ben
     assert endpoints.lost == {'depth': 2}
 
 
+@pytest.mark.usefixtures('quick')
 def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
     from sonar_imm.nodes.base import TrackerNode
     from sonar_imm.nodes.messages import message_class
 
-    bench = make_bench('-p', 'diagnostics_period:=0.05', '-p', 'queue_depth:=5')
+    bench = make_bench('-p', 'queue_depth:=5')
     node = bench.add(TrackerNode('walker', context=bench.context))
     given = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     kind = message_class('geometry_msgs/msg/PoseWithCovarianceStamped')

@@ -60,7 +60,7 @@ class Life:
     """One life of a node that keeps its state, and what is sent to it."""
 
     def __init__(self, make_bench, node_type, state, *more):
-        words = [f'state_file:={state}', f'tf_static_type:={ALONE}', *more]
+        words = [f'state_file:={state}', f"input_types:=['tf_static={ALONE}']", *more]
         self.bench = make_bench(*[word for item in words for word in ('-p', item)])
         self.node = self.bench.add(node_type(context=self.bench.context))
         self.sent = 0
@@ -117,7 +117,7 @@ def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp
 
 
 def test_a_place_that_was_said_before_the_node_was_there_is_heard(make_bench):
-    words = f'tf_static_type:={ALONE}', 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
+    words = f"input_types:=['tf_static={ALONE}']", 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
     bench = make_bench(*[word for item in words for word in ('-p', item)])
     publisher = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
     publisher.publish(transform('sonar', 'base_link', LEVER, RPY))
@@ -137,12 +137,11 @@ def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, t
         entry = next(item for item in inputs_of('diver') if item.name == topic.rpartition('/')[2])
         return topic, entry.write(fix, make), next(iter(entry.readers))
 
-    more = 'use_tf_static:=true', 'frame_id:=map'
-    first = Life(make_bench, DiverNode, tmp_path / 'state', *more)
+    first = Life(make_bench, DiverNode, tmp_path / 'state', 'frame_id:=map')
     first.tell('odom', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     first.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))
     first.end()
-    again = Life(make_bench, DiverNode, tmp_path / 'state', *more)
+    again = Life(make_bench, DiverNode, tmp_path / 'state', 'frame_id:=map')
     again.send(*fix_at('/fix', 2.0, 'odom', 5.5, 7.0))
     tracker = again.node.tracker
     known = tracker._stream.state
@@ -154,7 +153,7 @@ def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, t
 
 
 def test_a_fix_in_a_frame_that_the_tree_knows_is_turned_and_another_is_refused(make_bench, capfd):
-    bench = make_bench('-p', f'tf_static_type:={ALONE}', '-p', 'frame_id:=map')
+    bench = make_bench('-p', 'frame_id:=map')
     node = bench.add(DiverNode(context=bench.context))
     kind = next(entry for entry in inputs_of('diver') if entry.name == 'fix')
     type_name = next(iter(kind.readers))

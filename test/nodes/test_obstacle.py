@@ -176,13 +176,13 @@ def test_reset_deletes_all_markers(rig):
 
 
 def test_a_type_that_is_not_installed_is_refused_in_one_sentence(make_bench):
-    bench = make_bench('-p', 'detections_type:=marine_acoustic_msgs/msg/SonarRanges')
+    bench = make_bench('-p', "input_types:=['detections=marine_acoustic_msgs/msg/SonarRanges']")
     with pytest.raises(ConfigError, match='SonarRanges is not installed'):
         bench.add(ObstacleNode(context=bench.context))
 
 
 def test_a_laser_scan_is_heard_when_it_is_asked_for(make_bench):
-    bench = make_bench('-p', 'detections_type:=sensor_msgs/msg/LaserScan')
+    bench = make_bench('-p', "input_types:=['detections=sensor_msgs/msg/LaserScan']")
     node = bench.add(ObstacleNode(context=bench.context))
     publisher = bench.peer.create_publisher(LaserScan, '/detections', 10)
     bench.spin_until(publisher.get_subscription_count)

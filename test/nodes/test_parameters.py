@@ -51,7 +51,7 @@ def test_defaults_and_descriptors(start):
     node = start()
     assert node.get_parameter('sound_speed').value == 1500.0
     assert node.get_parameter('queue_depth').value == 50
-    assert node.get_parameter('fix_type').value == 'geometry_msgs/msg/PoseWithCovarianceStamped'
+    assert node.get_parameter('input_types').value == []
     made = node.describe_parameter('sound_speed')
     assert made.description == 'speed of sound [m/s]'
     assert (made.floating_point_range[0].from_value, made.floating_point_range[0].to_value) == (

@@ -89,8 +89,9 @@ def test_a_node_that_is_started_again_goes_on(start, tmp_path):
     assert again.node.tracker.counts['duplicate'] == 1
 
 
+@pytest.mark.usefixtures('quick')
 def test_states_are_saved_while_running_and_only_when_something_was_heard(start, tmp_path):
-    rig = start('state_interval:=0.1')
+    rig = start()
     rig.bench.spin_until(lambda: rig.node._saved_state._taken == 0)
     rig.send(a_fix(1.0))
     rig.bench.spin_until((tmp_path / 'state').exists)
@@ -130,10 +131,9 @@ def test_a_state_that_does_not_go_with_what_is_measured_is_given_up(start, tmp_p
     rig = start()
     rig.send(a_fix(1.0))
     end(rig)
-    header, block = parts_of(tmp_path / 'state')
-    fixes = next(pair for pair in header['state'][1:] if pair[0] == 'fixes')
-    fixes[1] = ['dict', [1, 'a fix']]
-    forge(tmp_path / 'state', header, block)
+    header, arrays = parts_of(tmp_path / 'state')
+    header['state']['tracker']['fixes'] = [[1, 'a fix']]
+    forge(tmp_path / 'state', header, arrays)
     again = start()
     again.send(a_fix(2.0), a_fix(3.0, 3.0, 3.0), a_fix(4.0, 3.0, 3.0))
     said = capfd.readouterr().err

@@ -92,15 +92,15 @@ def parameters_of(bag, folder, *options):
 def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
     assert parameters_of(bag, tmp_path / 'own')['sonar_lever'] == [2.0, 0.0, -0.3]
     assert f'using the parameters of the recording, {bag}' in capsys.readouterr().out
-    changed = parameters_of(bag, tmp_path / 'set', '--set', 'components=5')
-    assert changed['sonar_lever'] == [2.0, 0.0, -0.3] and changed['components'] == 5
+    changed = parameters_of(bag, tmp_path / 'set', '--set', 'max_tracks=5')
+    assert changed['sonar_lever'] == [2.0, 0.0, -0.3] and changed['max_tracks'] == 5
     other = tmp_path / 'other.yaml'
-    other.write_text('components: 7\n')
+    other.write_text('max_tracks: 7\n')
     given = parameters_of(bag, tmp_path / 'given', '--params', str(other))
     assert f'--params is used in place of the parameters of the recording, {bag}' in (
         capsys.readouterr().out
     )
-    assert given['sonar_lever'] == [0.0, 0.0, 0.0] and given['components'] == 7
+    assert given['sonar_lever'] == [0.0, 0.0, 0.0] and given['max_tracks'] == 7
 
 
 def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):

@@ -157,8 +157,7 @@ def test_navsatfix_is_tracked_and_what_says_nothing_is_named_and_counted(tmp_pat
     run, estimates = tracked(
         write_bag(tmp_path / 'bag', records),
         tmp_path / 'run',
-        origin_latitude=59.0,
-        origin_longitude=10.0,
+        origin=(59.0, 10.0, 0.0),
     )
     assert {reason: item['count'] for reason, item in run['refused'].items()} == {
         'no_fix': 5,
@@ -238,7 +237,7 @@ def test_metres_and_latitudes_without_an_origin_are_said(tmp_path):
     chosen = {'/nav': 'nav', '/relative': 'relative', '/amy/fix': 'fix'}
     run, _ = tracked(write_bag(tmp_path / 'bag', records), tmp_path / 'run', chosen)
     assert run['counts']['no_origin'] == 4
-    assert 'origin_latitude' in run['warnings'][0]
+    assert 'parameter origin ' in run['warnings'][0]
 
 
 def test_the_navigation_comes_along_with_a_chosen_topic(tmp_path):

@@ -152,7 +152,7 @@ def test_lockstep_without_a_node_says_so(link, stepping):
 
 def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, stepping):
     monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 3.0)
-    start('-p', 'fix_type:=geometry_msgs/msg/PointStamped')
+    start('-p', "input_types:=['fix=geometry_msgs/msg/PointStamped']")
     player, _, _ = stepping(topics=('/fix',))
     with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
         player.run(start_limit=START_LIMIT)

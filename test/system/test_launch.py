@@ -114,7 +114,7 @@ def test_a_session_with_a_node(ros2, domain, name, tmp_path):
     run = [ros2, 'run', 'sonar_imm', f'{name}_node', '--ros-args']
     more = []
     if name == 'fls_detector':  # the default needs a package
-        more = ['-p', 'image_type:=sensor_msgs/msg/Image']
+        more = ['-p', "input_types:=['image=sensor_msgs/msg/Image']"]
     managed = 'std_srvs/srv/Trigger' if name in SYSTEMS else ''
     with started([*run, '-p', 'autostart:=false', *more], domain) as output:
         say('node', 'list', told=f'/{name}\n')

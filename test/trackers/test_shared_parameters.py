@@ -19,7 +19,9 @@ from attrs import evolve, frozen
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Altitude, Detections, Navigation, Trace
+from sonar_imm.node_config import ObstacleNodeConfig
 from sonar_imm.parameters import Config, ConfigError, inherited, live, parameter
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
@@ -82,6 +84,16 @@ def test_the_rules_of_all_bases_hold():
 def test_only_what_a_base_has_can_be_inherited():
     with pytest.raises(KeyError):
         inherited(Left, 'third', False)
+
+
+@pytest.mark.parametrize('kind', [SYSTEMS['diver'].config_type(), ObstacleNodeConfig])
+def test_an_origin_is_three_numbers_on_earth(kind):
+    assert kind(origin=(54.0, 0.0, 40.0)).stated_origin() == Origin(54.0, 0.0, 40.0)
+    assert kind().stated_origin() is None and kind(origin=(0, 0, 40)).stated_origin() is None
+    with pytest.raises(ConfigError, match='three values, got 2'):
+        kind(origin=(54.0, 10.0))
+    with pytest.raises(ConfigError, match='origin: latitude must be between -90 and 90, got 91'):
+        kind(origin=(91.0, 10.0, 0.0))
 
 
 def test_a_parameter_may_change_in_all_systems_or_in_none():

@@ -15,177 +15,173 @@
 """The file of a state: what it holds, and what is refused. That a tracker goes on from it bit for
 bit is in test/conformance."""
 
-from collections import Counter
+from collections import deque
 import hashlib
 
 import attrs
 from helpers.hostile.states import forge, parts_of
-from helpers.tracked import tracked
+from helpers.tracked import resumed, tracked, tracker_from
 import numpy as np
 import pytest
 
 from sonar_imm.trackers import state_file, SYSTEMS
-from sonar_imm.trackers.state_file import (
-    frozen_state,
-    put,
-    read_state,
-    restore,
-    StateError,
-    tracker_from,
-    write_state,
-)
+from sonar_imm.trackers.state_file import read_state, StateError, write_state
+from sonar_imm.trackers.state_values import Decoder, encoded, frozen_state
 
 
-def test_parameters_that_may_change_are_those_of_now(tmp_path):
+@pytest.fixture
+def file(tmp_path):
+    """A state of a diver tracker."""
+    path, run = tmp_path / 'state', tracked('diver_table1')
+    write_state(path, run.saved(run.until(50)))
+    return path
+
+
+def test_parameters_that_may_change_are_those_of_now(file):
     run = tracked('diver_table1')
     changeable = attrs.evolve(run.config, max_tracks=run.config.max_tracks + 1)
     fixed = attrs.evolve(run.config, history=run.config.history + 1.0)
-    write_state(tmp_path / 'state', run.saved(run.until(50)))
-    saved = read_state(tmp_path / 'state')
-    assert tracker_from(saved, run.system, changeable).config == changeable
+    assert tracker_from(read_state(file), run.system, changeable).config == changeable
     with pytest.raises(StateError, match='history was 10.0, is 11.0'):
-        tracker_from(saved, run.system, fixed)
+        tracker_from(read_state(file), run.system, fixed)
     with pytest.raises(StateError, match='of a diver tracker'):
         obstacle = SYSTEMS['obstacle']
-        tracker_from(saved, obstacle, obstacle.config_type()())
+        tracker_from(read_state(file), obstacle, obstacle.config_type()())
 
 
-def test_arrays_come_back_as_they_were(tmp_path):
-    """Layout and permission to write choose among compiled kernels and orders of summation."""
-    arrays = [
+def test_the_file_is_named_arrays_and_json(tmp_path):
+    run, path = tracked('fathometer_drift'), tmp_path / 'state'
+    tracker = run.until(20)
+    write_state(path, run.saved(tracker))
+    header, arrays = parts_of(path)
+    sets = header['state']['tracker']['_before']['sets']
+    assert sets['class'] == 'Sets' and sets['cell'] == {}
+    np.testing.assert_array_equal(arrays['tracker/_before/sets/cell'], tracker._before.sets.cell)
+
+
+def test_arrays_come_back_as_they_were():
+    """Layout chooses among compiled kernels and orders of summation."""
+
+    class Owner:
+        STATE = ('arrays', 'numbers')
+        arrays: list[np.ndarray]
+        numbers: list[float | int]
+
+    owner, again, arrays = Owner(), Owner(), {}
+    again.arrays, again.numbers = [], []
+    owner.arrays = [
         np.asfortranarray(np.arange(6.0).reshape(2, 3)),
-        np.arange(4, dtype=np.complex64)[::2],
+        np.arange(200.0).reshape(2, 100).T,
+        np.arange(400, dtype=np.complex64)[::2],
         np.array([], np.uint16),
-        np.array(3.5),
-        np.array([np.nan, np.inf, -0.0]),
+        np.zeros((0, 4)),
+        np.array(['a', 'bcd']),
+        np.array([True, False] * 50),
+        np.array([np.nan, -np.nan, np.inf, -0.0]),
     ]
-    arrays[-1].flags.writeable = False
-    run = tracked('diver_table1')
-    odd = [np.float32(0.1), float('nan'), 1 << 63, b'x']
-    extras = {'arrays': [*arrays, arrays[0]], 'odd': odd}
-    write_state(tmp_path / 'state', run.saved(run.until(0), extras=extras))
-    back = read_state(tmp_path / 'state').extras
-    for first, other in zip(arrays, back['arrays']):
+    owner.numbers = [float('nan'), 1 << 63, -0.0, 0.1, np.float64(0.1), np.int64(5)]
+    data = encoded(frozen_state(owner), 'x', arrays)
+    owner.arrays[0][:] = 9.0  # what happens afterwards changes nothing
+    assert set(arrays) == {f'x/arrays/{k}' for k in (0, 1, 2, 6)}
+    Decoder((), arrays, None).put(again, data, 'x')
+    owner.arrays[0][:] = np.arange(6.0).reshape(2, 3)
+    for first, other in zip(owner.arrays, again.arrays):
         assert (first.dtype, first.tobytes()) == (other.dtype, other.tobytes())
-        assert first.flags.writeable == other.flags.writeable
         assert first.flags.f_contiguous == other.flags.f_contiguous or first.strides == (16,)
-        assert other.flags.aligned
-    assert back['arrays'][0] is back['arrays'][-1]
-    assert back['odd'][0] == np.float32(0.1) and type(back['odd'][0]) is np.float32
-    assert np.isnan(back['odd'][1]) and back['odd'][2:] == [1 << 63, b'x']
+        assert other.flags.aligned and other.flags.writeable
+    assert not arrays and repr(again.numbers) == '[nan, 9223372036854775808, -0.0, 0.1, 0.1, 5]'
 
 
-def test_counters_that_two_share_stay_shared():
-    run = tracked('diver_table1')
-    tracker = run.system.build(run.config)
-    restore(tracker, frozen_state(run.until(20)))
-    assert tracker.counts is tracker._stream.counts is tracker._georeferencer._counts
-    target = Counter(old=3)
-    assert put(target, Counter(new=1)) is target and target == Counter(new=1)
+def test_what_several_hold_stays_shared_and_queues_keep_their_length(tmp_path):
+    tracker = tracked('diver_table1').until(20)
+    again = resumed(tmp_path / 'state', tracker, 'diver')
+    assert again.counts == tracker.counts and again.counts
+    assert again.counts is again._stream.counts is again._georeferencer._counts
+    run = tracked('bathymetry_ship')
+    again = resumed(tmp_path / 'state', run.until(60), 'bathymetry')
+    assert type(again._loud) is deque and again._loud.maxlen == 100
+    assert again.counts is again._queue.counts
 
 
-def test_damaged_files_are_one_sentence(tmp_path):
-    run = tracked('diver_table1')
-    path = tmp_path / 'state'
-    write_state(path, run.saved(run.until(30)))
-    good = path.read_bytes()
-    rng = np.random.default_rng(1)
+def test_damaged_files_are_one_sentence(file):
+    good, rng = file.read_bytes(), np.random.default_rng(1)
     for k in range(200):
         content = bytearray(good)
         if k % 2:
             content[rng.integers(len(good))] ^= 1 << rng.integers(8)
         else:
             del content[rng.integers(len(good)) :]
-        path.write_bytes(content)
+        file.write_bytes(content)
         with pytest.raises(StateError):
-            read_state(path)
+            read_state(file)
 
 
-def test_a_sound_state_under_another_checksum_is_damaged(tmp_path):
+def test_a_sound_state_under_another_checksum_is_damaged(file):
     """The npz has checksums of its own, which know nothing of each other and not of the line."""
-    run, path = tracked('diver_table1'), tmp_path / 'state'
-    lines, bodies = [], []
-    for count in (5, 6):
-        write_state(path, run.saved(run.until(count)))
-        line, _, body = path.read_bytes().partition(b'\n')
-        lines.append(line)
-        bodies.append(body)
-    path.write_bytes(lines[0] + b'\n' + bodies[0])
-    read_state(path)
-    path.write_bytes(lines[0] + b'\n' + bodies[1])
+    run = tracked('diver_table1')
+    line, _, body = file.read_bytes().partition(b'\n')
+    write_state(file, run.saved(run.until(6)))
+    other = file.read_bytes().partition(b'\n')[2]
+    file.write_bytes(line + b'\n' + body)
+    read_state(file)
+    file.write_bytes(line + b'\n' + other)
     with pytest.raises(StateError, match='it is damaged: the checksum does not fit'):
-        read_state(path)
+        read_state(file)
 
 
-def test_a_state_of_another_format_is_refused(tmp_path):
-    run, path = tracked('diver_table1'), tmp_path / 'state'
-    write_state(path, run.saved(run.until(5)))
-    now = state_file.FORMAT
-    line = path.read_bytes().replace(b'state %d ' % now, b'state %d ' % (now - 1), 1)
-    path.write_bytes(line)
-    with pytest.raises(StateError, match=f'its format is {now - 1}, not {now}'):
-        read_state(path)
+def test_states_of_other_formats_are_refused(file):
+    good, now = file.read_bytes(), state_file.FORMAT
+    for then in (*range(1, now), now + 1):
+        file.write_bytes(good.replace(b'state %d ' % now, b'state %d ' % then, 1))
+        with pytest.raises(StateError, match=f'its format is {then}, of another version'):
+            read_state(file)
 
 
-def test_a_file_larger_than_any_state_is_not_read(tmp_path, monkeypatch):
-    path = tmp_path / 'state'
-    path.write_bytes(b'x' * 1001)
+def test_a_file_larger_than_any_state_is_neither_read_nor_written(file, monkeypatch):
+    run = tracked('diver_table1')
     monkeypatch.setattr(state_file, '_LARGEST', 1000)
+    with pytest.raises(OSError, match='too large'):
+        write_state(file, run.saved(run.until(5)))
     monkeypatch.setattr(hashlib, 'sha256', lambda body: pytest.fail('it was read'))
     with pytest.raises(StateError, match='larger than any state'):
-        read_state(path)
+        read_state(file)
 
 
-@pytest.mark.parametrize(
-    'change',
-    [
-        lambda header: header.update(version='9.9.9'),
-        lambda header: header.update(system='submarine'),
-        lambda header: header.update(system=['diver']),
-        lambda header: header.update(parameters=[]),
-        lambda header: header.update(saved_ns='now'),
-        lambda header: header.update(newest_ns=1.5),
-        lambda header: header.update(extras=['list']),
-        lambda header: header.pop('state'),
-        lambda header: header.update(state=['object', 0, ['a']]),
-        lambda header: header.update(state=[[]]),
-        lambda header: header['classes'][0].append(1),
-    ],
-)
-def test_a_file_that_says_something_else_is_refused(change, tmp_path):
+def test_a_file_that_says_something_else_is_refused(file):
+    run, (header, arrays) = tracked('diver_table1'), parts_of(file)
+    state = header['state']
+    for change in (
+        {'version': '9.9.9'},
+        {'system': 'submarine'},
+        {'system': ['diver']},
+        {'parameters': []},
+        {'saved_ns': 'now'},
+        {'newest_ns': 1.5},
+        {'extras': ['list']},
+        {'state': None},
+        {'state': {}},
+        {'state': [[]]},
+        {'state': {**state, 'tracker': 5}},
+        {'state': {**state, 'tracker': {}}},
+        {'state': {**state, 'intake': {}}},
+        {'state': {**state, 'tracker': {**state['tracker'], 'more': 1}}},
+    ):
+        forge(file, header | change, arrays)
+        with pytest.raises(StateError):
+            tracker_from(read_state(file), run.system, run.config)
+    forge(file, header, arrays)
+    tracker_from(read_state(file), run.system, run.config)
+
+
+def test_a_state_that_cannot_be_written_leaves_the_old_one(file, monkeypatch):
     run = tracked('diver_table1')
-    path = tmp_path / 'state'
-    write_state(path, run.saved(run.until(5)))
-    header, block = parts_of(path)
-    forge(path, header, block)
-    read_state(path)
-    change(header)
-    forge(path, header, block)
-    with pytest.raises(StateError):
-        read_state(path)
-
-
-def test_an_attribute_without_a_name_is_refused():
-    run = tracked('diver_table1')
-    state = frozen_state(run.until(5))
-    state['_stream'].attributes[5] = 6
-    with pytest.raises(StateError, match='does not fit'):
-        restore(run.build(), state)
-    with pytest.raises(StateError, match='another tracker'):
-        restore(run.build(), 5)
-
-
-def test_a_state_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
-    run = tracked('diver_table1')
-    path = tmp_path / 'state'
-    write_state(path, run.saved(run.until(5)))
-    before = path.read_bytes()
+    before = file.read_bytes()
 
     def full(handle):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr('os.fsync', full)
     with pytest.raises(OSError, match='No space'):
-        write_state(path, run.saved(run.until(6)))
-    assert path.read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ['state']
+        write_state(file, run.saved(run.until(6)))
+    assert file.read_bytes() == before
+    assert [path.name for path in file.parent.iterdir()] == ['state']

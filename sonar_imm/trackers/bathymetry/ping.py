@@ -81,10 +81,9 @@ _BLOCK = 32768
 
 
 class PosedPing(NamedTuple):
-    """A ping, the poses of the ship (T + 1,), ENU from FLU, when it was sent and when each bin was
+    """The poses of the ship (T + 1,), ENU from FLU, when a ping was sent and when each bin was
     received, the frame of the navigation, and the newest altitude, m, None when there is none."""
 
-    snapshot: Snapshot
     poses: Pose
     frame_id: str
     altitude: float | None

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The classes that a saved state of this tracker may hold, see `state_file`."""
+"""The classes of values that a saved state of this tracker may hold, see `state_file`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from ...acoustics.geometry import Pose
 from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Navigation, Snapshot
 from ..navigation import NavigationBuffer
-from .config import BathymetryConfig
 from .ping import LoudBins, Ping, PosedPing
-from .tracker import Alone, Coupling, PoseQueue
+from .tracker import Alone
 
 STATE_TYPES = (
     *STREAM_TYPES,
-    *(Altitude, Navigation, Snapshot, NavigationBuffer, Pose, BathymetryConfig),
-    *(PoseQueue, Coupling, Alone, Ping, PosedPing, LoudBins),
+    *(Altitude, Navigation, Snapshot, NavigationBuffer, Pose),
+    *(Alone, Ping, PosedPing, LoudBins),
 )

@@ -52,9 +52,9 @@ from collections import Counter, deque
 from collections.abc import Collection, Sequence
 from functools import cached_property
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-from attrs import evolve, frozen
+from attrs import define, evolve, field, frozen
 import numpy as np
 
 from ...acoustics.layover import Layover
@@ -107,19 +107,25 @@ class BathymetryTracker:
     """The tracker of `trackers.Tracker` for the sea floor: `process` takes `Snapshot`,
     `Navigation` and `Altitude`."""
 
-    STATE = ('counts', '_queue', '_coupling', '_health', '_loud', '_residuals')
+    STATE = ('_queue', '_coupling', '_health', '_loud', '_residuals')
+
+    _queue: PoseQueue
+    _coupling: Coupling
+    _health: dict[str, float]
+    _loud: deque[LoudBins]
+    _residuals: deque[float]
 
     def __init__(self, config: BathymetryConfig):
         self.config = config
         self.reset()
 
     def reset(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._queue = PoseQueue(self.counts)
+        self._queue = PoseQueue()
+        self.counts: Counter[str] = self._queue.counts
         self._coupling = Coupling()
-        self._health: dict[str, float] = {}
-        self._loud: deque[LoudBins] = deque(maxlen=PINGS_JUDGED)
-        self._residuals: deque[float] = deque(maxlen=PINGS_JUDGED)
+        self._health = {}
+        self._loud = deque(maxlen=PINGS_JUDGED)
+        self._residuals = deque(maxlen=PINGS_JUDGED)
 
     @property
     def frames(self) -> KnownFrames:
@@ -171,8 +177,8 @@ class BathymetryTracker:
                 tracker._queue.add_pose(still)
             gap = evolve(self.config, max_gap=60.0)
             tracker._queue.add_ping(snapshot)
-            for posed in tracker._queue.ready(gap):
-                track_ping(Ping(tracker.config, posed.snapshot, posed))
+            for ping in tracker._queue.ready(gap):
+                track_ping(evolve(ping, config=tracker.config))
         track_ping(Ping(tracker.config, snapshot, None))
 
     def health(self) -> dict[str, float]:
@@ -270,8 +276,7 @@ class BathymetryTracker:
             self._queue.add_ping(measurement)
         if not self._moving:
             return []
-        ready = self._queue.ready(self.config)
-        return [Ping(self.config, posed.snapshot, posed) for posed in ready]
+        return self._queue.ready(self.config)
 
     @staticmethod
     def work(task: Ping) -> Answer | Alone:
@@ -332,24 +337,33 @@ def noise_warnings(ratios: Sequence[float]) -> list[str]:
     ]
 
 
+@define(eq=False)
 class PoseQueue:
     """Poses and the pings that wait for them: until the navigation says how the ship lay from the
     transmission of the ping to the reception of its last bin. A ping is skipped, and counted, when
     the navigation has a gap there, and may be late by `KEPT_NS`: poses are kept that long.
-    counts: where to count what is not used."""
+    STATE: see `trackers.Tracker`."""
 
-    def __init__(self, counts: Counter[str]):
-        self.counts = counts
-        self.has_poses = False
+    STATE: ClassVar = ('has_poses', '_stream', '_buffer', '_altitudes', '_waiting')
+
+    has_poses: bool = field(init=False, default=False)
+    _stream: Stream = field(init=False)
+    _buffer: NavigationBuffer = field(init=False, factory=NavigationBuffer)
+    _altitudes: list[Altitude] = field(init=False, factory=list)
+    _waiting: list[Snapshot] = field(init=False, factory=list)
+
+    def __attrs_post_init__(self) -> None:
         rules = StreamRules(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
-        self._stream = Stream((Navigation,), rules, counts)
-        self._buffer = NavigationBuffer()
-        self._altitudes: list[Altitude] = []
-        self._waiting: list[Snapshot] = []
+        self._stream = Stream((Navigation,), rules)
 
     def __len__(self) -> int:
         """How many pings wait."""
         return len(self._waiting)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was not used, by reason."""
+        return self._stream.counts
 
     @property
     def frames(self) -> KnownFrames:
@@ -377,7 +391,7 @@ class PoseQueue:
             self.counts['navigation_missing'] += 1
         self._waiting.append(snapshot)
 
-    def ready(self, config: BathymetryConfig) -> list[PosedPing]:
+    def ready(self, config: BathymetryConfig) -> list[Ping]:
         """The pings whose poses are known now, in the order in which they came."""
         done, waiting = [], []
         for snapshot in self._waiting:
@@ -395,7 +409,8 @@ class PoseQueue:
             else:
                 poses = self._buffer.poses(stamps)
                 altitude = self._altitude(int(stamps[-1]))
-                done.append(PosedPing(snapshot, poses, self._stream.frame_id, altitude))
+                posed = PosedPing(poses, self._stream.frame_id, altitude)
+                done.append(Ping(config, snapshot, posed))
         self._waiting = waiting
         return done
 
@@ -450,6 +465,7 @@ class Favoured(NamedTuple):
     favour: FloatArray | None
 
 
+@define(eq=False)
 class Coupling:
     """Labels of neighbouring pings lean on each other: rough patches are wider than a ping.
 
@@ -468,12 +484,13 @@ class Coupling:
     what makes a chart of them takes them to be.
 
     A ping's estimate is therefore ready when the next one has come: `Coupling` holds the
-    newest ping of each side until then.
+    newest ping of each side until then. STATE: see `trackers.Tracker`.
     """
 
-    def __init__(self) -> None:
-        self._before: dict[str, Alone] = {}
-        self._held: dict[str, Alone] = {}
+    STATE: ClassVar = ('_before', '_held')
+
+    _before: dict[str, Alone] = field(init=False, factory=dict)
+    _held: dict[str, Alone] = field(init=False, factory=dict)
 
     def __len__(self) -> int:
         """How many pings are held."""

@@ -94,6 +94,7 @@ EVERYWHERE: Mapping[str, coverage.Coverage] = {}
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
 
+
 class Mixture(NamedTuple):
     """One diver: L hypotheses, x (L, n), P (L, n, n) with probabilities mu (L,), and by what
     `scale` (L,) each multiplies the variances of measurements."""
@@ -274,9 +275,7 @@ def _explain_echoes(
     ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
     of the pairs is not what the ping shows; for it nothing happened.
     """
-    fits = [
-        fit_measurements(*mixture[:3], config.target_z, ping.measured) for mixture in mixtures
-    ]
+    fits = [fit_measurements(*mixture[:3], config.target_z, ping.measured) for mixture in mixtures]
     fit, nis = (np.array(column) for column in zip(*fits))
     near = (nis < NEAR) & ping.echo
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]

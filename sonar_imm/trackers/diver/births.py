@@ -99,9 +99,7 @@ def at_fixes(known: Known, group: Group) -> Known:
     return known
 
 
-def births_from_ping(
-    ping: Arrivals, free: BoolArray, config: DiverConfig
-) -> list[Birth]:
+def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> list[Birth]:
     """Positions from the rows (n,) of a ping that are `free`.
 
     With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
@@ -129,9 +127,7 @@ def _by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
     return [rows[(pair == each).all(axis=1)] for each in np.unique(pair, axis=0)]
 
 
-def _fix(
-    ping: Arrivals, rows: IndexArray, config: DiverConfig
-) -> tuple[list[Birth], IndexArray]:
+def _fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> tuple[list[Birth], IndexArray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
     rows = spread(rows)
     fix = locate(ping, rows, config)
@@ -177,9 +173,7 @@ def _agreeing(
     return nearest[nis[nearest] <= 9.0]
 
 
-def locate(
-    ping: Arrivals, rows: IndexArray, config: DiverConfig
-) -> Localisation | None:
+def locate(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
     """The fix that `rows` of the ping give by themselves, None when they give none to believe.
 
     With depth as a state it is the best of those at the heights where the models begin.

@@ -119,14 +119,21 @@ class Clutter(NamedTuple):
         return self.scans >= ENOUGH and many
 
 
-Clutters = tuple[tuple[str, Clutter], ...]
-"""What is known of each sensor that showed scans, the one heard last at the end."""
+class Clutters(NamedTuple):
+    """What is known of each sensor that showed scans, `by_sensor`, the one heard last at the
+    end."""
 
+    by_sensor: tuple[tuple[str, Clutter], ...] = ()
 
-def replaced(known: Clutters, sensor: str, clutter: Clutter) -> Clutters:
-    """With what is known of `sensor` now; the sensor silent for longest makes room for it."""
-    others = [item for item in known if item[0] != sensor]
-    return (*others, (sensor, clutter))[-MOST_SENSORS:]
+    def of(self, sensor: str) -> Clutter | None:
+        """Return what is known of a sensor, None for nothing."""
+        return dict(self.by_sensor).get(sensor)
+
+    def replaced(self, sensor: str, clutter: Clutter) -> Clutters:
+        """Return this with what is known of `sensor` now; the sensor silent for longest makes
+        room for it."""
+        others = [item for item in self.by_sensor if item[0] != sensor]
+        return Clutters((*others, (sensor, clutter))[-MOST_SENSORS:])
 
 
 def count(known: Known, group: Group) -> Known:
@@ -134,34 +141,35 @@ def count(known: Known, group: Group) -> Known:
     if group.config.clutter_density or group.target_id is not None or not group.whole:
         return known
     clutters: Clutters = known.memory['clutter']
-    before = dict(clutters).get(group.sensor, Clutter())
+    before = clutters.of(group.sensor) or Clutter()
     assert group.found is not None
     after = before.after(group.z, np.clip(1.0 - group.found.claimed, 0.0, 1.0))
-    return known.remember(clutter=replaced(clutters, group.sensor, after))
+    return known.remember(clutter=clutters.replaced(group.sensor, after))
 
 
 def without_first_fixes(known: Known, scan: Scan) -> Known:
     """Take back the first fixes of tracks that this scan confirmed, which were counted as false
     ones. A stage of the tracker."""
     clutters: Clutters = known.memory['clutter']
-    own = dict(clutters)
-    sensor = next((group.sensor for group in scan.fixes if group.sensor in own), None)
-    if sensor is None:
+    sensor = next((group.sensor for group in scan.fixes if clutters.of(group.sensor)), None)
+    own = None if sensor is None else clutters.of(sensor)
+    if sensor is None or own is None:
         return known
     life, before = known.life, scan.before.life
     firm = life.track_id[(life.status != TENTATIVE) & (known['target_id'] == NOBODY)]
-    new = len(np.setdiff1d(firm, before.track_id[before.status != TENTATIVE]))
+    new = len(set(firm.tolist()) - set(before.track_id[before.status != TENTATIVE].tolist()))
     if not new:
         return known
-    after = own[sensor]._replace(false=max(own[sensor].false - new, 0.0))
-    return known.remember(clutter=replaced(clutters, sensor, after))
+    after = own._replace(false=max(own.false - new, 0.0))
+    return known.remember(clutter=clutters.replaced(sensor, after))
 
 
 def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
     """Sentences on fixes that no track takes, where nobody is `tracked`, and on false ones that
     the association does not expect."""
     if not tracked and any(
-        clutter.scans >= ENOUGH and clutter.false > ALL * clutter.scans for _, clutter in known
+        clutter.scans >= ENOUGH and clutter.false > ALL * clutter.scans
+        for _, clutter in known.by_sensor
     ):
         return [
             'no track takes the fixes: nobody is there, or they are further apart than a diver '
@@ -169,7 +177,7 @@ def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
         ]
     if config.pairing != 'gnn':
         return []
-    found = [clutter for _, clutter in known if clutter.evident]
+    found = [clutter for clutter in each if clutter.evident]
     return [
         f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
         f'({clutter.density:.1g} for each square metre), and association gnn expects '

@@ -22,11 +22,15 @@ from typing import Any, cast
 
 from attrs import evolve, fields, frozen
 
-from ...acoustics.geodesy import Origin
 from ...parameters import Config, constant, inherited, live, MODELS, parameter, ParameterSpec
 from ..model_checks import chain_problems
 from ..own_models import diver_models
-from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from ..shared_parameters import (
+    DetectionParameters,
+    OriginParameters,
+    StreamParameters,
+    TrackLifeParameters,
+)
 
 MODEL_SETS = ('families', 'heading_speed')
 
@@ -39,6 +43,7 @@ TARGETS: dict[str, dict[str, Any]] = {
         'hover_enter': 0.05,
         'hover_stay': 0.95,
         'acceleration_noise': (0.05, 0.4, 0.02),
+        'vertical_speed_std': 0.3,
     },
     'fish': {
         'speed_mean': 0.6,
@@ -47,6 +52,7 @@ TARGETS: dict[str, dict[str, Any]] = {
         'brisk_speed_noise': 0.2,
         'stay_probability': 0.7,
         'acceleration_noise': (0.1, 1.0, 0.05),
+        'vertical_speed_std': 0.3,
     },
     'boat': {
         'speed_mean': 6.0,
@@ -100,7 +106,7 @@ _WORD = re.compile(r'[A-Za-z0-9_]+')
 
 
 @frozen(kw_only=True)
-class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, StreamParameters):
     """All parameters of the diver tracker. The defaults are the `families` of the docs.
 
     own: values that sensors have of their own, by names as ``radar.fix_std``.
@@ -126,18 +132,17 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'longer gaps are crossed in steps of this length, so that the diver may turn within them',
         range=(1e-3, 3600.0))
     stay_probability: float = parameter(0.86, '',
-        'probability of keeping the heading over a reference step', range=(0.0, 1.0))
+        'probability of keeping the heading over 1 s', range=(0.0, 1.0))
     heading_concentration: float = constant(3.0, '',
         'kappa: a turn by an angle a has a probability proportional to exp(kappa cos a); 0: all '
         'turns are alike', range=(0.0, 50.0))
     hover_enter: float = constant(0.02, '',
-        'probability of stopping over a reference step', range=(0.0, 1.0))
+        'probability of stopping over 1 s', range=(0.0, 1.0))
     hover_stay: float = constant(0.9, '',
-        'probability of staying stopped over a reference step', range=(0.0, 1.0))
+        'probability of staying stopped over 1 s', range=(0.0, 1.0))
     transition_matrix: tuple[float, ...] = parameter((), '',
-        'whole transition matrix over a reference step, row-major, row = from; empty: built from '
-        'stay_probability, heading_concentration, hover_enter and hover_stay', range=(0.0, 1.0),
-        kind='float[]')
+        'whole transition matrix over 1 s, row-major, row = from; empty: built from '
+        'stay_probability', range=(0.0, 1.0), kind='float[]')
     initial_probabilities: tuple[float, ...] = parameter((), '',
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
     family_switch_rate: float = constant(0.001, '1/s',
@@ -163,19 +168,19 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'families: standard deviation on each axis of the velocity of a new track, around zero; '
         '2 at a fix of a diver', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
-        'random walk of the speed over a reference step (heading_speed, families)',
+        'random walk of the speed over 1 s (heading_speed, families)',
         range=(0.0, 10.0))
     brisk_speed_noise: float = constant(0.07, 'm/s',
-        'families: random walk of the speed over a reference step in the brisk family, in place '
+        'families: random walk of the speed over 1 s in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
     lateral_noise: float = constant(0.24, 'm',
-        'random walk sideways over a reference step (heading_speed, families)',
+        'random walk sideways over 1 s (heading_speed, families)',
         range=(0.0, 10.0))
     hover_noise: float = constant(0.05, 'm',
-        'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
+        'random walk of the position over 1 s while stopped', range=(0.0, 10.0))
     acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
-        'families: acceleration noise of lively_calm, lively_sharp and quiet over a reference '
-        'step; empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
+        'families: acceleration noise of lively_calm, lively_sharp and quiet over 1 s; '
+        'empty: values tuned for divers', range=(0.0, 100.0), kind='float[]')
 
     # -- measurements ----------------------------------------------------------------------------
     fix_std: float = live(1.0, 'm',
@@ -264,8 +269,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
-    max_gap: float = inherited(StreamParameters, 'max_gap', 3600.0, constant=True)
-    restart_after: int = inherited(StreamParameters, 'restart_after', 5, constant=True)
     birth_density: float = live(1.2e-5, '1/m^2',
         'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
@@ -301,15 +304,10 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     own: tuple[tuple[str, Any], ...] = ()
 
     # -- latitude and longitude ------------------------------------------------------------------
-    origin_latitude: float = parameter(0.0, 'deg',
-        'latitude of the origin of the frame of the tracks; with both latitude and longitude 0: '
-        'the first position given in latitude and longitude', range=(-90.0, 90.0))
-    origin_longitude: float = parameter(0.0, 'deg',
-        'longitude of the origin of the frame of the tracks, see origin_latitude',
-        range=(-360.0, 360.0))
-    origin_height: float = parameter(0.0, 'm',
-        'height of the origin of the frame of the tracks above the ellipsoid',
-        range=(-12000.0, 12000.0))
+    origin: tuple[float, ...] = inherited(OriginParameters, 'origin', (0.0, 0.0, 0.0),
+        description='latitude, longitude and height above the ellipsoid of the origin of the '
+        'frame of the tracks; with both latitude and longitude 0: the first position given in '
+        'latitude and longitude, at that height')
     frame_id: str = parameter('', '',
         'frame that the input must be in, and the frame of positions given in latitude and '
         'longitude; empty: the frame of the first message accepted, and map')
@@ -429,12 +427,6 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     def map_frame(self) -> str:
         """The frame of positions that come as latitude and longitude."""
         return self.frame_id or 'map'
-
-    def origin(self) -> Origin | None:
-        """The origin that is stated, None for none."""
-        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
-            return None
-        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
 
     @classmethod
     def specs_with(cls, values: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:

@@ -231,9 +231,7 @@ class Seen(NamedTuple):
         return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.usual), 1.0)
 
 
-def detecting(
-    stated: Mapping[str, Coverage], models: ModelSet
-) -> Callable[[Known, Group], Known]:
+def detecting(stated: Mapping[str, Coverage], models: ModelSet) -> Callable[[Known, Group], Known]:
     """Return the stage that notes how probable the fixes of a group are, by what is `stated` of
     sensors."""
 
@@ -265,9 +263,7 @@ def missing(
     return miss
 
 
-def of_sensor(
-    stated: Mapping[str, Coverage], sensor: str, config: DiverConfig
-) -> Coverage | None:
+def of_sensor(stated: Mapping[str, Coverage], sensor: str, config: DiverConfig) -> Coverage | None:
     """Return what is `stated` of a sensor, None where it sees everywhere."""
     return stated.get(sensor if sensor in config.sensors else '')
 

@@ -22,18 +22,18 @@ and between them,
     z - g (x, y) = z_track - g (x, y)_track + e,    g = R_z,xy R_xy^-1,    var e = R_zz - g R_xy,z
 
 where e has nothing to do with the errors of x and y. So the two updates in turn are the one by all
-three coordinates. It weighs the models too, and with them the copies of the depth bank.
+three coordinates. It weighs the models too, and with them the rows of the track.
 
 z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
 z alone. What is refused is remembered; the next fix that agrees with it says that the depth was
 wrong, and z begins there.
 
 *Rows.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
-Far away all rows of a track, each of which began in its part of the water column, may come to agree
-on a depth that is not well known. When the diver then comes near, one Gaussian cannot become two
-depths, and all rows may go to the wrong one. So rows that agree are spread over what they believe,
-before a ping that bends within it: the Gaussian becomes the sum of narrower ones with the same mean
-and variance, and the arrivals choose.
+Far away all rows of a track, each of which began in its part of the water column, may come to
+agree on a depth that is not well known. When the diver then comes near, one Gaussian cannot become
+two depths, and all rows may go to the wrong one. So rows that agree are spread over what they
+believe, before a ping that bends within it: the Gaussian becomes the sum of narrower ones with the
+same mean and variance, and the arrivals choose.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold
-from ...estimation.covariance import add_jitter
 from ...estimation.bank import Gaussians, LOG_2PI
+from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
 from .config import DiverConfig
 from .instruments import Layout

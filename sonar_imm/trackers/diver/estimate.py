@@ -27,7 +27,7 @@ from . import births, clutter, depth, offsets
 from .config import DiverConfig
 from .fixes import scale_of, stated_weight
 from .forgetting import PUBLISHES
-from .known import Known, outputs
+from .known import Known, of_rows
 from .models import FAMILIES, HOVER, ModelSet
 
 
@@ -39,7 +39,8 @@ def estimate_of(
     # Of tracks whose hits are counted the existence is NaN.
     known = known.only(~(known['existence'] <= PUBLISHES))
     mean, covariance = published(known, models)
-    covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
+    if known.memory['recent'].pairs:
+        covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -78,9 +79,10 @@ def published(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
     are apart. If they are better, this is cautious.
     """
     maps = tuple(part.outputs for part in models.parts)
-    mean, covariance = outputs(known.rows, maps)
+    rows, each = known.rows, of_rows(known.rows, maps)
+    mean, covariance = rows.combine(*each, rows.weight)
     if len(models.scales) > 1:
-        own, covariance = outputs(known.rows, maps, stated_weight(known.rows))
+        own, covariance = rows.combine(*each, stated_weight(rows))
         off = mean - own
         covariance = covariance + off[:, :, None] * off[:, None, :]
     return mean, covariance

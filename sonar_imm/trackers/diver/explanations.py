@@ -37,7 +37,7 @@ Inside, the list is the last axis, along which numpy runs.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,8 +65,8 @@ MOST_ITERATIONS = 60
 SMALLEST_GAIN = 1e-7
 """Gain in log-density that ends a search: far below what a model probability could show."""
 
-SHORTEST_STEP = 1e-3
-"""Share of a step below which a search does not try."""
+SHORTER = 0.5 ** np.arange(1, 10)
+"""Shares of a step that are tried where the whole of it does not climb."""
 
 FEW = 8
 """Unknowns up to which the equations of all searches are solved together."""
@@ -122,6 +122,12 @@ def _last(P: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.moveaxis(P, 0, -1))
 
 
+def _pick(part: Any, rows: IndexArray) -> Any:
+    """Return the entries `rows` of the last axis, which stays the one that lies in a row: indexing
+    puts it first."""
+    return part.take(rows, axis=-1)
+
+
 def _symmetric(P: FloatArray) -> FloatArray:
     return 0.5 * (P + np.swapaxes(P, 0, 1))
 
@@ -134,10 +140,10 @@ def fit_each(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the likelihood and the NIS of each measurement under each hypothesis, (L, C) each."""
     nu, gradient = _residuals(x.T, measured, height)
-    cross = sum(gradient[:, a, None] * _last(P)[:, a] for a in _active(gradient))
-    S = _variances(measured) + (cross * gradient).sum(axis=1)
-    nis = nu * nu / S
-    return (np.exp(-0.5 * nis) / np.sqrt(2.0 * math.pi * S)).T, nis.T
+    G = np.ascontiguousarray(np.moveaxis(gradient, -1, 0))
+    S = measured.variance + ((G @ P) * G).sum(axis=2)
+    nis = nu.T**2 / S
+    return np.exp(-0.5 * nis) / np.sqrt(2.0 * math.pi * S), nis
 
 
 def fit_measurements(
@@ -170,11 +176,6 @@ def expect_measurements(
     apart = nu - residual[:, None]
     covariance = inside + (apart * mu) @ apart.T
     return residual, 0.5 * (covariance + covariance.T)
-
-
-def _active(gradient: FloatArray) -> IndexArray:
-    """Return the components on which some of the measurements depend; gradient (C, n, L)."""
-    return np.flatnonzero(gradient.any(axis=(0, 2)))
 
 
 # -- all subsets ---------------------------------------------------------------------------------
@@ -223,9 +224,11 @@ def subset_ping(
     total = np.add.reduceat(share, starts)
     share /= total[now.of]
     mean = np.add.reduceat(share * now.x, starts, axis=1)
-    apart = now.x - mean[:, now.of]
-    second = now.P + apart[:, None] * apart
-    covariance = np.add.reduceat(share * second, starts, axis=2)
+    apart = now.x - _pick(mean, now.of)
+    covariance = np.empty((len(mean), len(mean), L))
+    for a, own in enumerate(apart):
+        second = share * (now.P[a] + own * apart)
+        covariance[a] = np.add.reduceat(second, starts, axis=1)
     taken = np.add.reduceat(share * now.good, starts, axis=1)
     return mean.T, np.moveaxis(covariance, -1, 0), best + np.log(total), taken.T
 
@@ -242,7 +245,7 @@ def _grow(
     all too improbable."""
     variance = _variances(measured)[node]
     if variance.shape[1] > 1:
-        variance = variance[:, now.of]
+        variance = _pick(variance, now.of)
     nu, gradient = _residuals(now.x, measured, height, node)
     cross, S = innovation_variances(now.P, gradient, variance)
     wild = math.log(measured.density[node].sum())
@@ -260,13 +263,15 @@ def _grow(
     old, option = np.nonzero(score >= (best[now.of] - PRUNE)[:, None])
     taken = np.maximum(option - 1, 0)
     took = option > 0
-    good = now.good[:, old]
+    good = _pick(now.good, old)
     good[node.start + taken, np.arange(len(old))] |= took
     # What takes none has no gain.
-    cross, nu = np.where(took, cross[taken, :, old].T, 0.0), nu[taken, old]
+    cross = np.where(took, np.ascontiguousarray(cross[taken, :, old].T), 0.0)
+    nu = nu[taken, old]
     S = np.where(took, S[taken, old], 1.0)
-    grown = apply_gain(now.x[:, old], now.P[:, :, old], cross, S, nu, estimated)
-    return _Explanations(now.of[old], *grown, good, score[old, option])
+    x, P = _pick(now.x, old), _pick(now.P, old)
+    apply_gain(x, P, cross, S, nu, estimated)
+    return _Explanations(now.of[old], x, P, good, score[old, option])
 
 
 def _best(now: _Explanations, most: int) -> _Explanations:
@@ -277,7 +282,7 @@ def _best(now: _Explanations, most: int) -> _Explanations:
     order = np.lexsort((-now.weight, now.of))
     rank = np.arange(len(order)) - (np.cumsum(count) - count)[now.of]
     kept = np.sort(order[rank < most])
-    return _Explanations._make(part[..., kept] for part in now)
+    return _Explanations._make(_pick(part, kept) for part in now)
 
 
 # -- heavy tails ---------------------------------------------------------------------------------
@@ -321,8 +326,8 @@ class _Searches(NamedTuple):
     weight: FloatArray
     """(C, S) weights of the residuals."""
 
-    def only(self, kept: np.ndarray) -> _Searches:
-        return _Searches._make(part[..., kept] for part in self)
+    def only(self, kept: IndexArray) -> _Searches:
+        return _Searches._make(_pick(part, kept) for part in self)
 
 
 def _prior(
@@ -339,8 +344,9 @@ def _prior(
     place = np.full(n + 1, -1)
     place[active] = np.arange(len(active))
     own = measured._replace(columns=place[columns])
-    variance = np.broadcast_to(_variances(measured), (len(columns), len(x)))[:, known]
-    parts = own, active, x.T[np.ix_(active, known)], root[..., known], variance
+    variance = np.broadcast_to(_variances(measured), (len(columns), len(x)))
+    variance = _pick(variance, known)
+    parts = own, active, x[np.ix_(known, active)].T.copy(), _pick(root, known), variance
     prior = _Prior(*parts, variance, height, degrees)
     nothing = np.zeros(prior.mean.shape)
     seen = (_look(prior, np.arange(len(known)), nothing, nothing[0]).slope ** 2).sum(axis=1)
@@ -349,21 +355,33 @@ def _prior(
 
 def _look(prior: _Prior, of: IntArray, u: FloatArray, square: FloatArray) -> _Searches:
     """Return the searches that stand at u (a, S)."""
-    root = prior.root[: len(u), : len(u)][..., of]
-    x = prior.mean[:, of] + np.einsum('abs,bs->as', root, u)
+    root = _pick(prior.root[: len(u), : len(u)], of)
+    x = _pick(prior.mean, of) + np.einsum('abs,bs->as', root, u)
     residual, gradient = _residuals(x, prior.measured, prior.height)
-    slope = np.einsum('cas,abs->cbs', gradient, root)
-    misfit = residual * residual / prior.variance[:, of]
+    slope = _whitened(gradient, root, prior.measured.columns)
+    misfit = residual * residual / _pick(prior.variance, of)
     weight = (prior.degrees + 1.0) / (prior.degrees + misfit)
     tails = np.log1p(misfit / prior.degrees).sum(axis=0)
     value = -0.5 * ((u * u).sum(axis=0) + square + (prior.degrees + 1.0) * tails)
     return _Searches(of, u, square, value, residual, slope, weight)
 
 
+def _whitened(gradient: FloatArray, root: FloatArray, columns: IntArray) -> FloatArray:
+    """Return gradients (C, a, S) by the whitened state; root (a, a, S)."""
+    if len(root) <= FEW:
+        return np.einsum('cas,abs->cbs', gradient, root)
+    slope = np.zeros(gradient.shape)
+    for each, own, row in zip(slope, gradient, columns.tolist()):
+        used = {*row, row[OFFSET] + 1} if row[OFFSET] >= 0 else {*row}
+        for k in used - {-1}:
+            each[: k + 1] += own[k] * root[k, : k + 1]
+    return slope
+
+
 def _start(prior: _Prior, of: IntArray, positions: FloatArray | None) -> _Searches:
     """Return searches that start at `positions` (2, S), None for those of the prior; the
     emission, if any, at its median."""
-    mean = prior.mean[:, of]
+    mean = _pick(prior.mean, of)
     x = mean.copy()
     columns = prior.measured.columns[0]
     if positions is not None:
@@ -383,23 +401,32 @@ def _start(prior: _Prior, of: IntArray, positions: FloatArray | None) -> _Search
     return _look(prior, of, u[:a], (u[a:] * u[a:]).sum(axis=0))
 
 
-def _normal_equations(prior: _Prior, now: _Searches) -> tuple[FloatArray, FloatArray]:
-    """Return the information A (a, a, S) and b (a, S) of the weighted least squares ``A du = b``
-    that each search solves next."""
-    a = len(now.u)
-    heavy = now.slope * (now.weight / prior.noise[:, now.of])[:, None]
-    A = np.einsum('cas,cbs->abs', heavy, now.slope)
-    A[range(a), range(a)] += 1.0
-    return A, np.einsum('cas,cs->as', heavy, now.residual) - now.u
+def _step(prior: _Prior, now: _Searches) -> FloatArray:
+    """Return the steps (a, S) to the weighted least squares."""
+    heavy = now.slope * (now.weight / _pick(prior.noise, now.of))[:, None]
+    A = _information(now.slope, heavy)
+    if len(A) == len(now.u):
+        return _solve(A, np.einsum('cas,cs->as', heavy, now.residual) - now.u)
+    there = now.residual + np.einsum('cas,as->cs', now.slope, now.u)
+    return np.einsum('cas,cs->as', heavy, _solve(A, there)) - now.u
 
 
-def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solve positive definite A (a, a, S) for b (a, S); also the logarithm (S,) of its
-    determinant."""
+def _information(slope: FloatArray, heavy: FloatArray) -> FloatArray:
+    """Return ``1 + H' W H`` (a, a, S) of slopes H (C, a, S) and W H, or, where that is smaller,
+    ``1 + H H' W`` (C, C, S), which has the same determinant."""
+    if len(slope) < slope.shape[1]:
+        A = np.einsum('cas,das->cds', slope, heavy)
+    else:
+        A = np.einsum('cas,cbs->abs', heavy, slope)
+    A[range(len(A)), range(len(A))] += 1.0
+    return A
+
+
+def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve A (a, a, S), positive definite but for a scale of its columns, for b (a, S)."""
     if len(A) > FEW:
-        each = np.moveaxis(A, -1, 0)
-        solution = np.linalg.solve(each, b.T[..., None])[..., 0]
-        return np.asarray(solution.T), np.linalg.slogdet(each)[1]
+        solution = np.linalg.solve(np.moveaxis(A, -1, 0), b.T[..., None])[..., 0]
+        return np.ascontiguousarray(solution.T)
     A, b = A.copy(), b.copy()
     for k in range(len(A)):
         for i in range(k + 1, len(A)):
@@ -408,31 +435,42 @@ def _solve(A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
             A[i, k + 1 :] -= share * A[k, k + 1 :]
     for k in range(len(A) - 1, -1, -1):
         b[k] = (b[k] - (A[k, k + 1 :] * b[k + 1 :]).sum(axis=0)) / A[k, k]
-    return b, np.log(A[range(len(A)), range(len(A))]).sum(axis=0)
+    return b
+
+
+def _shortened(prior: _Prior, old: _Searches, step: FloatArray) -> tuple[_Searches, FloatArray]:
+    """Return where searches stand after the longest of `SHORTER` steps that climbs, else after the
+    shortest, and their gains (S,)."""
+    every, many = np.repeat(np.arange(len(old.of)), len(SHORTER)), len(old.of)
+    share = np.tile(SHORTER, many)
+    u = _pick(old.u, every) + share * _pick(step, every)
+    square = old.square[every] * (1.0 - share) ** 2
+    tried = _look(prior, old.of[every], u, square)
+    gain = (tried.value - old.value[every]).reshape(many, -1)
+    climbs = gain >= 0.0
+    climbs[:, -1] = True
+    chosen = climbs.argmax(axis=1) + len(SHORTER) * np.arange(many)
+    return tried.only(chosen), gain.ravel()[chosen]
 
 
 def _climb(prior: _Prior, now: _Searches) -> tuple[FloatArray, FloatArray]:
     """Return the maxima uphill of the searches, u (a, S), and their log-densities (S,)."""
     u, value, live = now.u.copy(), now.value.copy(), np.arange(len(now.of))
     for _ in range(MOST_ITERATIONS):
-        step, _ = _solve(*_normal_equations(prior, now))
+        step = _step(prior, now)
         trial = _look(prior, now.of, now.u + step, np.zeros(len(live)))
         gain = trial.value - now.value
-        lost, length = np.flatnonzero(~(gain >= 0.0)), 0.5
-        while len(lost) and length > SHORTEST_STEP:
-            old = now.only(lost)
-            shorter = old.u + length * step[:, lost], old.square * (1.0 - length) ** 2
-            again = _look(prior, old.of, *shorter)
-            for part, new in zip(trial, again):
+        lost = np.flatnonzero(~(gain >= 0.0))
+        if len(lost):
+            shorter, gain[lost] = _shortened(prior, now.only(lost), step[:, lost])
+            for part, new in zip(trial, shorter):
                 part[..., lost] = new
-            gain[lost] = again.value - old.value
-            lost, length = lost[~(gain[lost] >= 0.0)], 0.5 * length
         better = gain > 0.0
         u[:, live[better]], value[live[better]] = trial.u[:, better], trial.value[better]
-        climbs = gain > SMALLEST_GAIN
-        if not climbs.any():
+        climbs = np.flatnonzero(gain > SMALLEST_GAIN)
+        if not len(climbs):
             break
-        live, now = live[climbs], trial if climbs.all() else trial.only(climbs)
+        live, now = live[climbs], trial if len(climbs) == len(live) else trial.only(climbs)
     return u, value
 
 
@@ -489,10 +527,11 @@ def student_t_ping(
         better = value[k] > best + SMALLEST_GAIN
         at, best = np.where(better, u[:, k], at), np.where(better, value[k], best)
     now = _look(prior, own, at, np.zeros(len(own)))
-    evidence[known] = best - 0.5 * _solve(*_normal_equations(prior, now))[1]
+    information = _information(now.slope, now.slope * (now.weight / prior.noise)[:, None])
+    evidence[known] = best - 0.5 * np.linalg.slogdet(np.moveaxis(information, -1, 0))[1]
     weights[known] = now.weight.T
     place = prior.mean + np.einsum('abs,bs->as', prior.root[: len(at), : len(at)], at)
-    mean = x.T[:, known]
+    mean = x[known].T.copy()
     there = mean.copy()
     there[prior.active] = place
     residual, gradient = _residuals(there, measured, height)
@@ -506,8 +545,6 @@ def student_t_ping(
     for c in range(C):
         innovation = residual[c] + (gradient[c] * (there - means)).sum(axis=0)
         noise = wider * variance[c] / weight[c]
-        means, covariances, _ = consider_scalar(
-            means, covariances, gradient[c], noise, innovation, estimated
-        )
+        consider_scalar(means, covariances, gradient[c], noise, innovation, estimated)
     x1[known], P1[known] = means[:, : len(own)].T, np.moveaxis(covariances[..., len(own) :], -1, 0)
     return x1, P1, evidence, weights

@@ -14,9 +14,9 @@
 
 """Fixes: which are whose, and what they do to the tracks.
 
-Every fix is compared with every row it may belong to (`compare`): with the covariances that the row
-assumes, under all its models. So each fix has a density under each row, and one under each whole
-track. By these densities it is decided whose it is:
+Every fix is compared with every row it may belong to (`compare`): with the covariances that the
+row assumes, under all its models. So each fix has a density under each row, and one under each
+whole track. By these densities it is decided whose it is:
 
 - `by_name`: the fix says so. A name settles whose a fix is, never whether it is good.
 - `jointly` (jipda): every pairing of tracks and fixes is weighed, exactly (`estimation.jipda`). So
@@ -45,11 +45,21 @@ from ...estimation import bank, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
 from ...estimation.bank import Innovations
-from ...estimation.rows import Borrowed, log_sum, revived, ROW_AGAIN, Rows, thinned, LEAST_LOG
+from ...estimation.rows import (
+    Borrowed,
+    LEAST_LOG,
+    log_sum,
+    of_targets,
+    revived,
+    ROW_AGAIN,
+    Rows,
+    thinned,
+)
 from ...measurements import NOBODY
 from .innovations import FixConsistency, watch
-from .known import Feature, Known, outputs, repaired
+from .known import Feature, Known, of_rows, repaired
 from .models import ModelSet
+from .offsets import RecentPairs
 from .scan import Group
 
 FEATURES = {
@@ -65,7 +75,7 @@ track explained the last ten scans or so, a log-likelihood ratio; white: whitene
 last fix; existence: probability that there is a diver, NaN where hits are counted instead;
 evidence: sum of the probabilities of its detections."""
 
-FAR = 100.0
+FAR = 80.0
 """Normalised distance squared along an axis, from what every model expects, beyond which a density
 is nothing but small: what counts is which one is nearer."""
 
@@ -108,15 +118,13 @@ class Assumptions(NamedTuple):
             return cls(np.arange(N), scale, rows.logw, rows.target, np.ones(N, np.bool_))
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
-        row = np.concatenate([np.arange(N), borrowed.lender(rows, 'scale')])
-        columns = (
-            row,
-            np.concatenate([scale, borrowed.key]),
-            np.concatenate([rows.logw, borrowed.logw]),
-            target,
-            np.arange(len(target)) < N,
+        return cls(
+            np.concatenate([np.arange(N), borrowed.lender(rows, 'scale')])[order],
+            np.concatenate([scale, borrowed.key])[order],
+            np.concatenate([rows.logw, borrowed.logw])[order],
+            target[order],
+            order < N,
         )
-        return cls(*(column[order] for column in columns))
 
 
 class Pairs(NamedTuple):
@@ -174,9 +182,11 @@ def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs
     among = Assumptions.of(rows, known.borrowed)
     expected = [bank.expected(b, part.measured) for b, part in zip(rows.blocks, models.parts)]
     off = _off(expected, among, z, R)
-    near = off <= 1.0
+    # All rows of a track see what one of them may: else one would stay where it is for ever.
+    near = of_targets(np.logical_or, off <= 1.0, among.target)
     if group.target_id is not None:
-        near = (known['target_id'][:, None] == group.target_id)[among.target]
+        near = known['target_id'][:, None] == group.target_id
+    near = near[among.target]
     assumption, fix = np.nonzero(near)
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
@@ -201,7 +211,9 @@ def _of_mixture(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
         of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
         best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
         safe = np.where(np.isfinite(best), best, 0.0)
-        return np.asarray((best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0])
+        return np.asarray(
+            (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
+        )
 
 
 def density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
@@ -368,44 +380,47 @@ def updated(
     estimated: tuple[BoolArray | None, ...],
 ) -> Known:
     """Return the tracks after fixes that are theirs with the probabilities of `found`."""
-    among, exists = pairs.among, found.exists
-    exists = np.where(exists > 0.0, exists, 1.0)
+    among = pairs.among
+    exists = np.where(found.exists > 0.0, found.exists, 1.0)
     missed = np.where(found.beta.any(axis=1), found.missed / exists, 1.0)
-    target = among.target[pairs.assumption]
-    weight = found.beta[target, pairs.fix] / exists[target]
+    track = among.target[pairs.assumption]
+    weight = found.beta[track, pairs.fix] / exists[track]
     used = np.flatnonzero((weight > 0.0) & (pairs.log > -np.inf))
-    assumption, fix, target, weight = (
-        each[used] for each in (pairs.assumption, pairs.fix, target, weight)
-    )
-    whole = pairs.whole[target, fix]
-    gain = weight * np.exp(pairs.log[used] - whole)
-    factor = missed[among.target] + np.bincount(assumption, gain, minlength=len(among.row))
-    with np.errstate(divide='ignore'):
-        logw = among.logw + np.log(factor)
-    logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
-    rows = known.rows.replace(logw=logw[among.own][np.argsort(among.row[among.own])])
-    borrowed = known.borrowed
-    if len(borrowed):
-        order = np.argsort(borrowed.target, kind='stable')
-        after = np.empty(len(borrowed))
-        after[order] = logw[~among.own]
-        borrowed = Borrowed(borrowed.target, borrowed.key, after)
+    assumption, weight = pairs.assumption[used], weight[used]
+    whole = pairs.whole[track[used], pairs.fix[used]]
+    gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
+    rows, borrowed = _reweighed(known, among, missed[among.target] + gain)
     rows, borrowed, left = thinned(rows, borrowed, 'scale', _staying(rows))
+    # The pairs of rows that are left, in the order of these.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
-    own = among.own[assumption] & (place[among.row[assumption]] >= 0)
-    row, blocks, factors = place[among.row[assumption[own]]], [], []
-    of_row = missed[rows.target]
+    row = np.where(among.own, place[among.row], -1)[assumption]
+    own = row >= 0
+    row, used, weight, whole = row[own], used[own], weight[own, None], whole[own, None]
+    blocks, factors = [], []
     for block, part, each, mask in zip(rows.blocks, models.parts, pairs.compared, estimated):
-        chosen = each.only(used[own])
-        ratio = weight[own, None] * np.exp(chosen.log - whole[own, None])
-        block, factor = bank.update(block, chosen, row, ratio, of_row, part.measured, mask)
+        chosen = each.only(used)
+        ratio, none = weight * np.exp(chosen.log - whole), missed[rows.target]
+        block, factor = bank.update(block, chosen, row, ratio, none, part.measured, mask)
         blocks.append(block)
         factors.append(factor)
     sound, repairs = repaired(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).with_models(np.concatenate(factors, axis=1))
     rows, borrowed = revived(rows, borrowed, 'scale', borrowed.logw > math.log(ROW_AGAIN))
     return known.replace(rows=rows, borrowed=borrowed).counted(repairs=repairs)
+
+
+def _reweighed(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
+    """Return the rows and the list of those without one after the weights of all assumptions were
+    multiplied by `factor` (A,)."""
+    with np.errstate(divide='ignore'):
+        logw = among.logw + np.log(factor)
+    logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
+    rows, borrowed = known.rows, known.borrowed
+    of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
+    of_rows[among.row[among.own]] = logw[among.own]
+    of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.own]
+    return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list)
 
 
 def _staying(rows: Rows) -> BoolArray:
@@ -463,17 +478,24 @@ def _watched(known: Known, group: Group, found: Association, models: ModelSet) -
         return known
     fix = found.fix[tracks]
     seen = tuple(part.seen for part in models.parts)
-    mean, covariance = outputs(known.rows, seen, stated_weight(known.rows))
+    mean, covariance = known.rows.combine(*of_rows(known.rows, seen), stated_weight(known.rows))
     scale = scale_of(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
     before: FixConsistency = known.memory['fixes']
     white, after = watch(
-        mean[tracks], covariance[tracks], group.z[fix], R, known['white'][tracks], tentative, before
+        mean[tracks],
+        covariance[tracks],
+        group.z[fix],
+        R,
+        known['white'][tracks],
+        tentative,
+        before,
     )
     after = after.with_scale(scale, tentative)
     columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof')}
     columns['white'][tracks] = white
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
-    return known.put(**columns).remember(fixes=after)
+    # Where fixes say where divers are, nothing is assumed of the instruments.
+    return known.put(**columns).remember(fixes=after, recent=RecentPairs())

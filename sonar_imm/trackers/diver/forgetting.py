@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which tracks end: by their existence or their misses, by broken numbers, because another track is
-the same diver, or because there are too many.
+"""Which tracks end: by their existence or their misses, by broken numbers, because another track
+is the same diver, or because there are too many.
 
-What the hits and misses of `estimation.association.Tracks` are to a hard choice, the probability of
-existence is where all pairings are weighed: it says when a track is confirmed, published and ended.
+What the hits and misses of `estimation.association.Tracks` are to a hard choice, the probability
+of existence is where all pairings are weighed: it says when a track is confirmed, published and
+ended.
 """
 
 from __future__ import annotations
@@ -79,9 +80,7 @@ def forgetting(
             looked, refused, known = _by_looks(known, hit, looked, refused)
         looked = looked | refused
         by_existence = np.isfinite(known['existence'])
-        life, kept = known.life.scan(
-            hit, known.stamp_ns, rules, looked=looked & ~by_existence
-        )
+        life, kept = known.life.scan(hit, known.stamp_ns, rules, looked=looked & ~by_existence)
         if models.families is not None and any(group.whole for group in scan.fixes):
             doubted, over = doubtful(known, config)
             status = np.where(doubted[kept], TENTATIVE, life.status).astype(np.uint8)
@@ -165,6 +164,10 @@ def judge(
     if not looked.any():
         return Judged(status, alive, known['near_to'], known['near_for'])
     nameless = [group for group in groups if group.target_id is None]
+    if len(known) < 2:
+        return Judged(
+            status, alive, np.zeros(len(known), np.int64), np.zeros(len(known), np.int64)
+        )
     near_to, near_for = coalescence(known, was, *places(known, models), nameless)
     before = np.where(near_to == known['near_to'], known['near_for'], 0)
     near_for = np.where(looked, near_for, before)

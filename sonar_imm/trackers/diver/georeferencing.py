@@ -35,9 +35,9 @@ from __future__ import annotations
 
 from collections import Counter
 from operator import attrgetter
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
-from attrs import evolve
+from attrs import define, evolve, field
 import numpy as np
 
 from ...acoustics import geometry
@@ -81,13 +81,19 @@ class _Vessel(NamedTuple):
     axes: FloatArray
 
 
+@define(eq=False)
 class Samples:
-    """What one instrument says of the vessel: poses, of which only a part may be meant."""
+    """What one instrument says of the vessel: poses, of which only a part may be meant. STATE: see
+    `trackers.Tracker`."""
 
-    def __init__(self, kept_ns: int):
-        self._kept_ns = kept_ns
-        self._gate: StampGate[Navigation] = StampGate(kept_ns, _LONGEST_PAUSE_NS, _RESTART_AFTER)
-        self.buffer = NavigationBuffer()
+    STATE: ClassVar = ('_gate', 'buffer')
+
+    _kept_ns: int
+    _gate: StampGate[Navigation] = field(init=False)
+    buffer: NavigationBuffer = field(init=False, factory=NavigationBuffer)
+
+    def __attrs_post_init__(self) -> None:
+        self._gate = StampGate(self._kept_ns, _LONGEST_PAUSE_NS, _RESTART_AFTER)
 
     def add(self, sample: Navigation, counts: Counter[str]) -> bool:
         """Take a sample in; True when the clock was restarted, so that all before is forgotten."""
@@ -109,19 +115,35 @@ class Samples:
         return self.buffer.samples[int(np.abs(stamps - stamp_ns).argmin())]
 
 
+@define(eq=False)
 class Georeferencer:
-    """Gives what the tracker can use of each measurement; counts what it cannot in `counts`."""
+    """Gives what the tracker can use of each measurement; counts what it cannot in `counts`.
+    STATE: see `trackers.Tracker`."""
 
-    def __init__(self, config: DiverConfig, counts: Counter[str]):
-        self.config = config
-        self.origin = config.origin()
-        self._counts = counts
-        self._stated = self.origin is not None
-        self._first: Origin | None = None
-        self._metric = False
-        kept = max(KEPT_NS, nanoseconds(config.history))
+    STATE: ClassVar = (
+        'origin',
+        '_first',
+        '_metric',
+        '_poses',
+        '_places',
+        '_headings',
+        '_waiting',
+    )
+
+    config: DiverConfig
+    _counts: Counter[str]
+    origin: Origin | None = field(init=False)
+    _first: Origin | None = field(init=False, default=None)
+    _metric: bool = field(init=False, default=False)
+    _poses: Samples = field(init=False)
+    _places: Samples = field(init=False)
+    _headings: Samples = field(init=False)
+    _waiting: list[RelativeFix] = field(init=False, factory=list)
+
+    def __attrs_post_init__(self) -> None:
+        self.origin = self.config.stated_origin()
+        kept = max(KEPT_NS, nanoseconds(self.config.history))
         self._poses, self._places, self._headings = (Samples(kept) for _ in range(3))
-        self._waiting: list[RelativeFix] = []
 
     def __len__(self) -> int:
         """How many relative fixes wait for the vessel's pose."""
@@ -133,8 +155,7 @@ class Georeferencer:
         if self._counts['no_origin']:
             sentences.append(
                 f'{self._counts["no_origin"]} positions cannot be used: those in metres and those '
-                'in latitude and longitude need origin_latitude and origin_longitude to stand '
-                'beside each other'
+                'in latitude and longitude need the parameter origin to stand beside each other'
             )
         if len(self._waiting) > 1 and not self._vessel_known():
             sentences.append(
@@ -167,8 +188,8 @@ class Georeferencer:
             return self._after(self._headings, _turned(measurement))
         if isinstance(measurement, GeodeticFix):
             if self._first is None:
-                height = self.config.origin_height
-                self._first = Origin(measurement.latitude, measurement.longitude, height)
+                latitude, longitude = measurement.latitude, measurement.longitude
+                self._first = Origin(latitude, longitude, self.config.origin[2])
             if isinstance(measurement, VesselFix):
                 return self._after(self._places, self._moved(measurement))
             return [self._fix_of(measurement)] if self._on_earth() else []
@@ -184,7 +205,7 @@ class Georeferencer:
 
     def _in_metres(self) -> bool:
         """Whether metres can be used; counts a refusal."""
-        if self.origin is not None and not self._stated:
+        if self.origin is not None and self.config.stated_origin() is None:
             self._counts['no_origin'] += 1
             return False
         self._metric = True

@@ -16,8 +16,8 @@
 
 `Known` is one immutable value. A track is a weighted set of rows (`estimation.rows`): a row is one
 interacting multiple model filter under one assumption, a scale of the covariances of measurements
-or a depth at which the track began. What a stage of the tracker notes of each track is a *feature*,
-what it remembers of no track stands in the *memory*; this module knows neither by name.
+or a depth at which the track began. What a stage of the tracker notes of each track is a
+*feature*, what it remembers of no track stands in the *memory*; this module knows neither by name.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MOST_STEPS = 300
 
 
 class Feature(NamedTuple):
-    """What is noted of each track: the value of a track that begins, the shape of one, its type."""
+    """What is noted of each track: the value for one that begins, its shape and its type."""
 
     birth: Any
     shape: tuple[int, ...] = ()
@@ -63,9 +63,9 @@ class Known:
     life: Tracks
     rows: Rows
     borrowed: Borrowed
-    features: Mapping[str, np.ndarray]
-    memory: Mapping[str, Any]
-    counts: Mapping[str, int]
+    features: dict[str, np.ndarray]
+    memory: dict[str, Any]
+    counts: dict[str, int]
 
     @classmethod
     def nobody(
@@ -75,7 +75,7 @@ class Known:
         none = np.empty((0, models.copies, len(models.names), size))
         empty = np.empty((*none.shape, size))
         rows = models.rows(none, empty, none[..., 0], none[..., 0, 0])
-        columns = {
+        columns: dict[str, np.ndarray] = {
             name: np.empty((0, *feature.shape), feature.kind) for name, feature in features.items()
         }
         return cls(0, life, rows, Borrowed.none(), columns, {}, {})
@@ -122,8 +122,7 @@ class Known:
         count = len(life) - len(self)
         rows = self.rows.append(evolve(new, target=new.target + len(self)))
         features = {
-            name: with_rows(column, count, columns[name])
-            for name, column in self.features.items()
+            name: with_rows(column, count, columns[name]) for name, column in self.features.items()
         }
         return evolve(self, life=life, rows=rows, features=features)
 
@@ -137,17 +136,35 @@ class Known:
         return np.flatnonzero(self.rows.target == track)
 
     def require_like(self, other: Known, constants: int) -> None:
-        """Raise ValueError where this is no value of the models of `other`, with so many constants
-        behind their components."""
-        shapes = [
-            (len(known.rows.blocks), *(block.x.shape[2] for block in known.rows.blocks))
-            + tuple((name, column.shape[1:]) for name, column in sorted(known.features.items()))
-            for known in (self, other)
-        ]
-        size = [known.rows.blocks[0].x.shape[1] for known in (self, other)]
-        seen = self.life.seen.shape[1:] == other.life.seen.shape[1:]
-        if shapes[0] != shapes[1] or size[0] not in (size[1], size[1] + constants) or not seen:
+        """Raise ValueError where this is no value of the models of `other`, which has no track,
+        with so many constants behind their components."""
+        rows, T = self.rows, len(self)
+        sizes = {
+            block.x.shape[1] - there.x.shape[1]
+            for block, there in zip(rows.blocks, other.rows.blocks)
+        }
+        good = (
+            self._form == other._form
+            and sizes in ({0}, {constants})
+            and all(len(column) == T for column in self.features.values())
+            and all(len(column) == len(rows) for column in rows.key.values())
+            and np.array_equal(np.unique(rows.target), np.arange(T))
+            and bool((np.diff(rows.target) >= 0).all() and (rows.parent >= -1).all())
+            and bool(np.isin(self.borrowed.target, rows.target).all())
+        )
+        if not good:
             raise ValueError('states are of other models')
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        """Names, types and shapes, but for the numbers of tracks, rows and constants."""
+        columns = sorted({**self.features, **self.rows.key}.items())
+        return (
+            [(name, column.shape[1:], column.dtype) for name, column in columns],
+            [(name, type(value)) for name, value in sorted(self.memory.items())],
+            [block.x.shape[2] for block in self.rows.blocks],
+            self.life.seen.shape[1],
+        )
 
     def finite(self) -> BoolArray:
         """Return which tracks (T,) have finite numbers only."""
@@ -157,17 +174,19 @@ class Known:
         return np.bincount(self.rows.target[~good], minlength=len(self)) == 0
 
 
-def outputs(
-    rows: Rows, maps: tuple[FloatArray, ...], weight: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, q) and covariance (T, q, q) of outputs of the motion, `maps` (q, n', m) of
-    each block; weight (N,): of the rows, their own if not given."""
+def of_rows(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (N, q) and covariance (N, q, q) of outputs of the motion under each row, `maps`
+    (q, n', m) of each block."""
     blocks = [
         Gaussians(block.x[:, : E.shape[1]], block.P[:, : E.shape[1], : E.shape[1]])
         for block, E in zip(rows.blocks, maps)
     ]
-    mean, covariance = bank.combine(blocks, rows.mu, maps)
-    return rows.combine(mean, covariance, rows.weight if weight is None else weight)
+    return bank.combine(blocks, rows.mu, maps)
+
+
+def outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, q) and covariance (T, q, q) of outputs of the motion, as in `of_rows`."""
+    return rows.combine(*of_rows(rows, maps), rows.weight)
 
 
 def places(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
@@ -180,7 +199,7 @@ def repaired(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]
     changes no other (`estimation.covariance`)."""
     found, count = [], 0
     for block in blocks:
-        P = np.moveaxis(block.P, 0, 2)
+        P = block.P.transpose(1, 2, 0, 3)
         bad = ~are_sound(P)
         if bad.any():
             covariance = block.P.copy()

@@ -49,7 +49,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import lru_cache
 import math
 from typing import NamedTuple
 
@@ -58,7 +57,7 @@ import numpy as np
 
 from ...estimation import markov
 from ...estimation.adaptation import Chain
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.arrays import FloatArray, IndexArray, IntArray
 from ...estimation.bank import Bank, Gaussians, Measured, Moves
 from ...estimation.gauss_markov import gauss_markov
 from ...estimation.motion import Motion, white_acceleration
@@ -452,7 +451,9 @@ def _families(config: DiverConfig) -> ModelSet:
         chain = rate_chain(config, np.eye(M))
     else:
         rates = markov.RateChain(markov.persistent(len(LIVELY), LIVELY_STAY), T).generator
-        generators = [markov.RateChain(models.chain.matrix, T).generator for models in (steady, brisk)]
+        generators = [
+            markov.RateChain(models.chain.matrix, T).generator for models in (steady, brisk)
+        ]
         generators += [rates, np.zeros((len(QUIET), len(QUIET)))]
         generator = _between(family, generators, config.family_switch_rate)
         chain = markov.RateChain.of_generator(generator, T)

@@ -14,8 +14,8 @@
 
 """Tracks whose name is known, and what to do when a diver is also seen without one.
 
-A named track takes its part of the fixes that have no name, so that a diver with a transponder on a
-sonar is one track. A second track can stand beside it all the same:
+A named track takes its part of the fixes that have no name, so that a diver with a transponder on
+a sonar is one track. A second track can stand beside it all the same:
 the sonar may have seen the diver before the transponder was heard. Two divers that swim together
 are seen together, now and then at least; a single diver never is. So a nameless track that stays
 beside a named one, for so many scans that two divers would have been seen together once but for a
@@ -28,8 +28,9 @@ still is seen goes on without its name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,8 +51,15 @@ MISTAKEN = 1e-3
 """Probability that two divers side by side are taken for one."""
 
 
+class LastNamed(NamedTuple):
+    """The stamp of the last measurement of each name."""
+
+    stamps: dict[int, int] = {}
+
+
 def patience(detection_probability: float) -> int:
-    """Return the scans after which a track never seen together with the one beside it is the same diver."""
+    """Return after how many scans a track never seen together with the one beside it is the same
+    diver."""
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
@@ -60,10 +68,10 @@ def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
     for `max_coast` seconds."""
 
     def remember(known: Known, scan: Scan) -> Known:
-        last: Mapping[int, int] = known.memory['last_named']
-        if not scan.names and not last:
+        named: LastNamed = known.memory['last_named']
+        if not scan.names and not named.stamps:
             return known
-        last = {**last, **dict.fromkeys(scan.names, known.stamp_ns)}
+        last = {**named.stamps, **dict.fromkeys(scan.names, known.stamp_ns)}
         tracked = set(known['target_id'].tolist())
         last = {
             name: stamp_ns
@@ -73,7 +81,7 @@ def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
         }
         kept = np.isin(known['target_id'], np.array(list(last), np.int64))
         target_id = np.where(kept, known['target_id'], NOBODY)
-        return known.put(target_id=target_id).remember(last_named=last)
+        return known.put(target_id=target_id).remember(last_named=LastNamed(last))
 
     return remember
 
@@ -83,7 +91,7 @@ def merging(models: ModelSet) -> Callable[[Known, Scan], Known]:
     name where it belongs."""
 
     def merge(known: Known, scan: Scan) -> Known:
-        return merged(known, scan, models) if known.memory['last_named'] else known
+        return merged(known, scan, models) if known.memory['last_named'].stamps else known
 
     return merge
 
@@ -122,8 +130,8 @@ def merged(known: Known, scan: Scan, models: ModelSet) -> Known:
 
 
 def _prefer(known: Known, row: int, other: int) -> bool:
-    """Return whether of two tracks of one diver the first goes on: confirmed before tentative, then
-    older."""
+    """Return whether of two tracks of one diver the first goes on: confirmed before tentative,
+    then older."""
     tentative = known.life.status == TrackStatus.TENTATIVE
     if tentative[row] != tentative[other]:
         return bool(tentative[other])
@@ -140,5 +148,6 @@ def near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
 
 
 def squared(apart: FloatArray, S: FloatArray) -> FloatArray:
-    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2, 2)."""
+    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2,
+    2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

@@ -39,7 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -48,8 +48,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .instruments import AT_TRANSMITTER
-from .known import Known
-from .scan import Group, Ping
+from .scan import Ping
 
 MEMORY = 100.0
 """Pings over which the evidence is forgotten."""
@@ -100,10 +99,10 @@ class RecentPairs(NamedTuple):
     of tags, rx (R, 3), variance (R,) of the path, m^2, and age (R,) in pings."""
 
     pairs: tuple[tuple[int, int], ...] = ()
-    tx: FloatArray = np.zeros((0, 3))
-    rx: FloatArray = np.zeros((0, 3))
-    variance: FloatArray = np.zeros(0)
-    age: FloatArray = np.zeros(0)
+    tx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    rx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    variance: Annotated[FloatArray, 'p'] = np.zeros(0)
+    age: Annotated[FloatArray, 'p'] = np.zeros(0)
 
     def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
         """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
@@ -146,12 +145,12 @@ class RecentPairs(NamedTuple):
 class Offsets(NamedTuple):
     """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
     = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
-    square and freedom: of all t, and how many there were; recent: the pairs of the last pings."""
+    square and freedom: of all t, and how many there were."""
 
     pairs: tuple[tuple[int, int], ...] = ()
-    score: FloatArray = np.zeros(CAUSES)
-    variance: FloatArray = np.zeros((CAUSES, CAUSES))
-    length: FloatArray = np.zeros(0)
+    score: Annotated[FloatArray, 's'] = np.zeros(CAUSES)
+    variance: Annotated[FloatArray, 'ss'] = np.zeros((CAUSES, CAUSES))
+    length: Annotated[FloatArray, 'p'] = np.zeros(0)
     square: float = 0.0
     freedom: float = 0.0
 
@@ -304,14 +303,6 @@ def watched(
             echoes[echo[members[off[members].argmin()]]] = True
         found = found.after(seen, echoes, ids, place, config)
     return found, recent
-
-
-def forget_heard(known: Known, group: Group) -> Known:
-    """Assume nothing of instruments where a fix says where a diver is. A stage of the tracker."""
-    assert group.found is not None
-    if not known.memory['recent'].pairs or not group.found.hit.any():
-        return known
-    return known.remember(recent=RecentPairs())
 
 
 def widened(

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
-from attrs import define, evolve, field, frozen
+from attrs import define, evolve, field
 import numpy as np
 
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
@@ -182,14 +182,14 @@ class Scan:
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
-        clutter: Clutters = (),
+        clutter: Clutters,
     ) -> Scan:
         """The scan of `items`; clutter: of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config), []
-        known = dict(clutter) if config.pairing != 'gnn' else {}
-        for at, group in enumerate(fixes):
-            if group.target_id is None and group.sensor in known:
-                fixes[at] = evolve(group, learnt=known[group.sensor].density)
+        for group in fixes if config.pairing != 'gnn' else ():
+            found = clutter.of(group.sensor)
+            if group.target_id is None and found is not None:
+                group.learnt = found.density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()
@@ -260,9 +260,7 @@ def _named_and_nameless(scan: Fixes, config: DiverConfig) -> list[Group]:
     return groups
 
 
-def _group(
-    scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool
-) -> Group:
+def _group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -> Group:
     """The rows of a scan, with their names or as all that there was to see."""
     position, covariance = scan.position[rows], np.full((len(rows), 3, 3), np.nan)
     if scan.covariance is not None:
@@ -270,7 +268,11 @@ def _group(
     R = np.ascontiguousarray(covariance[:, :2, :2])
     if not (stated := np.isfinite(R)).all():
         R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
-    heights = Heights.of(position, covariance, config.covariance_scale) if config.dimensions == 3 else None
+    heights = (
+        Heights.of(position, covariance, config.covariance_scale)
+        if config.dimensions == 3
+        else None
+    )
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _place(config)

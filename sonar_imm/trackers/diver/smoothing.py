@@ -83,8 +83,9 @@ class _Smoothed(NamedTuple):
 
 
 def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
-    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and the
-    transitions (K, M, M) into each step; of all models together what they weigh at the end."""
+    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M)
+    and the transitions (K, M, M) into each step; of all models together what they weigh at the
+    end."""
     filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)
     if len(blocks) == 1:
         return np.broadcast_to(filtered[-1], filtered.shape)
@@ -197,7 +198,8 @@ class SmoothingDiverTracker(DiverTracker):
                     continue
                 kept = found.setdefault((number, track_id), _Smoothed([], [], [], [], []))
                 logw = float(np.log(max(share, 1e-300)))
-                for column, value in zip(kept, (x[k], P[k], mu[k], logw, key)):
+                columns: tuple[list[Any], ...] = tuple(kept)
+                for column, value in zip(columns, (x[k], P[k], mu[k], logw, key)):
                     column.append(value)
 
     def _path(
@@ -269,9 +271,7 @@ class SmoothingDiverTracker(DiverTracker):
         F_all[..., range(n, size), range(n, size)] = 1.0
         return F_all, Q_all, B_all
 
-    def _told(
-        self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]
-    ) -> Known:
+    def _told(self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]) -> Known:
         """What is known of a scan, given all data."""
         known = scan.known
         parts = [found[number, track_id] for track_id in known.life.track_id.tolist()]

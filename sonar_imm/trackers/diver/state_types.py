@@ -12,16 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The classes that a saved state of this tracker may hold, see `state_file`."""
+"""The classes of values that a saved state of this tracker may hold, see `state_file`."""
 
 from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...estimation.association import Tracks
+from ...estimation.bank import Gaussians
 from ...estimation.consistency import NisMemory
 from ...estimation.rows import Borrowed, Rows
-from ...estimation.bank import Gaussians
-from ...intake.stream import REPLAY_TYPES
+from ...intake.stream import STREAM_TYPES
 from ...measurements import (
     Arrivals,
     Fix,
@@ -35,20 +35,20 @@ from ...measurements import (
     VesselPose,
 )
 from ..navigation import NavigationBuffer
-from . import clutter
-from .config import DiverConfig
+from .clutter import Clutter, Clutters
 from .depth import HeightCounts
-from .georeferencing import Georeferencer, Samples
 from .innovations import FixConsistency
 from .instruments import Instruments
 from .known import Known
+from .names import LastNamed
 from .offsets import Offsets, RecentPairs
 
 STATE_TYPES = (
-    *REPLAY_TYPES,
+    *STREAM_TYPES,
     *(Arrivals, Fix, Fixes, Start),
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
-    *(Georeferencer, Samples, NavigationBuffer, Origin, DiverConfig),
-    *(Known, Rows, Borrowed, Gaussians, Tracks, NisMemory, FixConsistency, HeightCounts, Instruments),
-    *(Offsets, RecentPairs, clutter.Clutter),
+    *(NavigationBuffer, Origin),
+    *(Known, Rows, Borrowed, Gaussians, Tracks),
+    *(NisMemory, FixConsistency, HeightCounts, Instruments, Offsets, RecentPairs),
+    *(Clutter, Clutters, LastNamed),
 )

@@ -27,9 +27,9 @@ The measurements of a stamp, a `Scan`, go through stages, each a function of wha
             -> learn -> forget -> begin
 
 The stages are put together once, from the parameters. What is known after a scan is one immutable
-value, `Known`, so that a late measurement is put in its place by computing the scans after it again
-(`intake.stream`). Positions that are not metres in the frame of the tracks are brought into it
-first (`georeferencing`).
+value, `Known`, so that a late measurement is put in its place by computing the scans after it
+again (`intake.stream`). Positions that are not metres in the frame of the tracks are brought into
+it first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -70,7 +70,7 @@ from .georeferencing import Georeferencer
 from .innovations import FixConsistency
 from .instruments import Instruments, Layout
 from .known import crossed, Feature, Known
-from .models import build_models
+from .models import build_models, ModelSet
 from .scan import Group, Scan
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
@@ -87,6 +87,9 @@ class DiverTracker:
     `Start`, and what `georeferencing` makes fixes of."""
 
     STATE = ('_stream', '_georeferencer')
+
+    _stream: ReplayStream[Known]
+    _georeferencer: Georeferencer
 
     def __init__(self, config: DiverConfig):
         self.models = build_models(config := config.for_target())
@@ -129,7 +132,6 @@ class DiverTracker:
             models.families and restart.restarting(models, self._chain, layouts, associate),
             fixes.updating(models, lambda known: layouts(known).estimated(models)),
             config.dimensions == 3 and depth.updating(models, layouts, config),
-            offsets.forget_heard,
             clutter.count,
             covered and coverage.missing(models, lambda known: bool(layouts(known).mask.all())),
             turn and turning(models, layout, back=True),
@@ -166,15 +168,16 @@ class DiverTracker:
             offsets=offsets.Offsets(),
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
-            clutter=(),
-            last_named={},
+            clutter=clutter.Clutters(),
+            last_named=names.LastNamed(),
         )
 
     def restored(self) -> None:
-        """Raise ValueError for states, put in, that are none of these models."""
-        nobody = self._nobody(Tracks.none(self.rules))
-        for known in self._stream.kept:
-            known.require_like(nobody, self._layouts(known).size - self.models.n)
+        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
+        is none of these models."""
+        base, nobody = self._stream.base, self._nobody(Tracks.none(self.rules))
+        base.require_like(nobody, len(self._layouts(base).variances))
+        self._stream.restored()
 
     @property
     def origin(self) -> Origin | None:
@@ -296,7 +299,7 @@ def wanted(*stages: object) -> tuple:
 
 
 def turning(
-    models: object, layout: Callable[[Instruments], Layout], *, back: bool = False
+    models: ModelSet, layout: Callable[[Instruments], Layout], *, back: bool = False
 ) -> OfGroup:
     """Return the stage that turns the tracks as a sensor shows them whose bearings may all be off,
     or back."""

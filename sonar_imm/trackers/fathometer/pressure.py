@@ -30,11 +30,10 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 import math
-from typing import NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-from attrs import frozen
+from attrs import define, field, frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acoustics.geodesy import Origin
 from ...acoustics.spectra import (
@@ -44,6 +43,7 @@ from ...acoustics.spectra import (
     SlidingAverage,
     SnapshotStream,
 )
+from ...estimation.arrays import BoolArray, FloatArray
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection
 from ...measurements.fathometer import MAX_FREQUENCIES
 from .config import FathometerConfig
@@ -72,13 +72,16 @@ class Collected(NamedTuple):
     depth_std: float = 0.0
 
 
+@define(eq=False)
 class BlockDepths:
     """Mean and standard deviation of the depths that come with blocks, each counted as often as it
-    has samples."""
+    has samples. STATE: see `trackers.Tracker`."""
 
-    def __init__(self) -> None:
-        self._stated = True
-        self._first, self._sums = 0.0, np.zeros(3)
+    STATE: ClassVar = ('_stated', '_first', '_sums')
+
+    _stated: bool = field(init=False, default=True)
+    _first: float = field(init=False, default=0.0)
+    _sums: Annotated[FloatArray, '3'] = field(init=False, factory=lambda: np.zeros(3))
 
     def add(self, depth: float | None, samples: int) -> None:
         self._stated &= depth is not None
@@ -117,17 +120,42 @@ def automatic_snapshot(config: FathometerConfig, hydrophones: int, reach: float)
     return min(seconds, config.record_seconds)
 
 
+class Beginning(NamedTuple):
+    """What the length and the number of snapshots follow from, beside the parameters; rate: of
+    samples, Hz; reach: as of `PressureStream.push`."""
+
+    hydrophones: int
+    rate: float
+    reach: float
+
+
+@define(eq=False)
 class PressureStream:
     """Collects `Pressure` into `CrossSpectra`: whole records, and previews from the sliding
-    average."""
+    average. STATE: see `trackers.Tracker`. Setting `_begun` makes the streams that follow from it.
+    """
 
-    def __init__(self, config: FathometerConfig, counts: Counter[str]):
-        self.config = config
-        self.counts = counts
-        self._shape: tuple[int, float] | None = None
-        self._next_ns = 0
-        self._alive: NDArray[np.bool_] = np.ones(0, np.bool_)
-        self._depths = BlockDepths()
+    STATE: ClassVar = (
+        '_begun',
+        '_next_ns',
+        '_alive',
+        '_depths',
+        '_snapshots',
+        '_blocks',
+        '_sliding',
+    )
+
+    config: FathometerConfig
+    counts: Counter[str]
+    _begun: Beginning | None = field(
+        init=False, default=None, on_setattr=lambda stream, _, begun: stream._begin(begun)
+    )
+    _next_ns: int = field(init=False, default=0)
+    _alive: Annotated[BoolArray, 'M'] = field(init=False, factory=lambda: np.ones(0, np.bool_))
+    _depths: BlockDepths = field(init=False, factory=BlockDepths)
+    _snapshots: SnapshotStream | None = field(init=False, default=None)
+    _blocks: BlockAverage | None = field(init=False, default=None)
+    _sliding: SlidingAverage | None = field(init=False, default=None)
 
     def push(self, block: Pressure, reach: float) -> tuple[list[Collected], list[Collected]]:
         """Records and previews that `block` completes, each with the stamp of the block. reach: m
@@ -135,6 +163,7 @@ class PressureStream:
         without a living hydrophone in common with the record, and for one that would take too much
         memory."""
         self._follow(block, reach)
+        assert self._snapshots is not None and self._blocks is not None
         self._alive &= block.alive
         self._depths.add(block.reference_depth, len(block))
         records: list[Collected] = []
@@ -153,27 +182,31 @@ class PressureStream:
     @property
     def waiting(self) -> int:
         """Snapshots that wait for the rest of their record."""
-        return 0 if self._shape is None else self._blocks.waiting
+        return 0 if self._blocks is None else self._blocks.waiting
 
     def _follow(self, block: Pressure, reach: float) -> None:
         """Begin anew when the array is another one or time has leapt."""
-        shape = block.hydrophones, block.sample_rate
+        now, known = Beginning(block.hydrophones, block.sample_rate, reach), self._begun
         gap_ns = block.stamp_ns - self._next_ns
-        if shape != self._shape:
-            known = self._shape is not None
-            self._begin(block, reach)
-            self.counts['restarted_array'] += known
+        if known is None or known[:2] != now[:2]:
+            self._begun = now
+            self.counts['restarted_array'] += known is not None
         elif 2 * abs(gap_ns) > block.duration_ns:
             self.counts['gaps'] += 1
-            self._snapshots.restart()
+            if self._snapshots is not None:
+                self._snapshots.restart()
             if abs(gap_ns) > self.config.record_seconds * 1e9:
                 self.counts['records_abandoned'] += 1
-                self._begin(block, reach)
+                self._begun = now
         self._next_ns = block.stamp_ns + block.duration_ns
 
-    def _begin(self, block: Pressure, reach: float) -> None:
-        config, rate = self.config, block.sample_rate
-        seconds = config.snapshot_seconds or automatic_snapshot(config, block.hydrophones, reach)
+    def _begin(self, begun: Beginning | None) -> Beginning | None:
+        """Make the streams that follow from `begun`. An array that is refused leaves the one
+        before as it was."""
+        if begun is None:
+            return None
+        config, (phones, rate, reach) = self.config, begun
+        seconds = config.snapshot_seconds or automatic_snapshot(config, phones, reach)
         length = max(2, round(seconds * rate))
         hop = max(1, round(length * (1.0 - config.overlap)))
         if not config.snapshot_seconds:
@@ -193,16 +226,13 @@ class PressureStream:
         straddling = math.ceil(length / hop) - 1
         count = max(1, round(config.record_seconds * rate / hop) - straddling)
         step = round(config.preview_seconds * rate / hop)
-        self._check_memory(block.hydrophones, length, last - first + 1, count if step else 0)
-        # An array that is refused leaves the one before as it was.
-        self._spacing = spacing
-        self._frequency = spacing * np.arange(first, last + 1)
+        self._check_memory(phones, length, last - first + 1, count if step else 0)
         self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
         self._blocks = BlockAverage(count, straddling)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
-        self._alive = np.ones(block.hydrophones, np.bool_)
+        self._alive = np.ones(phones, np.bool_)
         self._depths = BlockDepths()
-        self._shape = block.hydrophones, rate
+        return begun
 
     def _check_memory(self, phones: int, length: int, rows: int, kept: int) -> None:
         needed = 4 * length * phones + 8 * rows * phones * (phones + kept)
@@ -215,6 +245,8 @@ class PressureStream:
             )
 
     def _record(self, average: Average, block: Pressure) -> Collected:
+        assert self._begun is not None and self._snapshots is not None
+        spacing, rows = self._begun.rate / self._snapshots.length, self._snapshots.rows
         csdm = average.csdm.copy()
         # A hydrophone that failed in any of the blocks is out for the whole record.
         csdm[:, ~self._alive] = 0.0
@@ -222,21 +254,24 @@ class PressureStream:
         spectra = CrossSpectra(
             stamp_ns=block.stamp_ns,
             frame_id=block.frame_id,
-            frequency=self._frequency,
+            frequency=spacing * np.arange(rows.start, rows.stop),
             csdm=csdm,
             snapshots=average.snapshots,
             reference_depth=self._depths.mean,
         )
         config = self.config
         worth = effective_snapshots(config.window, config.overlap, average.snapshots)
-        return Collected(spectra, worth, 1.0 / self._spacing, self._depths.std)
+        return Collected(spectra, worth, 1.0 / spacing, self._depths.std)
 
 
+@define(eq=False)
 class CompanionDepths:
-    """The newest depths of the array, as a companion instrument has them, by stamp."""
+    """The newest depths of the array, as a companion instrument has them, by stamp. STATE: see
+    `trackers.Tracker`."""
 
-    def __init__(self) -> None:
-        self._depths: list[tuple[int, float]] = []
+    STATE: ClassVar = ('_depths',)
+
+    _depths: list[tuple[int, float]] = field(init=False, factory=list)
 
     def add(self, depth: ArrayDepth) -> None:
         insort(self._depths, (depth.stamp_ns, depth.depth))
@@ -268,11 +303,14 @@ class CompanionDepths:
         return [depth for _, depth in self._depths[low:high]]
 
 
+@define(eq=False)
 class CompanionPlaces:
-    """Latitudes and longitudes of the array, degrees, by stamp, as a companion has them."""
+    """Latitudes and longitudes of the array, degrees, by stamp, as a companion has them. STATE:
+    see `trackers.Tracker`."""
 
-    def __init__(self) -> None:
-        self._fixes: list[tuple[int, float, float]] = []
+    STATE: ClassVar = ('_fixes',)
+
+    _fixes: list[tuple[int, float, float]] = field(init=False, factory=list)
 
     def add(self, fix: GeodeticFix) -> None:
         insort(self._fixes, (fix.stamp_ns, fix.latitude, fix.longitude))

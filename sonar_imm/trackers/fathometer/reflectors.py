@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from attrs import evolve, Factory, frozen
 import numpy as np
@@ -436,10 +436,10 @@ class Seen(NamedTuple):
     depth without the error of the array's, sign (K,), datum: variance of the array's depth,
     records: how many records' time passed since the one before."""
 
-    track_id: NDArray[np.uint32]
-    depth: FloatArray
-    variance: FloatArray
-    sign: FloatArray
+    track_id: Annotated[NDArray[np.uint32], 'k']
+    depth: Annotated[FloatArray, 'k']
+    variance: Annotated[FloatArray, 'k']
+    sign: Annotated[FloatArray, 'k']
     datum: float
     records: int = 1
 

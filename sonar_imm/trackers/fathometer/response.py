@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from attrs import evolve, field, frozen
 import numpy as np
@@ -106,13 +106,13 @@ class Response:
 
     stamp_ns: int
     frame_id: str
-    depth: FloatArray = field(repr=False)
-    amplitude: FloatArray = field(repr=False)
-    sigma: FloatArray = field(repr=False)
+    depth: Annotated[FloatArray, 'd'] = field(repr=False)
+    amplitude: Annotated[FloatArray, 'd'] = field(repr=False)
+    sigma: Annotated[FloatArray, 'd'] = field(repr=False)
     reference_depth: float = np.nan
     aperture: float = 0.0
     snapshot_seconds: float = 0.0
-    pulse: Pulse | None = field(default=None, repr=False)
+    pulse: SampledPulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
 
 
@@ -338,7 +338,9 @@ def array_response(
     )
 
 
-def processor_pulse(coherence: ArrayCoherence, lattice: Lattice, sound_speed: float) -> Pulse:
+def processor_pulse(
+    coherence: ArrayCoherence, lattice: Lattice, sound_speed: float
+) -> SampledPulse:
     """The pulse that the processor leaves of a reflector, by its spectrum: a table over all lags
     of the lattice, four to a cell."""
     step, count = 0.25 * lattice.step, 4 * lattice.cells

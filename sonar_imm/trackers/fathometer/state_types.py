@@ -12,30 +12,27 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The classes that a saved state of this tracker may hold, see `state_file`."""
+"""The classes of values that a saved state of this tracker may hold, see `state_file`."""
 
 from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...acoustics.pulse import SampledPulse
-from ...acoustics.spectra import BlockAverage, SlidingAverage, SnapshotStream
-from ...estimation.set_filter import LagSmoother, SetStep, Weighted
+from ...estimation.set_filter import SetStep, Weighted
 from ...estimation.set_model import Sets
 from ...estimation.set_shifts import ShiftPath
 from ...intake.stream import STREAM_TYPES
-from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace
-from .config import FathometerConfig
-from .pressure import BlockDepths, CompanionDepths, CompanionPlaces, Pace, PressureStream
+from ...measurements import CrossSpectra, Pressure, Trace
+from .pressure import Beginning, Pace
 from .reflectors import Identified, Identities, Multiples, Seen
 from .response import Lattice, Response
 from .slopes import Slope
-from .tracker import Fit, Taken
+from .tracker import Taken
 
 STATE_TYPES = (
     *STREAM_TYPES,
-    *(ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Trace, Origin, FathometerConfig),
-    *(PressureStream, BlockDepths, SnapshotStream, BlockAverage, SlidingAverage),
-    *(CompanionDepths, CompanionPlaces, Pace, Response, SampledPulse, Lattice, Taken, Fit),
-    *(LagSmoother, SetStep, Weighted, Sets, ShiftPath),
+    *(CrossSpectra, Pressure, Trace, Origin),
+    *(Beginning, Pace, Response, SampledPulse, Lattice, Taken),
+    *(SetStep, Weighted, Sets, ShiftPath),
     *(Identities, Identified, Slope, Multiples, Seen),
 )

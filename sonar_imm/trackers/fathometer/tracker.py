@@ -47,9 +47,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 import math
-from typing import Any
+from typing import Any, ClassVar
 
-from attrs import evolve, frozen
+from attrs import define, evolve, field, frozen
 import numpy as np
 
 from ...acoustics.pulse import independent_samples
@@ -150,6 +150,23 @@ class FathometerTracker:
         '_fit',
     )
 
+    response: Response | None
+    refusals: dict[str, str]
+    _stream: OnceStream
+    _pace: Pace
+    _ids: Identities
+    _depths: CompanionDepths
+    _places: CompanionPlaces
+    _hydrophones: int
+    _pressure: PressureStream
+    _multiples: Multiples
+    _lattice: Lattice | None
+    _before: Weighted | None
+    _smoother: LagSmoother
+    _taken: deque[Taken]
+    _health: dict[str, float]
+    _fit: Fit
+
     def __init__(self, config: FathometerConfig):
         self.config = config
         self.pulse = pulse_of(config)
@@ -159,8 +176,7 @@ class FathometerTracker:
         rules = StreamRules.of(self.config)
         self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
         self.counts = self._stream.counts
-        self.response: Response | None = None
-        self.refusals: dict[str, str] = {}
+        self.response, self.refusals = None, {}
         self._ids = Identities()
         self._depths = CompanionDepths()
         self._places = CompanionPlaces()
@@ -173,14 +189,14 @@ class FathometerTracker:
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
         self._multiples = Multiples()
-        self._lattice: Lattice | None = None
+        self._lattice = None
         self._settled = self.config
         self._padded: Lattice | None = None
         self._filter: SetFilter | None = None
-        self._before: Weighted | None = None
+        self._before = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
-        self._taken: deque[Taken] = deque(maxlen=self.config.smoothing_lag + 1)
-        self._health: dict[str, float] = {}
+        self._taken = deque(maxlen=self.config.smoothing_lag + 1)
+        self._health = {}
         self._fit = Fit()
 
     def restored(self) -> None:
@@ -535,20 +551,23 @@ class FathometerTracker:
         return found, pmf
 
 
+@define(eq=False)
 class Fit:
     """Whether the last records go with what is configured.
 
     A filter with another pulse, or a noise that is too low, does not fail: it fills the record
     with reflectors up to its limit, or finds no set that explains the record. Kept are whether a
     set explained each record, how probable the greatest number of reflectors was, and whether it
-    has negative samples, and negative echoes that nothing explains."""
+    has negative samples, and negative echoes that nothing explains. STATE: see
+    `trackers.Tracker`."""
 
-    def __init__(self) -> None:
-        self._explained: deque[bool] = deque(maxlen=_RECORDS)
-        self._full: deque[float] = deque(maxlen=_RECORDS)
-        self._found: deque[int] = deque(maxlen=_RECORDS)
-        self._signed: deque[bool] = deque(maxlen=_RECORDS)
-        self._negative: deque[bool] = deque(maxlen=_RECORDS)
+    STATE: ClassVar = ('_explained', '_full', '_found', '_signed', '_negative')
+
+    _explained: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
+    _full: deque[float] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
+    _found: deque[int] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
+    _signed: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
+    _negative: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
 
     def add(
         self, ok: bool, reflectors: Reflectors, response: Response, full: float, negative: bool

@@ -37,12 +37,12 @@ navigation problems', for considered errors.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
-from .filters import put, Sonar, View
+from .filters import Sonar, View
 
 CENTRE = 0.1
 """That of ten glints of equal strength."""
@@ -54,24 +54,14 @@ class Bodies(NamedTuple):
     """Of T tracks: number (T,) of echoes with an extent, and their mean standard deviation (T, 2),
     m, in range and across it; zeros as long as there was none."""
 
-    number: FloatArray
-    std: FloatArray
+    number: Annotated[FloatArray, 'T']
+    std: Annotated[FloatArray, 'T2']
 
     @staticmethod
     def unknown(T: int) -> Bodies:
         return Bodies(np.zeros(T), np.zeros((T, 2)))
 
-    def rows(self, which: np.ndarray) -> Bodies:
-        return Bodies(self.number[which], self.std[which])
-
-    def joined(self, other: Bodies) -> Bodies:
-        return Bodies(*(np.concatenate(both) for both in zip(self, other)))
-
-    def replaced(self, rows: np.ndarray, new: Bodies) -> Bodies:
-        """A copy with `new` in some of its rows."""
-        return Bodies(*put(self, rows, new))
-
-    def seen(
+    def with_echoes(
         self, extended: BoolArray, z: FloatArray, R: FloatArray, own: FloatArray
     ) -> tuple[Bodies, FloatArray]:
         """After one detection z (T, 2), R (T, 2, 2) for each, of which some are `extended` (T,);
@@ -91,7 +81,7 @@ class Bodies(NamedTuple):
         return after, used[:, :, None] * np.eye(2)
 
 
-def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> View:
+def with_common_errors(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> View:
     """The view with the errors that are the same in every ping."""
     centre = CENTRE * np.square(bodies.std)
     reach, away = view.state * [1.0, 0.0, 1.0], view.place - sonar.pose.position

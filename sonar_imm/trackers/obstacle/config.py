@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+import math
 
 from attrs import frozen
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from ...acoustics.geometry import AZIMUTH_MODELS
 from ...estimation.arrays import FloatArray
 from ...measurements import BEAM_AXES
-from ...parameters import inherited, live, MODELS, parameter
+from ...parameters import constant, inherited, live, MODELS, parameter
 from ..own_models import obstacle_behaviour
 from ..shared_parameters import (
     DetectionParameters,
@@ -33,9 +34,15 @@ from ..shared_parameters import (
     TrackLifeParameters,
 )
 
-METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 MISSES = ('ignored', 'evidence')
+GRADES = {
+    'ins': (0.01, 0.02, 0.01),
+    'dvl': (0.05, 0.05, 0.01),
+    'dead_reckoning': (0.3, 0.1, 0.02),
+}
+"""Random walks of the errors of navigation: horizontal position m/sqrt(s), yaw deg/sqrt(s), depth
+m/sqrt(s). Of a compass what wanders within a minute."""
 LEAST_DETECTION = 1e-3
 """An echo is never quite impossible."""
 
@@ -48,38 +55,35 @@ class ObstacleConfig(
     AUV."""
 
     # fmt: off
-    method: str = parameter('gaussian_sum', '',
-        'treatment of the vertical offset: gaussian_sum (estimated, over depth slices) or '
-        'seafloor (assumed on the sea floor, as in the paper)', choices=METHODS)
-    components: int = parameter(9, '', 'number of depth slices of gaussian_sum', range=(1, 201))
+    components: int = constant(9, '', 'number of depth slices', range=(1, 201))
 
-    # -- what an obstacle may do, gaussian_sum only ----------------------------------------------
+    # -- what an obstacle may do -----------------------------------------------------------------
     behaviours: tuple[str, ...] = parameter(BEHAVIOURS, '',
-        'behaviours of an obstacle that gaussian_sum considers: fixed, swaying (on its mooring), '
-        'moving, seabed (lying on the sea floor); seabed is left out while no altitude is known, '
-        'and needs another beside it; also behaviours that other packages register',
+        'behaviours of an obstacle that are considered: fixed, swaying (on its mooring), moving, '
+        'seabed (lying on the sea floor); seabed is left out while no altitude is known, and '
+        'needs another beside it; also behaviours that other packages register',
         choices=BEHAVIOURS, group=MODELS)
     sway_std: float = parameter(0.5, 'm',
         'behaviour swaying: standard deviation of the position along each axis; twice as much is '
         'considered too, at a tenth of the prior probability',
         range=(0.001, 100.0))
-    sway_time: float = parameter(20.0, 's',
+    sway_time: float = constant(20.0, 's',
         'behaviour swaying: time over which the position is correlated', range=(0.1, 3600.0))
     max_speed: float = parameter(1.5, 'm/s',
         'behaviour moving: twice the standard deviation of the velocity along each axis before '
         'anything is known of it', range=(0.01, 50.0))
-    speed_noise: float = parameter(0.05, 'm/s/sqrt(s)',
+    speed_noise: float = constant(0.05, 'm/s/sqrt(s)',
         'behaviour moving: random walk of the velocity', range=(0.0, 10.0))
-    behaviour_time: float = parameter(1000.0, 's',
+    behaviour_time: float = constant(1000.0, 's',
         'mean time for which an obstacle keeps its behaviour', range=(1.0, 1e6))
-    seabed_std: float = parameter(1.0, 'm',
+    seabed_std: float = constant(1.0, 'm',
         'behaviour seabed: standard deviation of the depth of the sea floor at the obstacle, '
         'relative to that below the vehicle', range=(0.01, 100.0))
 
-    ground_std: float = parameter(0.5, 'm',
+    ground_std: float = constant(0.5, 'm',
         'behaviour seabed: standard deviation of the depth of an obstacle, relative to the '
         'soundings of ground around it', range=(0.01, 100.0))
-    ground_radius: float = parameter(5.0, 'm',
+    ground_radius: float = constant(5.0, 'm',
         'distance to which soundings of ground tell the depth of the sea floor at an obstacle',
         range=(0.5, 1000.0))
 
@@ -114,16 +118,10 @@ class ObstacleConfig(
         'z of nav is zero at the sea surface, so that no obstacle lies higher than z = 0')
 
     # -- what the sonar measures -----------------------------------------------------------------
-    range_std: float = live(0.15, 'm',
+    range_std: float = live(0.15782, 'm',
         'standard deviation of a range that comes without variance', range=(1e-6, 100.0))
-    bearing_std_deg: float = live(0.25, 'deg',
+    bearing_std_deg: float = live(0.25534, 'deg',
         'standard deviation of a bearing that comes without variance', range=(1e-6, 45.0))
-    range_step: float = live(0.17, 'm',
-        'sampling step of a range that comes without variance, adds step^2 / 12',
-        range=(0.0, 100.0))
-    bearing_step_deg: float = live(0.18, 'deg',
-        'sampling step of a bearing that comes without variance, adds step^2 / 12',
-        range=(0.0, 45.0))
     elevation_std_deg: float = live(1.0, 'deg',
         'standard deviation of an elevation that comes without variance; of sonars that measure '
         'elevations only', range=(0.01, 45.0))
@@ -138,38 +136,37 @@ class ObstacleConfig(
         'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
     outlier_probability: float = live(0.02, '',
         'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
-    detection_ranges: tuple[float, ...] = live((), 'm',
-        'ranges at which detection_factors are given, rising; empty: detection_probability counts '
-        'at every range', range=(0.0, 1e5), kind='float[]')
-    detection_factors: tuple[float, ...] = live((), '',
-        'share of detection_probability that is left at each of detection_ranges; linear between '
-        'them, constant beyond', range=(0.0, 1.0), kind='float[]')
-    sector_edge_deg: float = live(0.0, 'deg',
+    detection_profile: tuple[float, ...] = live((), 'm, 1',
+        'pairs of a range and the share of detection_probability that is left there, ranges '
+        'rising; linear between them, constant beyond; empty: detection_probability counts at '
+        'every range', range=(0.0, 1e5), kind='float[]')
+    sector_edge_deg: float = constant(0.0, 'deg',
         'width at either edge of the sector in which an obstacle without an echo is not missed',
         range=(0.0, 45.0))
     misses: str = parameter('ignored', '',
-        'what pings without an echo say of the height of an obstacle, gaussian_sum only: nothing '
-        '(ignored), or that it is less probable in the beam (evidence)', choices=MISSES)
+        'what pings without an echo say of the height of an obstacle: nothing (ignored), or that '
+        'it is less probable in the beam (evidence)', choices=MISSES)
     # -- what is believed of depth and navigation ------------------------------------------------
-    max_offset: float = parameter(0.0, 'm',
+    max_offset: float = constant(0.0, 'm',
         'largest vertical offset of a new obstacle; 0: what beam, surface and altitude allow',
         range=(0.0, 1000.0))
-    altitude_std: float = live(0.1, 'm',
+    altitude_std: float = constant(0.1, 'm',
         'standard deviation of an altitude that comes without variance', range=(1e-6, 100.0))
-    max_altitude_age: float = live(5.0, 's',
+    max_altitude_age: float = constant(5.0, 's',
         'age up to which an altitude is used', range=(0.0, 3600.0))
-    scale_std: float = parameter(0.003, '',
+    scale_std: float = constant(0.003, '',
         'standard deviation of the scale error of the horizontal distances of nav against sonar '
         'ranges', range=(0.0, 0.2))
     range_scale_std: float = live(0.001, '',
         'standard deviation of the scale error of ranges, from the sound speed that the sonar '
         'assumes; part of the covariance of range, offset and position', range=(0.0, 0.2))
-    position_noise: float = parameter(0.01, 'm/sqrt(s)',
-        'random walk of the error of the horizontal position in nav', range=(0.0, 10.0))
-    yaw_noise_deg: float = parameter(0.02, 'deg/sqrt(s)',
-        'random walk of the error of the yaw in nav', range=(0.0, 10.0))
-    depth_noise: float = parameter(0.01, 'm/sqrt(s)',
-        'random walk of the error of the depth in nav', range=(0.0, 10.0))
+    navigation_grade: str = parameter('ins', '',
+        'how fast the error of nav grows: ins (inertial system with a DVL: 0.08 m and 0.15 deg in '
+        'a minute), dvl (DVL and compass: 0.4 m, 0.4 deg) or dead_reckoning (speed through the '
+        'water and compass: 2.3 m, 0.8 deg)', choices=tuple(GRADES))
+    navigation_noise: tuple[float, ...] = constant((), 'm/sqrt(s), deg/sqrt(s), m/sqrt(s)',
+        'random walks of horizontal position, yaw and depth; empty: as of navigation_grade',
+        range=(0.0, 10.0), kind='float[]')
 
     # -- avoidance -------------------------------------------------------------------------------
     safety_radius: float = live(3.0, 'm',
@@ -180,7 +177,7 @@ class ObstacleConfig(
         'safety_radius horizontally', range=(0.01, 1000.0))
     cpa_horizon: float = live(120.0, 's',
         'time ahead for which collisions are predicted', range=(1.0, 3600.0))
-    course_window: float = parameter(10.0, 's',
+    course_window: float = constant(10.0, 's',
         'length of the latest positions of the vehicle from which its course is estimated',
         range=(1.0, 600.0))
     course_std: float = live(0.035, 'm/s',
@@ -198,12 +195,12 @@ class ObstacleConfig(
         'largest number of obstacles remembered after they left the field of view; 0: none; the '
         'oldest and least certain go first',
         range=(0, 10000))
-    landmark_time: float = live(86400.0, 's',
+    landmark_time: float = constant(86400.0, 's',
         'mean time for which an obstacle that nobody sees stays where it was',
         range=(1.0, 1e8))
 
     # -- time ------------------------------------------------------------------------------------
-    max_navigation_gap: float = parameter(1.0, 's',
+    max_navigation_gap: float = constant(1.0, 's',
         'longest time between two poses of nav that is interpolated; pings in longer gaps are '
         'skipped', range=(0.001, 3600.0))
     max_extrapolation: float = parameter(0.0, 's',
@@ -211,9 +208,6 @@ class ObstacleConfig(
         '0: it waits for the next pose', range=(0.0, 10.0))
     history: float = inherited(StreamParameters, 'history', 5.0)
     max_gap: float = inherited(StreamParameters, 'max_gap', 600.0)
-    seed: int = parameter(0, '',
-        'seed of the random number generator; this tracker draws no random numbers',
-        range=(0, 2**31 - 1))
     # fmt: on
 
     def check(self) -> list[str]:
@@ -227,10 +221,14 @@ class ObstacleConfig(
             obstacle_behaviour(name, self)
         if set(self.behaviours) <= {'seabed'}:
             problems.append('behaviours needs one of fixed, swaying, moving at least')
-        if len(self.detection_ranges) != len(self.detection_factors):
-            problems.append('detection_ranges and detection_factors need as many values each')
-        if any(a >= b for a, b in pairwise(self.detection_ranges)):
-            problems.append('detection_ranges have to rise')
+        if len(self.detection_profile) % 2:
+            problems.append('detection_profile needs pairs of a range and a share')
+        if any(a >= b for a, b in pairwise(self.detection_profile[::2])):
+            problems.append('detection_profile: ranges have to rise')
+        if any(share > 1.0 for share in self.detection_profile[1::2]):
+            problems.append('detection_profile: shares must be between 0 and 1')
+        if len(self.navigation_noise) not in (0, 3):
+            problems.append('navigation_noise needs three values')
         if len(set(self.behaviours)) < len(self.behaviours):
             problems.append('behaviours names one of them twice')
         return problems
@@ -239,9 +237,14 @@ class ObstacleConfig(
         """The behaviours that other packages bring."""
         return tuple(sorted(set(self.behaviours) - set(BEHAVIOURS)))
 
+    def drift(self) -> tuple[float, float, float]:
+        """Return the random walks of horizontal position, yaw (rad) and depth, over sqrt(s)."""
+        position, yaw_deg, depth = self.navigation_noise or GRADES[self.navigation_grade]
+        return position, math.radians(yaw_deg), depth
+
     def detection_at(self, distance: FloatArray) -> FloatArray:
         """Probability that a ping shows obstacles at ranges (T,) in the beam."""
-        if not self.detection_ranges:
+        if not self.detection_profile:
             return np.full(len(distance), self.detection_probability)
-        factor = np.interp(distance, self.detection_ranges, self.detection_factors)
+        factor = np.interp(distance, self.detection_profile[::2], self.detection_profile[1::2])
         return np.clip(self.detection_probability * factor, LEAST_DETECTION, 1.0)

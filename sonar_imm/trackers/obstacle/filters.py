@@ -12,36 +12,51 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The state of an obstacle, and how a ping changes it: one filter per method.
+"""The filter of an obstacle: a Gaussian sum over depth and behaviour.
 
-`DepthSlices` is the default. The vertical offset d_st shows in two ways: while the vehicle rolls,
-an obstacle above and one below the sonar swing to opposite sides; and on the approach the range
-closes more slowly the further off the course in the vertical the obstacle lies, whether above or
-below. Both are so weak at first, and the second so ambiguous, that no single Gaussian holds what
-is known. So the vertical reach of the beam is cut into slices, each slice is an unscented Kalman
-filter over (d, delta, z, s), and their likelihoods say in which of them the obstacle is. The state
-that stays constant is the obstacle's own depth z; d_st follows from it and the vehicle's depth.
+**Depth.** The vertical offset of an obstacle shows in two ways: while the vehicle rolls, an
+obstacle above and one below the sonar swing to opposite sides; and on the approach the range
+closes more slowly the further off the course in the vertical it lies, whether above or below. Both
+are so weak at first, and the second so ambiguous, that no single Gaussian holds what is known. So
+the vertical reach of the beam is cut into slices, each an unscented Kalman filter over (d, delta,
+z, s), and their likelihoods say in which of them the obstacle is. What stays constant is the
+obstacle's own depth z; its offset follows from it and the vehicle's depth.
 
-With a single slice that is clamped to the sea floor below the vehicle the same filter is the
-paper's (`seafloor`).
+**Behaviour.** Inside each slice runs an interacting multiple model filter over what the obstacle
+does; two more states e say how:
 
-Everything is in NED and FRD; T targets, K components. Component weights mu (T, K).
+fixed     nothing
+swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
+          `sway_time` and has the standard deviation `sway_std`; or `WIDER` times as much
+moving    e is the velocity, m/s, a random walk of `speed_noise`; horizontal only
+others    of other packages, see `own_models`
+seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
+          its own
+
+The depth never changes, so slices do not interact; behaviours are mixed (`mixtures.mix`) before
+each step. The cycle is mix, predict, update, combine. The probability of a behaviour is its weight
+summed over the slices.
+
+Everything is in NED and FRD; T obstacles, K components of weights mu (T, K).
+
+Source: docs/obstacle.md, sections Methods and Behaviours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import gate_threshold
+from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
-from .config import ObstacleConfig
-from .unscented import Motion, RELATIVE, Step
+from .config import BEHAVIOURS, ObstacleConfig
+from .unscented import COMMON, Motion, RELATIVE, STATES, Step
 
 BAND = 0.9
 """Probability of the interval `low` to `high`."""
@@ -55,16 +70,23 @@ surprising."""
 SOFT = 0.05
 """Of the half height of the beam: standard deviation of the edges that are left."""
 
-
-def put(
-    parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Copies of arrays with `new` in some of their rows."""
-    copies = [part.copy() for part in parts]
-    for part, values in zip(copies, new):
-        part[rows] = values
-    return copies
-
+PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
+"""Probability of each behaviour of a new obstacle, among those asked for."""
+WIDER, WIDE_SHARE = 2.0, 0.1
+"""How much farther some of what sways does so, and their share. Nobody knows beforehand how far a
+mooring lets go: one that swings twice as far as believed is outside of the 90 % band in a third of
+all cases. Echoes soon tell the two apart, so the share hardly matters."""
+DROPPED = 1e-5
+"""A slice that weighs less takes no further part, and a behaviour in one not in this ping."""
+OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
+"""1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
+density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which
+one that starts to move shows that it does."""
+SWITCHING = BEHAVIOURS[:3]
+ALIKE_AT_LEAST = 3
+ALIKE = 0.05
+"""m/s by which velocities that are alike may differ, beside three times their standard
+deviation."""
 
 NOWHERE = np.full(3, np.nan)
 
@@ -80,14 +102,14 @@ class Sonar(NamedTuple):
     late: Pose | None = None
     late_by: float = 0.0
     reference: float = 0.0
-    course: FloatArray = NOWHERE
+    course: Annotated[FloatArray, '3'] = NOWHERE
 
     def seabed_below(self) -> float:
         """Depth of the sea floor below the sonar, m, NaN when unknown."""
         return self.altitude - self.reference
 
 
-class Hints(NamedTuple):
+class HeightPrior(NamedTuple):
     """What is known of the height of B new obstacles besides the beam, NaN where nothing is:
     elevations (B, 2) between which each lies, rad below the axis of the sonar; floor (B,): how far
     below the sonar the sea floor is at each, m, with its standard deviation (B,)."""
@@ -100,24 +122,14 @@ class Hints(NamedTuple):
 class Mixture(NamedTuple):
     """x (T, K, n), P (T, K, n, n), mu (T, K)."""
 
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-
-    def rows(self, which: np.ndarray) -> Mixture:
-        return Mixture(self.x[which], self.P[which], self.mu[which])
+    x: Annotated[FloatArray, 'TKS']
+    P: Annotated[FloatArray, 'TKSS']
+    mu: Annotated[FloatArray, 'TK']
 
     def is_finite(self) -> BoolArray:
         """Return which targets (T,) have finite numbers throughout."""
         means, covariances = np.isfinite(self.x), np.isfinite(self.P)
         return np.asarray(means.all(axis=(1, 2)) & covariances.all(axis=(1, 2, 3)))
-
-    def joined(self, other: Mixture) -> Mixture:
-        return Mixture(*(np.concatenate(both) for both in zip(self, other)))
-
-    def replaced(self, rows: np.ndarray, new: Mixture) -> Mixture:
-        """A copy with `new` in some of its rows."""
-        return Mixture(*put(self, rows, new))
 
 
 class View(NamedTuple):
@@ -148,48 +160,31 @@ class DepthSlices:
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
-        self.seafloor = config.method == 'seafloor'
-        self.K = 1 if self.seafloor else config.components
+        self.K = config.components
         self.moves = np.zeros(self.K, np.bool_)
         self._still = Motion.none(self.K)
         self.cone = config.azimuth_model == 'cone'
-        self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
         self._beam = beam_of(config)
         vertical, horizontal, reach = self._beam
         edge = np.radians(config.sector_edge_deg)
         self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
-        self._noise = (
-            config.position_noise**2,
-            np.radians(config.yaw_noise_deg) ** 2,
-            config.depth_noise**2,
-        )
-
-    def ready(self, sonar: Sonar) -> bool:
-        """Whether a target can begin: the sea floor has to be known for `seafloor`."""
-        return not self.seafloor or bool(np.isfinite(sonar.altitude))
+        self._noise = tuple(walk**2 for walk in config.drift())
 
     def begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, hints: Hints | None = None
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
-        fresh = self._begin(z, R, sonar, self.K, hints)
-        return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
-
-    def _begin(
-        self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int, hints: Hints | None
-    ) -> Mixture:
-        """New targets in K slices of equal weight, four states."""
-        B = len(z)
+        B, K = len(z), self.K
         x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.scale**2
-        span = depth_span(z, sonar, self.config, hints)
+        P[..., 3, 3] = self.config.scale_std**2
+        span = depth_span(z, sonar, self.config, height)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
         P[..., 2, 2] = np.square(sigma)[:, None]
-        return Mixture(x, P, np.full((B, K), 1.0 / K))
+        return self._unshift(Mixture(x, P, np.full((B, K), 1.0 / K)), z, sonar)
 
     def _unshift(self, fresh: Mixture, z: FloatArray, sonar: Sonar) -> Mixture:
         """Two-way timing: the state at the transmission of which z would be measured."""
@@ -202,10 +197,9 @@ class DepthSlices:
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
-        mixture = self._clamp_to_seafloor(mixture, before)
-        return self.carried(mixture, before.pose, after.pose, dt)
+        return self.predict_unchanged(mixture, before.pose, after.pose, dt)
 
-    def carried(
+    def predict_unchanged(
         self, mixture: Mixture, before: Pose, after: Pose, dt: float
     ) -> tuple[Mixture, int]:
         """`advance` of targets that go on with what they do."""
@@ -231,9 +225,9 @@ class DepthSlices:
         *after, nis, repaired = mixtures.update(*mixture, h, z, R, outlier, self.outlier_density)
         return Mixture(*after), nis, int(np.count_nonzero(repaired))
 
-    def seen(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
+    def apply_echo(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
         """With what an echo in this ping says of the height, or one in the ping before, of the
-        sonar `last` (`looks`)."""
+        sonar `last` (`beam`)."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
@@ -243,7 +237,9 @@ class DepthSlices:
         beam = edge, soft, *others
         return Mixture(*mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, *beam)[:3])
 
-    def missed(self, mixture: Mixture, p: FloatArray, sonar: Sonar) -> tuple[Mixture, FloatArray]:
+    def apply_miss(
+        self, mixture: Mixture, p: FloatArray, sonar: Sonar
+    ) -> tuple[Mixture, FloatArray]:
         """After a ping without an echo of the targets, which each give one with the probability
         p (T,) inside the beam; and the probability (T,) beforehand that the beam held them."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
@@ -278,7 +274,7 @@ class DepthSlices:
         """Probability of each behaviour, (T, B)."""
         return np.ones((len(mu), 1))
 
-    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+    def beam_probability(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, not at the edge of its sector, and
         whether (T,) it lies ahead."""
         x, P, mu = mixture
@@ -295,30 +291,132 @@ class DepthSlices:
         out = unscented.points(mixture.x, *sonar.pose, self.cone)
         return two_way_echo(out, sonar, self.config)
 
-    def _clamp_to_seafloor(self, mixture: Mixture, sonar: Sonar) -> Mixture:
-        """For `seafloor`: the depth is the sea floor's, whatever was measured."""
-        if not self.seafloor or not np.isfinite(sonar.altitude):
-            return mixture
-        x, P = mixture.x.copy(), mixture.P.copy()
-        x[..., 2] = sonar.pose.position[2] + sonar.altitude
-        P[..., 2, :] = P[..., :, 2] = 0.0
-        P[..., 2, 2] = self.config.altitude_std**2
-        return Mixture(x, P, mixture.mu)
+
+class BehaviourSlices(DepthSlices):
+    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
+
+    n = STATES
+
+    def __init__(self, config: ObstacleConfig):
+        super().__init__(config)
+        self.own = {name: obstacle_behaviour(name, config) for name in config.own_behaviours()}
+        known = (*SWITCHING, *self.own, 'seabed')
+        self.behaviours = tuple(name for name in known if name in config.behaviours)
+        switching = [name for name in self.behaviours if name != 'seabed']
+        if 'swaying' in switching:
+            switching.insert(switching.index('swaying') + 1, 'swaying')
+        self.outlier_density = OUTLIER_DENSITY
+        self.slices, self.M = config.components, len(switching)
+        seabed = ['seabed'] * ('seabed' in self.behaviours)
+        behaviour = np.array(switching * self.slices + seabed)
+        self.K = len(behaviour)
+        self._same = behaviour[: self.M, None] == behaviour[: self.M]
+        wide = np.zeros(self.K, np.bool_)
+        for a in np.flatnonzero(np.diagonal(self._same, offset=1)) + 1:
+            wide[a : self.slices * self.M : self.M] = True
+        sways = behaviour == 'swaying'
+        self._sway = config.sway_std * np.where(wide, WIDER, 1.0) * sways
+        self._share = np.where(sways, np.where(wide, WIDE_SHARE, 1.0 - WIDE_SHARE), 1.0)
+        self._count, self._identity = round(self._share[: self.M].sum()), np.eye(self.M)
+        self._is = {name: behaviour == name for name in known}
+        self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
+        self.moves = self._is['moving']
+        self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
+        self._prior = self._sway**2
+        self._prior += self._moving * (0.5 * config.max_speed) ** 2
+        for name, own in self.own.items():
+            self._prior += self._is[name] * own.std**2
+            if own.velocity:
+                self.moves = self.moves | self._is[name]
+
+    def begin(
+        self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
+    ) -> Mixture:
+        B, M, last = len(z), self.M, self.slices * self.M
+        floor, floor_std = np.full(B, sonar.seabed_below()), np.full(B, self.config.seabed_std)
+        if height is not None:
+            sounded = np.isfinite(height.floor)
+            floor = np.where(sounded, height.floor, floor)
+            std = np.hypot(height.floor_std, self.config.ground_std)
+            floor_std = np.where(sounded, std, floor_std)
+        known = np.isfinite(floor) & ('seabed' in self.behaviours)
+        lowest, highest = depth_span(z, sonar, self.config, height)
+        # What lies deeper than the sea floor is left to its own slice.
+        above_floor = np.maximum(floor, lowest + 0.5 * (highest - lowest))
+        highest = np.where(known, np.minimum(highest, above_floor), highest)
+        centre, sigma = _cut_slices(lowest, highest, self.slices)
+        x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
+        x[..., :2] = z[:, None]
+        P[..., :2, :2] = R[:, None]
+        P[..., 3, 3] = self.config.scale_std**2
+        x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
+        P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
+        mu = np.zeros((B, self.K))
+        for some in (known, ~known):
+            shares = PRIOR | {name: own.share for name, own in self.own.items()}
+            prior = {name: shares[name] for name in self.behaviours}
+            if some is not known:
+                prior.pop('seabed', None)
+            total = sum(prior.values())
+            for name in prior:
+                share = prior[name] / total / self._share[self._is[name]].sum()
+                mu[np.ix_(some, self._is[name])] = share * self._share[self._is[name]]
+        if 'seabed' in self.behaviours:
+            x[:, last, 2] = sonar.pose.position[2] + np.where(known, floor, 0.0)
+            P[:, last, 2, 2] = floor_std**2
+        # e is unknown and uncorrelated with the rest.
+        for i in (COMMON, COMMON + 1):
+            P[:, :, i, i] = self._prior
+        return self._unshift(Mixture(x, P, mu), z, sonar)
+
+    def advance(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
+        mixed = mixtures.mix(*mixture, self._prior, self.slices, self._transition(dt), DROPPED)
+        return self.predict_unchanged(Mixture(*mixed), before.pose, after.pose, dt)
+
+    def behaviour(self, mu: FloatArray) -> FloatArray:
+        return np.asarray(mu @ self._of)
+
+    def _transition(self, dt: float) -> FloatArray:
+        """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds
+        later. As long as it sways it does so equally far."""
+        share, N = self._share[: self.M], self._count
+        rate = N / ((N - 1) * self.config.behaviour_time) if N > 1 else 0.0
+        change = (1.0 - 1.0 / N) * -math.expm1(-rate * dt)
+        other = share * change / max(N - 1, 1)
+        return np.where(self._same, self._identity * (1.0 - change), other)
+
+    def _motion(self, dt: float) -> Motion:
+        config, swaying, moving = self.config, self._swaying, self._moving
+        phi = math.exp(-dt / config.sway_time)
+        swung = self._sway**2 * -math.expm1(-2.0 * dt / config.sway_time)
+        built_in = Motion(
+            keep=swaying * phi + moving,
+            step=swaying * (phi - 1.0) + moving * dt,
+            push=swaying + moving * (0.5 * dt),
+            noise=swung + moving * (config.speed_noise**2 * dt),
+            prior=self._prior,
+        )
+        steps = built_in[:4]
+        for name, own in self.own.items():
+            steps = tuple(a + self._is[name] * b for a, b in zip(steps, own.step(dt)))
+        return Motion(*steps, self._prior)
 
 
 def depth_span(
-    z: FloatArray, sonar: Sonar, config: ObstacleConfig, hints: Hints | None = None
+    z: FloatArray, sonar: Sonar, config: ObstacleConfig, height: HeightPrior | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
-    beam, or where `hints` say, below the surface, above the sea floor."""
+    beam, or where `height` says, below the surface, above the sea floor."""
     a, b, c = sonar.pose.R[2]
     d, delta = z.T
     k = a * np.cos(delta) + b * np.sin(delta)
     edge = np.radians(min(0.5 * BEAM_MARGIN * config.vertical_fov_deg, 85.0))
     ends = d * (k * np.cos(edge) + c * np.array([[-1.0], [1.0]]) * np.sin(edge))
     lowest, highest, least = ends.min(axis=0), ends.max(axis=0), 0.02 * d
-    if hints is not None:
-        ends = hints.elevations
+    if height is not None:
+        ends = height.elevations
         seen = d[:, None] * (k[:, None] * np.cos(ends) + c * np.sin(ends))
         known = np.isfinite(seen).all(axis=1)
         lowest = np.where(known, seen.min(axis=1), lowest)
@@ -333,8 +431,8 @@ def depth_span(
         bottom = np.full(len(d), max(sonar.altitude, 0.0))
     else:
         bottom = np.full(len(d), np.inf)
-    if hints is not None:
-        bottom = np.where(np.isfinite(hints.floor), hints.floor + 2.0 * hints.floor_std, bottom)
+    if height is not None:
+        bottom = np.where(np.isfinite(height.floor), height.floor + 2.0 * height.floor_std, bottom)
     highest = np.minimum(highest, bottom + least)
     if config.depth_is_absolute:
         lowest = np.maximum(lowest, np.minimum(-sonar.pose.position[2], 0.0) - least)
@@ -357,9 +455,8 @@ def _outlier_density(config: ObstacleConfig) -> float:
     """Of a detection that passed the gate but is not the target's: uniform over a gate as wide as
     the sonar's own error makes it."""
     threshold = gate_threshold(config.gate_probability, 2)
-    range_std = np.sqrt(config.range_std**2 + config.range_step**2 / 12.0)
-    bearing_std = np.radians(np.hypot(config.bearing_std_deg, config.bearing_step_deg / 12.0**0.5))
-    return float(1.0 / (np.pi * threshold * range_std * bearing_std))
+    bearing_std = np.radians(config.bearing_std_deg)
+    return float(1.0 / (np.pi * threshold * config.range_std * bearing_std))
 
 
 def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:
@@ -377,3 +474,57 @@ def beam_of(config: ObstacleConfig) -> tuple[float, float, float]:
     fov = config.vertical_fov_deg, config.horizontal_fov_deg
     vertical, horizontal = np.radians(0.5 * np.array(fov))
     return float(vertical), float(horizontal), config.max_range
+
+
+def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
+    """`depth_slices` with the outermost ones ending where the span does: centres and half widths,
+    (B, K). The others keep their place, in pairs about the sonar."""
+    centre, half = depth_slices(lowest, highest, K)
+    ends = np.concatenate([centre - half[:, None], centre[:, -1:] + half[:, None]], axis=1)
+    ends[:, 0], ends[:, -1] = lowest, highest
+    width = np.diff(ends, axis=1)
+    return 0.5 * (ends[:, 1:] + ends[:, :-1]), 0.5 * width
+
+
+def build_filter(config: ObstacleConfig) -> DepthSlices:
+    """The filter for the behaviours that are asked for."""
+    return (DepthSlices if set(config.behaviours) == {'fixed'} else BehaviourSlices)(config)
+
+
+def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
+    """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
+    is more probably the navigation that drifts: an error of its velocity moves all alike."""
+    if np.count_nonzero(confirmed) < ALIKE_AT_LEAST or not filter_.moves.any():
+        return False
+    which = np.flatnonzero(confirmed)
+    which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
+    if len(which) < ALIKE_AT_LEAST:
+        return False
+    v, covariance = _velocity(mixture, which, filter_.moves)
+    off = v - np.median(v, axis=0)
+    variance = np.trace(covariance, axis1=-2, axis2=-1)
+    alike = np.einsum('ti,ti->t', off, off) <= 9.0 * variance + ALIKE**2
+    return bool(alike.sum() >= ALIKE_AT_LEAST and alike.sum() > 0.5 * confirmed.sum())
+
+
+def _velocity(
+    mixture: Mixture, which: IndexArray, moves: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (q, 2) and covariance (q, 2, 2) of the velocity of some obstacles; what does not move
+    has 0, without spread."""
+    x, P = mixture.x[which, :, COMMON:], mixture.P[which, :, COMMON:, COMMON:]
+    x[:, ~moves], P[:, ~moves] = 0.0, 0.0
+    return mixtures.moment_match(x, P, mixture.mu[which], 2)
+
+
+def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:
+    """``prob_<behaviour>``, and the velocity with its covariance, east then north (ENU)."""
+    covariance = view.velocity_covariance
+    return {
+        **{f'prob_{name}': view.behaviour[:, i] for i, name in enumerate(behaviours)},
+        'vx': view.velocity[:, 1],
+        'vy': view.velocity[:, 0],
+        'vel_cov_x_x': covariance[:, 1, 1],
+        'vel_cov_x_y': covariance[:, 0, 1],
+        'vel_cov_y_y': covariance[:, 0, 0],
+    }

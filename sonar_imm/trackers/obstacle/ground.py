@@ -28,7 +28,7 @@ Source: docs/obstacle.md, section Ground.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -55,11 +55,11 @@ class Cells(NamedTuple):
     """n cells: key (n,) rising; number (n,) of soundings; sums (n,) of their heights, m, and of
     their variances, m^2; stamp_ns (n,) of the newest."""
 
-    key: IntArray
-    number: FloatArray
-    height: FloatArray
-    variance: FloatArray
-    stamp_ns: IntArray
+    key: Annotated[IntArray, 'c']
+    number: Annotated[FloatArray, 'c']
+    height: Annotated[FloatArray, 'c']
+    variance: Annotated[FloatArray, 'c']
+    stamp_ns: Annotated[IntArray, 'c']
 
     @staticmethod
     def none() -> Cells:

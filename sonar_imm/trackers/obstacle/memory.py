@@ -34,9 +34,9 @@ half. While nobody looks, the probability falls with `landmark_time`.
 
 **Drift.** The errors of navigation between two stamps are those between two pings, only more of
 them: coming back is one step of the prediction (`filters`), from the pose of the sonar when the
-track ended to that of now. Navigation that walks by `position_noise` makes a landmark uncertain
-by 0.6 m in an hour at the default. A landmark stays where it is: components that move are left
-out, and what mostly moves is not kept. Moored ones swing on.
+track ended to that of now. The grade `ins` makes a landmark uncertain by 0.6 m in an hour. A
+landmark stays where it is: components that move are left out, and what mostly moves is not kept.
+Moored ones swing on.
 
 Source: docs/obstacle.md, section Memory; Musicki, Evans, Stankovic 1994, 'Integrated probabilistic
 data association', for the existence.
@@ -45,15 +45,21 @@ data association', for the existence.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, take
+from ...estimation.association import TrackRules
+from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
-from .filters import Mixture, Sonar
+from .filters import DepthSlices, Mixture, Sonar
+
+if TYPE_CHECKING:
+    from .pings import Mount
+    from .state import Known
 
 SUREST = 9.2
 """Bound of the log-odds of existence: 0.9999."""
@@ -79,13 +85,13 @@ class Landmark(NamedTuple):
     seen_ns: int
     log_odds: float
     sonar: Pose
-    which: np.ndarray
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
+    which: Annotated[np.ndarray, 'k']
+    x: Annotated[FloatArray, 'kn']
+    P: Annotated[FloatArray, 'knn']
+    mu: Annotated[FloatArray, 'k']
     body: tuple[float, FloatArray]
-    place: FloatArray
-    covariance: FloatArray
+    place: Annotated[FloatArray, '3']
+    covariance: Annotated[FloatArray, '33']
     low: float
     high: float
 
@@ -106,7 +112,8 @@ class Landmark(NamedTuple):
     def spread(self, stamp_ns: int, config: ObstacleConfig) -> FloatArray:
         """Covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation drifted."""
         age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
-        drift = np.square([config.position_noise, config.position_noise, config.depth_noise])
+        position, _, depth = config.drift()
+        drift = np.square([position, position, depth])
         return self.covariance + np.diag(drift * age)
 
     def row(self, stamp_ns: int, config: ObstacleConfig) -> dict[str, float]:
@@ -151,7 +158,7 @@ def in_view(memory: Memory, stamp_ns: int, sonar: Sonar, config: ObstacleConfig)
     away = np.linalg.norm(m, axis=1)
     reach = np.array([3.0 * math.sqrt(np.trace(each.covariance[:2, :2])) for each in memory])
     age = np.array([max(stamp_ns - each.stamp_ns, 0) * 1e-9 for each in memory])
-    reach += 3.0 * config.position_noise * np.sqrt(age)
+    reach += 3.0 * config.drift()[0] * np.sqrt(age)
     sector = np.radians(0.5 * config.horizontal_fov_deg) + reach / np.maximum(away, 1e-6)
     seen = (np.abs(np.arctan2(m[:, 1], m[:, 0])) <= sector) & (m[:, 0] >= RETURNS * away)
     seen &= away <= config.max_range + reach
@@ -163,23 +170,17 @@ class Existence(NamedTuple):
     since that may have held them; held (T,): their probability of that, summed; silence (T,): log
     probability of no echo in all these pings of what was held."""
 
-    log_odds: FloatArray
-    pings: FloatArray
-    held: FloatArray
-    silence: FloatArray
+    log_odds: Annotated[FloatArray, 'T']
+    pings: Annotated[FloatArray, 'T']
+    held: Annotated[FloatArray, 'T']
+    silence: Annotated[FloatArray, 'T']
 
     @staticmethod
     def of(log_odds: FloatArray) -> Existence:
         """Of tracks that begin."""
         return Existence(log_odds, *np.zeros((3, len(log_odds))))
 
-    def rows(self, which: np.ndarray) -> Existence:
-        return Existence(*(part[which] for part in self))
-
-    def joined(self, other: Existence) -> Existence:
-        return Existence(*(np.concatenate(both) for both in zip(self, other)))
-
-    def after(
+    def with_ping(
         self, hit: BoolArray, fit: FloatArray, in_beam: FloatArray, p: FloatArray, clutter: float
     ) -> Existence:
         """After a ping with echoes of log density fit (T,) where `hit` (T,), of tracks that the
@@ -217,3 +218,82 @@ def odds(chance: float) -> float:
     """Log-odds of a probability, as bounded as those of tracks."""
     p = min(max(chance, 1e-9), 1.0 - 1e-9)
     return min(max(math.log(p / (1.0 - p)), -SUREST), SUREST)
+
+
+# -- tracks that end, and begin again -------------------------------------------------------------
+
+
+def remember(
+    known: Known, over: BoolArray, filter_: DepthSlices, mount: Mount, config: ObstacleConfig
+) -> Known:
+    """Return the same with landmarks of the confirmed obstacles whose tracks are `over` (T,)."""
+    over = over & known.confirmed
+    if not np.count_nonzero(over):
+        return known
+    log_odds = known.obstacles.existence.now()
+    stays = known.obstacles.mixture.mu[:, filter_.moves].sum(axis=1) <= 0.5
+    which = np.flatnonzero(over & stays & (log_odds > 0.0))
+    if not len(which):
+        return known
+    mixture, bodies = take(known.obstacles.mixture, which), take(known.obstacles.bodies, which)
+    mu = np.where(filter_.moves, 0.0, mixture.mu)
+    mu = np.where(mu >= LEAST_WEIGHT * mu.max(axis=1, keepdims=True), mu, 0.0)
+    mixture = mixture._replace(mu=mu / mu.sum(axis=1, keepdims=True))
+    view = with_common_errors(
+        filter_.view(mixture, known.sonar), known.sonar, bodies, config.range_scale_std
+    )
+    place, covariance = mount.to_enu(view.place, view.place_covariance)
+    level = place[:, 2] + view.state[:, 2]
+    fresh = []
+    for i, row in enumerate(which.tolist()):
+        weighs = np.flatnonzero(mixture.mu[i])
+        fresh.append(
+            Landmark(
+                track_id=int(known.life.track_id[row]),
+                stamp_ns=known.stamp_ns,
+                seen_ns=int(known.life.last_hit_ns[row]),
+                log_odds=float(log_odds[row]),
+                sonar=known.sonar.pose,
+                which=weighs,
+                x=mixture.x[i, weighs],
+                P=mixture.P[i, weighs],
+                mu=mixture.mu[i, weighs],
+                body=(float(bodies.number[i]), bodies.std[i]),
+                place=place[i],
+                covariance=covariance[i],
+                low=float(level[i] - view.high[i]),
+                high=float(level[i] - view.low[i]),
+            )
+        )
+    return known._replace(memory=kept((*known.memory, *fresh), known.stamp_ns, config))
+
+
+def recall(known: Known, filter_: DepthSlices, rules: TrackRules, config: ObstacleConfig) -> Known:
+    """Return the same with tracks again of the landmarks that come into view, as long as there is
+    room."""
+    memory = known.memory
+    if memory and memory[-1].stamp_ns > known.stamp_ns:
+        memory = kept(memory, known.stamp_ns, config)
+        known = known._replace(memory=memory)
+    if not memory:
+        return known
+    back = in_view(memory, known.stamp_ns, known.sonar, config)
+    back = back[: max(0, config.max_tracks - len(known.life))]
+    for each in (memory[i] for i in sorted(back)):
+        if each.track_id in known.life.track_id:
+            continue  # numbers began anew, and this one lives
+        dt = (known.stamp_ns - each.stamp_ns) * 1e-9
+        mixture, repairs = filter_.predict_unchanged(
+            each.mixture(filter_.K), each.sonar, known.sonar.pose, dt
+        )
+        if not mixture.is_finite()[0]:
+            continue
+        number, std = each.body
+        chance = odds(each.existence(known.stamp_ns, config.landmark_time))
+        body = Bodies(np.array([number]), std[None])
+        life = known.life.resumed(each.track_id, known.stamp_ns, rules)
+        known = known.joined(life, mixture, body, chance, silent=True)
+        known = known._replace(repairs=known.repairs + repairs)
+    gone = set(back)
+    memory = tuple(each for i, each in enumerate(memory) if i not in gone)
+    return known._replace(memory=memory) if gone else known

@@ -250,7 +250,7 @@ def weight_by_beam(
     reach: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the density of mixtures (T, K) times `floor + slope B`, moment-matched component by
-    component, and the mean (T,) of B beforehand (`looks`).
+    component, and the mean (T,) of B beforehand (`beam`).
 
     m (T, K, 3): where the means lie, seen from the sonar; floor, slope (T,); edge and soft, rad:
     half height of the pattern B and the standard deviation of its edges; horizontal, reach: half

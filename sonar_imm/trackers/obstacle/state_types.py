@@ -12,26 +12,27 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The classes that a saved state of this tracker may hold, see `state_file`."""
+"""The classes of values that a saved state of this tracker may hold, see `state_file`."""
 
 from __future__ import annotations
 
 from ...acoustics import geometry
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from ...intake.stream import REPLAY_TYPES
+from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Detections, Ground, Navigation
 from ..navigation import NavigationBuffer
+from .beam import MissEvidence
 from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
-from .looks import Looks
 from .memory import Existence, Landmark
-from .state import ObstacleState, PingState
+from .pings import Inbox
+from .state import Known, Obstacles, ObstacleState
 
 STATE_TYPES = (
-    *REPLAY_TYPES,
+    *STREAM_TYPES,
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
-    *(ObstacleState, PingState, Tracks, NisMemory, Mixture, Sonar, Bodies, Looks),
-    *(Existence, Landmark, GroundMap, Cells),
+    *(ObstacleState, Inbox, Known, Obstacles, Tracks, NisMemory, Mixture, Sonar, Bodies),
+    *(MissEvidence, Existence, Landmark, GroundMap, Cells),
 )

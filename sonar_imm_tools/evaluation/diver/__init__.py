@@ -79,7 +79,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         from .figures import sections
 
         # Of a run whose first fix was the origin, only the run knows it.
-        origin = Origin(**run['origin']) if run.get('origin') else config.origin()
+        origin = Origin(**run['origin']) if run.get('origin') else config.stated_origin()
         return sections(metrics, series, truth, raw, origin)
 
     return Judgement(

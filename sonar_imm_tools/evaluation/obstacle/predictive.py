@@ -25,11 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.elevation import Elevations
-from sonar_imm.trackers.obstacle.state import PingState
+from sonar_imm.trackers.obstacle.pings import Ping
+from sonar_imm.trackers.obstacle.state import Known
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
 from ..tuning import Scores, Tunable
@@ -54,7 +53,7 @@ def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunabl
     p = config.detection_probability
     found.append(Tunable(name='detection_probability', start=p, kind='logit'))
     found.append(Tunable(name='clutter_density', start=config.clutter_density))
-    for name in ('sway_std', 'max_speed', 'speed_noise', 'position_noise', 'yaw_noise_deg'):
+    for name in ('sway_std', 'max_speed'):
         if (start := getattr(config, name)) > 0.0:
             found.append(Tunable(name=name, start=start, usual=False))
     return found
@@ -69,19 +68,16 @@ class Scored(ObstacleTracker):
         self.area = config.max_range * math.radians(config.horizontal_fov_deg)
         super().__init__(config)
 
-    def _associate(
-        self, now: PingState, z: FloatArray, R: FloatArray, seen: Elevations | None
-    ) -> tuple[np.ndarray, FloatArray, FloatArray]:
-        chosen, h, fit = super()._associate(now, z, R, seen)
-        config = self.config
-        score = len(z) * math.log(config.clutter_density) - config.clutter_density * self.area
-        if len(h):
-            log_f = np.full(len(h), -np.inf)
-            hit = chosen >= 0
-            log_f[hit] = fit[hit]
-            chance = self._chance(now.mixture)
-            in_beam, _ = self.filter.outlook(now.mixture, now.sonar)
-            for track, track_id in enumerate(now.life.track_id.tolist()):
+    def _associate(self, known: Known, ping: Ping) -> Known:
+        known = super()._associate(known, ping)
+        config, T, echoes = self.config, len(known.life), len(ping.echoes)
+        score = echoes * math.log(config.clutter_density) - config.clutter_density * self.area
+        if T:
+            log_f = np.where(ping.match.hit, ping.match.fit, -np.inf)
+            mixture = known.obstacles.mixture
+            chance = self._chance(mixture)
+            in_beam, _ = self.filter.beam_probability(mixture, ping.sonar)
+            for track, track_id in enumerate(known.life.track_id.tolist()):
                 p = float(chance[track] * np.clip(in_beam[track], 0.01, 1.0))
                 gap = log_f[track] - math.log(config.clutter_density)
                 ratio = math.exp(min(gap, 600.0)) if np.isfinite(gap) else 0.0
@@ -89,5 +85,5 @@ class Scored(ObstacleTracker):
                 total = 1.0 - r * p + r * p * ratio
                 score += math.log(total)
                 self.existence[track_id] = r * (1.0 - p + p * ratio) / total
-        self.scores[now.stamp_ns] = score, len(z) if len(h) else 0
-        return chosen, h, fit
+        self.scores[ping.stamp_ns] = score, echoes if T else 0
+        return known

@@ -40,7 +40,7 @@ from ... import SECOND
 from ..conversion import ConversionReport, JUMP, Leaps, provenance
 from ..csv_table import BadRow
 from ..messages import ros_message
-from ..places import origin_of_detections
+from ..places import origin_parameters
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND
@@ -152,9 +152,8 @@ def write_records(
             for message in made:
                 write(message.topic, message.content, stamp_ns)
         if '/detections' in report.messages and frame.origin is not None:
-            place = frame.origin.latitude, frame.origin.longitude
-            for system, values in origin_of_detections(place).items():
-                own[system] = {**own.get(system, {}), **values}
+            place = origin_parameters((frame.origin.latitude, frame.origin.longitude, 0.0))
+            own['obstacle'] = {**own.get('obstacle', {}), **place}
         if not set(report.messages) - {'/nav', '/altitude'}:
             raise report.nothing(path)
     if frame.missing:

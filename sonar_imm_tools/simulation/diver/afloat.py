@@ -55,7 +55,7 @@ GEODETIC = (
 def instruments_of_places(config: Any) -> dict[str, Any]:
     """What a tracker has to know of these sensors."""
     if config.sensor == 'geodetic':
-        return {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
+        return {'origin': (ORIGIN.latitude, ORIGIN.longitude, 0.0)}
     return {
         'tags': tuple(f'diver_{number}' for number in range(1, config.divers + 1)),
         'transceiver_lever': tuple(LEVER.tolist()),

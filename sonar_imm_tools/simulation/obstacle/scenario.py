@@ -96,7 +96,7 @@ class ObstacleScenario(ImageScenario):
 
     INSTRUMENT = (
         'sonar_lever', 'sonar_mount_rpy_deg', 'azimuth_model', 'ping_timing', 'max_range',
-        'horizontal_fov_deg', 'vertical_fov_deg', 'detection_ranges', 'detection_factors',
+        'horizontal_fov_deg', 'vertical_fov_deg', 'detection_profile',
     )  # fmt: skip
 
     # fmt: off
@@ -187,12 +187,9 @@ class ObstacleScenario(ImageScenario):
         'scale error of the ranges, 1 sigma', range=(0.0, 0.2))
     detection_probability: float = parameter(1.0, '',
         'probability that a ping shows an obstacle in the beam', range=(0.0, 1.0))
-    detection_ranges: tuple[float, ...] = parameter((), 'm',
-        'ranges at which detection_factors are given; empty: as detectable everywhere',
-        range=(0.0, 1e5), kind='float[]')
-    detection_factors: tuple[float, ...] = parameter((), '',
-        'share of detection_probability that is left at detection_ranges', range=(0.0, 1.0),
-        kind='float[]')
+    detection_profile: tuple[float, ...] = parameter((), 'm, 1',
+        'pairs of a range and the share of detection_probability that is left there; empty: as '
+        'detectable everywhere', range=(0.0, 1e5), kind='float[]')
     outlier_probability: float = parameter(0.0, '',
         'probability that an echo of an obstacle is an outlier, which comes from elsewhere',
         range=(0.0, 1.0))
@@ -250,8 +247,8 @@ class ObstacleScenario(ImageScenario):
         problems = super().check()
         if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
             problems.append('obstacle_speed needs two values, the least and the greatest')
-        if len(self.detection_ranges) != len(self.detection_factors):
-            problems.append('detection_ranges and detection_factors need as many values each')
+        if len(self.detection_profile) % 2:
+            problems.append('detection_profile needs pairs of a range and a share')
         if self.images and self.ping_timing != 'instant':
             problems.append('images are made at one instant: ping_timing has to be instant')
         return problems

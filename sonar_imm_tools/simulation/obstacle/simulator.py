@@ -453,9 +453,8 @@ def _pings(
         up: list[float] = []
         for echo, inside in echoes:
             chance = config.detection_probability
-            if config.detection_ranges:
-                share = np.interp(echo[k, 0], config.detection_ranges, config.detection_factors)
-                chance *= float(share)
+            if profile := config.detection_profile:
+                chance *= float(np.interp(echo[k, 0], profile[::2], profile[1::2]))
             seen = rng.uniform() < chance
             outlier = rng.uniform() < config.outlier_probability
             error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)

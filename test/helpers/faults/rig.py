@@ -19,9 +19,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
+import os
+from pathlib import Path
 import re
 import time
 from typing import Any
+from unittest import mock
 
 from attrs import define, field, frozen
 from diagnostic_msgs.msg import DiagnosticArray
@@ -48,6 +51,7 @@ from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
 from .cases import Action, Case, Message, SECOND, Step
 
+TESTS = str(Path(__file__).resolve().parents[2])
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
@@ -142,10 +146,17 @@ class Rig:
             end = 'publisher' if name.endswith('estimate') else 'subscription'
             for policy in ('history:=keep_all', 'reliability:=reliable'):
                 arguments += ['-p', f'qos_overrides./{name}.{end}.{policy}']
-        arguments += ['-p', 'diagnostics_period:=0.05']
         self.domain = enter(reserved_domain_id())
         with self._discovery():
-            self.node = enter(NodeProcess(case.system, domain_id=self.domain, arguments=arguments))
+            search = os.pathsep.join(filter(None, [TESTS, os.environ.get('PYTHONPATH')]))
+            with mock.patch.dict(os.environ, PYTHONPATH=search):
+                process = NodeProcess(
+                    case.system,
+                    domain_id=self.domain,
+                    arguments=arguments,
+                    module='helpers.faults.quick_node',
+                )
+            self.node = enter(process)
             self.link = enter(Link('rig', domain_id=self.domain))
         self.recorder = Recorder(self.link, f'/{case.system}')
         self.diagnostics = Diagnostics()

@@ -420,6 +420,6 @@ FAULTS = (
         level='WARN',
         says='the state cannot be saved',
         settle=0,
-        arguments=('-p', 'state_file:=/sys/sonar_imm_state', '-p', 'state_interval:=0.2'),
+        arguments=('-p', 'state_file:=/sys/sonar_imm_state'),
     ),
 )

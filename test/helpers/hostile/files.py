@@ -33,8 +33,8 @@ import numpy as np
 
 from helpers.field_files import FORMATS, line
 from helpers.hostile.states import forge, forged, parts_of
-from helpers.tracked import tracked
-from sonar_imm.trackers.state_file import read_state, StateError, tracker_from, write_state
+from helpers.tracked import tracked, tracker_from
+from sonar_imm.trackers.state_file import read_state, StateError, write_state
 from sonar_imm_tools.cli import main
 
 SPOTS = 12
@@ -130,12 +130,12 @@ def states_damaged(recording, draws, first=0):
         path = Path(name) / 'state'
         write_state(path, run.saved(run.until(CUT)))
         good = path.read_bytes()
-        header, block = parts_of(path)
+        header, arrays = parts_of(path)
         text = json.dumps(header)
         for k in range(first, first + draws):
             rng = np.random.default_rng(k)
             if k % 4:
-                forge(path, *forged(text, block, rng))
+                forge(path, *forged(text, arrays, rng))
             else:
                 path.write_bytes(damaged(good, rng))
             start = process_time()

@@ -60,8 +60,7 @@ VARIANTS = {
     'diver': (
         {'max_tracks': 4},
         {
-            'origin_latitude': 3.0,
-            'origin_longitude': 3.0,
+            'origin': [3.0, 3.0, 0.0],
             'fix_bias_std': 0.5,
             'tags': ['a'],
             'max_tracks': 4,
@@ -94,7 +93,7 @@ VARIANTS = {
             'max_tracks': 4,
             'history': 1.0,
         },
-        {'method': 'seafloor', 'behaviours': ['fixed'], 'max_tracks': 4},
+        {'behaviours': ['fixed'], 'max_tracks': 4},
     ),
 }
 """Parameters of the trackers under test; small, since speed is not what is tried."""

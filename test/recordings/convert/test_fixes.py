@@ -318,11 +318,7 @@ def test_a_flag_that_is_neither_is_said(tmp_path):
 def test_the_origin_of_latitudes_is_told_the_tracker(convert):
     report = convert('time,lat,lon\n1,59.5,10.25\n2,59.50001,10.25\n')
     content = yaml.safe_load((report.path / 'parameters.yaml').read_text())
-    assert content['diver']['ros__parameters'] == {
-        'origin_latitude': 59.5,
-        'origin_longitude': 10.25,
-        'origin_height': 0.0,
-    }
+    assert content['diver']['ros__parameters'] == {'origin': [59.5, 10.25, 0.0]}
     DiverConfig.from_mapping(content['diver']['ros__parameters'])
 
 

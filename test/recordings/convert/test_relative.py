@@ -148,7 +148,7 @@ def test_a_vessel_by_latitude_and_longitude_is_placed_exactly(convert):
     )
     kinds = [type(item) for item in measured(report)]
     assert kinds == [VesselFix, VesselHeading, RelativeFix] * 2
-    assert known(report)['origin_latitude'] == 60.0
+    assert known(report)['origin'][0] == 60.0
     there = pymap3d.enu2geodetic(*(500.0 * np.sqrt([0.5, 0.5, 0.0])), 60.0, 10.18, 0.0)
     expected = pymap3d.geodetic2enu(*there, 60.0, 10.0, 0.0)[:2]
     last = tracked(report)

@@ -96,7 +96,7 @@ def test_a_node_that_is_killed_goes_on_with_ids_and_covariances(
     whole = final(system, undisturbed.play(messages))
     for turn in range(TURNS):
         path = tmp_path / f'state_{turn}'
-        arguments = '-p', f'state_file:={path}', '-p', 'state_interval:=0.1'
+        arguments = '-p', f'state_file:={path}'
         stop, cut = (int(rng.integers(*item)) for item in ((again, len(messages) - 6), (2, 6)))
         cut += stop
         first = killed(case, arguments, path, messages[:stop], messages[stop:cut], rng)

@@ -262,9 +262,7 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
     origin = Origin(54.0, 10.0, 40.0)
     latitude, longitude, height = origin.geodetic(np.array([30.0, 40.0, -12.0])).tolist()
     settings = {
-        'origin_latitude': 54.0,
-        'origin_longitude': 10.0,
-        'origin_height': 40.0,
+        'origin': (54.0, 10.0, 40.0),
         'dimensions': 3,
         'max_tracks': 1,
         'vessel': 'fixed',
@@ -275,7 +273,7 @@ def test_latitude_and_longitude_and_what_a_transceiver_sees_bring_their_heights(
     assert estimate.state[0, Z] == pytest.approx(-12.0, abs=1e-3)
     flat = [GeodeticFix(stamp_ns=k * 10**9, **place) for k in range(1, 9)]
     assert last(DiverTracker(DiverConfig(**settings)), flat).covariance[0, Z, Z] > 25.0
-    settings |= {'origin_latitude': 0.0, 'origin_longitude': 0.0}
+    settings |= {'origin': (0.0, 0.0, 40.0)}
     seen = [RelativeFix(stamp_ns=k * 10**9, offset=[30.0, 40.0, -12.0]) for k in range(1, 9)]
     relative = last(DiverTracker(DiverConfig(**settings)), seen)
     assert relative.state[0, Z] == pytest.approx(-12.0, abs=0.1)

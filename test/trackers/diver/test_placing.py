@@ -69,7 +69,7 @@ def run(tracker, measurements):
 
 
 def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres():
-    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0)
+    config = DiverConfig(origin=(59.0, 10.0, 0.0))
     path = [(1000.0 + 0.7 * k, 500.0 - 0.3 * k, 0.0) for k in range(30)]
     on_earth = run(DiverTracker(config), [geodetic(k + 1, p) for k, p in enumerate(path)])
     metres = run(
@@ -113,8 +113,8 @@ def test_metres_without_an_origin_and_latitudes_do_not_mix():
     assert second.counts['no_origin'] == 1
     run(second, [relative(3.5, (9.0, 0.0, 0.0)), pose(4, (0, 0, 0), 0.0)])
     assert second.counts['no_origin'] == 2
-    assert 'origin_latitude' in second.warnings()[0]
-    stated = DiverTracker(DiverConfig(origin_latitude=59.0, origin_longitude=10.0))
+    assert 'parameter origin ' in second.warnings()[0]
+    stated = DiverTracker(DiverConfig(origin=(59.0, 10.0, 0.0)))
     both = run(stated, [geodetic(1, (5.0, 0.2, 0.0)), fix(2)])
     assert not stated.counts['no_origin'] and len(both[-1]) == 1
 
@@ -140,7 +140,7 @@ def test_navigation_that_nothing_needs_decides_nothing():
 
 
 def test_an_unknown_height_is_that_of_the_origin():
-    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0, origin_height=40.0)
+    config = DiverConfig(origin=(59.0, 10.0, 40.0))
     known, unknown = (
         run(DiverTracker(config), [geodetic(1, (2e4, 0.0, 0.0), **height)])[0].state
         for height in ({'height': 40.0}, {'height': np.nan})
@@ -238,7 +238,7 @@ def test_a_clock_that_was_set_back_forgets_the_vessel():
 
 
 def test_a_position_and_a_heading_make_a_pose():
-    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0)
+    config = DiverConfig(origin=(59.0, 10.0, 0.0))
     tracker = DiverTracker(config)
     made = run(
         tracker,
@@ -296,9 +296,7 @@ def on_earth_and_back(origin, vessel, east_north_up):
 def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latitude, levelled):
     """A vessel 10 km from the origin, a diver 1 km from the vessel."""
     origin = (latitude, 170.0, 12.0)
-    config = DiverConfig(
-        origin_latitude=origin[0], origin_longitude=origin[1], origin_height=origin[2], **EXACT
-    )
+    config = DiverConfig(origin=origin, **EXACT)
     for east, north, yaw in ((1e4, 0.0, 0.3), (-7e3, 7e3, 2.0), (0.0, -1e4, -1.0)):
         vessel = tuple(float(part) for part in pymap3d.enu2geodetic(east, north, 0.0, *origin))
         offset = np.array([800.0, -600.0, -40.0])
@@ -315,7 +313,7 @@ def test_relative_positions_far_from_the_origin_are_exact_up_to_88_degrees(latit
 def test_magnetic_north_is_turned_to_true_north(levelled):
     """Magnetic north lies 20 degrees east of true north: what a compass shows as due north is at
     20 degrees clockwise."""
-    stated = {'origin_latitude': 70.0, 'origin_longitude': 10.0, **EXACT}
+    stated = {'origin': (70.0, 10.0, 0.0), **EXACT}
     config = DiverConfig(magnetic_declination_deg=20.0, **stated)
     ahead = (0.0, 500.0, 0.0) if levelled else (500.0, 0.0, 0.0)
     found = placed(config, (70.0, 10.0, 0.0), ahead, np.pi / 2, levelled=levelled)
@@ -332,7 +330,7 @@ def test_the_declination_turns_no_pose_of_nav():
 
 def test_covariances_turn_with_the_axes():
     """At 88 degrees of latitude, 90 degrees of longitude from the origin, north is west."""
-    place = {'origin_latitude': 88.0, 'origin_longitude': 1.0}
+    place = {'origin': (88.0, 1.0, 0.0)}
     config = DiverConfig(model_set='heading_speed', **place, **EXACT)
     tracker = DiverTracker(config)
     for second in (1, 2):

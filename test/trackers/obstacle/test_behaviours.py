@@ -24,14 +24,14 @@ import pytest
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.obstacle import behaviours
-from sonar_imm.trackers.obstacle.behaviours import (
+from sonar_imm.trackers.obstacle import filters
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.filters import (
     behaviour_columns,
     BehaviourSlices,
     build_filter,
+    Sonar,
 )
-from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -186,7 +186,7 @@ def test_how_far_an_obstacle_sways_need_not_be_known(monkeypatch):
 
     squared, inside = nees()
     assert squared < 1.7 and inside > 0.7
-    monkeypatch.setattr(behaviours, 'WIDE_SHARE', 1e-12)
+    monkeypatch.setattr(filters, 'WIDE_SHARE', 1e-12)
     assert nees()[0] > 1.5 * squared
 
 
@@ -244,9 +244,9 @@ def test_it_takes_three_and_more_than_half_of_all_to_doubt_the_navigation(
     v[:moving] = (0.4, 0.0)
     v[moving:] = np.arange(other)[:, None] * 30.0 - 100.0
     monkeypatch.setattr(
-        behaviours, '_velocity', lambda rows, moves: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
+        filters, '_velocity', lambda *_: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
     )
     filter_ = SimpleNamespace(moves=np.array([False, True]), behaviours=('fixed', 'moving'))
-    mixture = SimpleNamespace(mu=mu, rows=lambda which: which)
+    mixture = SimpleNamespace(mu=mu)
     known = np.arange(confirmed + 1) < confirmed  # the last one is tentative
-    assert behaviours.moving_alike(filter_, mixture, known) == alike
+    assert filters.moving_alike(filter_, mixture, known) == alike

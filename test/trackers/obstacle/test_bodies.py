@@ -23,7 +23,7 @@ import pytest
 from benchmarks.image_tracks import detected, tracked
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections
-from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, considered
+from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, with_common_errors
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar, View
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
@@ -42,7 +42,9 @@ def test_an_echo_is_as_uncertain_as_those_of_its_track_were():
     used = []
     for k in range(200):
         # Every other echo looks like that of a point.
-        bodies, R = bodies.seen(given, Z, stated(*((0.2, 0.4) if k % 2 else (0.02, 0.04))), OWN)
+        bodies, R = bodies.with_echoes(
+            given, Z, stated(*((0.2, 0.4) if k % 2 else (0.02, 0.04))), OWN
+        )
         used.append(np.sqrt(np.diagonal(R[0])) * [1.0, Z[0, 0]])
     assert_allclose(used[0], [(0.15 + 0.02) / 2.0, (0.004 * 40.0 + 0.04) / 2.0])
     assert_allclose(np.mean(used[100:], axis=0), [0.11, 0.22], rtol=0.02)
@@ -51,9 +53,9 @@ def test_an_echo_is_as_uncertain_as_those_of_its_track_were():
 
 def test_detections_without_extent_are_as_uncertain_as_they_say():
     bodies, R = Bodies.unknown(2), np.array([0.3, 0.01])[:, None, None] * np.eye(2)
-    after, used = bodies.seen(np.array([False, False]), np.repeat(Z, 2, axis=0), R, OWN)
+    after, used = bodies.with_echoes(np.array([False, False]), np.repeat(Z, 2, axis=0), R, OWN)
     assert after is bodies and used is R
-    after, used = bodies.seen(np.array([False, True]), np.repeat(Z, 2, axis=0), R, OWN)
+    after, used = bodies.with_echoes(np.array([False, True]), np.repeat(Z, 2, axis=0), R, OWN)
     assert_allclose(used[0], R[0])
     assert after.number.tolist() == [0.0, 1.0] and not after.std[0].any()
 
@@ -62,7 +64,7 @@ def test_the_size_is_kept_in_metres_while_the_range_closes():
     bodies, given = Bodies.unknown(1), np.array([True])
     for distance in np.linspace(50.0, 10.0, 60):
         z = np.array([[distance, 0.0]])
-        bodies, R = bodies.seen(given, z, stated(0.1, 0.3, z), OWN)
+        bodies, R = bodies.with_echoes(given, z, stated(0.1, 0.3, z), OWN)
     assert_allclose(np.sqrt(R[0, 1, 1]) * 10.0, 0.3, rtol=0.05)
 
 
@@ -73,7 +75,7 @@ def test_an_error_of_the_scale_lies_along_the_line_of_sight():
     away = np.array([30.0, 12.0, 4.0])
     state = np.array([np.linalg.norm(away), np.arctan2(12.0, 30.0), 4.0])
     view = view_of(state, sonar.pose.position + away)
-    found = considered(view, sonar, Bodies.unknown(1), 0.01)
+    found = with_common_errors(view, sonar, Bodies.unknown(1), 0.01)
     factor = 1.0 + 0.01 * rng.normal(size=(200_000, 1))
     seen = factor * state * [1.0, 0.0, 1.0]
     assert_allclose(found.covariance[0], np.cov(seen.T), atol=2e-3)
@@ -85,7 +87,7 @@ def test_the_centre_of_a_body_lies_beside_its_echoes():
     sonar = Sonar(Pose(np.zeros(3), np.eye(3)))
     away = 20.0 * np.array([np.cos(0.5), np.sin(0.5), 0.0])
     view = view_of(np.array([20.0, 0.5, 0.0]), away)
-    found = considered(view, sonar, Bodies(np.ones(1), np.array([[0.2, 0.6]])), 0.0)
+    found = with_common_errors(view, sonar, Bodies(np.ones(1), np.array([[0.2, 0.6]])), 0.0)
     assert_allclose(np.diagonal(found.covariance[0]), CENTRE * np.array([0.04, 0.36 / 400.0, 0.0]))
     along = away / 20.0
     across = np.array([-along[1], along[0], 0.0])
@@ -127,7 +129,7 @@ def test_a_track_that_was_missed_keeps_its_size():
                 extent_bearing=[0.003] * n,
             )
         )
-        assert tracker._stream.state.last.bodies.number[0] == 1.0 + k // 2
+        assert tracker._stream.state.known.obstacles.bodies.number[0] == 1.0 + k // 2
 
 
 def image_run(setting, seed):

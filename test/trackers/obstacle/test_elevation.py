@@ -24,8 +24,13 @@ from scipy.stats import norm
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle.elevation import Elevations, expected, outliers, updated
-from sonar_imm.trackers.obstacle.filters import depth_span, Hints, Mixture, Sonar
+from sonar_imm.trackers.obstacle.beam import (
+    apply_elevations,
+    Elevations,
+    expected_elevations,
+    outlier_probability,
+)
+from sonar_imm.trackers.obstacle.filters import depth_span, HeightPrior, Mixture, Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
@@ -38,13 +43,11 @@ IDEAL = {
 }
 FAITHFUL = {
     'scale_std': 0.0,
-    'position_noise': 0.0,
-    'yaw_noise_deg': 0.0,
-    'depth_noise': 0.0,
+    'navigation_noise': (0.0, 0.0, 0.0),
     'range_scale_std': 0.0,
     'outlier_probability': 0.0,
-    'range_step': 0.0,
-    'bearing_step_deg': 0.0,
+    'range_std': 0.15,
+    'bearing_std_deg': 0.25,
 }
 POSE = geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.05, -0.08, 0.7))
 
@@ -124,7 +127,7 @@ def some_mixture(T=3, K=4, seed=0):
 @pytest.mark.parametrize('cone', [False, True])
 def test_an_elevation_is_expected_where_geometry_has_it(cone):
     mixture = some_mixture()
-    angle, H = expected(mixture, POSE, cone)
+    angle, H = expected_elevations(mixture, POSE, cone)
     model = 'cone' if cone else 'plane'
 
     def of(x):
@@ -144,9 +147,9 @@ def test_an_elevation_is_expected_where_geometry_has_it(cone):
 
 def test_an_update_is_that_of_kalman_among_outliers():
     mixture, config = some_mixture(), ObstacleConfig()
-    angle, H = expected(mixture, POSE, False)
+    angle, H = expected_elevations(mixture, POSE, False)
     seen = Elevations(np.array([0.01, np.nan, -0.05]), np.array([3e-4, 1.0, 1e-4]))
-    after = updated(mixture, seen, 0.1, POSE, config)
+    after = apply_elevations(mixture, seen, 0.1, POSE, config)
     np.testing.assert_array_equal(after.x[1], mixture.x[1])
     np.testing.assert_array_equal(after.mu[1], mixture.mu[1])
     for t in (0, 2):
@@ -171,12 +174,12 @@ def test_an_update_is_that_of_kalman_among_outliers():
 def test_an_echo_that_range_and_azimuth_call_an_outlier_says_nothing_of_the_height():
     mixture = some_mixture(T=1, K=1)
     z, R = mixture.x[:, 0, :2] + [[9.0, 0.0]], np.diag([0.02, 2e-5])[None]
-    doubt = outliers(mixture, mixture.x[..., :2], z, R, 0.02, 1.0)
+    doubt = outlier_probability(mixture, mixture.x[..., :2], z, R, 0.02, 1.0)
     assert doubt[0, 0] > 0.999
     seen = Elevations(np.array([0.05]), np.array([1e-4]))
-    after = updated(mixture, seen, doubt, POSE, ObstacleConfig())
+    after = apply_elevations(mixture, seen, doubt, POSE, ObstacleConfig())
     np.testing.assert_allclose(after.x, mixture.x, atol=0.02)
-    near = outliers(mixture, mixture.x[..., :2], mixture.x[:, 0, :2], R, 0.02, 1.0)
+    near = outlier_probability(mixture, mixture.x[..., :2], mixture.x[:, 0, :2], R, 0.02, 1.0)
     assert near[0, 0] < 0.05
 
 
@@ -184,7 +187,7 @@ def test_new_obstacles_lie_where_the_elevation_says():
     level = Sonar(geometry.Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)), altitude=10.0)
     z = np.array([[40.0, 0.1], [40.0, 0.1]])
     ends = np.array([[-0.02, 0.06], [np.nan, np.nan]])
-    hints = Hints(ends, *np.full((2, 2), np.nan))
+    hints = HeightPrior(ends, *np.full((2, 2), np.nan))
     low, high = depth_span(z, level, ObstacleConfig(), hints)
     plain = depth_span(z, level, ObstacleConfig())
     assert (low[0], high[0]) == pytest.approx((-0.8, 2.4), abs=0.01)

@@ -19,23 +19,15 @@ from typing import NamedTuple
 
 from attrs import evolve
 from helpers.estimates import same
+from helpers.tracked import resumed
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.memory import Existence, kept, SUREST
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
-from sonar_imm.trackers.state_file import (
-    frozen_state,
-    json_parameters,
-    read_state,
-    Saved,
-    tracker_from,
-    write_state,
-)
 
 # A vehicle that comes by the same obstacles again and again, for the tests of memory.
 
@@ -226,17 +218,17 @@ def test_existence_is_that_of_an_obstacle_that_the_beam_holds_always_or_never():
     no, yes = np.zeros(4, bool), np.array([False, False, False, True])
     in_beam, p = np.array([1.0, 0.6, 0.0, 1.0]), np.full(4, 0.8)
     for _ in range(3):
-        existence = existence.after(no, np.zeros(4), in_beam, p, 0.1)
+        existence = existence.with_ping(no, np.zeros(4), in_beam, p, 0.1)
     odds = np.exp(0.5) * np.array([0.2**3, 0.4 + 0.6 * 0.2**3, 1.0, 0.2**3])
     np.testing.assert_allclose(existence.now(), np.log(odds))
-    far = existence.after(no, np.zeros(4), in_beam, np.full(4, 0.5), 0.1)
+    far = existence.with_ping(no, np.zeros(4), in_beam, np.full(4, 0.5), 0.1)
     assert far.now()[0] == pytest.approx(np.log(np.exp(0.5) * 0.2**3 * 0.5))
-    existence = existence.after(yes, np.full(4, np.log(0.02)), in_beam, p, 0.1)
+    existence = existence.with_ping(yes, np.full(4, np.log(0.02)), in_beam, p, 0.1)
     odds = odds[3] * 0.8 * 0.02 / 0.1
     assert existence.now()[3] == pytest.approx(np.log(odds))
     assert existence.pings.tolist() == [4.0, 4.0, 0.0, 0.0]
     for _ in range(20):
-        existence = existence.after(yes, np.full(4, 5.0), in_beam, p, 0.1)
+        existence = existence.with_ping(yes, np.full(4, 5.0), in_beam, p, 0.1)
     assert existence.now()[3] == SUREST
 
 
@@ -270,16 +262,7 @@ def test_the_oldest_and_least_certain_landmarks_are_given_up_first():
 
 def test_landmarks_are_saved_with_the_state(tmp_path):
     tracker, rest = remembered()
-    saved = Saved(
-        system='obstacle',
-        parameters=json_parameters(tracker.config),
-        saved_ns=0,
-        newest_ns=None,
-        state=frozen_state(tracker),
-        extras={},
-    )
-    write_state(tmp_path / 'state', saved)
-    again = tracker_from(read_state(tmp_path / 'state'), SYSTEMS['obstacle'], tracker.config)
+    again = resumed(tmp_path / 'state', tracker, 'obstacle')
     assert [each.track_id for each in again.landmarks] == [
         each.track_id for each in tracker.landmarks
     ]

@@ -22,9 +22,8 @@ from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.trackers.obstacle import mixtures
 from sonar_imm.trackers.obstacle import unscented as behave
-from sonar_imm.trackers.obstacle.behaviours import BehaviourSlices
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.filters import Sonar
+from sonar_imm.trackers.obstacle.filters import BehaviourSlices, Sonar
 
 MODELS = {'plane': False, 'cone': True}
 
@@ -190,8 +189,8 @@ def test_covariance_of_a_step_equals_sampling(kind):
     rng = np.random.default_rng(5)
     filter_ = BehaviourSlices(
         ObstacleConfig(
-            components=1, behaviours=(kind,), position_noise=0.0, yaw_noise_deg=0.0,
-            depth_noise=0.0, speed_noise=0.3, scale_std=0.0,
+            components=1, behaviours=(kind,), navigation_noise=(0.0, 0.0, 0.0),
+            speed_noise=0.3, scale_std=0.0,
         )
     )  # fmt: skip
     sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)))

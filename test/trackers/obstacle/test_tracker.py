@@ -35,6 +35,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from benchmarks.obstacle_paper import SeafloorTracker
 from benchmarks.real_navigation import data_folder, dead_reckoned, summary
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
@@ -86,20 +87,16 @@ def test_an_empty_ping_is_a_ping():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor'])
-def test_every_method_follows(method):
-    scene, final = track_scene('approach', 3, method=method)
-    error, variance, _, _ = offset_at(scene, final, 40.0)
-    if method == 'seafloor':
-        assert error == pytest.approx(12.0, abs=1.0)  # it believes the sea floor, 15 m below
-    else:
-        assert abs(error) < 4.0 * np.sqrt(variance) + 1.0
-
-
-def test_the_seafloor_filter_sees_an_obstacle_that_comes_too_fast():
+def test_what_is_believed_on_the_sea_floor_comes_too_fast():
     """The paper's observation: measured ranges run ahead of the prediction."""
-    _, on_seabed = track_scene('approach', 3, method='seafloor')
-    _, free = track_scene('approach', 3)
+    scene, free = track_scene('approach', 3)
+    error, variance, _, _ = offset_at(scene, free, 40.0)
+    assert abs(error) < 4.0 * np.sqrt(variance) + 1.0
+    config = ObstacleConfig(sonar_lever=scenario('approach').sonar_lever)
+    given = [item.measurement for item in scene.measurements]
+    on_seabed = run(SeafloorTracker(config), given)
+    error, *_ = offset_at(scene, on_seabed, 40.0)
+    assert error == pytest.approx(12.0, abs=1.0)  # it believes the sea floor, 15 m below
     assert mean_nis(on_seabed) > 1.5 * mean_nis(free)
 
 
@@ -122,8 +119,8 @@ def test_conventions_of_sonars(model, timing):
 
 
 def test_two_way_timing_matters():
-    sharp = {'bearing_std_deg': 0.05, 'bearing_step_deg': 0.0}
-    overrides = {'ping_timing': 'two_way', 'yaw_rms_deg': 4.0, **sharp}
+    sharp = {'bearing_std_deg': 0.05}
+    overrides = {'ping_timing': 'two_way', 'yaw_rms_deg': 4.0, 'bearing_step_deg': 0.0, **sharp}
     _, right = track_scene('approach', 1, overrides, **sharp, **FIXED)
     _, wrong = track_scene('approach', 1, overrides, ping_timing='instant', **sharp, **FIXED)
     assert mean_nis(right) < 2.4
@@ -295,7 +292,7 @@ def test_pings_in_a_gap_of_the_navigation_are_skipped():
 
 # -- where a sonar sees less -------------------------------------------------------------------
 
-FALLS = {'detection_ranges': [20.0, 40.0, 60.0], 'detection_factors': [1.0, 0.6, 0.15]}
+FALLS = {'detection_profile': [20.0, 1.0, 40.0, 0.6, 60.0, 0.15]}
 
 
 def test_the_probability_of_a_detection_falls_with_range():
@@ -303,10 +300,9 @@ def test_the_probability_of_a_detection_falls_with_range():
     distance = np.array([5.0, 30.0, 60.0, 90.0])
     assert_allclose(config.detection_at(distance), [0.8, 0.64, 0.12, 0.12])
     assert ObstacleConfig().detection_at(distance).tolist() == [0.9] * 4
-    with pytest.raises(ConfigError, match='as many'):
-        ObstacleConfig(detection_ranges=[5.0])
-    with pytest.raises(ConfigError, match='rise'):
-        ObstacleConfig(detection_ranges=[5.0, 5.0], detection_factors=[1.0, 0.5])
+    for profile, problem in (([5.0], 'pairs'), ([5, 1, 5, 0.5], 'rise'), ([5.0, 2.0], 'shares')):
+        with pytest.raises(ConfigError, match=problem):
+            ObstacleConfig(detection_profile=profile)
 
 
 def test_misses_count_where_the_sonar_would_see():
@@ -338,7 +334,7 @@ def test_at_the_edge_of_the_sector_nothing_is_missed(edge, counted):
     sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)))
     z = np.array([[30.0, np.radians(21.5)], [30.0, np.radians(20.0)]])
     mixture = filter_.begin(z, np.tile(np.diag([0.02, 2e-5]), (2, 1, 1)), sonar)
-    in_beam, ahead = filter_.outlook(mixture, sonar)
+    in_beam, ahead = filter_.beam_probability(mixture, sonar)
     assert (in_beam[0] > 0.3) == counted and in_beam[1] > 0.3 and ahead.all()
 
 

@@ -41,7 +41,7 @@ from sonar_imm_tools.recordings.messages import ros_message
 
 NOISY = ('approach_dst+3_noisy', 'approach_level_mirror_noisy')
 NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
-SHARP = {'range_std': 0.01, 'bearing_std_deg': 0.01, 'range_step': 0.0, 'bearing_step_deg': 0.0}
+SHARP = {'range_std': 0.01, 'bearing_std_deg': 0.01}
 
 
 @pytest.mark.parametrize('name', NOISY)

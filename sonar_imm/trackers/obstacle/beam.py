@@ -12,11 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+"""What the vertical pattern of the sonar says of the height of an obstacle.
 
-"""Sonars that measure the elevation of an echo as well: imaging sonars in three dimensions, and
-multibeam sonars that look ahead.
-
-The filter is the same. What an elevation adds is a third measurement of each component,
+**Elevations.** Imaging sonars in three dimensions, and multibeam sonars that look ahead, measure
+the elevation of an echo as well: a third measurement of each component,
 
     eps(d, delta, z) = asin(m_z / d),    positive down, m the point seen from the sonar,
 
@@ -26,29 +25,59 @@ echo is gated in three dimensions; clutter is spread evenly over the height of t
 azimuth go into the update first, the elevation after them, with the probability that the echo is
 an outlier which they leave. Rows without elevation are treated as ever, also beside others.
 
-Source: docs/obstacle.md, section Elevation.
+**Misses** (`misses: evidence`). Where an obstacle lies at the elevation eps, a ping shows it with
+the probability p B(eps): p is how often this obstacle gives an echo inside the beam, B the pattern
+of the beam, 1 inside and 0 outside. So with the depth z of a component N(m, S), and eps = eps(m) +
+(z - m) / d, a ping multiplies the density of z by
+
+    f(z) = 1 - p B(z)                        without an echo,
+    f(z) = outlier + (1 - outlier) B(z)      with one, which may not be the obstacle's.
+
+B is the difference of two normal distribution functions, so that Z = E f is known in closed form;
+Z weighs the component, and its derivatives give mean and covariance of what is left of it,
+
+    x + P[:, z] (log Z)',    P + P[:, z] P[z, :] (log Z)''.
+
+Used is the last echo and the misses since: where it was seen then, and is not now. The next echo
+shows that it was in the beam all the time, and only faint; so the filter goes on without all this,
+and what is published is a copy. A beam that is higher than stated therefore harms no track. Nor
+does the life of a track depend on it: misses that put an obstacle out of the beam would excuse
+themselves.
+
+p is learned when an echo comes, from how many misses it ends. So misses of what always gave an
+echo say a lot, and those of what flickers little. Where exactly a beam ends is not known: its
+pattern falls off, and how far out an obstacle is still seen depends on its strength. That error is
+the same in every ping, so a tenth to both sides of the edge (`filters.EDGE`) an echo is believed
+as inside and a miss as outside.
+
+Source: docs/obstacle.md, sections Elevation and Misses; Minka 2001, 'A family of algorithms for
+approximate Bayesian inference', for the moments.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ...acoustics.geometry import Pose
 from ...estimation import imm
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, replace_rows, take
 from ...estimation.association import gate_threshold
 from .config import ObstacleConfig
-from .filters import Mixture
+from .filters import DepthSlices, Mixture, Sonar
 from .unscented import points
 
 REACH = 4.0
 """Standard deviations of an elevation over which a new obstacle has its slices."""
-SMALLEST = 0.1
+STEEPEST = 0.1
 """Cosine of 84 degrees: no sonar sees obstacles so steeply above or below."""
 _LEAST = 1e-8
 """rad^2; no sonar measures an elevation to less than 0.006 degrees."""
+PINGS = 10.0
+"""As many pings in the beam the stated probability of a detection counts for."""
+SUREST = 0.95
+"""Largest p: an echo may also be given to a neighbour."""
 
 
 class Elevations(NamedTuple):
@@ -57,9 +86,6 @@ class Elevations(NamedTuple):
 
     angle: FloatArray
     variance: FloatArray
-
-    def rows(self, which: np.ndarray) -> Elevations:
-        return Elevations(self.angle[which], self.variance[which])
 
     def ends(self) -> FloatArray:
         """Between which angles (D, 2) the detections lie."""
@@ -79,7 +105,7 @@ class Elevations(NamedTuple):
         )
 
 
-def expected(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, FloatArray]:
+def expected_elevations(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, FloatArray]:
     """The elevation (T, K) of each component, rad below the axis of the sonar, and its derivatives
     (T, K, 3) by range, azimuth and depth.
 
@@ -106,20 +132,20 @@ def expected(mixture: Mixture, pose: Pose, cone: bool) -> tuple[FloatArray, Floa
     out, down = m[..., 0] / r, m[..., 2] / r
     turn = _at_least(c * out - a * down)
     ahead = a * out + c * down
-    scale = cosine * out / np.maximum(level / d, SMALLEST)
+    scale = cosine * out / np.maximum(level / d, STEEPEST)
     H[..., 0] = -scale * (cosine * ahead + b * sine) / (r * turn)
     H[..., 1] = -scale * (b * cosine - sine * ahead) / (cosine * turn)
-    H[..., 1] -= sine * down / np.maximum(level / d, SMALLEST)
+    H[..., 1] -= sine * down / np.maximum(level / d, STEEPEST)
     H[..., 2] = scale / (r * turn)
     return np.arctan2(m[..., 2], level), H
 
 
 def _at_least(turn: FloatArray) -> FloatArray:
     """Away from 0, where an obstacle would lie straight above or below."""
-    return np.copysign(np.maximum(np.abs(turn), SMALLEST), turn)
+    return np.copysign(np.maximum(np.abs(turn), STEEPEST), turn)
 
 
-def fits(
+def elevation_fits(
     mixture: Mixture,
     h: FloatArray,
     pose: Pose,
@@ -132,7 +158,7 @@ def fits(
     `seen`, of which h (T, K, 2) is expected. Densities are those per metre and radian beside
     clutter that is as dense at any elevation in the beam."""
     T, K, n = mixture.x.shape
-    angle, slope = expected(mixture, pose, config.azimuth_model == 'cone')
+    angle, slope = expected_elevations(mixture, pose, config.azimuth_model == 'cone')
     H = np.zeros((T, K, 3, n))
     H[:, :, 0, 0] = H[:, :, 1, 1] = 1.0
     H[:, :, 2, :3] = slope
@@ -148,7 +174,7 @@ def fits(
     return np.asarray(fit + np.log(fov))
 
 
-def outliers(
+def outlier_probability(
     mixture: Mixture,
     h: FloatArray,
     z: FloatArray,
@@ -169,7 +195,7 @@ def outliers(
     return np.asarray(other / np.maximum(own + other, 1e-300))
 
 
-def updated(
+def apply_elevations(
     mixture: Mixture,
     seen: Elevations,
     outlier: FloatArray | float,
@@ -183,11 +209,13 @@ def updated(
         if not len(known):
             return mixture
         some = outlier[known] if isinstance(outlier, np.ndarray) else outlier
-        return mixture.replaced(
-            known, updated(mixture.rows(known), seen.rows(known), some, pose, config)
+        return replace_rows(
+            mixture,
+            known,
+            apply_elevations(take(mixture, known), take(seen, known), some, pose, config),
         )
     x, P, mu = mixture
-    angle, H = expected(mixture, pose, config.azimuth_model == 'cone')
+    angle, H = expected_elevations(mixture, pose, config.azimuth_model == 'cone')
     # Only range, azimuth and depth show.
     g = P[..., 0] * H[..., :1] + P[..., 1] * H[..., 1:2] + P[..., 2] * H[..., 2:3]
     S = g[..., 0] * H[..., 0] + g[..., 1] * H[..., 1] + g[..., 2] * H[..., 2]
@@ -203,3 +231,58 @@ def updated(
     mu1 = mu * likelihood
     total = mu1.sum(axis=1, keepdims=True)
     return Mixture(x1, P1, np.where(total > 0.0, mu1 / np.maximum(total, 1e-300), mu))
+
+
+# -- misses ---------------------------------------------------------------------------------------
+
+
+class MissEvidence(NamedTuple):
+    """Of T tracks: `seen` (T,), pings with an echo; `due` (T,), pings up to the last echo in which
+    the beam held the obstacle; `missed` (T,), expected number of pings since, in which it did;
+    `silent` (T,), whether the newest ping had none; `shown`: the mixture with what the last echo
+    and the misses since say."""
+
+    seen: Annotated[FloatArray, 'T']
+    due: Annotated[FloatArray, 'T']
+    missed: Annotated[FloatArray, 'T']
+    silent: Annotated[BoolArray, 'T']
+    shown: Mixture
+
+    @staticmethod
+    def first(mixture: Mixture, silent: bool = False) -> MissEvidence:
+        """Of tracks that begin, with an echo or, out of memory, without."""
+        T = len(mixture.mu)
+        return MissEvidence(np.ones(T), np.ones(T), np.zeros(T), np.full(T, silent), mixture)
+
+    def predicted(
+        self, filter_: DepthSlices, before: Sonar, after: Sonar, dt: float
+    ) -> MissEvidence:
+        """As the sonar will see the obstacles `dt` seconds later."""
+        silent = np.flatnonzero(self.silent)
+        if not len(silent):
+            return self
+        later, _ = filter_.advance(take(self.shown, silent), before, after, dt)
+        return self._replace(shown=replace_rows(self.shown, silent, later))
+
+    def with_ping(
+        self, hit: BoolArray, mixture: Mixture, filter_: DepthSlices, sonar: Sonar, last: Sonar
+    ) -> MissEvidence:
+        """With one more ping, which had an echo of the tracks where `hit` (T,); last: the sonar in
+        the ping before."""
+        silent, fresh = np.flatnonzero(~hit), np.flatnonzero(~hit & ~self.silent)
+        shown = filter_.apply_echo(mixture, sonar, sonar)
+        if len(silent):
+            shown = replace_rows(shown, silent, take(self.shown, silent))
+        if len(fresh):
+            once = filter_.apply_echo(take(mixture, fresh), sonar, last)
+            shown = replace_rows(shown, fresh, once)
+        due = np.where(hit, self.due + 1.0 + self.missed, self.due)
+        missed = np.where(hit, 0.0, self.missed)
+        if len(silent):
+            mean = np.einsum('tk,tk->t', mixture.mu[silent], mixture.x[silent, :, 0])
+            stated = filter_.config.detection_at(mean)
+            p = (PINGS * stated + self.seen[silent]) / (PINGS + self.due[silent])
+            later, inside = filter_.apply_miss(take(shown, silent), np.minimum(p, SUREST), sonar)
+            shown = replace_rows(shown, silent, later)
+            missed[silent] += inside
+        return MissEvidence(self.seen + hit, due, missed, ~hit, shown)

@@ -20,13 +20,13 @@ from scipy.stats import norm
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.trackers.obstacle.beam import MissEvidence
 from sonar_imm.trackers.obstacle.filters import DepthSlices, EDGE, Mixture, SOFT, Sonar
-from sonar_imm.trackers.obstacle.looks import Looks
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 P_D, OTHER = 0.9, 1e-4
-STILL = {'scale_std': 0.0, 'position_noise': 0.0, 'yaw_noise_deg': 0.0, 'depth_noise': 0.0}
+STILL = {'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0)}
 DEPTH = 20.0
 HALF = np.radians(7.5)
 R = np.diag([0.15**2, np.radians(0.25) ** 2])
@@ -103,9 +103,9 @@ def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, 
             grid.echo(step * k, z[0, 0])
         else:
             if k == echoes:
-                mixture = filter_.seen(mixture, sonar(k), sonar(k - 1))
+                mixture = filter_.apply_echo(mixture, sonar(k), sonar(k - 1))
                 grid.seen(step * (k - 1), pitch)
-            mixture, _ = filter_.missed(mixture, np.array([P_D]), sonar(k))
+            mixture, _ = filter_.apply_miss(mixture, np.array([P_D]), sonar(k))
             grid.miss(step * k, pitch)
         if k in (echoes - 1, echoes, echoes + 3, echoes + 7):
             view = filter_.view(mixture, sonar(k))
@@ -122,13 +122,13 @@ def test_misses_are_forgotten_with_the_next_echo_but_for_how_often_it_gives_none
     mixture.x[..., 0], mixture.x[..., 2] = 30.0, DEPTH + 1.0
     filter_ = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
     sonar = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3)))
-    looks = Looks.first(mixture)
+    looks = MissEvidence.first(mixture)
     for _ in range(3):
-        looks = looks.after(np.array([True, False]), mixture, filter_, sonar, sonar)
+        looks = looks.with_ping(np.array([True, False]), mixture, filter_, sonar, sonar)
     # It may be above the beam or below.
     assert looks.shown.P[1, 0, 2, 2] > 1.5 * mixture.P[1, 0, 2, 2]
     np.testing.assert_array_equal(mixture.P[1], np.eye(4)[None])
-    looks = looks.after(np.array([True, True]), mixture, filter_, sonar, sonar)
+    looks = looks.with_ping(np.array([True, True]), mixture, filter_, sonar, sonar)
     np.testing.assert_array_equal(looks.shown.P[1], looks.shown.P[0])
     assert looks.seen.tolist() == [5.0, 2.0] and looks.due[0] == 5.0 and looks.due[1] > 2.5
 
@@ -139,14 +139,14 @@ def test_an_echo_says_that_the_beam_holds_it_and_leaving_sideways_takes_nothing_
     filter_ = DepthSlices(ObstacleConfig(behaviours=('fixed',), components=1))
     sonar = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3)))
     aside = Sonar(Pose(np.array([0.0, 0.0, DEPTH]), geometry.rotation(0.0, 0.0, 1.0)))
-    looks = Looks.first(mixture).after(np.array([True]), mixture, filter_, sonar, sonar)
+    looks = MissEvidence.first(mixture).with_ping(np.array([True]), mixture, filter_, sonar, sonar)
     # The beam is 2.6 m high there: of a normal distribution, within 1.1 times that, .52.
     seen = looks.shown.P[0, 0, 2, 2]
     assert seen == pytest.approx(0.52, abs=0.03)
     mixture.x[..., 1] = -1.0
     for last in (sonar, aside):
         looks = looks._replace(shown=mixture._replace(P=looks.shown.P))
-        looks = looks.after(np.array([False]), mixture, filter_, aside, last)
+        looks = looks.with_ping(np.array([False]), mixture, filter_, aside, last)
     assert looks.missed[0] == 0.0
     assert looks.shown.P[0, 0, 2, 2] == pytest.approx(seen, rel=0.01)
 

@@ -1,0 +1,282 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From measurements to pings: where the sonar was, and which echoes it heard.
+
+Navigation, altitudes, soundings and detections arrive in any order. They lie in the `Inbox` until
+the navigation says where the sonar was: a pose completes the pings that waited for it. A `Ping` is
+what the stages of the tracker work on. Here, and only here, the axes change: poses come in as ENU
+and FLU and bearings count to port; the filters work in NED and FRD (`acoustics.geometry`) with
+azimuths to starboard; places go out as ENU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import define, evolve, field, frozen
+import numpy as np
+
+from ...acoustics import geometry
+from ...acoustics.geometry import Pose
+from ...estimation import imm
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray, take
+from ...estimation.association import gate_threshold, Tracks
+from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
+from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
+from .avoidance import course
+from .beam import apply_elevations, elevation_fits, Elevations, outlier_probability
+from .config import ObstacleConfig
+from .filters import DepthSlices, HeightPrior, Mixture, Sonar
+from .ground import GroundMap
+
+SMALLEST, WIDEST = 1e-12, 0.25
+"""Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
+nothing."""
+_H = np.eye(2)[None, None]
+"""Range and azimuth are states."""
+
+
+class Mount:
+    """Where the sonar sits on the vehicle."""
+
+    def __init__(self, config: ObstacleConfig):
+        self.lever = np.array(config.sonar_lever)
+        self.R = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
+
+    def sonar(self, vehicle: Pose) -> Pose:
+        """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
+        there = geometry.mounted(vehicle, self.lever, self.R)
+        return Pose(geometry.flip_world(there.position), geometry.flip_rotation(there.R))
+
+    @staticmethod
+    def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
+        """Points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
+        return geometry.flip_world(points), geometry.flip_covariance(covariance)
+
+
+@frozen(eq=False)
+class Echoes:
+    """The echoes of one ping: range and azimuth z (D, 2), m and rad positive to starboard, with
+    covariance R (D, 2, 2); extended (D,): whether an extent is stated; heights: their elevations,
+    None where none is measured."""
+
+    z: FloatArray
+    R: FloatArray
+    extended: BoolArray
+    heights: Elevations | None = None
+
+    @staticmethod
+    def of(ping: Detections, config: ObstacleConfig) -> Echoes:
+        """Return the rows that are echoes. One that is as uncertain as it is far says nothing and
+        is left out."""
+        z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
+        variance = np.column_stack([ping.var_range, ping.var_bearing])
+        stated = np.isfinite(variance) & (variance > SMALLEST)
+        variance = np.where(stated, variance, default_variance(config))
+        real = np.isfinite(z[:, 0]) & (np.abs(z[:, 1]) < 0.5 * np.pi)
+        real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
+        R, extended = variance[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
+        heights = Elevations.of(ping.elevation[real], ping.var_elevation[real], config)
+        return Echoes(z[real], R[real], extended[real], heights)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def rows(self, which: IndexArray | BoolArray) -> Echoes:
+        """Return some of the echoes."""
+        heights = self.heights and take(self.heights, which)
+        return Echoes(self.z[which], self.R[which], self.extended[which], heights)
+
+    def fits(
+        self, mixture: Mixture, h: FloatArray, C: FloatArray, pose: Pose, config: ObstacleConfig
+    ) -> FloatArray:
+        """Return how well each echo fits each obstacle (T, D), see `imm.gate`; h (T, K, 2), C (T,
+        K, 2, 2): what is expected."""
+        if self.heights:
+            return elevation_fits(mixture, h, pose, self.z, self.R, self.heights, config)
+        threshold = gate_threshold(config.gate_probability, 2)
+        return imm.gate(h, _H, C, mixture.mu, self.z, self.R, threshold)
+
+    def height_prior(
+        self, sonar: Sonar, ground: GroundMap, config: ObstacleConfig
+    ) -> HeightPrior | None:
+        """Return what is known of the height of obstacles that begin at these echoes."""
+        if not (self.heights or ground):
+            return None
+        ends = self.heights.ends() if self.heights else np.full((len(self), 2), np.nan)
+        return HeightPrior(ends, *ground.below(self.z, sonar, config))
+
+    def update_height(
+        self,
+        mixture: Mixture,
+        before: tuple[Mixture, FloatArray, FloatArray] | None,
+        filter_: DepthSlices,
+        pose: Pose,
+    ) -> Mixture:
+        """Return the obstacles after the elevation of one echo each. before: the mixture before
+        their range and azimuth, what was expected of these and the covariance R (T, 2, 2) used;
+        None for obstacles that begin."""
+        if not self.heights:
+            return mixture
+        doubt: FloatArray | float = filter_.config.outlier_probability
+        if before is not None:
+            old, h, R = before
+            density = filter_.outlier_density
+            doubt = outlier_probability(old, h, self.z, R, float(doubt), density)
+        return apply_elevations(mixture, self.heights, doubt, pose, filter_.config)
+
+
+def default_variance(config: ObstacleConfig) -> FloatArray:
+    """Return the variances (2,), m^2 and rad^2, of a detection that comes without."""
+    return np.square([config.range_std, np.radians(config.bearing_std_deg)])
+
+
+@frozen(eq=False)
+class Match:
+    """The echo `chosen` (T,) by each obstacle, -1 for none, of which `expected` (T, K, 2) was
+    expected, and the log density `fit` (T,) of what was found."""
+
+    chosen: IntArray
+    expected: FloatArray
+    fit: FloatArray
+
+    @property
+    def hit(self) -> BoolArray:
+        """(T,) Which obstacles gave an echo."""
+        return self.chosen >= 0
+
+
+@frozen(eq=False)
+class Verdict:
+    """The tracks `life` that live on, `stays` (T,) which these are, and which lie `ahead` (T,)."""
+
+    life: Tracks
+    stays: BoolArray
+    ahead: BoolArray
+
+
+@define(eq=False)
+class Ping:
+    """One ping on its way through the stages. What a stage tells later ones stands in a slot that
+    no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
+    was, by `predict`; `match` by `associate`; `verdict` by `judge`."""
+
+    stamp_ns: int
+    sonar: Sonar
+    echoes: Echoes
+    ground: GroundMap
+    before: Sonar = field(init=False)
+    dt: float = field(init=False)
+    match: Match = field(init=False)
+    verdict: Verdict = field(init=False)
+
+
+@frozen(eq=False, kw_only=True)
+class Inbox:
+    """What came and is not used up. waiting: pings without a pose yet, each with the altitude
+    then; ground: soundings so far; skipped: pings so far for which navigation had a gap; missing:
+    pings so far that were given up because too many waited."""
+
+    navigation: NavigationBuffer = NavigationBuffer()
+    altitude: Altitude | None = None
+    ground: GroundMap = GroundMap()
+    waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
+    skipped: int = 0
+    missing: int = 0
+
+    def received(self, items: Iterable[Measurement]) -> Inbox:
+        """Return the inbox with all measurements of one stamp."""
+        navigation, altitude, ground = self.navigation, self.altitude, self.ground
+        pings = []
+        for item in items:
+            if isinstance(item, Navigation):
+                navigation = navigation.added(item)
+            elif isinstance(item, Altitude):
+                altitude = item
+            elif isinstance(item, Ground):
+                ground = ground.added(item)
+            elif isinstance(item, Detections):
+                pings.append(item)
+        waiting = [*self.waiting, *((ping, altitude) for ping in pings)]
+        given_up = max(0, len(waiting) - MOST_WAITING)
+        return evolve(
+            self,
+            navigation=navigation,
+            altitude=altitude,
+            ground=ground,
+            waiting=tuple(waiting[given_up:]),
+            missing=self.missing + given_up,
+        )
+
+    def released(
+        self, config: ObstacleConfig
+    ) -> tuple[Inbox, list[tuple[Detections, Altitude | None]]]:
+        """Return the inbox without the pings that wait no longer, and those that can be used."""
+        waiting, ready, skipped = list(self.waiting), [], self.skipped
+        while waiting and (state := self._readiness(waiting[0][0], config)) != 'wait':
+            first = waiting.pop(0)
+            if state == 'ready':
+                ready.append(first)
+            else:
+                skipped += 1
+        return evolve(self, waiting=tuple(waiting), skipped=skipped), ready
+
+    def _readiness(self, ping: Detections, config: ObstacleConfig) -> Readiness:
+        return self.navigation.readiness(
+            ping.stamp_ns,
+            ping.stamp_ns + _late_ns(config),
+            nanoseconds(config.max_navigation_gap),
+            nanoseconds(config.max_extrapolation),
+        )
+
+    def ping(
+        self,
+        detections: Detections,
+        altitude: Altitude | None,
+        mount: Mount,
+        config: ObstacleConfig,
+    ) -> Ping:
+        """Return the ping that one of the `released` ones is."""
+        sonar = self._sonar(detections.stamp_ns, altitude, mount, config)
+        return Ping(detections.stamp_ns, sonar, Echoes.of(detections, config), self.ground)
+
+    def _sonar(
+        self, stamp_ns: int, altitude: Altitude | None, mount: Mount, config: ObstacleConfig
+    ) -> Sonar:
+        vehicle = self.navigation.pose(stamp_ns)
+        pose = mount.sonar(vehicle)
+        reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
+        straight = geometry.flip_world(course(self.navigation, stamp_ns, config.course_window))
+        height = np.nan
+        if altitude and altitude.stamp_ns >= stamp_ns - nanoseconds(config.max_altitude_age):
+            height = altitude.altitude
+        late_ns = _late_ns(config)
+        if not late_ns:
+            return Sonar(pose, height, reference=reference, course=straight)
+        late = mount.sonar(self.navigation.pose(stamp_ns + late_ns))
+        return Sonar(pose, height, late, late_ns * 1e-9, reference, straight)
+
+    def forgetting(self, stamp_ns: int, config: ObstacleConfig) -> Inbox:
+        """Return the inbox without the poses that no ping needs any more."""
+        oldest = self.waiting[0][0].stamp_ns if self.waiting else stamp_ns
+        kept = self.navigation.since(oldest - nanoseconds(config.course_window))
+        return evolve(self, navigation=kept)
+
+
+def _late_ns(config: ObstacleConfig) -> int:
+    """How long after the transmission a pose is needed."""
+    if config.ping_timing == 'instant':
+        return 0
+    return nanoseconds(2.0 * config.max_range / config.sound_speed)

@@ -1,0 +1,147 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A list of hypotheses is each of them alone; mixtures against their definition."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.arrivals_3d import BEARING, CLOCK, EMISSION, observe, ONE_WAY, PATH
+from sonar_imm.trackers.diver.explanations import (
+    expect_measurements,
+    expect_residuals,
+    fit_measurements,
+    PingMeasurements,
+    student_t_maxima,
+    student_t_ping,
+    subset_ping,
+)
+
+MOTION, L = 4, 9
+
+
+def hypotheses(seed, receivers, tag=False, instruments=False):
+    """x (L, n), P (L, n, n) of hypotheses about one diver, and the ping that he causes: each
+    receiver may have an offset and a clock, and every third one a bearing."""
+    rng = np.random.default_rng(seed)
+    n = MOTION + 3 * receivers * instruments + tag
+    scale = np.array(
+        [4.0, 4.0, 0.5, 0.5] + [0.5, 0.5, 0.2] * receivers * instruments + [90.0] * tag
+    )
+    truth = np.zeros(n)
+    truth[:2] = rng.uniform(-40.0, 40.0, 2)
+    A = scale[:, None] * (np.eye(n) + 0.1 * rng.normal(size=(L, n, n)))
+    x = truth + 0.5 * scale * rng.normal(size=(L, n))
+    P = A @ np.swapaxes(A, 1, 2)
+    angle = 2.0 * np.pi * np.arange(receivers) / receivers
+    rx = np.column_stack([70.0 * np.cos(angle), 60.0 * np.sin(angle), -2.0 + 0.0 * angle])
+    parent = np.arange(0, receivers, 3)
+    row = np.append(np.arange(receivers), parent)
+    kind = np.append(np.full(receivers, ONE_WAY if tag else PATH), np.full(len(parent), BEARING))
+    columns = np.full((len(row), 7), -1)
+    columns[:, :2] = 0, 1
+    if instruments:
+        columns[:, 3], columns[:, CLOCK] = MOTION + 3 * row, MOTION + 3 * row + 2
+        columns[kind == BEARING, CLOCK] = -1
+    if tag:
+        columns[:, EMISSION] = n - 1
+    variance = np.where(kind == BEARING, 1e-3, 0.09)
+    value = observe(truth[:, None], -5.0, kind, columns, 0.0 * rx[row], rx[row])[0][:, 0]
+    value = value + np.sqrt(variance) * rng.normal(size=len(row))
+    value[1] += 7.0
+    # Bearings stand behind the echoes that they came with.
+    order = np.argsort(row, kind='stable')
+    place = np.argsort(order)
+    whose = np.append(np.full(receivers, -1), place[parent])[order]
+    parts = kind[order], value[order], variance[order], np.full(len(row), 0.02)
+    geometry = 0.0 * rx[row[order]], rx[row[order]], columns[order]
+    return x, P, PingMeasurements(np.arange(len(row)), whose, *parts, *geometry), truth
+
+
+def updates(measured, x, P, estimated, positions):
+    subsets = subset_ping(x, P, estimated, -5.0, measured, 0.05, 128)
+    return *subsets, *student_t_ping(x, P, estimated, -5.0, measured, positions, 4.0)
+
+
+@pytest.mark.parametrize('tag', [False, True])
+@pytest.mark.parametrize('instruments', [False, True])
+def test_a_list_of_hypotheses_is_each_of_them_with_its_own_variances(tag, instruments):
+    """Also where the errors of the instruments are only considered, and are more than arrivals."""
+    x, P, measured, truth = hypotheses(1, 5, tag, instruments)
+    estimated = (np.arange(x.shape[1]) < MOTION) | (np.arange(x.shape[1]) == x.shape[1] - tag)
+    positions = truth[:2] + [[3.0, -8.0], [-6.0, 2.0]]
+    scale = np.random.default_rng(2).choice([0.15, 1.0, 3.0, 10.0], L)
+    scaled = measured._replace(variance=scale[:, None] * measured.variance)
+    together = updates(scaled, x, P, estimated, positions)
+    for k in range(L):
+        own = measured._replace(variance=scale[k] * measured.variance)
+        alone = updates(own, x[[k]], P[[k]], estimated, positions)
+        for part, one in zip(together, alone):
+            np.testing.assert_allclose(part[k], one[0], rtol=1e-9, atol=1e-9)
+    if instruments:
+        considered = np.flatnonzero(~estimated)
+        np.testing.assert_allclose(together[0][:, considered], x[:, considered], atol=1e-12)
+        inside = np.ix_(range(L), considered, considered)
+        np.testing.assert_allclose(together[5][inside], P[inside], atol=1e-12)
+
+
+def test_a_mixture_is_what_its_definition_says():
+    x, P, measured, _ = hypotheses(3, 4)
+    mu = np.random.default_rng(4).dirichlet(np.ones(L))
+    mu[2] = 0.0
+    mu /= mu.sum()
+    one = measured.kind, measured.columns, measured.tx, measured.rx
+    expected, gradient = observe(x.T, -5.0, *one)
+    nu = measured.value[:, None] - expected
+    inside = np.einsum('cal,lab,dbl->lcd', gradient, P, gradient)
+    residual, covariance = expect_measurements(x, P, mu, -5.0, measured)
+    np.testing.assert_allclose(residual, nu @ mu)
+    np.testing.assert_allclose(expect_residuals(x, mu, -5.0, measured), nu @ mu)
+    second = inside + np.einsum('cl,dl->lcd', nu, nu)
+    np.testing.assert_allclose(
+        covariance, np.tensordot(mu, second, 1) - np.outer(nu @ mu, nu @ mu), atol=1e-8
+    )
+    S = np.einsum('lcc->lc', inside) + measured.variance
+    density = np.exp(-0.5 * nu.T**2 / S) / np.sqrt(2.0 * np.pi * S)
+    log_likelihood, nis = fit_measurements(x, P, mu, -5.0, measured)
+    np.testing.assert_allclose(log_likelihood, np.log(mu @ density))
+    np.testing.assert_allclose(nis, (nu.T**2 / S).min(axis=0))
+
+
+def test_a_hypothesis_whose_covariance_has_no_root_stays_as_it_is():
+    x, P, measured, truth = hypotheses(5, 8)
+    P[4, 1, 1] = -1.0
+    P[6] = np.nan
+    estimated, positions = np.ones(MOTION, bool), truth[None, :2]
+    heavy = estimated, -5.0, measured, positions, 4.0
+    after = student_t_ping(x, P, *heavy)
+    lost = np.isin(np.arange(L), [4, 6])
+    np.testing.assert_array_equal(np.isfinite(after[2]), ~lost)
+    np.testing.assert_array_equal(after[0][lost], x[lost])
+    np.testing.assert_array_equal(after[1][lost], P[lost])
+    for part, other in zip(after, student_t_ping(x[~lost], P[~lost], *heavy)):
+        np.testing.assert_array_equal(part[~lost], other)
+    nobody = student_t_ping(x[lost], P[lost], *heavy)
+    np.testing.assert_array_equal(nobody[2], -np.inf)
+    assert (student_t_maxima(x[4], P[4], positions, measured, -5.0, 4.0)[1] == -np.inf).all()
+
+
+def test_many_arrivals_lead_all_hypotheses_to_one_place():
+    """From wherever they start: the ping by itself says where the diver is."""
+    x, P, measured, truth = hypotheses(6, 12)
+    heavy = np.ones(MOTION, bool), -5.0, measured, truth[None, :2] + 5.0, 4.0
+    mean, covariance, _, weights = student_t_ping(x, P, *heavy)
+    assert np.hypot(*(mean[:, :2] - truth[:2]).T).max() < 1.0
+    assert (weights[:, 2] < 0.1).all()  # the echo that is late
+    np.testing.assert_array_equal(covariance, np.swapaxes(covariance, 1, 2))
