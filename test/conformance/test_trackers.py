@@ -253,4 +253,4 @@ def _same(value, other):
         return np.array_equal(value, other, equal_nan=value.dtype.kind == 'f')
     if hasattr(value, '__dict__') and not callable(value):
         return _same(vars(value) | {'_cache': 0}, vars(other) | {'_cache': 0})
-    return callable(value) or value == other
+    return callable(value) or value == other or (value != value and other != other)

@@ -45,21 +45,15 @@ data association', for the existence.
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple, TYPE_CHECKING
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, take
-from ...estimation.association import TrackRules
-from .bodies import Bodies, with_common_errors
+from ...estimation.arrays import BoolArray, FloatArray
 from .config import ObstacleConfig
-from .filters import DepthSlices, Mixture, Sonar
-
-if TYPE_CHECKING:
-    from .pings import Mount
-    from .state import Known
+from .filters import Mixture, Sonar
 
 SUREST = 9.2
 """Bound of the log-odds of existence: 0.9999."""
@@ -218,82 +212,3 @@ def odds(chance: float) -> float:
     """Log-odds of a probability, as bounded as those of tracks."""
     p = min(max(chance, 1e-9), 1.0 - 1e-9)
     return min(max(math.log(p / (1.0 - p)), -SUREST), SUREST)
-
-
-# -- tracks that end, and begin again -------------------------------------------------------------
-
-
-def remember(
-    known: Known, over: BoolArray, filter_: DepthSlices, mount: Mount, config: ObstacleConfig
-) -> Known:
-    """Return the same with landmarks of the confirmed obstacles whose tracks are `over` (T,)."""
-    over = over & known.confirmed
-    if not np.count_nonzero(over):
-        return known
-    log_odds = known.obstacles.existence.now()
-    stays = known.obstacles.mixture.mu[:, filter_.moves].sum(axis=1) <= 0.5
-    which = np.flatnonzero(over & stays & (log_odds > 0.0))
-    if not len(which):
-        return known
-    mixture, bodies = take(known.obstacles.mixture, which), take(known.obstacles.bodies, which)
-    mu = np.where(filter_.moves, 0.0, mixture.mu)
-    mu = np.where(mu >= LEAST_WEIGHT * mu.max(axis=1, keepdims=True), mu, 0.0)
-    mixture = mixture._replace(mu=mu / mu.sum(axis=1, keepdims=True))
-    view = with_common_errors(
-        filter_.view(mixture, known.sonar), known.sonar, bodies, config.range_scale_std
-    )
-    place, covariance = mount.to_enu(view.place, view.place_covariance)
-    level = place[:, 2] + view.state[:, 2]
-    fresh = []
-    for i, row in enumerate(which.tolist()):
-        weighs = np.flatnonzero(mixture.mu[i])
-        fresh.append(
-            Landmark(
-                track_id=int(known.life.track_id[row]),
-                stamp_ns=known.stamp_ns,
-                seen_ns=int(known.life.last_hit_ns[row]),
-                log_odds=float(log_odds[row]),
-                sonar=known.sonar.pose,
-                which=weighs,
-                x=mixture.x[i, weighs],
-                P=mixture.P[i, weighs],
-                mu=mixture.mu[i, weighs],
-                body=(float(bodies.number[i]), bodies.std[i]),
-                place=place[i],
-                covariance=covariance[i],
-                low=float(level[i] - view.high[i]),
-                high=float(level[i] - view.low[i]),
-            )
-        )
-    return known._replace(memory=kept((*known.memory, *fresh), known.stamp_ns, config))
-
-
-def recall(known: Known, filter_: DepthSlices, rules: TrackRules, config: ObstacleConfig) -> Known:
-    """Return the same with tracks again of the landmarks that come into view, as long as there is
-    room."""
-    memory = known.memory
-    if memory and memory[-1].stamp_ns > known.stamp_ns:
-        memory = kept(memory, known.stamp_ns, config)
-        known = known._replace(memory=memory)
-    if not memory:
-        return known
-    back = in_view(memory, known.stamp_ns, known.sonar, config)
-    back = back[: max(0, config.max_tracks - len(known.life))]
-    for each in (memory[i] for i in sorted(back)):
-        if each.track_id in known.life.track_id:
-            continue  # numbers began anew, and this one lives
-        dt = (known.stamp_ns - each.stamp_ns) * 1e-9
-        mixture, repairs = filter_.predict_unchanged(
-            each.mixture(filter_.K), each.sonar, known.sonar.pose, dt
-        )
-        if not mixture.is_finite()[0]:
-            continue
-        number, std = each.body
-        chance = odds(each.existence(known.stamp_ns, config.landmark_time))
-        body = Bodies(np.array([number]), std[None])
-        life = known.life.resumed(each.track_id, known.stamp_ns, rules)
-        known = known.joined(life, mixture, body, chance, silent=True)
-        known = known._replace(repairs=known.repairs + repairs)
-    gone = set(back)
-    memory = tuple(each for i, each in enumerate(memory) if i not in gone)
-    return known._replace(memory=memory) if gone else known

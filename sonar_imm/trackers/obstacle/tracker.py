@@ -47,9 +47,9 @@ from .avoidance import closest_approach
 from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
 from .filters import behaviour_columns, build_filter, Mixture, moving_alike
-from .memory import Memory, recall, remember
+from .memory import Memory
 from .pings import default_variance, Match, Mount, Ping, Verdict
-from .state import Known, ObstacleState
+from .state import Known, ObstacleState, recall, remember
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
