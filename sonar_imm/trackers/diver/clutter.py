@@ -177,7 +177,7 @@ def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
         ]
     if config.pairing != 'gnn':
         return []
-    found = [clutter for clutter in each if clutter.evident]
+    found = [clutter for _, clutter in known.by_sensor if clutter.evident]
     return [
         f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
         f'({clutter.density:.1g} for each square metre), and association gnn expects '
