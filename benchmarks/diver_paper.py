@@ -361,7 +361,7 @@ def forward(
     models: ModelSet, chain: AdaptiveChain | PaperChain, z: np.ndarray, R: np.ndarray
 ) -> Iterator[Step]:
     """Filter N runs of K fixes, one a second, at once."""
-    x, P, mu = models.new_tracks(z[:, 0], R[:, 0])
+    x, P, mu = (part[:, 0] for part in models.new_tracks(z[:, 0], R[:, 0]))
     F, Q, B = models.motion(1.0)
     H = models.E[:, :2]
     learnt = chain.fresh(len(z))

@@ -21,6 +21,7 @@ import numpy as np
 
 from sonar_imm.estimation import imm
 from sonar_imm.measurements import Fixes
+from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.fixes import compare, singly
 from sonar_imm.trackers.diver.innovations import FARTHEST, FixConsistency, MEMORY, watch
 from sonar_imm.trackers.diver.scan import Scan
@@ -45,7 +46,7 @@ def predicted(item):
     tracker = DiverTracker(CONFIG)
     for second in range(1, 6):
         tracker.process(scan(second, PLACES + 0.5 * second))
-    now = Scan.of([item], tracker.config)
+    now = Scan.of([item], tracker.config, Clutters())
     known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
     return tracker, known, now.fixes[0]
 
