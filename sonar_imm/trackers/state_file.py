@@ -155,7 +155,7 @@ def read_state(path: Path) -> Saved:
         raise StateError(f'its format is {form}, of another version; this one has {FORMAT}')
     if words[1] != hashlib.sha256(body).hexdigest().encode():
         raise StateError('it is damaged: the checksum does not fit')
-    with understood(EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
+    with understood():
         arrays = _arrays(body)
         text = arrays.pop('header').tobytes()
         if len(text) > _LARGEST_HEADER:
@@ -213,7 +213,7 @@ def _array(content: bytes) -> np.ndarray:
 
 
 def _saved(header: Any, arrays: dict[str, np.ndarray]) -> Saved:
-    """Return the contents of a header. Raises the exceptions of `understood`."""
+    """Return the contents of a header. Raises ValueError and others, see `understood`."""
     if header['version'] != __version__:
         version = str(header['version'])[:_SHORT]
         raise StateError(f'it was saved by version {version}, not {__version__}')
@@ -263,7 +263,7 @@ def intake_from(saved: Saved, system: System, config: Config, frame_id: str = ''
     intake = Intake(system.build(then), frame_id)
     tracker = intake.tracker
     # Odd numbers are refused, or lived with: numpy need not warn of them.
-    with understood(Exception), np.errstate(all='ignore'):
+    with understood(), np.errstate(all='ignore'):
         types = types_of(system)
         Decoder(types, saved.arrays, then).put(intake, saved.state['intake'], 'intake')
         intake.restored()  # now the tracker knows where the sonar is

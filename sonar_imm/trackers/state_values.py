@@ -60,17 +60,6 @@ _WORD = 1 << 63
 _KEYS = 10_000
 """Most keys of one mapping that are not text: numbers can be chosen so that all of them have the
 same hash, which takes time with the square of their number."""
-_UNFIT = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
-"""Exceptions raised by data that no tracker has written."""
-
 Lengths = tuple[dict[str, int], dict[str, int]]
 """Lengths by letter: those shared with the values around, and those of one value."""
 
@@ -83,13 +72,13 @@ class StateError(ValueError):
 
 
 @contextlib.contextmanager
-def understood(*more: type[Exception]) -> Iterator[None]:
-    """Raise `StateError` in place of the exceptions of data that do not fit, `more` included."""
+def understood() -> Iterator[None]:
+    """Raise `StateError` in place of any exception: data can lead to many."""
     try:
         yield
     except StateError:
         raise
-    except _UNFIT + more as error:
+    except Exception as error:
         why = str(error)[:_LONGEST] or type(error).__name__
         raise StateError(f'it does not fit this version ({why})') from None
 
@@ -139,9 +128,9 @@ def encoded(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         names = ((name, getattr(value, name)) for name in _fields(kind))
         fields = {name: encoded(item, f'{path}/{name}', arrays) for name, item in names}
         return {'class': kind.__name__, **fields}
-    if kind in (tuple, list):
+    if kind in (tuple, list, deque):
         return [encoded(item, f'{path}/{k}', arrays) for k, item in enumerate(value)]
-    if kind is dict:
+    if kind in (dict, Counter):
         return [
             [key, encoded(item, f'{path}/{_step(key, k)}', arrays)]
             for k, (key, item) in enumerate(value.items())
@@ -177,7 +166,7 @@ def _form(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 class Decoder:
-    """The inverse of `encoded`. Raises ValueError, and others of `understood`, for data that
+    """The inverse of `encoded`. Raises ValueError and others, see `understood`, for data that
     `encoded` has not written.
 
     types: classes of values. arrays: by path; each is taken out when it is read. config: stands
@@ -212,7 +201,7 @@ class Decoder:
             return array
         if kind is Union:
             for choice in arguments:
-                with contextlib.suppress(*_UNFIT):
+                with contextlib.suppress(Exception):
                     return self._read(data, choice, path, there, lengths)
             raise ValueError(f'{path} cannot be like that')
         if kind in _PLAIN or (kind is object and type(data) in _PLAIN):
@@ -237,7 +226,7 @@ class Decoder:
         both = enumerate(zip(data, arguments, strict=True))
         items = [self._read(item, hint, f'{path}/{k}') for k, (item, hint) in both]
         # The length of a queue follows from the parameters.
-        return deque(items, there.maxlen) if kind is deque else kind(items)
+        return deque(items, getattr(there, 'maxlen', None)) if kind is deque else kind(items)
 
     def _mapping(
         self, data: Any, kind: Any, arguments: tuple[Any, ...], path: str, there: Any
@@ -249,8 +238,8 @@ class Decoder:
             _plain(key, of_key, path): self._read(item, of_item, f'{path}/{_step(key, k)}')
             for k, (key, item) in enumerate(data)
         }
-        if kind is dict:
-            return pairs
+        if kind is dict or there is None:
+            return kind(pairs)
         there.clear()  # other objects may count with it, too
         there.update(pairs)
         return there

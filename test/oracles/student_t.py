@@ -25,7 +25,7 @@ The maximum is not the only one. Whoever calls gives the starts, among them thos
 suggest, so that many good numbers outvote any prior.
 
 The information of the weighted update overstates what is known: residuals near the middle are
-weighted by more than one. `trackers.diver.explanations` therefore widens the variances by
+weighted by more than one. `trackers.diver.heavy_tails` therefore widens the variances by
 ``(nu+3)/(nu+1)``, the ratio of the curvature of the Gaussian to the Fisher information of the t
 density, for the covariance, not for the mean.
 

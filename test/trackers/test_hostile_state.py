@@ -34,6 +34,7 @@ from helpers.tracked import tracked, tracker_from
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.trackers import SYSTEMS
@@ -199,6 +200,7 @@ ARRAYS = [
     ['<i8', [1], '00' * 8],
     ['|V8', [1], '00' * 8],
     ['no', [1], '00' * 8],
+    ['05,f8', [1], '00' * 8],
     [['<f8'], [1], '00' * 8],
     [None, [1], '00' * 8],
 ]
@@ -333,6 +335,7 @@ POSE = {
     'position': {'array': '<f8', 'shape': [3], 'bytes': '00' * 24},
     'R': {'array': '<f8', 'shape': [3, 3], 'bytes': '00' * 72},
 }
+ORIGIN = {'class': 'Origin', 'latitude': 1.0, 'longitude': 2.0, 'height': 3.0}
 VECTOR = {'array': '<f8', 'shape': [2], 'bytes': '00' * 16}
 
 
@@ -346,7 +349,7 @@ def owner_of(value, hint):
 
 def decoded(data, hint, there=None):
     owner = owner_of(there, hint)
-    Decoder((Pose,), {}, DiverConfig()).put(owner, {'x': data}, '')
+    Decoder((Pose, Origin), {}, DiverConfig()).put(owner, {'x': data}, '')
     return owner.x
 
 
@@ -365,6 +368,11 @@ def test_annotations_say_what_may_stand_where():
         ([['new', 1]], Counter[str], counts),
         (POSE, Pose | None, None),
         (POSE, Any, None),
+        (POSE, Origin | Pose, None),
+        ([POSE, ORIGIN], list[Origin | Pose], None),
+        ([['a', [[1, ORIGIN]]]], dict[str, tuple[tuple[int, Origin], ...]], None),
+        ([1, 2], deque[int], None),
+        ([['new', 1]], Counter[str], None),
         (VECTOR, Annotated[FloatArray, 'T'], None),
         (VECTOR, FloatArray | float | str, None),
         ('x', FloatArray | float | str, None),
@@ -390,6 +398,7 @@ def test_annotations_say_what_may_stand_where():
         ([[[1], 0]], dict[int, int]),
         ('x', int | None),
         (POSE, int | None),
+        (POSE, Origin),
         ({**POSE, 'class': 'Fix'}, Any),
         ({**POSE, 'more': 1}, Pose),
         ({**POSE, 'R': VECTOR}, Pose),

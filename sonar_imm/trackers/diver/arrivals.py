@@ -15,7 +15,7 @@
 """What becomes of the divers by a ping: which measurements are whose, and the update by them.
 
 Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets, more of them by heavy tails (`ping_kernels`). So are the arrivals of a tag,
+outlier subsets (`explanations`), more of them by `heavy_tails`. So are the arrivals of a tag,
 however few: its time of emission is unknown, so that among three or four receivers no subset is
 refuted by the others, and what decides is whether the whole lies where the ping by itself would
 put it.
@@ -46,17 +46,16 @@ from . import coverage, offsets
 from .config import DiverConfig
 from .depth import spread, with_rows
 from .explanations import (
-    DEGREES,
     expect_measurements,
     expect_residuals,
+    fit_each,
     fit_measurements,
     MOST_EXPLANATIONS,
     PingMeasurements,
-    student_t_maxima,
-    student_t_ping,
     subset_ping,
 )
 from .fixes import STATED
+from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
@@ -275,16 +274,20 @@ def _explain_echoes(
     ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
     of the pairs is not what the ping shows; for it nothing happened.
     """
-    fits = [fit_measurements(*mixture[:3], config.target_z, ping.measured) for mixture in mixtures]
-    fit, nis = (np.array(column) for column in zip(*fits))
-    near = (nis < NEAR) & ping.echo
+    x, P, mu, _ = (np.concatenate(column) for column in zip(*mixtures))
+    likelihood, nis = fit_each(x, P, config.target_z, ping.measured)
+    first = np.cumsum([0, *(len(mixture.mu) for mixture in mixtures[:-1])])
+    fit = np.log(np.maximum(np.add.reduceat(mu[:, None] * likelihood, first), 1e-300))
+    near = (np.minimum.reduceat(nis, first) < NEAR) & ping.echo
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (known.life.status == TENTATIVE)
-    first, hits = _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)
+    explained_first, hits = _by_rank(
+        known, mixtures, ping, config, layout, rank, fit, near, pairs
+    )
     doubtful = (hits > 0) & (2 * hits < len(pairs))
     if not doubtful.any():
-        return first
+        return explained_first
     rank = np.where(doubtful, EXCLUDED, rank)
     return _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)[0]
 

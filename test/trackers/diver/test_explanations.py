@@ -23,10 +23,9 @@ from sonar_imm.trackers.diver.explanations import (
     expect_residuals,
     fit_measurements,
     PingMeasurements,
-    student_t_maxima,
-    student_t_ping,
     subset_ping,
 )
+from sonar_imm.trackers.diver.heavy_tails import student_t_maxima, student_t_ping
 
 MOTION, L = 4, 9
 

@@ -385,9 +385,9 @@ def errors(estimates, places, settled):
     return np.array(rows)
 
 
-@pytest.mark.parametrize('seed', [1017, 1035])
+@pytest.mark.parametrize('seed', [1017, 1018])
 def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
-    # Rows that had met went to the wrong side here: NEES 877 and 725.
+    # Rows that had met went to the wrong side here: NEES 621 and 44.
     scene, places = past_the_transmitter(seed)
     settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
     tracker = SmoothingDiverTracker(DiverConfig(**settings))

@@ -36,11 +36,8 @@ from sonar_imm.trackers.diver.arrivals import (
     update_by_ping,
     with_takings,
 )
-from sonar_imm.trackers.diver.explanations import (
-    PingMeasurements,
-    student_t_ping,
-    subset_ping,
-)
+from sonar_imm.trackers.diver.explanations import PingMeasurements, subset_ping
+from sonar_imm.trackers.diver.heavy_tails import student_t_ping
 from sonar_imm.trackers.diver.instruments import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.scan import ping_measurements
