@@ -124,7 +124,10 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
             rows = max(rows, len(tracker._stream.state.life))
         seconds, scans = seconds + time.process_time() - begin, scans + len(items)
         if settings['association'] != 'gnn':
-            learnt += [found.density / density for _, found in tracker._stream.state.clutter]
+            learnt += [
+                found.density / density
+                for _, found in tracker._stream.state.memory['clutter'].by_sensor
+            ]
         series, truth = series_of(made), true_paths(scene)
         scored.append(score(series, truth, cutoff=cutoff))
         span += scored[-1]['span_s']

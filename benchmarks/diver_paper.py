@@ -54,8 +54,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import average_bounds, nees
 from sonar_imm.estimation.motion import Model, Motion
 from sonar_imm.estimation.smoothing import imm_smooth
-from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.state_space import headings, ModelSet
+from sonar_imm.trackers.diver.models import build_models, headings, ModelSet
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm.truth import TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -287,8 +286,8 @@ def by_parameters(models: ModelSet, config: DiverConfig) -> AdaptiveChain:
     """The chain as the tracker has it."""
     return AdaptiveChain(
         models.chain,
-        config.adaptation,  # type: ignore[arg-type]
         weight=config.adaptation_prior,
+        learns=config.adaptation == 'counts',
     )
 
 
@@ -362,7 +361,7 @@ def forward(
     models: ModelSet, chain: AdaptiveChain | PaperChain, z: np.ndarray, R: np.ndarray
 ) -> Iterator[Step]:
     """Filter N runs of K fixes, one a second, at once."""
-    x, P, mu = models.new_tracks(z[:, 0], R[:, 0])
+    x, P, mu = (part[:, 0] for part in models.new_tracks(z[:, 0], R[:, 0]))
     F, Q, B = models.motion(1.0)
     H = models.E[:, :2]
     learnt = chain.fresh(len(z))

@@ -117,7 +117,7 @@ def raw_fixes(items: list, config: DiverConfig) -> list[Estimate]:
             covariance = config.covariance_scale * item.covariance[:2, :2]
             rows.append((item.stamp_ns, item.position[:2], covariance))
         elif isinstance(item, Arrivals):
-            fix = locate(item, np.arange(len(item)), config, config.covariance_scale)
+            fix = locate(item, np.arange(len(item)), config)
             rows += [(item.stamp_ns, fix.position, fix.covariance)] if fix else []
     alone = {'track_state': np.ones(1, np.uint8)}
     return [

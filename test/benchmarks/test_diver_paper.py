@@ -84,7 +84,7 @@ def test_the_guarded_product_in_a_filter_is_that_of_the_reference():
         names = (name for name in reference if name.startswith('A6_world16_adaptA_guard/'))
         given = {name.partition('/')[2]: reference[name] for name in names}
     models = SimpleNamespace(
-        new_tracks=lambda z, R: tuple(given[name][None] for name in ('x0', 'P0', 'mu0')),
+        new_tracks=lambda z, R: tuple(given[name][None, None] for name in ('x0', 'P0', 'mu0')),
         motion=lambda dt: Motion(given['F'], given['Q'], given['B']),
         E=given['E'],
     )
@@ -114,7 +114,9 @@ def test_world_headings_are_those_of_the_reference(monkeypatch):
 def test_world_headings_compose_in_position():
     """Their velocity is drawn afresh at each step; the law of the position composes."""
     models = build_models(DiverConfig(model_set='bench_world_headings'))
-    x, P, _ = models.new_tracks(np.array([[3.0, -2.0]]), np.array([[[2.0, 0.5], [0.5, 1.0]]]))
+    (x,), (P,), _ = models.new_tracks(
+        np.array([[3.0, -2.0]]), np.array([[[2.0, 0.5], [0.5, 1.0]]])
+    )
     long_x, long_P, _ = imm.predict(x, P, *models.motion(1.0))
     for _ in range(10):
         x, P, _ = imm.predict(x, P, *models.motion(0.1))

@@ -114,7 +114,7 @@ class DiverTracker:
             return layout(known.memory['instruments'])
 
         covered = coverage.stated(config)
-        associate = fixes.associating(models, config.pairing)
+        self._associate = fixes.associating(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
             **names.FEATURES,
@@ -128,8 +128,8 @@ class DiverTracker:
         self._of_group: tuple[OfGroup, ...] = wanted(
             turn and turning(models, layout),
             covered and coverage.detecting(covered, models),
-            associate,
-            models.families and restart.restarting(models, self._chain, layouts, associate),
+            self._associate,
+            models.families and restart.restarting(models, self._chain, layouts, self._associate),
             fixes.updating(models, lambda known: layouts(known).estimated(models)),
             config.dimensions == 3 and depth.updating(models, layouts, config),
             clutter.count,

@@ -34,13 +34,12 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from sonar_imm.estimation import imm
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig, MODEL_SETS
-from sonar_imm.trackers.diver.scan import Positions
-from sonar_imm.trackers.diver.state import DiverState
-from sonar_imm.trackers.diver.tracker import Association, DiverTracker
+from sonar_imm.trackers.diver.known import Known
+from sonar_imm.trackers.diver.scan import Group
+from sonar_imm.trackers.diver.tracker import DiverTracker
 
 from ..tuning import Scores, Tunable
 
@@ -90,60 +89,55 @@ class Scored(DiverTracker):
         self.scores: Scores = {}
         self.existence: dict[int, float] = {}
         self.area = area_of(measurements)
-        self._seen: list[Positions] = []
         super().__init__(config)
 
-    def _step(self, before: DiverState, stamp_ns: int, items: Any) -> DiverState:
-        self._seen, self.scores[stamp_ns] = [], (0.0, 0)
+    def _settle(self, config: DiverConfig) -> None:
+        super()._settle(config)
+        # A track that begins anew at a fix is asked once more: that is no prediction of it.
+        after = self._of_group.index(self._associate) + 1
+        self._of_group = (*self._of_group[:after], self._scoring, *self._of_group[after:])
+
+    def _step(self, before: Known, stamp_ns: int, items: Any) -> Known:
+        self.scores[stamp_ns] = (0.0, 0)
         return super()._step(before, stamp_ns, items)
 
-    def _associate(self, now: DiverState, fixes: Positions) -> Association:
-        association = super()._associate(now, fixes)
-        # A track that begins anew at a fix is asked once more: that is no prediction of it.
-        if not any(fixes is group for group in self._seen):
-            self._seen.append(fixes)
-            score, count = self.scores[now.stamp_ns]
-            gained, measured = self._score(now, fixes, association)
-            self.scores[now.stamp_ns] = score + gained, count + measured
-        return association
+    def _scoring(self, known: Known, group: Group) -> Known:
+        """Add what was predicted of a group of fixes. A stage of the tracker."""
+        score, count = self.scores[known.stamp_ns]
+        gained, measured = self._score(known, group)
+        self.scores[known.stamp_ns] = score + gained, count + measured
+        return known
 
-    def _score(self, now: DiverState, fixes: Positions, found: Association) -> tuple[float, int]:
-        config = fixes.config
-        p, m = config.detection_probability, len(fixes.z)
-        density = fixes.clutter + config.birth_density
-        log_f = np.full(len(now.x), -np.inf)
-        if len(found.tracks):
-            if found.densities is not None:
-                whole = found.densities.whole
-            else:
-                H = self._layout(now.instruments).H
-                expected = found.expected
-                whole = imm.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, math.inf)
-            log_f[found.tracks] = whole[found.tracks, found.detection]
+    def _score(self, known: Known, group: Group) -> tuple[float, int]:
+        config, found, seen = group.config, group.found, group.seen
+        assert found is not None and group.pairs is not None
+        p, m = config.detection_probability, len(group.z)
+        density = group.clutter + config.birth_density
+        tracks = np.flatnonzero(found.hit)
+        fix = found.fix[tracks]
+        log_f = np.full(len(known), -np.inf)
+        log_f[tracks] = group.pairs.whole[tracks, fix]
         score = m * math.log(density)
-        nameless = fixes.whole and fixes.target_id is None
+        nameless = group.whole and group.target_id is None
         if nameless:
             score -= density * self.area
-        known = config.max_tracks == 1
-        decay = 1.0
-        if found.seen is not None and len(found.tracks):
-            there = found.seen.fixes[found.detection] / found.seen.tracks[found.tracks]
-            log_f[found.tracks] += np.log(there)
-        for track, track_id in enumerate(now.life.track_id.tolist()):
+        sure = config.max_tracks == 1
+        if seen is not None:
+            log_f[tracks] += np.log(seen.fixes[fix] / seen.tracks[tracks])
+        for track, track_id in enumerate(known.life.track_id.tolist()):
             hit = np.isfinite(log_f[track])
             ratio = math.exp(min(log_f[track] - math.log(density), 600.0)) if hit else 0.0
-            if not nameless or now.target_id[track] != NOBODY:
+            if not nameless or known['target_id'][track] != NOBODY:
                 if hit:
                     score += math.log(1.0 - p + p * ratio)
                 continue
-            r = 1.0 if known else self.existence.get(track_id, config.birth_density / density)
-            r *= decay
-            p = p if found.seen is None else float(found.seen.tracks[track])
+            r = 1.0 if sure else self.existence.get(track_id, config.birth_density / density)
+            p = p if seen is None else float(seen.tracks[track])
             total = 1.0 - r * p + r * p * ratio
             score += math.log(total)
             self.existence[track_id] = r * (1.0 - p + p * ratio) / total
         # A fix that nothing came before cannot be predicted.
-        return score, m if len(now.x) else 0
+        return score, m if len(known) else 0
 
 
 def area_of(measurements: Sequence[Any]) -> float:

@@ -47,7 +47,7 @@ def scans(count, false, half, seed=11, divers=((0.0, 0.0), (0.0, 2.0)), aspect=1
 def learnt(items, **settings):
     tracker = DiverTracker(DiverConfig(model_set='heading_speed', **settings))
     made = [tracker.process(item)[-1] for item in items]
-    ((_, found),) = tracker._stream.state.memory['clutter']
+    ((_, found),) = tracker._stream.state.memory['clutter'].by_sensor
     return found.density, made
 
 
@@ -74,7 +74,7 @@ def test_what_is_stated_stays_and_gnn_learns_nothing():
     tracker = DiverTracker(config)
     for item in items:
         tracker.process(item)
-    assert tracker._stream.state.memory['clutter'] == ()
+    assert tracker._stream.state.memory['clutter'].by_sensor == ()
     usual, stated = (
         DiverTracker(DiverConfig(association='gnn', clutter_density=value))
         for value in (0.0, CLUTTER)
@@ -104,7 +104,7 @@ def test_each_sensor_has_its_own():
                     sensor=sensor,
                 )
             )
-    found = dict(tracker._stream.state.memory['clutter'])
+    found = dict(tracker._stream.state.memory['clutter'].by_sensor)
     assert sorted(found) == ['', 'left']
 
 

@@ -1,0 +1,272 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""All that is known after a scan: one table of rows for all tracks, none of which knows of another
+but by the fixes that they share."""
+
+import subprocess
+import sys
+
+from attrs import evolve
+from helpers.diver_runs import read_only, run, SECOND
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import rows as table
+from sonar_imm.estimation.bank import Gaussians
+from sonar_imm.measurements import Fixes
+from sonar_imm.trackers.diver import fixes
+from sonar_imm.trackers.diver.estimate import published
+from sonar_imm.trackers.diver.known import repaired
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SETS = [
+    {'association': 'jipda'},
+    {'association': 'gnn'},
+    {'model_set': 'heading_speed', 'association': 'gnn', 'gate_probability': 0.9999},
+]
+
+
+def scan(second, places, std=0.5, order=None):
+    position = np.pad(np.reshape(places, (-1, 2)), [(0, 0), (0, 1)])
+    order = np.arange(len(position)) if order is None else order
+    return Fixes(
+        stamp_ns=round(second * SECOND),
+        position=position[order],
+        covariance=np.tile(std**2 * np.eye(2), (len(position), 1, 1))[order],
+        frame_id='map',
+    )
+
+
+def swims(divers, seconds, seed, apart=60.0, false=0.0, detected=0.9, scatter=1.0):
+    """Scans of divers who turn, `apart` from each other, one array (k, 2) of each diver, and false
+    fixes; the scatter of the fixes in terms of what they state."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(0.3 * rng.normal(size=(seconds, divers)), axis=0)
+    place = np.cumsum(0.7 * np.stack([np.cos(heading), np.sin(heading)], axis=-1), axis=0)
+    place[..., 1] += apart * np.arange(divers)
+    for second in range(seconds):
+        seen = place[second] + scatter * 0.5 * rng.normal(size=(divers, 2))
+        there = rng.uniform(size=divers) < (detected if second > 5 else 1.0)
+        wild = rng.uniform(-30.0, 30.0, (rng.poisson(false), 2)) + [0.35 * second, 0.0]
+        yield [seen[[d]] if there[d] else seen[:0] for d in range(divers)], wild
+
+
+def scans(*arguments, **settings):
+    for second, (own, wild) in enumerate(swims(*arguments, **settings), start=1):
+        yield scan(second, np.concatenate([*own, wild]))
+
+
+@pytest.mark.parametrize('settings', SETS)
+@pytest.mark.parametrize('seed', range(2))
+def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
+    """And the weights of a track, with those that it borrows, sum to one."""
+    tracker = DiverTracker(DiverConfig(max_tracks=5, **settings))
+    scales = np.sort(tracker.models.scales)
+    ended, lent, before = 0, 0, tracker._stream.state
+    for item in scans(3, 50, seed, apart=5.0, false=3.0, scatter=1.5):
+        tracker.process(item)
+        known = tracker._stream.state
+        rows, borrowed, ids = known.rows, known.borrowed, known.life.track_id
+        assert all(len(column) == len(known) for column in known.features.values())
+        assert (np.diff(rows.target) >= 0).all()
+        assert np.array_equal(np.unique(rows.target), np.arange(len(known)))
+        total = np.bincount(rows.target, np.exp(rows.logw), len(known))
+        total += np.bincount(borrowed.target, np.exp(borrowed.logw), len(known))
+        np.testing.assert_allclose(total, 1.0, rtol=1e-9)
+        np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
+        for track in range(len(known)):
+            own = rows.key['scale'][known.rows_of(track)]
+            own = np.append(own, borrowed.key[borrowed.target == track])
+            assert np.array_equal(np.sort(own), scales)
+        old = rows.parent >= 0
+        parents = before.life.track_id[before.rows.target[rows.parent[old]]]
+        assert np.array_equal(parents, ids[rows.target[old]])
+        ended += len(np.setdiff1d(before.life.track_id, ids))
+        lent, before = lent + len(borrowed), known
+    assert ended > 10 and (lent > 100) == (len(scales) > 1)
+
+
+@pytest.mark.parametrize('settings', SETS)
+def test_tracks_in_one_table_are_trackers_of_one(settings):
+    """Divers too far apart to share a fix."""
+    config = DiverConfig(max_tracks=9, clutter_density=1e-5, **settings)
+    made = list(swims(3, 30, 4))
+    together = run(
+        DiverTracker(config),
+        [scan(k, np.concatenate(own)) for k, (own, _) in enumerate(made, start=1)],
+    )
+    for d in range(3):
+        alone = run(DiverTracker(config), [scan(k, own[d]) for k, (own, _) in enumerate(made, 1)])
+        for both, single in zip(together, alone):
+            assert both.extras['track_id'][d] == d + 1 and len(single) == 1
+            for name in ('state', 'covariance', 'probabilities'):
+                due = getattr(single, name)[0]
+                np.testing.assert_allclose(getattr(both, name)[d], due, rtol=1e-9, atol=1e-12)
+            for name in ('existence', 'nis'):
+                np.testing.assert_allclose(both.extras[name][d], single.extras[name][0])
+
+
+@pytest.mark.parametrize('settings', SETS)
+def test_a_scene_far_from_the_origin_is_the_same(settings):
+    config, far = DiverConfig(max_tracks=3, **settings), np.array([1e6, -1e6, 0.0])
+    here = list(scans(2, 40, 5, apart=6.0, false=1.0))
+    there = [evolve(item, position=item.position + far) for item in here]
+    for near, away in zip(run(DiverTracker(config), here), run(DiverTracker(config), there)):
+        assert np.array_equal(near.extras['track_id'], away.extras['track_id'])
+        np.testing.assert_allclose(away.state[:, :2] - far[:2], near.state[:, :2], atol=1e-6)
+        np.testing.assert_allclose(away.state[:, 2:], near.state[:, 2:], atol=1e-6)
+        np.testing.assert_allclose(away.covariance, near.covariance, atol=1e-6)
+
+
+@pytest.mark.parametrize('settings', SETS)
+def test_the_order_of_the_fixes_in_a_scan_changes_nothing(settings):
+    config, rng = DiverConfig(max_tracks=3, **settings), np.random.default_rng(6)
+    first = list(scans(2, 40, 6, apart=6.0, false=2.0))
+    other = []
+    for item in first:
+        order = rng.permutation(len(item))
+        other.append(
+            evolve(item, position=item.position[order], covariance=item.covariance[order])
+        )
+    firm = []
+    for one, two in zip(run(DiverTracker(config), first), run(DiverTracker(config), other)):
+        rows = [np.flatnonzero(each.extras['track_state'] > 0) for each in (one, two)]
+        for name in ('state', 'covariance', 'probabilities'):
+            ours, theirs = (getattr(each, name)[own] for each, own in zip((one, two), rows))
+            assert len(ours) == len(theirs)
+            order = (
+                np.lexsort(one.state[rows[0]].round(6).T),
+                np.lexsort(two.state[rows[1]].round(6).T),
+            )
+            np.testing.assert_allclose(ours[order[0]], theirs[order[1]], rtol=1e-9, atol=1e-9)
+        firm.append(len(rows[0]))
+    assert 2 in firm
+
+
+@pytest.mark.parametrize('scatter', [0.5, 1.0])
+@pytest.mark.parametrize('association', ['jipda', 'gnn'])
+def test_rows_that_lost_their_weight_would_have_said_nothing_else(
+    association, scatter, monkeypatch
+):
+    """Estimates are those of a tracker that computes every scale, to a thousandth of a standard
+    deviation as a rule, and never to more than a tenth."""
+    config = DiverConfig(max_tracks=5, association=association)
+    items = list(scans(2, 60, 7, apart=25.0, scatter=scatter))
+    trackers, off, wide = [DiverTracker(config) for _ in range(2)], [], []
+    thin = run(trackers[0], items)
+    monkeypatch.setattr(table, 'ROW_LOST', 1e-300)
+    for one, two in zip(thin, run(trackers[1], items)):
+        assert np.array_equal(one.extras['track_id'], two.extras['track_id'])
+        std, its = (np.sqrt(np.diagonal(e.covariance, axis1=1, axis2=2)) for e in (two, one))
+        off.append(np.abs((one.state - two.state) / std).max(initial=0.0))
+        wide.append(np.abs(its / std - 1.0).max(initial=0.0))
+    assert len(trackers[0]._stream.state.rows) < len(trackers[1]._stream.state.rows)
+    assert np.median(off) < 2e-3 and np.median(wide) < 1e-3
+    assert max(off) < 0.1 and max(wide) < 0.02
+
+
+def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
+    """An assumption without a row of its own has its weight, and is in no mixture twice."""
+    tracker = DiverTracker(DiverConfig())
+    run(tracker, scans(2, 20, 8))
+    known = tracker._stream.state
+    rows = known.rows
+    first = rows.first[rows.target]
+    same = tuple(block.rows(first) for block in rows.blocks)
+    agreeing = known.replace(rows=rows.replace(blocks=same, mu=rows.mu[first]))
+    one = rows.take(rows.first)
+    stated = np.ones(len(one))
+    single = known.replace(
+        rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': stated})
+    )
+    for ours, due in zip(published(agreeing, tracker.models), published(single, tracker.models)):
+        np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
+    spread = fixes.spread_over_scales(agreeing)
+    for ours, due in zip(published(spread, tracker.models), published(single, tracker.models)):
+        np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize('settings', SETS)
+def test_a_spoilt_covariance_is_repaired_alone(settings):
+    tracker = DiverTracker(DiverConfig(max_tracks=3, **settings))
+    made = [scan(k, np.concatenate(own)) for k, (own, _) in enumerate(swims(3, 21, 9), start=1)]
+    run(tracker, made[:20])
+    known = tracker._stream.state
+    P = [block.P.copy() for block in known.rows.blocks]
+    row = int(known.rows_of(1)[0])
+
+    def spoil(P, of=slice(None)):
+        across = 1.5 * np.sqrt(P[row, 0, 0, of] * P[row, 1, 1, of])
+        P[row, 0, 1, of] = P[row, 1, 0, of] = across
+
+    spoil(P[0], 2)
+    blocks = tuple(Gaussians(block.x, part) for block, part in zip(known.rows.blocks, P))
+    after, count = repaired(blocks)
+    assert count == 1 and repaired(after)[1] == 0
+    for block, before in zip(after, blocks):
+        different = np.argwhere((block.P != before.P).any(axis=(1, 2))).tolist()
+        assert different == ([[row, 2]] if block is after[0] else [])
+    for part in P:
+        spoil(part)
+    spoilt = known.replace(rows=known.rows.replace(blocks=blocks))
+    read_only(spoilt)
+    last = made[20].stamp_ns, [made[20]]
+    healthy, other = (tracker._step(each, *last) for each in (known, spoilt))
+    assert other.counts['repairs'] > healthy.counts.get('repairs', 0)
+    for ours, due in zip(published(other, tracker.models), published(healthy, tracker.models)):
+        np.testing.assert_array_equal(ours[[0, 2]], due[[0, 2]])
+        assert np.isfinite(ours).all()
+
+
+NO_COMPILER = """
+import sys
+import numpy as np
+from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+for tracker in (DiverTracker(DiverConfig()), SmoothingDiverTracker(DiverConfig(dimensions=3))):
+    tracker.warm()
+    for second in range(1, 6):
+        tracker.process(Fix(stamp_ns=second * 10**9, position=np.array([0.5 * second, 0.0, -5.0])))
+    assert 'numba' not in sys.modules, 'fixes'
+    rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+    leg = np.linalg.norm(rx - [3.0, 0.1, -5.0], axis=1)
+    tx, no = np.tile(rx[0], (4, 1)), np.full(4, np.nan)
+    for second, many in ((6, 1), (7, 2)):
+        echoes = [np.repeat(part, many, axis=0) for part in (tx, rx, (leg + leg[0]) / 1500.0, no)]
+        tracker.process(
+            Arrivals(
+                stamp_ns=second * 10**9,
+                tx_id=np.zeros(4 * many),
+                rx_id=np.arange(4 * many),
+                tx=echoes[0],
+                rx=echoes[1],
+                toa=echoes[2],
+                var_toa=np.full(4 * many, 1e-8),
+                bearing=echoes[3],
+                var_bearing=echoes[3],
+            )
+        )
+    assert tracker._stream.state['nis_dof'].any()
+    assert 'numba' not in sys.modules, 'arrivals'
+tracker.smoothed()
+assert 'numba' not in sys.modules, 'smoothing'
+"""
+
+
+def test_nothing_is_compiled_for_divers():
+    done = subprocess.run([sys.executable, '-c', NO_COMPILER], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
