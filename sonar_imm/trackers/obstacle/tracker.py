@@ -311,9 +311,9 @@ class ObstacleTracker:
 
     def _end(self, known: Known, ping: Ping) -> Known:
         """End the tracks that are over or passed."""
-        stays = ping.verdict.stays
-        known = known._replace(obstacles=take(known.obstacles, stays), life=ping.verdict.life)
-        return known.only(ping.verdict.ahead[stays])
+        life, stays, ahead = ping.verdict
+        table = known.obstacles if stays.all() else take(known.obstacles, stays)
+        return known._replace(obstacles=table, life=life).only(ahead[stays])
 
     def _begin(self, known: Known, ping: Ping) -> Known:
         """Begin a track at each echo that nobody gave, as long as there is room."""
