@@ -51,7 +51,7 @@ FUZZ_JSON ?=
 FILES ?= 100
 STATES ?= 25000
 # Tests that run the compiled kernels.
-KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm \
+KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,imm \
     set_particles smoothing covariance kalman)) \
     $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
     test/trackers test/cli/test_bathymetry_vectors.py

@@ -66,7 +66,7 @@ from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..protocol import WarmStep
 from .config import BathymetryConfig
-from .kernels import Track
+from .grid_kernels import Track
 from .ping import (
     Answer,
     bin_stamps,
