@@ -79,7 +79,7 @@ $(STAMP): setup.py pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --editable .
 	@# Kernels compile while pip fetches the rest; whoever needs one earlier compiles it too.
-	@nohup nice $(BIN)/sonar-imm warm --jobs 1 >$(VENV)/warm.log 2>&1 &
+	@nohup nice $(BIN)/sonar-imm warm >$(VENV)/warm.log 2>&1 &
 	@# By its name: it is there, and need not be built again for what else it needs.
 	@$(INSTALL) 'sonar_imm$(ROS)'
 	@touch $@

@@ -57,7 +57,7 @@ ALLOWED = {
     'numpy.typing': {'NDArray'},
     'math': {'math'},
     'numba': {'numba'},
-    'typing': {'NamedTuple'},
+    'typing': {'Any', 'NamedTuple'},
     **dict.fromkeys(('.jit', '..estimation.jit', '...estimation.jit'), {'kernel'}),
     '__future__': {'annotations'},
     **dict.fromkeys(('.arrays', '...estimation.arrays'), TYPES),

@@ -88,7 +88,7 @@ def test_a_file_runs_no_program(file, tmp_path):
     """The step that is taken when the clock was set back is Popen, and its state a command."""
     header, block = parts_of(file)
     stream, victim = stream_of(header), tmp_path / 'made'
-    popen = number_of(header, 'sonar_imm.estimation.jit', 'subprocess.Popen')
+    popen = number_of(header, 'subprocess', 'Popen')
     set_attribute(stream, '_survivor', ['class', popen])
     command = ['list', 'touch', str(victim)]
     set_attribute(attributes(stream, '_history'), '_states', ['list', command])
@@ -102,8 +102,8 @@ def test_a_file_runs_no_program(file, tmp_path):
 
 
 GADGETS = [
-    ('sonar_imm.estimation.jit', 'subprocess.Popen'),
-    ('sonar_imm.estimation.jit', 'os._wrap_close'),
+    ('subprocess', 'Popen'),
+    ('sonar_imm.files', 'os._wrap_close'),
     ('sonar_imm.files', 'tempfile._TemporaryFileCloser'),
     ('sonar_imm.files', 'tempfile.TemporaryDirectory'),
     ('sonar_imm.files', 'Path'),

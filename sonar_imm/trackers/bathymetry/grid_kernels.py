@@ -60,13 +60,14 @@ a row gives the same bits however it is cut.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...estimation.jit import kernel
 
+_FIRST: Any = np.int64(0)  # a literal in a call would make a signature of its own
 _HALF_CIRCLE = 0.5 * math.pi
 _TURNS = 0.5 / math.pi
 ROUND = 1.5 * 2.0**52
@@ -694,7 +695,7 @@ def filter_ping(
     work, value, sines = np.empty((4, G)), np.empty(G), np.empty(G)
     kept, used = np.empty(4096 if keep else 0), 0
     carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
-    low, high = trim(p, 0, G)
+    low, high = trim(p, _FIRST, G)
     for t in range(T):
         echo, reach = ping.echo[t], 0
         if echo:
@@ -1027,7 +1028,7 @@ def filter_scatter(
     level, likelihood = np.empty(G), np.empty((K, G))
     kept, used = np.empty(4096 if keep else 0), 0
     wide = np.empty(2, np.int64)
-    low, high = trim(p, 0, G)
+    low, high = trim(p, _FIRST, G)
     for t in range(T):
         echo, reach = ping.echo[t], 0
         if echo:

@@ -49,7 +49,6 @@ from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
-from ..protocol import WarmStep
 from . import births, clutter, coverage, families, fix_kernels, heights, jipda, kbest, names, pings
 from .births import Birth
 from .config import DiverConfig
@@ -136,17 +135,11 @@ class DiverTracker:
         self._georeferencer.config = config
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
-        for _, compile_step in self.warm_steps(inputs):
-            compile_step()
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        steps: list[WarmStep] = []
         if inputs is None or not {Arrivals, Start}.issuperset(inputs):
-            steps.append(('fixes', self._warm_fixes))
+            self._warm_fixes()
         if inputs is None or Arrivals in inputs:
-            steps.append(('echoes', partial(self._warm_pings, np.zeros(3))))
-            steps.append(('tags', partial(self._warm_pings, np.full(3, np.nan))))
-        return steps
+            self._warm_pings(np.zeros(3))
+            self._warm_pings(np.full(3, np.nan))
 
     def _warm_fixes(self) -> None:
         tracker = self._for_warming()

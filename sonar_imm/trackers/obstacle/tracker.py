@@ -44,7 +44,6 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
-from ..protocol import WarmStep
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
@@ -135,9 +134,6 @@ class ObstacleTracker:
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Do nothing: no kernel has to be compiled."""
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return []
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
