@@ -16,8 +16,7 @@
 
 A kernel is compiled at its first call and kept on disk by numba: in `NUMBA_CACHE_DIR` if that is
 set, else beside the source if that can be written, else in the user's cache folder. numba compiles
-anew when the kernel's own file changes, so no kernel calls one of another file. Processes that
-compile at the same time write the same code: a configuration has one kind of arguments.
+anew when the kernel's own file changes, so no kernel calls one of another file.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from importlib import import_module
+from pathlib import Path
 import sys
 import time
 import traceback
@@ -43,6 +44,7 @@ from typing import Any, overload, TYPE_CHECKING
 
 from attrs import frozen
 
+from ..files import one_at_a_time
 from ..parameters import Config, ConfigError
 from .protocol import SmoothingTracker, Tracker
 
@@ -52,6 +54,9 @@ if TYPE_CHECKING:
     from .diver.tracker import DiverConfig, DiverTracker
     from .fathometer.tracker import FathometerConfig, FathometerTracker
     from .obstacle.tracker import ObstacleConfig, ObstacleTracker
+
+LONGEST_SECONDS = 120.0
+"""How long a process waits for another one that compiles: longer than that takes."""
 
 __all__ = ['SmoothingTracker', 'System', 'SYSTEMS', 'Tracker']
 
@@ -135,7 +140,10 @@ class System:
 
         before, start = jit.counts(), time.perf_counter()
         try:
-            tracker.warm(inputs)
+            # Of two processes that compile a kernel for different arguments one may keep its code
+            # under the name of the other's.
+            with one_at_a_time(Path(__file__).with_name(self.name), LONGEST_SECONDS):
+                tracker.warm(inputs)
         except Exception as error:  # what is damaged raises nearly anything when it is unpickled
             frames = traceback.extract_tb(error.__traceback__)
             if not any(frame.filename.endswith('caching.py') for frame in frames):
