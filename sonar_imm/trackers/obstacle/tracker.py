@@ -42,7 +42,6 @@ from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Ground, Measurement, Navigation
 from ..model_checks import track_rules
-from ..protocol import WarmStep
 from .avoidance import closest_approach
 from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
@@ -142,9 +141,6 @@ class ObstacleTracker:
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Do nothing: no kernel has to be compiled."""
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return []
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
