@@ -66,9 +66,6 @@ for name in RUNS:
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
 """
-COLD = {'_repair', '_update_again'}
-"""Compiled when the first covariance needs it, and what they call."""
-
 
 @pytest.fixture(scope='module')
 def found():
@@ -88,5 +85,5 @@ def test_nothing_is_left_to_compile_after_warm_and_a_kernel_has_one_kind_of_argu
     before, after = found[name]
     assert any(before.values()) or name.startswith('obstacle')  # which has no kernel
     late = {name for name in after if after[name] != before.get(name, [])}
-    assert {name for name in late if name.rpartition('.')[2] not in COLD} == set()
+    assert late == set()
     assert {name: kinds for name, kinds in after.items() if len(kinds) > 1} == {}

@@ -38,19 +38,6 @@ FILES = (
 )
 """One kernel for each verb."""
 ALONE = (*FILES, 'trackers/bathymetry/grid_kernels.py')
-NOT_YET = {
-    'acoustics/arrivals_3d.py',
-    'estimation/adaptation.py',
-    'estimation/consider.py',
-    'estimation/hypotheses.py',
-    'estimation/imm_kernels.py',
-    'estimation/jipda.py',
-    'estimation/small_matrices.py',
-    'trackers/diver/family_kernels.py',
-    'trackers/diver/fix_kernels.py',
-    'trackers/diver/ping_kernels.py',
-}
-"""They call kernels of one another: after a change of one of them delete what is compiled."""
 TYPES = {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'}
 ALLOWED = {
     'numpy': {'np'},
@@ -84,7 +71,7 @@ def kernels_of(tree):
 def test_every_kernel_file_is_known():
     files = {path.relative_to(PACKAGE).as_posix(): path for path in PACKAGE.rglob('*.py')}
     found = {name for name, path in files.items() if kernels_of(ast.parse(path.read_text()))}
-    assert found == {*ALONE, *NOT_YET}
+    assert found == {*ALONE}
 
 
 @pytest.mark.parametrize('name', ALONE)

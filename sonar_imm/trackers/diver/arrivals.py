@@ -82,7 +82,7 @@ DISTINCT = 1.0
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`ping_kernels`."""
+`explanations`."""
 
 TAKEN = 0.5
 """Probability of being good from which a measurement counts as a track's."""
