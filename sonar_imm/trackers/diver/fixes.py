@@ -427,8 +427,9 @@ def _staying(rows: Rows) -> BoolArray:
     """Return which rows (N,) stay whatever they weigh: those whose start is their state, and of
     each track the heaviest, and the heaviest that says how well its place is known."""
     scale = rows.key['scale']
-    stays = rows.key['start'] > 0
     first = rows.first
+    # A start is a state and no scale: all rows of such a track stay, also the first.
+    stays = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
     for counted in (np.ones(len(rows), np.bool_), scale >= STATED):
         log = np.where(counted, rows.logw, -np.inf)
         heaviest = log == np.maximum.reduceat(log, first)[rows.target]
