@@ -236,7 +236,8 @@ class DiverTracker:
     def _predict(self, before: Known, scan: Scan, stamp_ns: int) -> Known:
         """The tracks as this scan should show them; the step that led there stands in `scan`."""
         dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        start = before if not len(before) else fixes.spread_over_scales(before)
+        several = len(before) and len(self.models.scales) > 1
+        start = fixes.spread_over_scales(before) if several else before
         crossing = self.models, self._chain, start.rows, before['learnt']
         steps = crossed(*crossing, dt, self.config.longest_step)
         transition = np.linalg.matrix_power(steps[-1].transition, len(steps))
