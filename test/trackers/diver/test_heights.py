@@ -400,14 +400,32 @@ def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
 
 
 def test_a_track_that_was_somewhere_else_begins_anew_with_the_whole_bank():
-    # A ghost of two receivers, confirmed first, takes a ping 20 m away: z was then off by 6 m.
-    scene, places = past_the_transmitter(1043)
+    """Told 20 m away from where the diver is, by eight receivers that outvote it."""
     settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
-    tracker = DiverTracker(DiverConfig(**settings))
-    pings = [item.measurement for item in scene.measurements][:31]
-    found = [estimate for ping in pings for estimate in tracker.process(ping)]
-    nis = [float(np.nan_to_num(each.extras['nis']).max()) for each in found if len(each.state)]
-    lost = int(np.argmax(nis))
-    assert nis[lost] > 100.0
-    after = errors(found, places, lost)
+    tracker, rng = DiverTracker(DiverConfig(**settings)), np.random.default_rng(1)
+    angle = 2.0 * np.pi * np.arange(8) / 8.0
+    rx = np.column_stack([40.0 * np.cos(angle), 40.0 * np.sin(angle), -rng.uniform(1, 14, 8)])
+    told = Start(stamp_ns=10**9, position=[27.0, 3.0, 0.0], covariance=spatial(math.nan) * 4.0)
+    tracker.process(told)
+    found, places, no = [], {}, np.full(8, math.nan)
+    for second in range(2, 14):
+        place = np.array([7.0 + 0.5 * second, 3.0 + 0.2 * second, -15.0])
+        path = np.linalg.norm(place - rx, axis=1) + np.linalg.norm(place - rx[0])
+        ping = Arrivals(
+            stamp_ns=second * 10**9,
+            tx_id=np.zeros(8),
+            rx_id=np.arange(8),
+            tx=np.tile(rx[0], (8, 1)),
+            rx=rx,
+            toa=path / 1500.0 + 2e-4 * rng.normal(size=8),
+            var_toa=np.full(8, 4e-8),
+            bearing=no,
+            var_bearing=no,
+        )
+        found += tracker.process(ping)
+        places[second * 10**9] = place
+    assert found[0].extras['nis'][0] > 100.0
+    assert tracker._stream.state['spreads'].tolist() == [1]
+    assert {tuple(each.extras['track_id'].tolist()) for each in found} == {(1,)}
+    after = errors(found, places, 0)
     assert after[:, 1].mean() < 8.0 and np.abs(after[:, 0]).max() < 2.5
