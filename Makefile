@@ -51,7 +51,7 @@ FUZZ_JSON ?=
 FILES ?= 100
 STATES ?= 25000
 # Tests that run the compiled kernels.
-KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid set_particles)) \
+KERNEL_TESTS := test/estimation/test_set_particles.py \
     $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
     test/trackers test/cli/test_bathymetry_vectors.py
 
@@ -78,7 +78,7 @@ $(STAMP): setup.py pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --editable .
 	@# Kernels compile while pip fetches the rest; whoever needs one earlier compiles it too.
-	@nohup nice $(BIN)/sonar-imm warm --jobs 1 >$(VENV)/warm.log 2>&1 &
+	@nohup nice $(BIN)/sonar-imm warm >$(VENV)/warm.log 2>&1 &
 	@# By its name: it is there, and need not be built again for what else it needs.
 	@$(INSTALL) 'sonar_imm$(ROS)'
 	@touch $@

@@ -41,7 +41,7 @@ from scipy.special import kve
 from benchmarks.study import Parts, study, truths
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry.kernels import state_log_likelihoods
+from sonar_imm.trackers.bathymetry.grid_kernels import state_log_likelihoods
 from sonar_imm.trackers.bathymetry.ping import (
     CANNOT_TELL,
     estimate_of,

@@ -16,8 +16,8 @@
 
     python -m benchmarks.cold_start --out docs/results/cold_start.json
 
-Each case runs in a fresh process with an empty kernel cache: the tracker is built and warmed
-(`trackers.Tracker.warm_steps`) for the inputs of the case. CPU and wall seconds are those of
+Each case runs in a fresh process with an empty folder of compiled kernels: the tracker is built
+and warmed (`trackers.Tracker.warm`) for the inputs of the case. CPU and wall seconds are those of
 warming, without the import of Python's libraries; kernels are functions of the package, as many as
 were compiled; compilations count those that numba makes of its own functions too, and every
 combination of argument types; kB are those of the machine code kept on disk. CPU seconds mean
@@ -40,21 +40,18 @@ from benchmarks.study import in_fresh_process, Parts, study
 
 @frozen
 class Case:
-    """A system, its inputs (classes of `sonar_imm.measurements`) and parameters beside the
-    defaults. No inputs: all. steps: of those that the inputs need, by name; empty: all."""
+    """A system, its inputs (classes of `sonar_imm.measurements`, none: all) and parameters beside
+    the defaults."""
 
     system: str
     inputs: tuple[str, ...] = ()
     parameters: Mapping[str, Any] = field(factory=dict)
-    steps: tuple[str, ...] = ()
 
 
 CASES = {
     'diver, fixes': Case('diver', ('Fix',)),
     'diver, fixes, gnn': Case('diver', ('Fix',), {'association': 'gnn'}),
-    'diver, echoes': Case('diver', ('Arrivals',), steps=('echoes',)),
-    'diver, a tag': Case('diver', ('Arrivals',), steps=('tags',)),
-    'diver, a tag with depth': Case('diver', ('Arrivals',), {'dimensions': 3}, ('tags',)),
+    'diver, arrivals': Case('diver', ('Arrivals',)),
     'diver, everything': Case('diver', (), {'dimensions': 3}),
     'bathymetry, defaults': Case('bathymetry', ('Snapshot',)),
     'bathymetry, with navigation': Case(
@@ -92,9 +89,7 @@ def cold_start(case: Case, cache: str) -> dict[str, float]:
     inputs = {getattr(measurements, name) for name in case.inputs}
     cpu, wall = time.process_time(), time.perf_counter()
     with event.install_listener('numba:compile', Counter()):
-        for name, compile_step in tracker.warm_steps(inputs or None):
-            if not case.steps or name in case.steps:
-                compile_step()
+        tracker.warm(inputs or None)
     return {
         'CPU s': time.process_time() - cpu,
         'wall s': time.perf_counter() - wall,

@@ -40,6 +40,7 @@ import re
 import shutil
 import stat
 import tempfile
+import time
 from typing import Any
 
 try:
@@ -229,6 +230,24 @@ def lock(handle: int) -> None:
     if fcntl is None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
+def one_at_a_time(folder: Path, patience: float) -> Iterator[None]:
+    """Wait until no other process is in such a block for `folder`, `patience` seconds at most.
+    Without locks nobody waits."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            handle = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, handle)
+            end = time.monotonic() + patience
+            while time.monotonic() < end:
+                try:
+                    lock(handle)
+                    break
+                except BlockingIOError:
+                    time.sleep(0.02)
+        yield
 
 
 def remove_leftovers(path: Path) -> None:

@@ -43,6 +43,7 @@ GONE: dict[str, str] = {
     'command fuse': 'was removed: give both sensors to one diver node (parameter sensors)',
     'command chart': 'was removed: record ~/soundings and run sonar-imm survey',
     'command sweep': 'was removed: use sonar-imm simulate --seed, track --jobs and evaluate',
+    'option warm --jobs': 'was removed: one process compiles all kernels',
     'kind ek80': _RAW_FILE,
     'kind kongsberg': _RAW_FILE,
     'kind autoferry': 'was removed: write the positions as CSV (kind fixes)',

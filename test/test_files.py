@@ -19,6 +19,7 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -183,3 +184,13 @@ def test_what_is_renamed_is_on_the_disk_before_and_the_rename_after(tmp_path, mo
     with whole(tmp_path / 'file') as path:
         path.write_text('a')
     assert calls == [('sync', 'file'), ('rename', 'file'), ('sync', tmp_path.name)]
+
+
+@locks
+def test_who_waits_for_a_folder_goes_on_when_it_is_free_or_patience_ends(tmp_path):
+    with files.one_at_a_time(tmp_path, 60.0):
+        begun = time.monotonic()
+        with files.one_at_a_time(tmp_path, 0.1):
+            assert time.monotonic() - begun >= 0.1
+    with files.one_at_a_time(tmp_path, 60.0), files.one_at_a_time(tmp_path / 'nowhere', 60.0):
+        assert time.monotonic() - begun < 30.0

@@ -48,7 +48,6 @@ from functools import lru_cache
 import numpy as np
 
 from ..estimation.arrays import BoolArray, FloatArray
-from ..estimation.jit import kernel
 
 _LARGEST_FACTOR = 1e6
 CENSORED = 5.0
@@ -220,67 +219,48 @@ def _tails(false_alarm: float) -> tuple[FloatArray, FloatArray]:
     return np.array(variances)[::-1], np.maximum(np.array(factors)[::-1], 1.0)
 
 
-@kernel
 def across_beams(power: FloatArray, half: int) -> FloatArray:
     """Mean (R, B) over the beams within `half` of each, fewer at the edges."""
-    R, B = power.shape
-    mean = np.empty((R, B))
-    row = np.zeros(B + 2 * half)
-    inverse = np.empty(B)
-    for b in range(B):
-        inverse[b] = 1.0 / (min(b + half, B - 1) - max(b - half, 0) + 1)
-    for r in range(R):
-        for b in range(B):
-            row[half + b] = power[r, b]
-        total = mean[r]
-        total[:] = 0.0
-        for k in range(2 * half + 1):
-            for b in range(B):
-                total[b] += row[b + k]
-        for b in range(B):
-            total[b] *= inverse[b]
-    return mean
+    beam = np.arange(power.shape[1])
+    count = np.minimum(beam + half, len(beam) - 1) - np.maximum(beam - half, 0) + 1
+    padded = np.pad(power, ((0, 0), (half, half)))
+    return _sums(padded.T, 2 * half + 1).T / count
 
 
-@kernel
+def _sums(value: FloatArray, width: int) -> FloatArray:
+    """Sums (n - width + 1, ...) over `width` neighbours along the first axis of `value` (n, ...).
+
+    No running sum: one huge value would spoil the rest of it. Sums over 1, 2, 4, ... neighbours
+    are made of one another, and the sum over `width` of those.
+    """
+    length, size, done = len(value) - width + 1, 1, 0
+    total, block = np.zeros((length, *value.shape[1:])), value
+    while True:
+        if width & size:
+            total += block[done : done + length]
+            done += size
+        if done == width:
+            return total
+        block = block[:-size] + block[size:]
+        size *= 2
+
+
 def greatest_of_level(
     power: FloatArray, half: int, training: int, guard: int
 ) -> tuple[FloatArray, FloatArray]:
     """See `noise_level`; `half` beams on either side are averaged."""
-    # Sums are taken afresh for each cell: one huge value would spoil the rest of a running sum.
-    R, B = power.shape
+    R, least = len(power), (training + 1) // 2
     smooth = across_beams(power, half)
-    window = np.empty((R, B))  # mean of the rows r to r + training - 1 that there are
-    for r in range(R):
-        last = min(r + training, R)
-        total = window[r]
-        total[:] = 0.0
-        for k in range(r, last):
-            for b in range(B):
-                total[b] += smooth[k, b]
-        for b in range(B):
-            total[b] /= last - r
-    least = (training + 1) // 2
-    level = np.full((R, B), np.inf)
-    sides = np.zeros(R)
-    for r in range(R):
-        end = r - guard  # the side before ends here, exclusive
-        if end < least:
-            continue
-        sides[r] = 1.0
-        if end >= training:
-            level[r] = window[end - training]
-        else:
-            total = level[r]
-            total[:] = 0.0
-            for k in range(end):
-                for b in range(B):
-                    total[b] += smooth[k, b]
-            for b in range(B):
-                total[b] /= end
-        behind = r + guard + 1
-        if R - behind >= least:
-            sides[r] = 2.0
-            for b in range(B):
-                level[r, b] = max(level[r, b], window[behind, b])
-    return level, sides
+    row = np.arange(R)
+    near, far = row - guard, row + guard + 1  # the near side ends and the far side begins here
+    # Means over `training` rows that end or begin at each row, over fewer at the edges.
+    padded = np.pad(smooth, ((training, training), (0, 0)))
+    window = _sums(padded, training)[: R + training]
+    ends = np.arange(R + training)
+    window /= np.maximum(np.minimum(ends, R) - np.maximum(ends - training, 0), 1)[:, None]
+    level = np.full(power.shape, np.inf)
+    known = near >= least
+    level[known] = window[near[known]]
+    both = known & (R - far >= least)
+    level[both] = np.maximum(level[both], window[far[both] + training])
+    return level, known.astype(np.float64) + both

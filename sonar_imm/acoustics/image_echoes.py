@@ -39,7 +39,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from ..estimation.jit import kernel
 from .cfar import effective_cells, quiet_level, tail_factor, threshold_factor
 
 MAX_CELLS = 20_000
@@ -206,45 +205,36 @@ def _nothing() -> Echoes:
     return Echoes(*(np.empty(0) for _ in range(8)))
 
 
-@kernel
 def joined_parts(
     part: NDArray[np.intp], distance: FloatArray, bearing: FloatArray, reach: float
 ) -> NDArray[np.intp]:
     """Part numbers (n,) of cells in which parts with cells within `reach` of each other have the
     same one: 0, 1, ... without gaps. The cells lie at `distance` (n,) m, ascending, and `bearing`
     (n,) rad."""
-    n = len(part)
-    count = 0
-    for i in range(n):
-        count = max(count, part[i] + 1)
-    root = np.arange(count)
-    x, y = distance * np.cos(bearing), distance * np.sin(bearing)
-    for i in range(n):
-        for j in range(i + 1, n):
-            if distance[j] - distance[i] > reach:
-                break
-            if part[i] == part[j]:
-                continue
-            if (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 > reach * reach:
-                continue
-            a, b = part[i], part[j]
-            while root[a] != a:
-                root[a] = root[root[a]]
-                a = root[a]
-            while root[b] != b:
-                root[b] = root[root[b]]
-                b = root[b]
-            if a != b:
-                root[max(a, b)] = min(a, b)
-    number = np.full(count, -1)
-    used = 0
-    joined = np.empty(n, np.intp)
-    for i in range(n):
-        a = part[i]
-        while root[a] != a:
-            a = root[a]
-        if number[a] < 0:
-            number[a] = used
-            used += 1
-        joined[i] = number[a]
-    return joined
+    from scipy.spatial import cKDTree
+
+    reach, count = max(reach, 1e-9), int(part.max()) + 1
+    place = np.stack([np.cos(bearing), np.sin(bearing)]) * distance
+    # Cells in one square are within reach: what is joined by squares needs no look at its cells.
+    corner = np.floor(place / (reach * np.sqrt(0.5)))
+    square, of_cell = np.unique(corner[0] + 1j * corner[1], return_inverse=True)
+    root = _connected(part, count + of_cell)
+    close = cKDTree(np.stack([square.real, square.imag], axis=1)).query_pairs(
+        3.0, output_type='ndarray'
+    )
+    apart = close[np.diff(root[count + close], axis=1)[:, 0] != 0]
+    cell = np.flatnonzero(np.isin(of_cell, apart))
+    near = cell[cKDTree(place.T[cell]).query_pairs(reach, output_type='ndarray')]
+    root = _connected(*np.concatenate([np.stack([part, count + of_cell], axis=1), part[near]]).T)
+    _, first, number = np.unique(root[part], return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number]
+
+
+def _connected(a: NDArray[np.intp], b: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The component (n,) of each of the nodes of a graph with edges from `a` (e,) to `b` (e,)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    size = int(max(a.max(), b.max())) + 1
+    edges = coo_array((np.ones(len(a)), (a, b)), shape=(size, size))
+    return np.asarray(connected_components(edges, directed=False)[1], np.intp)

@@ -36,11 +36,12 @@ autocorrelation c_k = sum_p y_{p+k} conj(y_p) of the snapshot. `form_coefficient
 this into P complex numbers g with q(u) = Re sum_k g_k exp(-i k w u), w = 2 pi spacing, which
 Horner's rule sums in O(P) for each of thousands of candidate directions.
 
-Compiled loops take the likelihood from a table: see `likelihood_kernels`.
+Compiled loops take the likelihood from a table: see `likelihood_table`.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -51,6 +52,9 @@ from ..estimation.arrays import ComplexArray, FloatArray
 
 LIKELIHOODS = ('laplace', 'gaussian')
 MAX_STAVES = 64
+OCTAVES, OCTAVE_CELLS = (-20, 50), 32
+"""The likelihood is tabulated for q from 2^-20 to 2^50, so many cells to the octave; outside,
+q is put to the nearest end."""
 
 IMPOSSIBLE = -math.inf
 
@@ -120,3 +124,33 @@ def form_coefficients(
     coefficients *= -2.0 * kappa[..., None]
     coefficients[..., 0] = power * (1.0 - kappa)
     return coefficients / noise[..., None]
+
+
+@lru_cache(maxsize=32)
+def likelihood_table(staves: int, likelihood: str = 'laplace') -> FloatArray:
+    """The table of a likelihood, (4, cells): coefficients of the cubic in each cell. Read-only.
+
+    A double holds its own logarithm: its exponent and its first five bits number the cells, the
+    remaining bits say where in the cell it lies, so that compiled loops need no logarithm. The
+    relative error is 3e-7 at most. The Gaussian likelihood is a table too.
+
+    Raises ValueError for a number of staves or a likelihood that there is not.
+    """
+    if not 1 < staves <= MAX_STAVES:
+        raise ValueError(f'likelihoods are tabulated for 2 to {MAX_STAVES} staves, not {staves}')
+    if likelihood not in LIKELIHOODS:
+        raise ValueError(
+            f"there is no likelihood '{likelihood}'; there are {' and '.join(LIKELIHOODS)}"
+        )
+    node = np.arange((OCTAVES[1] - OCTAVES[0]) * OCTAVE_CELLS + 1)
+    q = np.ldexp(1.0 + (node % OCTAVE_CELLS) / OCTAVE_CELLS, OCTAVES[0] + node // OCTAVE_CELLS)
+    laplace = likelihood == 'laplace'
+    value = log_density(q, staves) if laplace else -q
+    slope = log_density_slope(q, staves) / q if laplace else -np.ones_like(q)
+    width, rise = np.diff(q), np.diff(value)
+    left, right = width * slope[:-1], width * slope[1:]
+    table = np.stack(
+        [value[:-1], left, 3.0 * rise - 2.0 * left - right, left + right - 2.0 * rise]
+    )
+    table.flags.writeable = False
+    return table

@@ -28,7 +28,7 @@ have no estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 import functools
 import sys
 import time
@@ -49,9 +49,9 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..node_config import chosen_types, node_config_type
 from ..parameters import Config
-from ..trackers import SYSTEMS, WarmStep
+from ..trackers import SYSTEMS
 from .diagnostics import Announcer, Meter, Reporter
-from .managed import DONE, FAILED, LOOK, ManagedNode, Warming
+from .managed import DONE, FAILED, LOADING, LOOK, ManagedNode, Warming
 from .messages import is_installed, make, message_class
 from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
 from .parameters import NodeParameters
@@ -120,27 +120,20 @@ class BaseNode(ManagedNode):
             self._offer()
         finally:
             self._made = self._entities() - before
-        self._warming = Warming(
-            self.warm_steps, self._connected, self.kernels_of, self.steps_elsewhere()
-        )
+        self._warming = Warming(self.warm, self.get_logger().info)
         self._until_warm = self.create_timer(LOOK, self.look, clock=self._steady)
 
     def look(self) -> None:
-        """End configuring once what the inputs need is compiled, and say what takes long."""
-        if self._warming is None:
+        """End configuring once the kernels are there."""
+        if self._warming is None or self._warming.is_alive() or self.state != 'configuring':
             return
-        if sentence := self._warming.due_sentence():
-            self.get_logger().info(sentence)
-        if self.state == 'configuring':
-            if self.attempt(self._warming.trouble, self.released) != DONE:
-                self.conclude(FAILED)
-                return
-            if self._warming.ready():
-                self.conclude(DONE)
-                if self.raises:
-                    self.change(Transition.TRANSITION_ACTIVATE)
-        if self._warming.done():
-            self.destroy_timer(self._until_warm)
+        self.destroy_timer(self._until_warm)
+        if self.attempt(self._warming.trouble, self.released) != DONE:
+            self.conclude(FAILED)
+            return
+        self.conclude(DONE)
+        if self.raises:
+            self.change(Transition.TRANSITION_ACTIVATE)
 
     def activated(self) -> None:
         """Hear the inputs."""
@@ -164,7 +157,6 @@ class BaseNode(ManagedNode):
     def released(self) -> None:
         """Take back what was made since `configured` began."""
         if self._warming is not None:
-            self._warming.stop(wait=False)
             self.destroy_timer(self._until_warm)
             self._warming = None
             self.release()
@@ -209,7 +201,8 @@ class BaseNode(ManagedNode):
     def destroy_node(self) -> None:
         """End; a kernel that is being compiled is finished, but not when a signal asked."""
         if self._warming is not None:
-            self._warming.stop(wait=not stopper.asked)
+            if not stopper.asked:
+                self._warming.join()
             self.release()
         super().destroy_node()
 
@@ -234,18 +227,9 @@ class BaseNode(ManagedNode):
         """`enabled`, `counts`, `health` and `warnings` for `Reporter.report`."""
         raise NotImplementedError
 
-    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
-        """What compiles or loads the kernels that these measurements need, None: all."""
-        raise NotImplementedError
-
-    def steps_elsewhere(self) -> Callable[[], list[WarmStep]] | None:
-        """What makes all steps of `warm_steps` again in another process; it is pickled."""
-        return None
-
-    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
-        """About how many kernels these steps of `warm_steps` need, and how many lines of source
-        they have; (0, 0): not known."""
-        return 0, 0
+    def warm(self) -> str:
+        """Compile or load kernels; returns how many, in a sentence, '' for none."""
+        return ''
 
     def answer(self) -> dict[str, int]:
         """The row on ``~/processed``."""
@@ -311,16 +295,6 @@ class BaseNode(ManagedNode):
         if not topic.latched or is_installed(chosen):
             return chosen
         return next(filter(is_installed, topic.readers), chosen)
-
-    def _connected(self) -> set[type] | None:
-        """Measurements of the inputs that somebody publishes, None when nobody does."""
-        connected = {
-            measurement
-            for name, (topic, _, _) in self._inputs.items()
-            if not topic.companion and self.count_publishers(self._topic_names[name])
-            for measurement in topic.measurements
-        }
-        return connected or None
 
     def _entities(self) -> set[Any]:
         """All that this node has on the graph now, and its timers."""
@@ -396,7 +370,7 @@ class BaseNode(ManagedNode):
     def _why_silent(self) -> str:
         """Why no input is heard."""
         if self._warming and self.state == 'configuring':
-            return self._warming.sentence()
+            return LOADING
         return f'no input is heard: the node is {self.state}'
 
 
@@ -513,17 +487,11 @@ class TrackerNode(BaseNode):
             ],
         }
 
-    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
-        """Those of the tracker."""
-        return self.tracker.warm_steps(inputs)
-
-    def steps_elsewhere(self) -> Callable[[], list[WarmStep]]:
-        """Those of a tracker with the same parameters."""
-        return functools.partial(SYSTEMS[self._name].warm_steps, self._config)
-
-    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
-        """Those of the system."""
-        return SYSTEMS[self._name].kernels_of(steps)
+    def warm(self) -> str:
+        """Compile or load what the inputs need."""
+        topics = [topic for topic, _, _ in self._inputs.values() if not topic.companion]
+        inputs = {measurement for topic in topics for measurement in topic.measurements}
+        return SYSTEMS[self._name].warm(self.tracker, inputs)
 
     def error_words(self) -> str:
         """What follows of an internal error."""

@@ -33,8 +33,7 @@ if __name__ == '__main__':
     stopper.listen()
     one_blas_thread()  # before numpy is imported
 
-from collections.abc import Callable, Collection
-import functools
+from collections.abc import Callable
 import sys
 from typing import Any
 
@@ -44,7 +43,6 @@ from msg_adapters.inputs import InputTopic
 from ..intake import KnownFrames
 from ..measurements import SonarInfo
 from ..node_config import DetectorNodeConfig
-from ..trackers import WarmStep
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
 from .base import BaseNode, TABLE
 from .messages import make, message_class
@@ -52,11 +50,6 @@ from .qos import output_qos
 from .running import run
 
 NAME = 'fls_detector'
-
-
-def warm_steps(config: DetectorConfig) -> list[WarmStep]:
-    """Those of the detector."""
-    return [('images', ImageDetector(config).warm)]
 
 
 class FlsDetectorNode(BaseNode):
@@ -95,14 +88,6 @@ class FlsDetectorNode(BaseNode):
         """Forget the sweep of a scanning sonar."""
         before, self._detector = self._detector, ImageDetector(self._settings[DetectorConfig])
         self._detector.infos = before.infos
-
-    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
-        """The detector has one."""
-        return warm_steps(self._settings[DetectorConfig])
-
-    def steps_elsewhere(self) -> Callable[[], list[WarmStep]]:
-        """The same."""
-        return functools.partial(warm_steps, self._settings[DetectorConfig])
 
     def work_report(self) -> dict[str, Any]:
         """How many messages of detections there were."""

@@ -29,7 +29,8 @@ are those of rclpy. Three things are done here, since rclpy (7.1 of Jazzy) does 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
+import sys
 import threading
 import time
 import traceback
@@ -44,127 +45,39 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from ..parameters import ConfigError
-from ..trackers import WarmStep
 
 LOOK = 0.02
 """Seconds between two looks at whether the kernels are there."""
+LOADING = 'loading kernels, no input is heard until then'
 DONE, FAILED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class Warming:
-    """Compiles or loads kernels in a thread of its own, step by step.
+class Warming(threading.Thread):
+    """Compile or load kernels while the executor answers everything else.
 
-    What the connected publishers call for comes first; when nobody publishes yet, that is
-    everything. The rest is compiled after `ready`, beside the first messages. A process of its own
-    compiles, so that the node does not keep the memory which that takes; it ends with the last
-    step. Where that cannot keep what it compiles, the thread compiles.
+    numba cannot be stopped: a thread whose node has ended runs on to its end.
     """
 
-    PATIENCE, PERIOD = 3.0, 10.0
-    """Seconds after which it is said that this takes long, and between two such sentences."""
-    DISCOVERY = 0.5
-    """Seconds that publishers have to be found before anything is compiled."""
-
-    def __init__(
-        self,
-        steps: Callable[[Collection[type] | None], list[WarmStep]],
-        connected: Callable[[], Collection[type] | None],
-        kernels_of: Callable[[Collection[str]], tuple[int, int]],
-        elsewhere: Callable[[], list[WarmStep]] | None = None,
-    ):
-        """steps: what there is to do for measurements of these classes, None for all. connected:
-        the classes that somebody publishes now, None for nobody. kernels_of: what steps need, see
-        `trackers.System.kernels_of`. elsewhere: makes the same steps in a process that compiles,
-        see `jit.Elsewhere`; None: the thread does."""
-        from ..estimation import jit  # and numba, which the tracker has loaded by now
-
-        self._steps, self._connected, self._kernels_of = steps, connected, kernels_of
-        self._elsewhere = elsewhere
-        self._process: jit.Elsewhere | None = None
-        self._jit, self._progress = jit, jit.Progress()
-        self._start = time.monotonic()
-        self._logged = -self.PERIOD
-        self._doing, self._ready = 'what is published', False
-        self._stopped = threading.Event()
+    def __init__(self, warm: Callable[[], str], log: Callable[[str], object]):
+        """warm: see `trackers.System.warm`; log: takes one sentence at the start and the end."""
+        super().__init__(name='kernels', daemon=True)
+        self._warm, self._log = warm, log
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name='kernels', daemon=True)
-        self._thread.start()
+        self.start()
 
-    def ready(self) -> bool:
-        """Whether what the inputs need is there."""
-        return self._ready
+    def run(self) -> None:
+        if 'numba' in sys.modules:
+            self._log(f'{LOADING}; the first time on a machine they are compiled')
+        try:
+            if done := self._warm():
+                self._log(done)
+        except Exception as error:
+            self._error = error
 
     def trouble(self) -> None:
         """Raise what went wrong."""
         if self._error:
             raise self._error
-
-    def done(self) -> bool:
-        """Whether everything is there."""
-        return not self._thread.is_alive()
-
-    def stop(self, *, wait: bool) -> None:
-        """Begin no further step, and no further kernel in the other process."""
-        self._stopped.set()
-        if process := self._process:
-            process.stop()
-        if wait:
-            self._thread.join()
-
-    def sentence(self) -> str:
-        """How far it is; empty when everything is there."""
-        if self.done():
-            return ''
-        waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
-        return f'{self._progress.sentence() or "loading kernels"} ({self._doing}); {waiting}'
-
-    def due_sentence(self) -> str:
-        """The same when it is time to say it (again), else empty."""
-        now = time.monotonic()
-        if now - self._start < self.PATIENCE or now - self._logged < self.PERIOD:
-            return ''
-        self._logged = now
-        return self.sentence()
-
-    def _run(self) -> None:
-        try:
-            self._work()
-        except Exception as error:
-            self._error = error
-        finally:
-            if self._process:
-                self._process.close()
-        self._ready = True
-
-    def _work(self) -> None:
-        if not self._jit.kernels:  # the node has just begun: give discovery a moment
-            end = time.monotonic() + self.DISCOVERY
-            while not self._connected() and time.monotonic() < end:
-                self._stopped.wait(LOOK)
-        left, done = dict(self._steps(None)), list[str]()
-        while left and not self._stopped.is_set():
-            called_for = dict(self._steps(self._connected()))
-            wanted = [name for name in left if name in called_for]
-            self._ready = self._ready or not wanted
-            self._progress.needed = self._kernels_of([*done, *(wanted or left)])
-            self._doing = (wanted or [*left])[0]
-            self._do(self._doing, left.pop(self._doing))
-            done.append(self._doing)
-
-    def _do(self, name: str, step: Callable[[], object]) -> None:
-        jit = self._jit
-        if self._elsewhere is not None:
-            if jit.kept(step):
-                return
-            with jit.Elsewhere.one_at_a_time:
-                # Another node of this process may have had it compiled meanwhile.
-                if jit.kept(step) or self._stopped.is_set():
-                    return
-                self._process = self._process or jit.Elsewhere.begin(self._elsewhere)
-                if self._process and not self._stopped.is_set():
-                    self._process.compile(name)
-        if not self._stopped.is_set():
-            step()
 
 
 class ManagedNode(LifecycleNodeMixin, Node):

@@ -34,14 +34,19 @@ sonar_imm.parameters.ConfigError: parameter 'fix_std' must be between 0.0001 and
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from importlib import import_module
+from pathlib import Path
+import sys
+import time
+import traceback
 from typing import Any, overload, TYPE_CHECKING
 
-from attrs import field, frozen
+from attrs import frozen
 
+from ..files import one_at_a_time
 from ..parameters import Config, ConfigError
-from .protocol import SmoothingTracker, Tracker, WarmStep
+from .protocol import SmoothingTracker, Tracker
 
 if TYPE_CHECKING:
     from .bathymetry.tracker import BathymetryConfig, BathymetryTracker
@@ -50,7 +55,10 @@ if TYPE_CHECKING:
     from .fathometer.tracker import FathometerConfig, FathometerTracker
     from .obstacle.tracker import ObstacleConfig, ObstacleTracker
 
-__all__ = ['SmoothingTracker', 'System', 'SYSTEMS', 'Tracker', 'WarmStep']
+LONGEST_SECONDS = 120.0
+"""How long a process waits for another one that compiles: longer than that takes."""
+
+__all__ = ['SmoothingTracker', 'System', 'SYSTEMS', 'Tracker']
 
 
 @frozen(kw_only=True)
@@ -63,9 +71,7 @@ class System:
 
     config, tracker, smoother: classes below `sonar_imm.trackers.<name>`, as ``module.Class``;
     smoother: '' when the tracker cannot look back. node_config: a class of
-    `sonar_imm.node_config`. kernels: about how many kernels each of the tracker's `warm_steps`
-    needs in the default configuration, and how many lines of source they have, shared ones
-    included, none where all is numpy; all_kernels: the same of all steps.
+    `sonar_imm.node_config`.
     """
 
     name: str
@@ -74,8 +80,6 @@ class System:
     tracker: str
     smoother: str = ''
     node_config: str = 'NodeConfig'
-    kernels: Mapping[str, tuple[int, int]] = field(factory=dict)
-    all_kernels: tuple[int, int] = (0, 0)
 
     @property
     def scenes(self) -> str:
@@ -123,22 +127,37 @@ class System:
             raise ConfigError(f'the {self.name} tracker has no smoother')
         return self._own(self.smoother)(config)
 
-    def kernels_of(self, steps: Collection[str]) -> tuple[int, int]:
-        """About how many kernels these steps need, and how many lines of source they have."""
-        each = [self.kernels.get(step, (0, 0)) for step in steps]
-        count, lines = (sum(column) for column in zip((0, 0), *each))
-        return min(count, self.all_kernels[0]), min(lines, self.all_kernels[1])
+    def warm(self, tracker: Tracker, inputs: Collection[type] | None = None) -> str:
+        """Compile or load kernels by `Tracker.warm`.
 
-    def warm(self, tracker: Tracker, inputs: Collection[type] | None = None) -> None:
-        """`Tracker.warm`, with a `jit.progress` that knows how much there is to do."""
-        from ..estimation import jit  # and numba, which the tracker has loaded by now
+        Returns how many, in a sentence; '' for a tracker without kernels. Raises `ConfigError` if
+        numba cannot read or write its folder.
+        """
+        if 'numba' not in sys.modules:
+            tracker.warm(inputs)
+            return ''
+        from ..estimation import jit
 
-        jit.expect(self.kernels_of([name for name, _ in tracker.warm_steps(inputs)]))
-        tracker.warm(inputs)
-
-    def warm_steps(self, config: Config) -> list[WarmStep]:
-        """Those of a tracker of its own, for another process: this can be pickled."""
-        return self.build(config).warm_steps()
+        before, start = jit.counts(), time.perf_counter()
+        try:
+            # Of two processes that compile a kernel for different arguments one may keep its code
+            # under the name of the other's.
+            with one_at_a_time(Path(__file__).with_name(self.name), LONGEST_SECONDS):
+                tracker.warm(inputs)
+        except Exception as error:  # what is damaged raises nearly anything when it is unpickled
+            frames = traceback.extract_tb(error.__traceback__)
+            if not any(frame.filename.endswith('caching.py') for frame in frames):
+                raise
+            why = ' '.join(str(getattr(error, 'strerror', None) or error).split())
+            raise ConfigError(
+                f'compiled kernels in {jit.folder()} cannot be read or kept ({why}): free or '
+                'delete that folder'
+            ) from None
+        compiled, loaded = (now - then for now, then in zip(jit.counts(), before))
+        if not compiled + loaded:
+            return ''
+        seconds = time.perf_counter() - start
+        return f'{compiled} kernels compiled, {loaded} loaded, {seconds:.1f} s'
 
     def state_types(self) -> tuple[type, ...]:
         """Return the classes of values that a saved state of the tracker may hold."""
@@ -160,8 +179,6 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
-            kernels={'pings': (4, 545), 'surfaces': (3, 239)},
-            all_kernels=(7, 784),
         ),
         System(
             name='diver',
@@ -170,8 +187,6 @@ SYSTEMS = {
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
             node_config='TracksNodeConfig',
-            kernels={'fixes': (29, 823), 'echoes': (15, 424), 'tags': (15, 424)},
-            all_kernels=(29, 823),
         ),
         System(
             name='fathometer',
@@ -179,8 +194,6 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
-            kernels={'records': (3, 277)},
-            all_kernels=(3, 277),
         ),
         System(
             name='obstacle',

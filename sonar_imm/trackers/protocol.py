@@ -17,14 +17,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, Protocol
 
 from ..estimates import Estimate
 from ..intake import KnownFrames
-
-WarmStep = tuple[str, Callable[[], object]]
-"""What compiles or loads a part of a tracker's kernels, and the name of that part."""
 
 
 class Tracker(Protocol):
@@ -66,13 +63,7 @@ class Tracker(Protocol):
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Compile or load every kernel that measurements of the classes `inputs` will need, by
-        default of all classes: all of `warm_steps`."""
-        ...
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        """The same in steps, for a caller who tells how far it is or works between them. A step
-        changes nothing of the tracker, and leaves nothing to compile of what it is named after.
-        They can be run in any order, each by itself, in any thread."""
+        default of all classes. Changes nothing of the tracker. `System.warm` calls it."""
         ...
 
     def health(self) -> dict[str, float]:

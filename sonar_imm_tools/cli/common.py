@@ -28,6 +28,7 @@ from typing import Any
 import click
 
 from msg_adapters.inputs import FEEDERS
+from sonar_imm.gone import GONE
 from sonar_imm.node_config import chosen_types, DetectorNodeConfig, node_config_type, NodeConfig
 from sonar_imm.parameters import (
     Config,
@@ -331,6 +332,17 @@ def _others(text: str, node_name: str) -> list[str]:
     return [] if mine else names
 
 
+class Renewed(click.Command):
+    """A command that says what took the place of its removed options."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        for word in args:
+            option = word.partition('=')[0]
+            if gone := GONE.get(f'option {ctx.info_name} {option}'):
+                ctx.fail(f"'{option}' {gone}")
+        return super().parse_args(ctx, args)
+
+
 def print_json(result: Any) -> None:
     """Print `result` as JSON; NaN and infinity, which JSON lacks, become null."""
     from ..offline.run_folder import finite
@@ -352,73 +364,32 @@ def warn(text: str) -> None:
 
 @contextlib.contextmanager
 def progress(
-    what: str, total: int | None, *, quiet: bool = False, compiles: bool = False
+    what: str, total: int | None, *, quiet: bool = False, first: str = ''
 ) -> Iterator[Advance]:
     """Yields ``advance(count)``: a bar on a terminal, else a line every few seconds (stderr).
-    compiles: the bar also says what is being compiled in this process."""
+    first: what a bar says until then, instead of `what`."""
     if quiet or not total:
         yield lambda count: None
-        return
-    with contextlib.ExitStack() as stack:
-        if sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import Progress
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
 
-            bar = stack.enter_context(Progress(console=Console(stderr=True), transient=True))
-            advance, say_now = _bar_progress(bar, what, total)
-        else:
-            advance, say_now = _plain_progress(what, total)
-        if compiles:
-            stack.enter_context(compiling(say_now))
-        yield advance
+        with Progress(console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(first or what, total=total)
+            yield lambda count: bar.update(task, advance=count, description=what)
+    else:
+        yield _plain_progress(what, total)
 
 
-@contextlib.contextmanager
-def compiling(say_now: Callable[[str], object]) -> Iterator[None]:
-    """Have `say_now` called with a sentence after each kernel that this process compiles."""
-    from sonar_imm.estimation import jit
-
-    def compiled() -> None:
-        say_now(jit.progress.sentence())
-
-    jit.listeners.append(compiled)
-    try:
-        yield
-    finally:
-        jit.listeners.remove(compiled)
-
-
-def _bar_progress(bar: Any, what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
-    task = bar.add_task(what, total=total)
+def _plain_progress(what: str, total: int) -> Advance:
+    """A line every few seconds, so that the log of a short job stays empty."""
+    done, printed = 0, time.monotonic()
 
     def advance(count: int) -> None:
-        bar.update(task, advance=count, description=what)
-
-    def say_now(sentence: str) -> None:
-        bar.update(task, description=sentence)
-
-    return advance, say_now
-
-
-def plain_lines() -> Callable[[str], None]:
-    """Prints a line every few seconds (stderr), so that the log of a short job stays empty."""
-    printed = time.monotonic()
-
-    def say_now(sentence: str) -> None:
-        nonlocal printed
+        nonlocal done, printed
+        done += count
         if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
             printed = time.monotonic()
-            warn(sentence)
+            warn(f'{what}: {done} of {total}')
 
-    return say_now
-
-
-def _plain_progress(what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
-    done, say_now = 0, plain_lines()
-
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
-        say_now(f'{what}: {done} of {total}')
-
-    return advance, say_now
+    return advance

@@ -336,7 +336,7 @@ def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
         outcome = track(
             job,
             lambda total: stack.enter_context(
-                progress('tracking', total, quiet=quiet, compiles=True)
+                progress('tracking', total, quiet=quiet, first='loading kernels')
             ),
         )
     return dict(outcome.run or {})

@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from pathlib import Path
 import time
@@ -27,11 +26,9 @@ import click
 
 from .common import (
     BAG,
-    compiling,
     example,
     json_option,
     params_option,
-    plain_lines,
     print_json,
     progress,
     say,
@@ -104,10 +101,7 @@ def command(
     if len({job.system for job in runs}) > 1:
         raise click.UsageError('the recordings fit different trackers: say --system')
     names = [name.strip() for name in (parameters or '').split(',') if name.strip()]
-    with contextlib.ExitStack() as stack:
-        if not as_json:
-            stack.enter_context(compiling(plain_lines()))
-        fitting, measurements = prepared(runs, names)
+    fitting, measurements = prepared(runs, names)
     begin = time.perf_counter()
     fitting.scores(None)
     most = most_evaluations(len(fitting.tunables))

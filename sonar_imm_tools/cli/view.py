@@ -24,24 +24,11 @@ import tempfile
 
 import click
 
-from sonar_imm.gone import GONE
-
-from .common import BAG, example, say
-
-
-class _View(click.Command):
-    """A command that says what took the place of its removed options."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        for word in args:
-            option = word.partition('=')[0]
-            if gone := GONE.get(f'option view {option}'):
-                ctx.fail(f"'{option}' {gone}")
-        return super().parse_args(ctx, args)
+from .common import BAG, example, Renewed, say
 
 
 @click.command(
-    cls=_View,
+    cls=Renewed,
     epilog=example(
         'sonar-imm view out', 'sonar-imm view dive.bag', 'sonar-imm view out --rerun out.rrd'
     ),

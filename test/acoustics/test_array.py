@@ -17,7 +17,8 @@ import math
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import array, likelihood_kernels
+from sonar_imm.acoustics import array
+from sonar_imm.trackers.bathymetry import grid_kernels
 
 TILT = math.radians(30.0)
 
@@ -72,7 +73,7 @@ def test_conjugation_turns_the_phase_round():
 
 def test_the_compiled_sines_are_those_of_numpy():
     D, out = np.linspace(-50.0, 50.0, 301), np.empty(301)
-    likelihood_kernels.direction_sines(D, 40.0, math.cos(TILT), math.sin(TILT), out)
+    grid_kernels.direction_sines(D, 40.0, math.cos(TILT), math.sin(TILT), out)
     expected = array.direction_sine(D, 40.0, TILT)
     assert np.array_equal(np.isnan(out), np.isnan(expected)) and np.isnan(out).any()
     assert np.allclose(out, expected, atol=1e-15, equal_nan=True)

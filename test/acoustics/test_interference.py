@@ -16,7 +16,8 @@ import numpy as np
 from oracles.array_likelihood import interfered_log_likelihood, log_likelihood
 import pytest
 
-from sonar_imm.acoustics import array, interference, laplace, likelihood_kernels
+from sonar_imm.acoustics import array, interference, laplace
+from sonar_imm.trackers.bathymetry import grid_kernels
 
 STAVES, SPACING = 8, 0.5
 STEP = array.phase_step(SPACING)
@@ -49,14 +50,14 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
     u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
     out = np.empty(len(u))
     for n in range(3):
-        likelihood_kernels.log_likelihoods(
+        grid_kernels.log_likelihoods(
             u,
             SPACING,
             -signal * form.beam[n],
             form.base[n],
             form.spread[n],
             signal,
-            likelihood_kernels.likelihood_table(STAVES, likelihood),
+            laplace.likelihood_table(STAVES, likelihood),
             np.empty((4, len(u))),
             out,
         )

@@ -20,7 +20,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import kve
 
-from sonar_imm.acoustics import array, laplace, likelihood_kernels
+from sonar_imm.acoustics import array, laplace
+from sonar_imm.trackers.bathymetry import grid_kernels
 
 STEP = array.phase_step(0.5)
 
@@ -132,8 +133,8 @@ def test_the_form_is_that_of_the_covariance(staves):
 def test_the_table_is_the_likelihood(staves, likelihood):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
     out = np.empty(len(q))
-    likelihood_kernels.log_densities(
-        q.copy(), np.empty(len(q)), likelihood_kernels.likelihood_table(staves, likelihood), out
+    grid_kernels.log_densities(
+        q.copy(), np.empty(len(q)), laplace.likelihood_table(staves, likelihood), out
     )
     if likelihood == 'gaussian':
         assert np.allclose(out, -q, rtol=1e-12)
@@ -146,13 +147,13 @@ def test_the_table_is_the_likelihood(staves, likelihood):
 
 
 def test_what_the_table_does_not_reach_is_held_at_its_end():
-    table, out = likelihood_kernels.likelihood_table(8), np.empty(5)
+    table, out = laplace.likelihood_table(8), np.empty(5)
     q = np.array([0.0, -1.0, 1e-30, np.nan, 1e300])
-    likelihood_kernels.log_densities(q.copy(), np.empty(5), table, out)
+    grid_kernels.log_densities(q.copy(), np.empty(5), table, out)
     assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
     for staves, likelihood in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
         with pytest.raises(ValueError):
-            likelihood_kernels.likelihood_table(staves, likelihood)
+            laplace.likelihood_table(staves, likelihood)
     assert not table.flags.writeable
 
 
@@ -163,14 +164,14 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, likelihood):
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
     out = np.empty(len(u))
-    likelihood_kernels.log_likelihoods(
+    grid_kernels.log_likelihoods(
         u,
         spacing,
         laplace.form_coefficients(y, signal, noise),
         0.0,
         np.empty(0, complex),
         0.0,
-        likelihood_kernels.likelihood_table(staves, likelihood),
+        laplace.likelihood_table(staves, likelihood),
         np.empty((4, len(u))),
         out,
     )

@@ -22,8 +22,6 @@ import sys
 from helpers.tracked import RUNS
 import pytest
 
-from sonar_imm.trackers import SYSTEMS
-
 PROGRAM = """
 import importlib, json, os, sys
 
@@ -31,10 +29,8 @@ sys.path.append('test')
 
 import numba
 from helpers.tracked import RUNS, Tracked
-from numba import types
 from numba.core.registry import CPUDispatcher
 
-from sonar_imm.estimation import jit
 from sonar_imm.trackers import SYSTEMS
 
 
@@ -43,8 +39,7 @@ def signatures():
     for name, module in list(sys.modules.items()):
         for key, value in list(vars(module).items()) if name.startswith('sonar_imm.') else ():
             if isinstance(value, CPUDispatcher) and value.py_func.__module__ == name:
-                kinds = {str(tuple(map(types.unliteral, s))) for s in value.signatures}
-                found[f'{name}.{key}'] = sorted(kinds)
+                found[f'{name}.{key}'] = sorted(map(str, value.signatures))
     return found
 
 
@@ -60,36 +55,22 @@ def recording(name):
     return Warmed(name).warmed, signatures()
 
 
-def steps(name):
-    system = SYSTEMS[name]
-    figures = {}
-    for step, compile_step in system.build(system.config_type()()).warm_steps():
-        jit.present.clear()
-        compile_step()
-        figures[step] = len(jit.present), sum(jit.present.values())
-    return figures
-
-
 # What all processes need is loaded once: each is a copy of this one, in which no kernel is.
 for system in SYSTEMS.values():
     importlib.import_module(f'sonar_imm.trackers.{system.name}.tracker')
 numba.njit(lambda: 0)()
-for task, names in ((recording, RUNS), (steps, SYSTEMS)):
-    for name in names:
-        child = os.fork()
-        if not child:
-            print(json.dumps([name, task(name)]), flush=True)
-            os._exit(0)
-        assert os.waitpid(child, 0)[1] == 0
+for name in RUNS:
+    child = os.fork()
+    if not child:
+        print(json.dumps([name, recording(name)]), flush=True)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
 """
-COLD = {'_repair', '_update_again'}
-"""Compiled when the first covariance needs it, and what they call."""
 
 
 @pytest.fixture(scope='module')
 def found():
-    """Of each recording the types of the arguments of each kernel, after `warm` and at the end; of
-    each system how many kernels its steps need."""
+    """Of each recording the types of the arguments of each kernel, after `warm` and at the end."""
     done = subprocess.run(
         [sys.executable, '-c', PROGRAM],
         cwd=Path(__file__).resolve().parents[2],
@@ -103,25 +84,7 @@ def found():
 @pytest.mark.parametrize('name', RUNS)
 def test_nothing_is_left_to_compile_after_warm_and_a_kernel_has_one_kind_of_arguments(found, name):
     before, after = found[name]
-    assert any(before.values()) or name.startswith('obstacle')  # which has no kernel
+    assert any(before.values()) or name.startswith(('diver', 'obstacle'))  # without kernels
     late = {name for name in after if after[name] != before.get(name, [])}
-    late = {name for name in late if '.surface_kernels.' not in name}  # flat floors do without
-    assert {name for name in late if name.rpartition('.')[2] not in COLD} == set()
+    assert late == set()
     assert {name: kinds for name, kinds in after.items() if len(kinds) > 1} == {}
-
-
-@pytest.mark.parametrize('name', SYSTEMS)
-def test_a_system_knows_about_how_many_kernels_its_steps_need(found, name):
-    """Those of the default configuration, as `jit.Progress` counts them; a shared kernel that an
-    earlier step has loaded is not loaded again, so that a later step may have fewer."""
-    figures = found[name]
-    system = SYSTEMS[name]
-    assert set(figures) == set(system.kernels)
-    if not figures:
-        return
-    first = next(iter(figures))
-    for known, right in zip(system.kernels[first], figures[first]):
-        assert 0.8 * right < known < 1.25 * right, figures
-    for column in (0, 1):
-        each = [figure[column] for figure in system.kernels.values()]
-        assert max(each) <= system.all_kernels[column] <= sum(each)

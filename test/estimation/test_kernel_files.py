@@ -36,14 +36,18 @@ FILES = (
     'trackers/bathymetry/filter_kernels.py',
     'trackers/bathymetry/surface_kernels.py',
 )
+"""One kernel for each verb."""
+ALONE = (*FILES, 'trackers/bathymetry/grid_kernels.py')
+TYPES = {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'}
 ALLOWED = {
     'numpy': {'np'},
     'numpy.typing': {'NDArray'},
     'math': {'math'},
     'numba': {'numba'},
+    'typing': {'Any', 'NamedTuple'},
     **dict.fromkeys(('.jit', '..estimation.jit', '...estimation.jit'), {'kernel'}),
     '__future__': {'annotations'},
-    '.arrays': {'BoolArray', 'ComplexArray', 'FloatArray', 'IndexArray', 'IntArray'},
+    **dict.fromkeys(('.arrays', '...estimation.arrays'), TYPES),
 }
 """What may be imported, and by which names; of `arrays` the names of types, which no code uses."""
 
@@ -58,7 +62,19 @@ def imported(tree):
             yield from ((module, alias.asname or alias.name) for alias in node.names)
 
 
-@pytest.mark.parametrize('name', FILES)
+def kernels_of(tree):
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    decorated = (f for f in functions if [ast.unparse(d) for d in f.decorator_list] == ['kernel'])
+    return {function.name for function in decorated}
+
+
+def test_every_kernel_file_is_known():
+    files = {path.relative_to(PACKAGE).as_posix(): path for path in PACKAGE.rglob('*.py')}
+    found = {name for name, path in files.items() if kernels_of(ast.parse(path.read_text()))}
+    assert found == {*ALONE}
+
+
+@pytest.mark.parametrize('name', ALONE)
 def test_a_kernel_file_imports_no_code_of_another(name):
     tree = ast.parse((PACKAGE / name).read_text())
     wrong = [(module, own) for module, own in imported(tree) if own not in ALLOWED.get(module, ())]
@@ -70,9 +86,7 @@ def test_a_kernel_has_its_helpers_in_it(name):
     """Called from two kernels a helper would be compiled three times."""
     tree = ast.parse((PACKAGE / name).read_text())
     functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-    kernels = {
-        f.name for f in functions if [ast.unparse(d) for d in f.decorator_list] == ['kernel']
-    }
+    kernels = kernels_of(tree)
     assert kernels and len(kernels) == len(functions)
     called = {
         node.func.id

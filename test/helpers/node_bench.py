@@ -32,26 +32,16 @@ def _walker(monkeypatch):
     walker.register(monkeypatch.setitem)
 
 
-class Steps:
-    """Steps named after what they wait for; each goes on when it is let go."""
+class Held:
+    """What a tracker does to get warm: it begins, and ends when it is let go."""
 
-    def __init__(self, **kinds):
-        self.kinds, self.done = kinds, []
-        self.begun = {name: threading.Event() for name in kinds}
-        self.go = {name: threading.Event() for name in kinds}
+    def __init__(self):
+        self.begun, self.let_go = threading.Event(), threading.Event()
 
-    def __call__(self, inputs):
-        chosen = [name for name, kind in self.kinds.items() if inputs is None or kind in inputs]
-        return [(name, lambda name=name: self.work(name)) for name in chosen]
-
-    def work(self, name):
-        self.begun[name].set()
-        assert self.go[name].wait(240.0)
-        self.done.append(name)
-
-    def let_go(self):
-        for event in self.go.values():
-            event.set()
+    def __call__(self, tracker=None, inputs=None):
+        self.begun.set()
+        assert self.let_go.wait(240.0)
+        return '2 kernels loaded'
 
 
 class Bench:

@@ -73,9 +73,6 @@ class WalkerTracker:
     def warm(self, inputs=None):
         pass
 
-    def warm_steps(self, inputs=None):
-        return []
-
     def health(self):
         return {'NIS': 1.25, 'tracks': float(bool(self.fixes))}
 

@@ -14,12 +14,11 @@
 
 """A node that a lifecycle manager starts, by real clients of `lifecycle_msgs`."""
 
-from functools import partial
-import pickle
-import time
+import math
+import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
-from helpers.node_bench import Steps
+from helpers.node_bench import Held
 from helpers.rig import a_fix, FIX
 from helpers.walker import WalkerTracker
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
@@ -29,18 +28,11 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm.estimation import jit  # noqa: E402
-from sonar_imm.measurements import (
-    Arrivals,  # noqa: E402
-    Fix,
-)
+from sonar_imm.measurements import Arrivals, Fix, Navigation
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.fls_detector import warm_steps as image_steps  # noqa: E402
-from sonar_imm.nodes.managed import Warming  # noqa: E402
+from sonar_imm.nodes.managed import Warming
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import output_qos
-from sonar_imm.trackers import SYSTEMS  # noqa: E402
-from sonar_imm.trackers.obstacle.detector import DetectorConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures('walker')
 
@@ -148,8 +140,8 @@ def test_a_transition_that_the_state_does_not_have_is_refused_and_survived(manag
 
 @pytest.mark.usefixtures('quick')
 def test_while_it_configures_the_node_answers_and_refuses_other_transitions(manage, monkeypatch):
-    steps = Steps(fixes=Fix)
-    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
+    held = Held()
+    monkeypatch.setattr(WalkerTracker, 'warm', lambda self, inputs=None: held())
     manager = manage()
     bench = manager.bench
     reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
@@ -157,7 +149,7 @@ def test_while_it_configures_the_node_answers_and_refuses_other_transitions(mana
     bench.spin_until(client.service_is_ready)
     asked = client.call_async(ChangeState.Request(transition=Transition(label='configure')))
     try:
-        bench.spin_until(steps.begun['fixes'].is_set)
+        bench.spin_until(held.begun.is_set)
         assert manager.state() == 'configuring'
         assert not manager.ask('activate') and not manager.ask('shutdown')
         assert not manager.ask(number=Transition.TRANSITION_ON_CONFIGURE_SUCCESS)
@@ -167,7 +159,7 @@ def test_while_it_configures_the_node_answers_and_refuses_other_transitions(mana
         bench.spin_until(lambda: reports and 'loading kernels' in reports[-1].status[0].message)
         assert not asked.done()
     finally:
-        steps.let_go()
+        held.let_go.set()
     bench.spin_until(asked.done)
     assert asked.result().success and manager.state() == 'inactive'
 
@@ -181,10 +173,10 @@ def test_what_fails_while_configuring_is_logged_and_can_be_tried_again(manage, t
 
 
 def test_kernels_that_cannot_be_compiled_leave_the_node_unconfigured(manage, monkeypatch, capfd):
-    def fails():
+    def fails(self, inputs):
         raise ZeroDivisionError('a bug')
 
-    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: [('all', fails)])
+    monkeypatch.setattr(WalkerTracker, 'warm', fails)
     manager = manage()
     assert not manager.ask('configure') and manager.state() == 'unconfigured'
     assert 'ZeroDivisionError: a bug' in capfd.readouterr().err
@@ -220,115 +212,49 @@ def test_a_program_can_use_the_verbs_of_rclpy(manage):
 # -- A node while its kernels are compiled --
 
 
-def kernels_of(steps):
-    """Three kernels with three lines each for every step."""
-    return 3 * len(steps), 9 * len(steps)
+def test_the_thread_says_when_it_begins_and_what_it_did(monkeypatch):
+    held, log = Held(), []
+    monkeypatch.setitem(sys.modules, 'numba', math)
+    warming = Warming(held, log.append)
+    assert held.begun.wait(240.0) and warming.is_alive()
+    assert log == [
+        'loading kernels, no input is heard until then; the first time on a machine '
+        'they are compiled'
+    ]
+    held.let_go.set()
+    warming.join()
+    warming.trouble()
+    assert log[1:] == ['2 kernels loaded']
 
 
-def finish(warming, steps):
-    steps.let_go()
-    warming.stop(wait=True)
-
-
-def test_what_is_published_comes_first_and_the_rest_after_the_node_is_ready():
-    steps = Steps(fixes=Fix, echoes=Arrivals)
-    warming = Warming(steps, lambda: {Arrivals}, kernels_of)
-    try:
-        assert steps.begun['echoes'].wait(240.0) and not warming.ready()
-        assert 'kernels (echoes)' in warming.sentence()
-        assert 'no input is heard until then' in warming.sentence()
-        steps.go['echoes'].set()
-        assert steps.begun['fixes'].wait(240.0)
-        assert warming.ready() and not warming.done()
-        assert 'messages may wait for it' in warming.sentence()
-    finally:
-        finish(warming, steps)
-    assert warming.done() and warming.sentence() == ''
-
-
-def test_when_nobody_publishes_everything_is_there_before_the_node_is_ready():
-    steps = Steps(fixes=Fix, echoes=Arrivals)
-    warming = Warming(steps, lambda: None, kernels_of)
-    try:
-        steps.go['fixes'].set()
-        assert steps.begun['echoes'].wait(240.0) and not warming.ready()
-    finally:
-        finish(warming, steps)
-    assert steps.done == ['fixes', 'echoes'] and warming.ready()
-
-
-def test_the_sentence_counts_the_kernels_of_what_is_published_and_then_of_all(monkeypatch):
-    monkeypatch.setattr(jit, 'present', {})
-    steps = Steps(fixes=Fix, echoes=Arrivals)
-    warming = Warming(steps, lambda: {Fix}, kernels_of)
-
-    def compiled(name):
-        jit.present[name] = 3
-        jit.kernels['compiled'] += 1
-        return warming.sentence()
-
-    try:
-        assert steps.begun['fixes'].wait(240.0)
-        assert warming.sentence() == 'loading kernels (fixes); no input is heard until then'
-        once, end = 'kernels, once for this machine, some 0 s more', 'no input is heard until then'
-        assert compiled('first') == f'compiling 2 of 3 {once} (fixes); {end}'
-        steps.go['fixes'].set()
-        assert steps.begun['echoes'].wait(240.0)
-        end = 'messages may wait for it'
-        assert compiled('second') == f'compiling 3 of 6 {once} (echoes); {end}'
-    finally:
-        jit.kernels['compiled'] -= 2
-        finish(warming, steps)
+def test_without_numba_nothing_is_said(monkeypatch):
+    log = []
+    monkeypatch.delitem(sys.modules, 'numba', raising=False)
+    Warming(lambda: '', log.append).join()
+    assert log == []
 
 
 def test_what_goes_wrong_is_raised_where_somebody_asks():
-    def fails():
-        raise ZeroDivisionError('a bug')
-
-    warming = Warming(lambda inputs: [('fixes', fails)], lambda: {Fix}, kernels_of)
-    while not warming.done():
-        time.sleep(0.01)
+    warming = Warming(lambda: 1 // 0, print)
+    warming.join()
     with pytest.raises(ZeroDivisionError):
         warming.trouble()
 
 
-@pytest.mark.parametrize('system', [*SYSTEMS.values(), None])
-def test_the_other_process_finds_the_steps_of_this_one(system):
-    """As they are pickled for it; None: of images."""
-    if system:
-        config = system.config_type()()
-        steps, own = partial(system.warm_steps, config), system.build(config).warm_steps()
-    else:
-        steps, own = partial(image_steps, DetectorConfig()), image_steps(DetectorConfig())
-    assert [name for name, _ in pickle.loads(pickle.dumps(steps))()] == [name for name, _ in own]
-
-
-@pytest.mark.parametrize('kept', [True, False])
-def test_a_process_of_its_own_compiles_and_ends(kept, monkeypatch):
-    """Where it keeps nothing the thread compiles."""
-    there, done = [], []
-
-    class Elsewhere:
-        one_at_a_time = jit.Elsewhere.one_at_a_time
-        begin = classmethod(lambda cls, steps: cls())
-        compile = there.append
-        stop = close = lambda self: there.append('ended')
-
-    monkeypatch.setattr(jit, 'Elsewhere', Elsewhere)
-    monkeypatch.setattr(jit, 'kept', lambda step: kept and bool(there))
-    steps = [(name, lambda name=name: done.append(name)) for name in ('fixes', 'echoes')]
-    warming = Warming(lambda inputs: steps, lambda: None, kernels_of, lambda: [])
-    warming._thread.join(240.0)
-    assert warming.ready() and warming.sentence() == ''
-    warming.trouble()
-    assert there == (['fixes', 'ended'] if kept else ['fixes', 'echoes', 'ended'])
-    assert done == (['fixes'] if kept else ['fixes', 'echoes'])
+def test_a_node_gets_warm_for_its_inputs(make_bench, monkeypatch):
+    asked = []
+    monkeypatch.setattr(WalkerTracker, 'warm', lambda self, inputs: asked.append(inputs))
+    bench = make_bench()
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    bench.spin_until(lambda: node.state == 'active')
+    (inputs,) = asked
+    assert {Fix, Arrivals} <= inputs and Navigation not in inputs
 
 
 @pytest.mark.usefixtures('quick')
 def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):
-    steps = Steps(fixes=Fix)
-    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
+    held = Held()
+    monkeypatch.setattr(WalkerTracker, 'warm', lambda self, inputs=None: held())
     bench = make_bench()
     reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
@@ -340,6 +266,6 @@ def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):
         assert reports[-1].status[0].message == reports[-1].status[1].message
         assert not node.get_subscriptions_info_by_topic('/fix')
     finally:
-        steps.let_go()
+        held.let_go.set()
     bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
     bench.spin_until(lambda: 'no message yet on' in reports[-1].status[0].message)

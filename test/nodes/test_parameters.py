@@ -19,7 +19,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
 from sonar_imm.gone import GONE
-from sonar_imm.node_config import NodeConfig
+from sonar_imm.node_config import chosen_types, NodeConfig
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.parameters import ConfigError
@@ -184,6 +184,26 @@ def test_changes_that_only_fit_together(start):
 )
 def test_bad_qos_overrides_are_explained(start, override):
     assert refusal(start, override)
+
+
+@pytest.mark.parametrize(
+    'entry, sentence',
+    [
+        ('fxi=geometry_msgs/msg/PointStamped', "did you mean 'fix'"),
+        ('nav=nav_msgs/msg/Odometry', "'nav=nav_msgs/msg/Odometry' is not <input>=<type> of one"),
+        ('fix=geometry_msgs/msg/PointStampd', "did you mean 'geometry_msgs/msg/PointStamped'"),
+        ('fix', "fix must be one of .*, got ''"),
+    ],
+)
+def test_a_type_is_one_that_the_input_can_have(entry, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        chosen_types('diver', [entry])
+
+
+def test_an_input_without_a_type_has_its_first_one():
+    chosen = chosen_types('diver', ['fixes=geometry_msgs/msg/PoseArray'])
+    assert chosen['fixes'] == 'geometry_msgs/msg/PoseArray'
+    assert chosen['fix'] == 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 @pytest.mark.parametrize('system', SYSTEMS)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Likelihoods of a direction from their definitions, for `acoustics.likelihood_kernels`."""
+"""Likelihoods of a direction from their definitions, for `trackers.bathymetry.grid_kernels`."""
 
 import numpy as np
 from numpy.typing import ArrayLike

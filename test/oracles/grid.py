@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The filter and smoother of `sonar_imm.estimation.grid` in numpy, over all cells."""
+"""The filter and smoother of `trackers.bathymetry.grid_kernels` in numpy, over all cells."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.estimation.grid import NARROW
+from sonar_imm.trackers.bathymetry.grid_kernels import NARROW
 
 
 class Filtered(NamedTuple):

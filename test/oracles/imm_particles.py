@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.estimation.elementary import exponentials
 from sonar_imm.trackers.bathymetry.filter_kernels import LEAST_CHANCE
+from sonar_imm.trackers.bathymetry.grid_kernels import exponentials
 
 
 class WeightUpdate(NamedTuple):

@@ -152,7 +152,7 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
         assert node.process.wait(120.0) == 2
-        own = ('[rcl]', 'kernels for ')
+        own = ('[rcl]', 'kernels')
         message = own_words(node.log()).splitlines()
         lines = [line for line in message if not any(word in line for word in own)]
     assert len(lines) == 1

@@ -42,7 +42,7 @@ are drawn again, since drawing can only add noise to it.
 **Likelihoods without calls of the C library**, which would prevent that the processor runs several
 particles at a time. exp is a polynomial and a shift into the exponent, cos and sin of 2 pi v are
 polynomials of what is left of v without its nearest whole number, doubled. The log likelihood of
-an echo comes from `likelihood_kernels.likelihood_table`: a double holds its own logarithm, its
+an echo comes from `acoustics.laplace.likelihood_table`: a double holds its own logarithm, its
 exponent and first bits number the cells of a table, the other bits say where in the cell it lies.
 
 Loops over particles are written so that the compiler can run them several at a time: no branch, no
@@ -80,7 +80,7 @@ E = tuple(1.0 / math.factorial(k) for k in range(13))
 S = tuple((-1.0) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(11))
 C = tuple((-1.0) ** k * math.pi ** (2 * k) / math.factorial(2 * k) for k in range(11))
 
-# The cells of `likelihood_kernels.likelihood_table`: 32 to the octave, from 2^-20 to 2^50.
+# The cells of `acoustics.laplace.likelihood_table`: 32 to the octave, from 2^-20 to 2^50.
 LOWEST, HIGHEST = 2.0**-20, 2.0**50 * (1.0 - 2.0**-50)
 CELL_BITS = 5
 SHIFT = 52 - CELL_BITS
@@ -147,9 +147,9 @@ def filter_block(
     an echo; favour (T, M): see `models.TerrainModels`, (0, M) for none. Drawn: uniform (B, 2, M),
     standard normal noise (B, M, k, N).
 
-    The likelihood, see `kernels.PingLikelihood`: echo (T,), form (T, P), base (T,), spread (T, P)
-    or None in white noise, signal (T,), table. The geometry, see `kernels.Geometry`: launch is
-    None where rays are straight, tilt None for states that are heights.
+    The likelihood, see `grid_kernels.PingLikelihood`: echo (T,), form (T, P), base (T,), spread
+    (T, P) or None in white noise, signal (T,), table. The geometry, see `grid_kernels.Geometry`:
+    launch is None where rays are straight, tilt None for states that are heights.
 
     Scratch: c (M,), running and value (M, N), mixed (M, n, N), origin (N + 1,), work (5, N) and
     the same memory as whole numbers, bits. Into mean (T, n), covariance (T, n, n),

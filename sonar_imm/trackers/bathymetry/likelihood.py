@@ -37,7 +37,6 @@ from ...acoustics import (
     coherence,
     interference,
     laplace,
-    likelihood_kernels,
     loudness,
     rays,
     sounding,
@@ -50,7 +49,7 @@ from ...acoustics.sounding import ErrorBudget, Looks
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from .config import BathymetryConfig
-from .kernels import Geometry, PingLikelihood
+from .grid_kernels import Geometry, PingLikelihood
 
 _TABLE_DEPTH = 0.02
 """Metres to which the depth of the array is rounded for a table of rays, so that pings share
@@ -328,7 +327,7 @@ def ping_likelihood(
         signal=np.ascontiguousarray(parts.signal),
         noise=np.ascontiguousarray(parts.noise),
         constant=np.ascontiguousarray(constant(P, parts.log_determinant)),
-        table=likelihood_kernels.likelihood_table(P, config.likelihood),
+        table=laplace.likelihood_table(P, config.likelihood),
         geometry=_drifting(swath.geometry, echo, config),
     )
     quiet = 1.0 if known.all() else float(np.quantile(parts.loudness, 0.1))

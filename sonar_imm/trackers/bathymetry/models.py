@@ -49,7 +49,7 @@ from ...acoustics.array import angle_of_depth
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
-from .kernels import Geometry
+from .grid_kernels import Geometry
 from .scatter import bank_of, Scatter
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
@@ -66,7 +66,8 @@ class UnknownHeight:
 
     The height of the floor is normal, mean and std, but not lower than `lowest`: there the first
     return would have come later. Angles are those at which such a floor is seen at the first bin,
-    from `height` of the array with `reach` and `tilt`, see `kernels.Geometry`; None for heights.
+    from `height` of the array with `reach` and `tilt`, see `grid_kernels.Geometry`; None for
+    heights.
     """
 
     mean: float

@@ -44,12 +44,15 @@ from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
 from .filter_kernels import filter_block, normals
-from .kernels import (
+from .grid_kernels import (
     filter_ping,
+    filter_scatter,
     GridMotion,
     Particles,
     PingLikelihood,
+    ScatterMotion,
     smooth_ping,
+    smooth_scatter,
     Track,
 )
 from .likelihood import (
@@ -62,7 +65,6 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, grid_cells, TerrainModels
-from .scatter import filter_scatter, ScatterMotion, smooth_scatter
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2

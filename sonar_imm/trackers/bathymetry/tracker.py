@@ -64,9 +64,8 @@ from ...intake import KnownFrames
 from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
-from ..protocol import WarmStep
 from .config import BathymetryConfig
-from .kernels import Track
+from .grid_kernels import Track
 from .ping import (
     Answer,
     bin_stamps,
@@ -139,18 +138,11 @@ class BathymetryTracker:
         self.config = config
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
-        for _, compile_step in self.warm_steps(inputs):
-            compile_step()
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
         if inputs is not None and Snapshot not in inputs:
-            return []
-        steps: list[WarmStep] = [('pings', self._warm_pings)]
-        # A flat floor does without these: the first pings do not wait for them.
-        later = inputs is None and self.config.layover_used == 'gated'
-        if later or self.config.layover_used == 'resolved':
-            steps.append(('surfaces', self._warm_surfaces))
-        return steps
+            return
+        self._warm_pings()
+        if self.config.layover_used != 'ignored':
+            self._warm_surfaces()
 
     def _short_ping(self) -> Snapshot:
         return Snapshot(

@@ -82,7 +82,7 @@ DISTINCT = 1.0
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`ping_kernels`."""
+`explanations`."""
 
 TAKEN = 0.5
 """Probability of being good from which a measurement counts as a track's."""
@@ -282,9 +282,7 @@ def _explain_echoes(
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (known.life.status == TENTATIVE)
-    explained_first, hits = _by_rank(
-        known, mixtures, ping, config, layout, rank, fit, near, pairs
-    )
+    explained_first, hits = _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)
     doubtful = (hits > 0) & (2 * hits < len(pairs))
     if not doubtful.any():
         return explained_first

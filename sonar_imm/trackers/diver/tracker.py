@@ -52,7 +52,6 @@ from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
-from ..protocol import WarmStep
 from . import (
     births,
     clutter,
@@ -196,9 +195,6 @@ class DiverTracker:
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Do nothing: there is nothing to compile."""
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return []
 
     def health(self) -> dict[str, float]:
         return estimate.health(self._stream.state, len(self._georeferencer))

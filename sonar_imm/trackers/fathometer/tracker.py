@@ -67,7 +67,6 @@ from ...estimation.set_model import (
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
-from ..protocol import WarmStep
 from .config import FathometerConfig
 from .pressure import (
     Collected,
@@ -225,15 +224,8 @@ class FathometerTracker:
             self._forget()
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
-        for _, compile_step in self.warm_steps(inputs):
-            compile_step()
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
         if inputs is not None and {ArrayDepth, GeodeticFix}.issuperset(inputs):
-            return []
-        return [('records', self._warm_records)]
-
-    def _warm_records(self) -> None:
+            return
         depth = 0.05 * np.arange(200)
         config = evolve(
             self.config,

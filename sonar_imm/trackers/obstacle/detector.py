@@ -181,21 +181,6 @@ class ImageDetector:
             self.infos.pop(next(iter(self.infos)))
         self.infos[info.frame_id] = info, config
 
-    def warm(self) -> None:
-        """Compile or load the kernels."""
-        rng = np.random.default_rng(0)
-        amplitude = rng.exponential(size=(60, 40))
-        amplitude[30, 20] = 1e3
-        detect(
-            SonarImage(
-                stamp_ns=1,
-                range=1.0 + np.arange(60.0),
-                bearing=np.linspace(0.3, -0.3, 40),
-                amplitude=amplitude,
-            ),
-            self.config,
-        )
-
     def _gathered(self, beam: SonarImage) -> SonarImage | None:
         """The sweep that `beam` ends, if it does; `beam` begins the next one."""
         ahead = abs(float(beam.bearing[0])) <= np.radians(0.5 * self.config.sweep_sector_deg)

@@ -24,8 +24,9 @@ azimuths to starboard; places go out as ENU.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
-from attrs import define, evolve, field, frozen
+from attrs import define, field, frozen
 import numpy as np
 
 from ...acoustics import geometry
@@ -143,8 +144,7 @@ def default_variance(config: ObstacleConfig) -> FloatArray:
     return np.square([config.range_std, np.radians(config.bearing_std_deg)])
 
 
-@frozen(eq=False)
-class Match:
+class Match(NamedTuple):
     """The echo `chosen` (T,) by each obstacle, -1 for none, of which `expected` (T, K, 2) was
     expected, and the log density `fit` (T,) of what was found."""
 
@@ -158,8 +158,7 @@ class Match:
         return self.chosen >= 0
 
 
-@frozen(eq=False)
-class Verdict:
+class Verdict(NamedTuple):
     """The tracks `life` that live on, `stays` (T,) which these are, and which lie `ahead` (T,)."""
 
     life: Tracks
@@ -183,8 +182,7 @@ class Ping:
     verdict: Verdict = field(init=False)
 
 
-@frozen(eq=False, kw_only=True)
-class Inbox:
+class Inbox(NamedTuple):
     """What came and is not used up. waiting: pings without a pose yet, each with the altitude
     then; ground: soundings so far; skipped: pings so far for which navigation had a gap; missing:
     pings so far that were given up because too many waited."""
@@ -211,8 +209,7 @@ class Inbox:
                 pings.append(item)
         waiting = [*self.waiting, *((ping, altitude) for ping in pings)]
         given_up = max(0, len(waiting) - MOST_WAITING)
-        return evolve(
-            self,
+        return self._replace(
             navigation=navigation,
             altitude=altitude,
             ground=ground,
@@ -231,7 +228,7 @@ class Inbox:
                 ready.append(first)
             else:
                 skipped += 1
-        return evolve(self, waiting=tuple(waiting), skipped=skipped), ready
+        return self._replace(waiting=tuple(waiting), skipped=skipped), ready
 
     def _readiness(self, ping: Detections, config: ObstacleConfig) -> Readiness:
         return self.navigation.readiness(
@@ -272,7 +269,7 @@ class Inbox:
         """Return the inbox without the poses that no ping needs any more."""
         oldest = self.waiting[0][0].stamp_ns if self.waiting else stamp_ns
         kept = self.navigation.since(oldest - nanoseconds(config.course_window))
-        return evolve(self, navigation=kept)
+        return self._replace(navigation=kept)
 
 
 def _late_ns(config: ObstacleConfig) -> int:

@@ -16,8 +16,10 @@
 
 `Known` is what is known after a ping. Its obstacles are a table, `Obstacles`: each column, or
 table in it, holds one row for each, in the order of `Known.life`; `estimation.arrays` takes,
-appends and replaces rows of all columns alike. No array is ever written again. What leaves the view
-is remembered as a landmark, and recalled when its place comes into view again (`memory`).
+appends and replaces rows of all columns alike. No array is ever written again.
+
+What leaves the view is remembered as a landmark (`memory`), and recalled when its place comes into
+view again.
 """
 
 from __future__ import annotations

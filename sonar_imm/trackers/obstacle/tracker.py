@@ -42,7 +42,6 @@ from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Ground, Measurement, Navigation
 from ..model_checks import track_rules
-from ..protocol import WarmStep
 from .avoidance import closest_approach
 from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
@@ -142,9 +141,6 @@ class ObstacleTracker:
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
         """Do nothing: no kernel has to be compiled."""
-
-    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return []
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
@@ -311,9 +307,9 @@ class ObstacleTracker:
 
     def _end(self, known: Known, ping: Ping) -> Known:
         """End the tracks that are over or passed."""
-        stays = ping.verdict.stays
-        known = known._replace(obstacles=take(known.obstacles, stays), life=ping.verdict.life)
-        return known.only(ping.verdict.ahead[stays])
+        life, stays, ahead = ping.verdict
+        table = known.obstacles if stays.all() else take(known.obstacles, stays)
+        return known._replace(obstacles=table, life=life).only(ahead[stays])
 
     def _begin(self, known: Known, ping: Ping) -> Known:
         """Begin a track at each echo that nobody gave, as long as there is room."""

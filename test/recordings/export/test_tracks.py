@@ -40,10 +40,8 @@ COUNT = 60
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp('tracks')
     write_dive(folder / 'bag', count=COUNT)
-    origin = [
-        f'--set=origin_{name}={value}' for name, value in zip(('latitude', 'longitude'), ORIGIN)
-    ]
-    assert main(['track', str(folder / 'bag'), str(folder / 'run'), *origin]) == 0
+    origin = f'--set=origin=[{ORIGIN[0]}, {ORIGIN[1]}, 0.0]'
+    assert main(['track', str(folder / 'bag'), str(folder / 'run'), origin]) == 0
     return folder / 'run'
 
 

@@ -24,9 +24,10 @@ import pytest
 from scipy import stats
 
 from sonar_imm.acoustics import interference, laplace, rays
-from sonar_imm.acoustics.likelihood_kernels import likelihood_table
+from sonar_imm.acoustics.laplace import likelihood_table
 from sonar_imm.estimation import particles
-from sonar_imm.trackers.bathymetry import kernels, ping
+from sonar_imm.trackers.bathymetry import grid_kernels as kernels
+from sonar_imm.trackers.bathymetry import ping
 from sonar_imm.trackers.bathymetry.filter_kernels import normals
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 

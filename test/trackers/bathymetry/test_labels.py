@@ -22,7 +22,8 @@ from scipy.stats import norm
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.bathymetry import kernels, scatter
+from sonar_imm.trackers.bathymetry import grid_kernels as kernels
+from sonar_imm.trackers.bathymetry import scatter
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run, verdict
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
@@ -90,7 +91,7 @@ def test_the_smoother_is_that_of_dense_matrices():
     cells = 0.02 * np.arange(-75, 76)
     transition = np.array([[0.9, 0.06, 0.04], [0.1, 0.85, 0.05], [0.02, 0.08, 0.9]])
     sigma = np.tile([1.5, 2.0, 3.0], (12, 1))
-    motion = scatter.ScatterMotion(
+    motion = kernels.ScatterMotion(
         kernels.GridMotion(cells, transition, sigma, 0, np.empty((0, 3))),
         np.array([0, 0, 1]),
         np.array([0.0, 0.0, 10.0]),
@@ -103,8 +104,8 @@ def test_the_smoother_is_that_of_dense_matrices():
         np.empty((12, 1)), np.empty((12, 1, 1)), np.empty((12, 2)), np.empty(12), np.empty(12)
     )
     window = np.empty((12, 2), np.int64)
-    kept = scatter.filter_scatter(p, motion, seen.likelihood, window, track, True)
-    scatter.smooth_scatter(kept, window, motion, seen.likelihood, track)
+    kept = kernels.filter_scatter(p, motion, seen.likelihood, window, track, True)
+    kernels.smooth_scatter(kept, window, motion, seen.likelihood, track)
     mean, variance, probability = dense(seen, cells, motion)
     assert seen.likelihood.echo.all()
     assert track.mean[:, 0] == pytest.approx(mean, abs=1e-5)

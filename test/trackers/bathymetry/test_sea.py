@@ -21,13 +21,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
-from sonar_imm.acoustics.likelihood_kernels import likelihood_table
+from sonar_imm.acoustics.laplace import likelihood_table
 from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Altitude, Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
-from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
-from sonar_imm.trackers.bathymetry.kernels import state_log_likelihoods as log_likelihoods
+from sonar_imm.trackers.bathymetry.grid_kernels import drift, PingLikelihood, sines_of
+from sonar_imm.trackers.bathymetry.grid_kernels import state_log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate

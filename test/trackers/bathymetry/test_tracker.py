@@ -29,7 +29,7 @@ from sonar_imm.measurements import Fix, Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.config import MODEL_SETS
-from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.grid_kernels import sines_of
 from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate

@@ -25,10 +25,13 @@ from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
+from sonar_imm.trackers.diver.births import begun_anew
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous, spread
+from sonar_imm.trackers.diver.estimate import published
+from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.known import outputs
-from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.models import build_models, START_DEPTHS
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
@@ -399,33 +402,21 @@ def test_a_dive_past_the_transmitter_does_not_end_on_the_wrong_side(seed):
     assert np.square(smoothed[:, 0]).mean() < 1.1 * np.square(filtered[:, 0]).mean()
 
 
-def test_a_track_that_was_somewhere_else_begins_anew_with_the_whole_bank():
-    """Told 20 m away from where the diver is, by eight receivers that outvote it."""
-    settings = {'model_set': 'heading_speed', 'max_tracks': 1, 'dimensions': 3}
-    tracker, rng = DiverTracker(DiverConfig(**settings)), np.random.default_rng(1)
-    angle = 2.0 * np.pi * np.arange(8) / 8.0
-    rx = np.column_stack([40.0 * np.cos(angle), 40.0 * np.sin(angle), -rng.uniform(1, 14, 8)])
-    told = Start(stamp_ns=10**9, position=[27.0, 3.0, 0.0], covariance=spatial(math.nan) * 4.0)
-    tracker.process(told)
-    found, places, no = [], {}, np.full(8, math.nan)
-    for second in range(2, 14):
-        place = np.array([7.0 + 0.5 * second, 3.0 + 0.2 * second, -15.0])
-        path = np.linalg.norm(place - rx, axis=1) + np.linalg.norm(place - rx[0])
-        ping = Arrivals(
-            stamp_ns=second * 10**9,
-            tx_id=np.zeros(8),
-            rx_id=np.arange(8),
-            tx=np.tile(rx[0], (8, 1)),
-            rx=rx,
-            toa=path / 1500.0 + 2e-4 * rng.normal(size=8),
-            var_toa=np.full(8, 4e-8),
-            bearing=no,
-            var_bearing=no,
-        )
-        found += tracker.process(ping)
-        places[second * 10**9] = place
-    assert found[0].extras['nis'][0] > 100.0
-    assert tracker._stream.state['spreads'].tolist() == [1]
-    assert {tuple(each.extras['track_id'].tolist()) for each in found} == {(1,)}
-    after = errors(found, places, 0)
-    assert after[:, 1].mean() < 8.0 and np.abs(after[:, 0]).max() < 2.5
+def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
+    """An update that is all but impossible tells nothing of the depth: the ping alone does."""
+    scene, places = past_the_transmitter(1043)
+    config = DiverConfig(model_set='heading_speed', max_tracks=1, dimensions=3)
+    tracker = DiverTracker(config)
+    pings = [item.measurement for item in scene.measurements][:20]
+    for ping in pings:
+        tracker.process(ping)
+    known, ping = tracker._stream.state, pings[-1]
+    free, layout = np.zeros(len(ping), bool), Instruments().layout(config, tracker.models)
+    for nis, again in ((10.0, 0), (1e3, 1)):
+        known = known.put(nis=np.array([nis]), nis_dof=np.array([4], np.uint16))
+        after = begun_anew(known, ping, free, tracker.models, layout, config)
+        assert after['spreads'][0] - known['spreads'][0] == again
+    assert len(after.rows) == START_DEPTHS and (after.rows.parent == -1).all()
+    mean, covariance = published(after, tracker.models)
+    error = mean[0, :3] - places[ping.stamp_ns][:3]
+    assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0

@@ -22,6 +22,7 @@ import pytest
 from sonar_imm.measurements import Altitude, Detections, Fix, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.navigation import MOST_WAITING
+from sonar_imm.trackers.obstacle.config import GRADES
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 NAME = 'approach_dst+3_noisy'
@@ -170,6 +171,25 @@ def test_parameters_are_checked_together():
         ObstacleConfig(sonar_lever=(1.0, 2.0))
     with pytest.raises(ConfigError, match='did you mean'):
         ObstacleConfig.from_mapping({'sonar_leaver': [0.0, 0.0, 0.0]})
+
+
+def test_a_grade_of_the_navigation_is_three_random_walks():
+    walks = [ObstacleConfig(navigation_grade=grade).drift() for grade in GRADES]
+    assert walks[0] == ObstacleConfig().drift() == (0.01, np.radians(0.02), 0.01)
+    assert walks == sorted(walks) and len(set(walks)) == len(walks)
+    exact = ObstacleConfig(navigation_grade='dvl', navigation_noise=(0.0, 0.0, 0.0))
+    assert exact.drift() == (0.0, 0.0, 0.0)
+
+
+def test_a_feature_that_is_off_has_no_stage():
+    def stages(**values):
+        return {stage.__name__ for stage in ObstacleTracker(ObstacleConfig(**values)).stages}
+
+    assert stages(misses='evidence') - stages() == {'_predict_misses', '_weigh_misses'}
+    assert stages() - stages(max_landmarks=0) == {'_remember'}
+    tracker = ObstacleTracker(ObstacleConfig())
+    tracker.reconfigure(ObstacleConfig(max_landmarks=0))
+    assert {stage.__name__ for stage in tracker.stages} == stages(max_landmarks=0)
 
 
 def test_rules_may_change_while_running():

@@ -16,7 +16,7 @@
 
 import numpy as np
 
-from sonar_imm.estimation.elementary import exponentials, phasors
+from sonar_imm.trackers.bathymetry.grid_kernels import exponentials, phasors
 
 
 def row(values):

@@ -18,7 +18,7 @@ import numpy as np
 from oracles.grid import filter_densities, smooth_densities, walk_matrix
 import pytest
 
-from sonar_imm.estimation import grid
+from sonar_imm.trackers.bathymetry import grid_kernels as grid
 
 CELLS = np.arange(-400, 401) * 0.05
 STEP = 0.05
