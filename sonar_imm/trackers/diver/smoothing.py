@@ -188,8 +188,7 @@ class SmoothingDiverTracker(DiverTracker):
         identity."""
         end = scans[last].known.rows
         rows: IndexArray = np.flatnonzero(end.target == _place(scans[last].known, track_id))
-        weight = end.take(rows).weight_among_themselves()
-        for row, share in zip(rows.tolist(), weight.tolist()):
+        for row in rows.tolist():
             path = self._path(scans, track_id, row, first, last)
             x, P, mu = self._along(path)
             key = {name: column[row] for name, column in end.key.items()}
@@ -197,9 +196,8 @@ class SmoothingDiverTracker(DiverTracker):
                 if number is None:
                     continue
                 kept = found.setdefault((number, track_id), _Smoothed([], [], [], [], []))
-                logw = float(np.log(max(share, 1e-300)))
                 columns: tuple[list[Any], ...] = tuple(kept)
-                for column, value in zip(columns, (x[k], P[k], mu[k], logw, key)):
+                for column, value in zip(columns, (x[k], P[k], mu[k], end.logw[row], key)):
                     column.append(value)
 
     def _path(
