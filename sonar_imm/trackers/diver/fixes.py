@@ -52,6 +52,7 @@ from ...estimation.rows import (
     of_targets,
     revived,
     ROW_AGAIN,
+    ROW_LOST,
     Rows,
     thinned,
 )
@@ -406,7 +407,7 @@ def updated(
         factors.append(factor)
     sound, repairs = repaired(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).with_models(np.concatenate(factors, axis=1))
-    rows, borrowed = revived(rows, borrowed, 'scale', borrowed.logw > math.log(ROW_AGAIN))
+    rows, borrowed = revived(rows, borrowed, 'scale', _again(rows, borrowed))
     return known.replace(rows=rows, borrowed=borrowed).counted(repairs=repairs)
 
 
@@ -424,17 +425,23 @@ def _reweighed(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Ro
 
 
 def _staying(rows: Rows) -> BoolArray:
-    """Return which rows (N,) stay whatever they weigh: those whose start is their state, and of
-    each track the heaviest, and the heaviest that says how well its place is known."""
-    scale = rows.key['scale']
-    first = rows.first
+    """Return which rows (N,) stay whatever they weigh among all: those whose start is their state,
+    of each track the heaviest, and those that weigh among the rows that say how well its place is
+    known."""
+    first, scale = rows.first, rows.key['scale']
     # A start is a state and no scale: all rows of such a track stay, also the first.
     stays = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
-    for counted in (np.ones(len(rows), np.bool_), scale >= STATED):
-        log = np.where(counted, rows.logw, -np.inf)
-        heaviest = log == np.maximum.reduceat(log, first)[rows.target]
-        stays = stays | (heaviest & counted)
-    return stays
+    stays |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
+    return stays | (stated_weight(rows) >= ROW_LOST) & (scale >= STATED)
+
+
+def _again(rows: Rows, borrowed: Borrowed) -> BoolArray:
+    """Return which assumptions (B,) weigh enough for a row, among all or among those that say how
+    well a place is known."""
+    stated = np.where(rows.key['scale'] >= STATED, np.exp(rows.logw), 0.0)
+    total = np.add.reduceat(stated, rows.first)[borrowed.target]
+    least = np.where((borrowed.key >= STATED) & (total > 0.0), total, 1.0) * ROW_AGAIN
+    return np.asarray(np.exp(borrowed.logw) > least)
 
 
 def stated_weight(rows: Rows) -> FloatArray:
