@@ -108,9 +108,9 @@ def run_case(engine, get, case):
     F, B, Q, E, P0, Z, R = (get(case, key) for key in ('F', 'B', 'Q', 'E', 'Pi', 'Z', 'R'))
     options = json.loads(str(get(case, 'opts')))
     valid = get(case, 'valid') if 'valid' in get(case) else np.ones(len(Z), bool)
-    form = {'em': 'counts', None: 'fixed'}[options.get('form')]
+    learns = {'em': True, None: False}[options.get('form')]
     # The reference starts its counts at N0 P0 and adds N0 P0 again: worth two N0 in all.
-    chain = AdaptiveChain(FixedChain(P0), form, weight=2.0 * options.get('N0', 1.0))
+    chain = AdaptiveChain(FixedChain(P0), weight=2.0 * options.get('N0', 1.0), learns=learns)
     x, P, mu = (get(case, key)[None].copy() for key in ('x0', 'P0', 'mu0'))
     learnt, H = chain.fresh(1), np.ascontiguousarray(E[:, :2])
     rows = []
