@@ -72,7 +72,7 @@ class AdaptiveChain:
         self._first = np.flatnonzero(np.diff(self._i, prepend=-1))
         self._prior = weight * chain.matrix[self._i, self._j]
 
-    def fresh(self, targets: int) -> FloatArray:
+    def initial_counts(self, targets: int) -> FloatArray:
         """Return what is known before anything was learnt: (targets, 2, E), transitions seen and
         expected, of the E that can be learnt."""
         return np.zeros((targets, 2, len(self._i)))

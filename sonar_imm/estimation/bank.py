@@ -56,12 +56,12 @@ __all__ = [
     'Bank',
     'combine',
     'compare',
-    'expected',
     'Gaussians',
     'Innovations',
     'mix',
     'Moves',
     'predict',
+    'predict_fix',
     'update',
     'weigh',
 ]
@@ -84,7 +84,7 @@ class Gaussians(NamedTuple):
     x: Annotated[FloatArray, 'Nnm']
     P: Annotated[FloatArray, 'Nnnm']
 
-    def rows(self, chosen: IndexArray | BoolArray) -> Gaussians:
+    def select(self, chosen: IndexArray | BoolArray) -> Gaussians:
         """Return the `chosen` rows."""
         return Gaussians(self.x[chosen], self.P[chosen])
 
@@ -160,22 +160,25 @@ def mix(
         # Moments about the origin lose the digits of a position, but not those of a speed, and
         # those of a velocity follow from them.
         centre[:, S] = 0.0
-    moments = [_moments(block, _padded(centre, k)) for k, block in enumerate(blocks)]
+    moments = [_moments(block, _pad_centre(centre, k)) for k, block in enumerate(blocks)]
     images = None
     if bank.velocities:
-        images, fit = _as_headings(bank, blocks[1], centre)
+        images, fit = _to_headings(bank, blocks[1], centre)
         _share_by_direction(W, fit, bank, a)
     c = W.sum(axis=1)
     dead = c <= DEAD
     W = np.where(dead[:, None], mu[:, :, None], W / np.where(dead, 1.0, c)[:, None])
     mixed = moments[0] @ W[:, :a, :a]
     if images is None:
-        return [_unpacked(mixed, _padded(centre, 0))], c
+        return [_unpack_moments(mixed, _pad_centre(centre, 0))], c
     for k in range(bank.velocities):
         mixed += images[:, :, k, bank.direction] * W[:, None, a + k, :a]
-    as_velocities = _as_velocities(bank, moments[0], blocks[0].x.shape[1])
+    as_velocities = _to_velocities(bank, moments[0], blocks[0].x.shape[1])
     moving = moments[1] @ W[:, a:, a:] + as_velocities @ W[:, :a, a:]
-    return [_unpacked(mixed, _padded(centre, 0)), _unpacked(moving, _padded(centre, 1))], c
+    return [
+        _unpack_moments(mixed, _pad_centre(centre, 0)),
+        _unpack_moments(moving, _pad_centre(centre, 1)),
+    ], c
 
 
 def _centre(block: Gaussians, mu: FloatArray) -> FloatArray:
@@ -185,7 +188,7 @@ def _centre(block: Gaussians, mu: FloatArray) -> FloatArray:
     return np.asarray((block.x @ weight[..., None])[..., 0])
 
 
-def _padded(centre: FloatArray, block: int) -> FloatArray:
+def _pad_centre(centre: FloatArray, block: int) -> FloatArray:
     """Return the centre (N, n, 1) in the components of a block: a velocity has one more."""
     if block == 0:
         return centre[..., None]
@@ -205,7 +208,7 @@ def _moments(block: Gaussians, centre: FloatArray) -> FloatArray:
     return np.concatenate([d, block.P[:, i, j] + d[:, i] * d[:, j]], axis=1)
 
 
-def _unpacked(moments: FloatArray, centre: FloatArray) -> Gaussians:
+def _unpack_moments(moments: FloatArray, centre: FloatArray) -> Gaussians:
     """Return mean and covariance of raw moments about `centre` (N, n, 1)."""
     n = centre.shape[1]
     i, j = _upper(n)
@@ -243,7 +246,7 @@ def _velocity_places(n: int) -> tuple[tuple[IndexArray, IndexArray], ...]:
     return tuple((each[0], each[1]) for each in pairs)
 
 
-def _as_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
+def _to_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
     """Return the moments (N, q', a) of headings and hovers in the components of a velocity."""
     (source, target), *along = _velocity_places(n)
     size = n + 1
@@ -267,7 +270,7 @@ def _as_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
     return out
 
 
-def _as_headings(
+def _to_headings(
     bank: Bank, block: Gaussians, centre: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the moments (N, q, b, D + 1) of b velocities as each of D headings and as a hover,
@@ -289,7 +292,7 @@ def _as_headings(
     x2, P2 = _with_speed(x1, P1, ux, uy)
     fit = -0.5 * (across * across / variance + LOG_2PI + np.log(variance))
     fit = fit + _log_positive_part(x2[:, S], P2[:, S, S])
-    hover = _as_hover(bank, block)
+    hover = _to_hover(bank, block)
     x2 = np.concatenate([x2, hover.x[..., None]], axis=-1)
     P2 = np.concatenate([P2, hover.P[..., None]], axis=-1)
     return _moments(Gaussians(x2, P2), centre[..., None, None]), fit
@@ -300,7 +303,7 @@ def _with_speed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return states (N, n', ...) and covariances (N, n', n', ...) with the speed along (ux, uy) in
     place of the velocity."""
-    kept = _but_velocity(x.shape[1])
+    kept = _without_velocity(x.shape[1])
     n, behind = x.shape[1] - 1, np.delete(np.arange(x.shape[1] - 1), S)
     x1 = np.empty((len(x), n, *x.shape[2:]))
     x1[:, behind], x1[:, S] = x[:, kept], ux * x[:, VX] + uy * x[:, VY]
@@ -313,14 +316,14 @@ def _with_speed(
 
 
 @lru_cache(maxsize=16)
-def _but_velocity(n: int) -> IndexArray:
+def _without_velocity(n: int) -> IndexArray:
     return np.delete(np.arange(n), [VX, VY])
 
 
-def _as_hover(bank: Bank, block: Gaussians) -> Gaussians:
+def _to_hover(bank: Bank, block: Gaussians) -> Gaussians:
     """Return the velocities with the speed of the prior, uncorrelated with all else."""
     N, n, m = block.x.shape
-    kept, behind = _but_velocity(n), np.delete(np.arange(n - 1), S)
+    kept, behind = _without_velocity(n), np.delete(np.arange(n - 1), S)
     x, P = np.empty((N, n - 1, m)), np.zeros((N, n - 1, n - 1, m))
     x[:, behind], x[:, S] = block.x[:, kept], bank.speed
     P[:, behind[:, None], behind] = block.P[:, kept[:, None], kept]
@@ -394,12 +397,12 @@ class Innovations(NamedTuple):
     nis: FloatArray
     log: FloatArray
 
-    def only(self, chosen: IndexArray | BoolArray) -> Innovations:
+    def select(self, chosen: IndexArray | BoolArray) -> Innovations:
         """Return the `chosen` pairs."""
         return Innovations._make(part[chosen] for part in self)
 
 
-def expected(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
+def predict_fix(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
     """Return what each model expects of a measurement, (N, 2, m), and the covariance of that, (N,
     3, m): xx, xy, yy."""
     PHt = np.swapaxes(_measure(block.P, measured), 1, 2)
@@ -417,13 +420,13 @@ def weigh(
 ) -> Innovations:
     """Compare the models of each pair's row with its measurement: row (p,), z (p, 2), R (p, 2,
     2)."""
-    return compare(*expected(block, measured), row, z, R)
+    return compare(*predict_fix(block, measured), row, z, R)
 
 
 def compare(
     h: FloatArray, S: FloatArray, row: IndexArray, z: FloatArray, R: FloatArray
 ) -> Innovations:
-    """Compare each pair's measurement with what its row expects: h, S as of `expected`, the rest
+    """Compare each pair's measurement with what its row expects: h, S as of `predict_fix`, the rest
     as in `weigh`."""
     v = z[..., None] - h[row]
     S = S[row] + np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1)[..., None]
@@ -477,7 +480,7 @@ def update(
     at = np.repeat(np.arange(len(rows)), np.diff([*first, len(row)]))
     share = np.where(alive[at], ratio / scale[at], 0.0)
     none = np.where(alive, missed[rows, None] / scale, 1.0)
-    shift, after = _conditioned(block, pairs, row, measured, estimated)
+    shift, after = _condition(block, pairs, row, measured, estimated)
     mean = np.add.reduceat(share[:, None] * shift, first)
     # About the new mean: what a sharp measurement leaves is lost beside the square of a shift.
     apart = shift - mean[at]
@@ -490,7 +493,7 @@ def update(
     return Gaussians(x1, P1), weight
 
 
-def _conditioned(
+def _condition(
     block: Gaussians,
     pairs: Innovations,
     row: IndexArray,

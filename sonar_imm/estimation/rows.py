@@ -41,7 +41,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'of_targets', 'revived', 'Rows', 'thinned']
+__all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
 
 LEAST_LOG = -345.0
 """Logarithm of the weight, 1e-150, that a row keeps: it may become true later."""
@@ -75,14 +75,14 @@ class Rows:
     @cached_property
     def first(self) -> IndexArray:
         """(T,) the first row of each target."""
-        return _first(self.target)
+        return _first_rows(self.target)
 
     @cached_property
     def weight(self) -> FloatArray:
         """(N,) the weights of the rows of each target; they sum to one."""
-        return self.weights_of(np.ones(len(self), np.bool_))
+        return self.weights_among(np.ones(len(self), np.bool_))
 
-    def weights_of(self, counted: BoolArray) -> FloatArray:
+    def weights_among(self, counted: BoolArray) -> FloatArray:
         """Return the weights (N,) of the rows among those that are `counted` (N,), of targets that
         have none of these among all."""
         if not len(self):
@@ -92,16 +92,16 @@ class Rows:
         weight = np.where(counted | none[self.target], np.exp(self.logw), 0.0)
         return weight / np.add.reduceat(weight, first)[self.target]
 
-    def weight_among_themselves(self) -> FloatArray:
+    def normalized_weight(self) -> FloatArray:
         """Return the weights (N,) of the rows of one target, whatever its place."""
         weight = np.exp(self.logw - self.logw.max())
         return np.asarray(weight / weight.sum())
 
-    def take(self, rows: IndexArray) -> Rows:
+    def select(self, rows: IndexArray) -> Rows:
         """Return those rows, in that order, each as often as it is named; `parent` says which they
         were."""
         return Rows(
-            tuple(block.rows(rows) for block in self.blocks),
+            tuple(block.select(rows) for block in self.blocks),
             self.mu[rows],
             self.logw[rows],
             self.target[rows],
@@ -109,12 +109,12 @@ class Rows:
             {name: column[rows] for name, column in self.key.items()},
         )
 
-    def of_targets(self, kept: BoolArray) -> Rows:
+    def select_targets(self, kept: BoolArray) -> Rows:
         """Return the rows of the targets where `kept` (T,) is True, which are numbered anew; their
         parents stay."""
         rows = np.flatnonzero(kept[self.target])
         renumbered = (np.cumsum(kept) - 1)[self.target[rows]]
-        return evolve(self.take(rows), target=renumbered, parent=self.parent[rows])
+        return evolve(self.select(rows), target=renumbered, parent=self.parent[rows])
 
     def append(self, new: Rows) -> Rows:
         """Return the table with more rows, of targets already there or of new ones.
@@ -138,16 +138,16 @@ class Rows:
         if (np.diff(both.target) >= 0).all():
             return both
         order = np.argsort(both.target, kind='stable')
-        return evolve(both.take(order), parent=both.parent[order])
+        return evolve(both.select(order), parent=both.parent[order])
 
-    def in_place_of(self, target: int, new: Rows) -> Rows:
+    def replace_target(self, target: int, new: Rows) -> Rows:
         """Return the table in which `new` are the rows of one target, without parents."""
-        left = self.take(np.flatnonzero(self.target != target))
+        left = self.select(np.flatnonzero(self.target != target))
         left = evolve(left, parent=self.parent[left.parent])
         count = len(new)
         return left.append(evolve(new, target=np.full(count, target), parent=np.full(count, -1)))
 
-    def with_models(self, factor: FloatArray) -> tuple[Rows, FloatArray]:
+    def multiply_models(self, factor: FloatArray) -> tuple[Rows, FloatArray]:
         """Return the rows after the probabilities of their models were multiplied by `factor` (N,
         M), and by what (N,) that multiplied the weight of each row."""
         mu = self.mu * factor
@@ -173,7 +173,7 @@ class Rows:
         spread = covariance + d[:, :, None] * d[:, None]
         return centre, np.add.reduceat(w[..., None] * spread, first)
 
-    def models(self) -> FloatArray:
+    def model_probabilities(self) -> FloatArray:
         """Return the probabilities (T, M) of the models of each target, over all its rows."""
         if not len(self):
             return self.mu
@@ -184,19 +184,19 @@ class Rows:
         return evolve(self, **changes)
 
 
-def _first(target: IntArray) -> IndexArray:
+def _first_rows(target: IntArray) -> IndexArray:
     """Return where each target begins, of targets (A,) in rising order."""
     changes = np.ones(len(target), np.bool_)
     np.not_equal(target[1:], target[:-1], out=changes[1:])
     return changes.nonzero()[0]
 
 
-def of_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
+def reduce_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
     """Return what a verb such as ``np.maximum`` makes of all that belongs to each target, (T,
     ...): values (A, ...), target (A,) in rising order, each of T there."""
     if not len(values):
         return values
-    return np.asarray(verb.reduceat(values, _first(target)))
+    return np.asarray(verb.reduceat(values, _first_rows(target)))
 
 
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
@@ -204,7 +204,7 @@ def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
     rising order, each of T there."""
     if not len(log):
         return np.empty((0, *log.shape[1:]))
-    first = _first(target)
+    first = _first_rows(target)
     top = np.maximum.reduceat(log, first)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):
@@ -221,24 +221,24 @@ class Borrowed:
     logw: Annotated[FloatArray, 'b']
 
     @classmethod
-    def none(cls) -> Borrowed:
+    def empty(cls) -> Borrowed:
         """Return an empty list."""
         return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
     def __len__(self) -> int:
         return len(self.target)
 
-    def of_targets(self, kept: BoolArray) -> Borrowed:
+    def select_targets(self, kept: BoolArray) -> Borrowed:
         """Return those of the targets where `kept` (T,) is True, which are numbered anew."""
         own = kept[self.target]
         return Borrowed((np.cumsum(kept) - 1)[self.target[own]], self.key[own], self.logw[own])
 
-    def without(self, target: int) -> Borrowed:
+    def without_target(self, target: int) -> Borrowed:
         """Return those of all other targets."""
         other = self.target != target
         return Borrowed(self.target[other], self.key[other], self.logw[other])
 
-    def lender(self, rows: Rows, name: str) -> IndexArray:
+    def find_lenders(self, rows: Rows, name: str) -> IndexArray:
         """Return the row (B,) of the same target that each is reckoned from: the nearest by the
         logarithm of the key `name`, of two as near the heavier."""
         if not len(self):
@@ -248,7 +248,7 @@ class Borrowed:
         return np.asarray(apart.argmin(axis=1))
 
 
-def thinned(
+def drop_weightless_rows(
     rows: Rows, borrowed: Borrowed, name: str, stays: BoolArray
 ) -> tuple[Rows, Borrowed, IndexArray]:
     """Return rows and list after rows that lost their weight were left out, but for those that
@@ -260,10 +260,12 @@ def thinned(
     target = np.concatenate([borrowed.target, rows.target[lost]])
     key = np.concatenate([borrowed.key, rows.key[name][lost]])
     new = Borrowed(target, key, np.concatenate([borrowed.logw, rows.logw[lost]]))
-    return evolve(rows.take(left), parent=rows.parent[left]), new, left
+    return evolve(rows.select(left), parent=rows.parent[left]), new, left
 
 
-def revived(rows: Rows, borrowed: Borrowed, name: str, again: BoolArray) -> tuple[Rows, Borrowed]:
+def restore_rows(
+    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
+) -> tuple[Rows, Borrowed]:
     """Return rows and list after assumptions `again` (B,) got a row, a copy of their lender."""
     if not again.any():
         return rows, borrowed
@@ -271,6 +273,6 @@ def revived(rows: Rows, borrowed: Borrowed, name: str, again: BoolArray) -> tupl
         Borrowed(borrowed.target[own], borrowed.key[own], borrowed.logw[own])
         for own in (again, ~again)
     )
-    lender = back.lender(rows, name)
-    copies = evolve(rows.take(lender), logw=back.logw, parent=rows.parent[lender])
+    lender = back.find_lenders(rows, name)
+    copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
     return rows.append(evolve(copies, key={**copies.key, name: back.key})), waiting

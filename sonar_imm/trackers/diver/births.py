@@ -15,7 +15,7 @@
 """Where new divers may be, and how a track begins there.
 
 A track begins at a fix that no track took, at a position that the free rows of a ping can explain,
-or where somebody says that a diver is. Such a start is no measurement: it is believed, so its
+or where somebody says that a diver is. Such a start is no measurement: it is birth_from_start, so its
 track is confirmed at once. Tracks without a name that it agrees with give way to it, or the diver
 would have two; with a single diver, all do.
 """
@@ -40,18 +40,18 @@ from ...measurements import Arrivals, NOBODY, Start
 from . import depth
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, places
+from .known import Feature, Known, track_positions
 from .models import ModelSet, start_depths, VELOCITY
 from .scan import (
     bearing_variance,
     Group,
     Height,
     Heights,
-    name_of,
     ping_measurements,
     Scan,
-    spread,
+    subsample,
     systematic_variance,
+    tag_id,
     toa_variance,
 )
 
@@ -86,16 +86,16 @@ class Birth(NamedTuple):
     seen_by: tuple[str, FloatArray] | None = None
 
 
-def at_fixes(known: Known, group: Group) -> Known:
+def spawn_at_fixes(known: Known, group: Group) -> Known:
     """Note every fix that no track took as a place to begin one. A stage of the tracker."""
-    found = group.found
+    found = group.association
     assert found is not None
     for d in np.flatnonzero(found.free).tolist():
         existence = math.nan if found.existence is None else float(found.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height
-        group.births.append(Birth(*place, group.turned_by))
+        group.births.append(Birth(*place, group.rotation_sensor))
     return known
 
 
@@ -111,10 +111,10 @@ def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> li
     for _ in range(MOST_FOUND):
         if not len(rows):
             break
-        pairs = [rows] if ping.passive else _by_pair(ping, rows)
+        pairs = [rows] if ping.passive else _rows_by_pair(ping, rows)
         if ping.passive or max(len(pair) for pair in pairs) == 1:
-            return births + _fix(ping, rows, config)[0]
-        found, used = _best_combination(ping, pairs, config)
+            return births + _locate_births(ping, rows, config)[0]
+        found, used = _find_best_combination(ping, pairs, config)
         if not found:
             return births
         births += found
@@ -122,25 +122,27 @@ def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> li
     return births
 
 
-def _by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
+def _rows_by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
     pair = np.column_stack([ping.tx_id, ping.rx_id])[rows]
     return [rows[(pair == each).all(axis=1)] for each in np.unique(pair, axis=0)]
 
 
-def _fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> tuple[list[Birth], IndexArray]:
+def _locate_births(
+    ping: Arrivals, rows: IndexArray, config: DiverConfig
+) -> tuple[list[Birth], IndexArray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
-    rows = spread(rows)
-    fix = locate(ping, rows, config)
+    rows = subsample(rows)
+    fix = locate_fix(ping, rows, config)
     if fix is None:
         return [], rows[:0]
     used = rows[fix.used | fix.used_bearing]
-    name = name_of(ping)
+    name = tag_id(ping)
     places = [(fix.position, fix.covariance)]
     places += [(place.position, place.covariance) for place in fix.alternatives]
     return [Birth(*place, ping, used, target_id=name) for place in places], rows[fix.used]
 
 
-def _best_combination(
+def _find_best_combination(
     ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
     """The fix that most pairs agree with, at least one more than seeded it."""
@@ -149,15 +151,15 @@ def _best_combination(
         return best
     seeding = sorted(pairs, key=len)[:SEED_PAIRS]
     for seed in islice(product(*seeding), MAX_COMBINATIONS):
-        for birth in _fix(ping, np.array(seed), config)[0]:
-            agreeing = _agreeing(ping, pairs, birth, config)
+        for birth in _locate_births(ping, np.array(seed), config)[0]:
+            agreeing = _select_agreeing(ping, pairs, birth, config)
             if len(agreeing) > max(SEED_PAIRS, len(best[1])):
-                refined = _fix(ping, agreeing, config)
+                refined = _locate_births(ping, agreeing, config)
                 best = refined if len(refined[1]) > len(best[1]) else best
     return best
 
 
-def _agreeing(
+def _select_agreeing(
     ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig
 ) -> IndexArray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
@@ -173,7 +175,7 @@ def _agreeing(
     return nearest[nis[nearest] <= 9.0]
 
 
-def locate(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
+def locate_fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
     """The fix that `rows` of the ping give by themselves, None when they give none to believe.
 
     With depth as a state it is the best of those at the heights where the models begin.
@@ -200,7 +202,7 @@ def locate(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisatio
 # -- tracks that begin ---------------------------------------------------------------------------
 
 
-def beginning(
+def spawn_stage(
     models: ModelSet,
     config: DiverConfig,
     layouts: Callable[[Known], Layout],
@@ -216,34 +218,34 @@ def beginning(
         for _, group in groupby(found, key=lambda birth: birth.seen_by and birth.seen_by[0]):
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
-            columns['learnt'] = chain.fresh(len(births))
+            columns['learnt'] = chain.initial_counts(len(births))
             columns['existence'] = [birth.existence for birth in births]
             columns['target_id'] = [birth.target_id for birth in births]
             life = known.life.born(len(births), known.stamp_ns, rules)
-            rows = rows_of(births, models, layout, config)
+            rows = birth_rows(births, models, layout, config)
             known = known.with_tracks(life, rows, columns)
         return known
 
-    def begin(known: Known, scan: Scan) -> Known:
+    def spawn(known: Known, scan: Scan) -> Known:
         found = [birth for group in scan.fixes for birth in group.births] + scan.births
         if found:
-            room = max(0, most_tracks(config) - len(known))
-            known = with_tracks(known, each_name_once(found)[:room])
+            room = max(0, max_total_tracks(config) - len(known))
+            known = with_tracks(known, without_duplicate_ids(found)[:room])
         for start in scan.starts:
             known, free = make_room(known, start, config, models)
             if free:
-                known = confirmed(with_tracks(known, [believed(start, config)]))
+                known = confirm_newest(with_tracks(known, [birth_from_start(start, config)]))
         return known
 
-    return begin
+    return spawn
 
 
-def most_tracks(config: DiverConfig) -> int:
+def max_total_tracks(config: DiverConfig) -> int:
     """Return how many tracks there may be, tentative ones and all."""
     return 10 + 5 * config.max_tracks
 
 
-def each_name_once(births: Sequence[Birth]) -> list[Birth]:
+def without_duplicate_ids(births: Sequence[Birth]) -> list[Birth]:
     """Return the births without a second one of the same name."""
     names: set[int] = set()
     first = []
@@ -254,7 +256,7 @@ def each_name_once(births: Sequence[Birth]) -> list[Birth]:
     return first
 
 
-def rows_of(
+def birth_rows(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Rows:
     """Return the rows of tracks that begin, all seen by one sensor."""
@@ -263,18 +265,18 @@ def rows_of(
         position = np.array([birth.position for birth in births])
         covariance = np.array([birth.covariance for birth in births])
         # A start comes alone.
-        parts = models.new_tracks(position, covariance, measured=births[0].measured)
-        x, P = layout.widened(*parts[:2])
-        mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.copies))
+        parts = models.initial_states(position, covariance, measured=births[0].measured)
+        x, P = layout.with_new_constants(*parts[:2])
+        mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.rows_per_track))
     else:
-        each = [_of_birth(birth, models, layout, config, plain) for birth in births]
+        each = [_birth_states(birth, models, layout, config, plain) for birth in births]
         x, P, mu, logw = (np.concatenate(part) for part in zip(*each))
     for track, birth in enumerate(births):
         if birth.ping is None and birth.measured:
             with_velocities_at_fix(P[track], models, config)
         if models.height >= 0 and birth.height is not None:
             for row in range(x.shape[1]):
-                depth.begin(
+                depth.begin_depth(
                     x[track, row],
                     P[track, row],
                     birth.height,
@@ -282,9 +284,11 @@ def rows_of(
                     models.height,
                     config,
                 )
-    rows = models.rows(x, P, mu, logw)
+    rows = models.make_rows(x, P, mu, logw)
     seen_by = births[0].seen_by
-    return rows if seen_by is None else layout.turned(rows, models, *seen_by, back=True)
+    return (
+        rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)
+    )
 
 
 def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
@@ -295,19 +299,19 @@ def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig)
         P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
 
 
-def _of_birth(
+def _birth_states(
     birth: Birth, models: ModelSet, layout: Layout, config: DiverConfig, plain: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one track."""
     where = birth.position[None]
-    logw = np.full((1, models.copies), -math.log(models.copies))
+    logw = np.full((1, models.rows_per_track), -math.log(models.rows_per_track))
     if birth.ping is None or birth.rows is None or plain:
-        x, P, mu = models.new_tracks(where, birth.covariance[None], birth.ping is None)
-        return *layout.widened(x, P), mu, logw
+        x, P, mu = models.initial_states(where, birth.covariance[None], birth.ping is None)
+        return *layout.with_new_constants(x, P), mu, logw
     from .arrivals import begin_from_ping, FAR
 
-    x, P, mu = models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
-    x, P = layout.widened(x, P)
+    x, P, mu = models.initial_states(where, np.eye(2)[None] * FAR**2, False)
+    x, P = layout.with_new_constants(x, P)
     ping = ping_measurements(birth.ping, birth.rows, config, models, layout)
     # All models of a row begin alike: one of each is enough to ask.
     begins = np.ascontiguousarray(x[0, :, 0]), np.ascontiguousarray(P[0, :, 0])
@@ -326,7 +330,7 @@ def _of_birth(
     return at, spread_at, mu, logw
 
 
-def begun_anew(
+def restart_track(
     known: Known,
     ping: Arrivals,
     free: BoolArray,
@@ -345,22 +349,22 @@ def begun_anew(
     dof = int(known['nis_dof'][track])
     if dof < SEED_PAIRS or known['nis'][track] <= gate_threshold(1.0 - LOST, dof):
         return known
-    mean, covariance = places(known, models)
+    mean, covariance = track_positions(known, models)
     birth = Birth(mean[track], covariance[track], ping, rows)
-    new = rows_of([birth], models, layout, config)
+    new = birth_rows([birth], models, layout, config)
     if not all(np.isfinite(part).all() for block in new.blocks for part in block):
         return known
-    return depth.spread_anew(known.with_rows_of(track, new), track)
+    return depth.count_respread(known.with_rows_of(track, new), track)
 
 
 # -- starts --------------------------------------------------------------------------------------
 
 
-def believed(start: Start, config: DiverConfig) -> Birth:
+def birth_from_start(start: Start, config: DiverConfig) -> Birth:
     """Return the birth of a track where somebody says that a diver is."""
     height = None
     if config.dimensions == 3:
-        stated = Heights.of(start.position[None], start.covariance[None], 1.0)
+        stated = Heights.from_fixes(start.position[None], start.covariance[None], 1.0)
         height = stated and stated.row(0)
     plane = start.position[:2], start.covariance[:2, :2]
     return Birth(*plane, measured=False, height=height)
@@ -373,21 +377,21 @@ def make_room(
     own."""
     going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
-        going &= _agree(known, start, config, models)
-    left = known.only(~going)
+        going &= _agrees_with_start(known, start, config, models)
+    left = known.select(~going)
     if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
         return left, True
-    return known.counted(not_started=1), False
+    return known.add_counts(not_started=1), False
 
 
-def confirmed(known: Known) -> Known:
+def confirm_newest(known: Known) -> Known:
     """Return the tracks with the newest one confirmed."""
     status = known.life.status.copy()
     status[-1] = CONFIRMED
     return known.replace(life=evolve(known.life, status=status))
 
 
-def no_room(known: Known, config: DiverConfig) -> list[str]:
+def start_warnings(known: Known, config: DiverConfig) -> list[str]:
     """Return what a user has to know of starts that began no track."""
     count = known.counts.get('not_started', 0)
     if not count:
@@ -397,9 +401,11 @@ def no_room(known: Known, config: DiverConfig) -> list[str]:
     ]
 
 
-def _agree(known: Known, start: Start, config: DiverConfig, models: ModelSet) -> BoolArray:
+def _agrees_with_start(
+    known: Known, start: Start, config: DiverConfig, models: ModelSet
+) -> BoolArray:
     """Return which tracks (T,) may be where the start is."""
-    mean, covariance = places(known, models)
+    mean, covariance = track_positions(known, models)
     apart = start.position[:2] - mean
     squared = np.einsum(
         'ta,ta->t',

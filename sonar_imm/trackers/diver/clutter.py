@@ -91,7 +91,7 @@ class Clutter(NamedTuple):
         found = number / ((PRIOR_SCANS + self.scans) * self.area)
         return min(max(found, LEAST), MOST)
 
-    def after(self, z: FloatArray, false: FloatArray) -> Clutter:
+    def with_scan(self, z: FloatArray, false: FloatArray) -> Clutter:
         """With a scan of fixes z (D, 2), each false with a probability (D,)."""
         kept = math.exp(-1.0 / MEMORY)
         added, old = float(false.sum()), kept * self.placed
@@ -125,43 +125,43 @@ class Clutters(NamedTuple):
 
     by_sensor: tuple[tuple[str, Clutter], ...] = ()
 
-    def of(self, sensor: str) -> Clutter | None:
+    def get(self, sensor: str) -> Clutter | None:
         """Return what is known of a sensor, None for nothing."""
         return dict(self.by_sensor).get(sensor)
 
-    def replaced(self, sensor: str, clutter: Clutter) -> Clutters:
+    def with_sensor(self, sensor: str, clutter: Clutter) -> Clutters:
         """Return this with what is known of `sensor` now; the sensor silent for longest makes
         room for it."""
         others = [item for item in self.by_sensor if item[0] != sensor]
         return Clutters((*others, (sensor, clutter))[-MOST_SENSORS:])
 
 
-def count(known: Known, group: Group) -> Known:
+def count_clutter(known: Known, group: Group) -> Known:
     """Take in the false ones of a scan. A stage of the tracker."""
-    if group.config.clutter_density or group.target_id is not None or not group.whole:
+    if group.config.clutter_density or group.target_id is not None or not group.is_complete:
         return known
     clutters: Clutters = known.memory['clutter']
-    before = clutters.of(group.sensor) or Clutter()
-    assert group.found is not None
-    after = before.after(group.z, np.clip(1.0 - group.found.claimed, 0.0, 1.0))
-    return known.remember(clutter=clutters.replaced(group.sensor, after))
+    before = clutters.get(group.sensor) or Clutter()
+    assert group.association is not None
+    after = before.with_scan(group.z, np.clip(1.0 - group.association.claimed, 0.0, 1.0))
+    return known.with_memory(clutter=clutters.with_sensor(group.sensor, after))
 
 
-def without_first_fixes(known: Known, scan: Scan) -> Known:
+def remove_first_fixes(known: Known, scan: Scan) -> Known:
     """Take back the first fixes of tracks that this scan confirmed, which were counted as false
     ones. A stage of the tracker."""
     clutters: Clutters = known.memory['clutter']
-    sensor = next((group.sensor for group in scan.fixes if clutters.of(group.sensor)), None)
-    own = None if sensor is None else clutters.of(sensor)
+    sensor = next((group.sensor for group in scan.fixes if clutters.get(group.sensor)), None)
+    own = None if sensor is None else clutters.get(sensor)
     if sensor is None or own is None:
         return known
-    life, before = known.life, scan.before.life
+    life, before = known.life, scan.previous.life
     firm = life.track_id[(life.status != TENTATIVE) & (known['target_id'] == NOBODY)]
     new = len(set(firm.tolist()) - set(before.track_id[before.status != TENTATIVE].tolist()))
     if not new:
         return known
     after = own._replace(false=max(own.false - new, 0.0))
-    return known.remember(clutter=clutters.replaced(sensor, after))
+    return known.with_memory(clutter=clutters.with_sensor(sensor, after))
 
 
 def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:

@@ -25,7 +25,7 @@ where e has nothing to do with the errors of x and y. So the two updates in turn
 three coordinates. It weighs the models too, and with them the rows of the track.
 
 z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
-z alone. What is refused is remembered; the next fix that agrees with it says that the depth was
+z alone. What is rejected is remembered; the next fix that agrees with it says that the depth was
 wrong, and z begins there.
 
 *Rows.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
@@ -51,13 +51,13 @@ from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, repaired
+from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .scan import Group, Height, Ping
 
 FEATURES = {
-    'refused_z': Feature(math.nan, (3,)),
-    'spreads': Feature(0, kind=np.int64),
+    'rejected_z': Feature(math.nan, (3,)),
+    'respreads': Feature(0, kind=np.int64),
 }
 """Stamp, z and variance of the last height of a fix that was not believed; how often the rows were
 spread anew."""
@@ -85,11 +85,11 @@ each. A gap is wider than `APART` times the standard deviations of both its neig
 
 
 class HeightCounts(NamedTuple):
-    """How many heights of fixes there were for tracks, how many of them were refused, and how many
+    """How many heights of fixes there were for tracks, how many of them were rejected, and how many
     lie outside `depth_min` to `depth_max`."""
 
     seen: int = 0
-    refused: int = 0
+    rejected: int = 0
     outside: int = 0
 
     def warnings(self, config: DiverConfig) -> list[str]:
@@ -103,15 +103,15 @@ class HeightCounts(NamedTuple):
                 f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
                 'origin_height for positions in latitude and longitude'
             )
-        if self.refused > DOUBTED * self.seen:
+        if self.rejected > DOUBTED * self.seen:
             found.append(
-                f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
+                f'{self.rejected} of {self.seen} heights of fixes were rejected: z misses by more '
                 'than it states, or the divers go up and down faster than vertical_speed_std'
             )
         return found
 
 
-def begin(
+def begin_depth(
     x: FloatArray,
     P: FloatArray,
     height: Height,
@@ -124,17 +124,17 @@ def begin(
     more than the fix, and does not contradict it: then z begins as without a fix."""
     variance = height.variance(covariance)
     width = config.depth_max - config.depth_min
-    if variance <= width**2 / 12.0 or _outside(height.value, variance, config):
-        _set(x, P, place, height.value, variance, config)
+    if variance <= width**2 / 12.0 or _is_outside(height.value, variance, config):
+        reset_depth(x, P, place, height.value, variance, config)
         P[:, :2, place] = P[:, place, :2] = covariance @ height.gain
 
 
-def _outside(value: float, variance: float, config: DiverConfig) -> bool:
+def _is_outside(value: float, variance: float, config: DiverConfig) -> bool:
     room = BEYOND * math.sqrt(variance)
     return not -config.depth_max - room <= value <= -config.depth_min + room
 
 
-def _set(
+def reset_depth(
     x: FloatArray, P: FloatArray, place: int, value: float, variance: float, config: DiverConfig
 ) -> None:
     """Forget what x (M, n), P (M, n, n) know of z and its rate, which follows it."""
@@ -144,29 +144,29 @@ def _set(
     P[:, place, place], P[:, place + 1, place + 1] = variance, config.vertical_speed_std**2
 
 
-def updating(
+def depth_stage(
     models: ModelSet, layouts: Callable[[Known], Layout], config: DiverConfig
 ) -> Callable[[Known, Group], Known]:
     """Return the stage that updates tracks by the heights of the fixes that are theirs."""
 
     def update_heights(known: Known, group: Group) -> Known:
-        return update(known, group, models, layouts(known), config)
+        return update_depth(known, group, models, layouts(known), config)
 
     return update_heights
 
 
-def update(
+def update_depth(
     known: Known, group: Group, models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Known:
     """Return the tracks after the heights of the fixes of a group that are theirs."""
-    heights, found = group.heights, group.found
+    heights, found = group.heights, group.association
     assert found is not None
     tracks = np.flatnonzero(found.hit)
     if heights is None or not len(tracks):
         return known
     tracks = tracks[np.isfinite(heights.value[found.fix[tracks]])]
     threshold = gate_threshold(config.gate_probability, 1)
-    columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'refused_z')}
+    columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'rejected_z')}
     counts: HeightCounts = known.memory['heights']
     seen, doubted, outside = counts
     for track in tracks.tolist():
@@ -174,41 +174,45 @@ def update(
         own = heights.row(fix)
         assert own is not None
         share = 1.0
-        if found.weighed:
+        if found.is_joint:
             share = min(found.beta[track, fix] / found.exists[track], 1.0)
-        known, nis = _updated(known, track, own, group.z[fix], share, models, layout, threshold)
+        known, nis = _update_track(
+            known, track, own, group.z[fix], share, models, layout, threshold
+        )
         variance = own.variance(group.R[fix])
-        outside += _outside(own.value, variance, config)
+        outside += _is_outside(own.value, variance, config)
         if nis <= threshold:
             columns['nis'][track] += nis
             columns['nis_dof'][track] += np.uint16(1)
-            columns['refused_z'][track] = np.nan
+            columns['rejected_z'][track] = np.nan
             continue
-        stamp, before, its = columns['refused_z'][track].tolist()
+        stamp, before, its = columns['rejected_z'][track].tolist()
         moved = config.vertical_speed_std * (known.stamp_ns - stamp) * 1e-9
         if (own.value - before) ** 2 <= threshold * (variance + its + moved**2):
-            known = _at_height(known, track, own.value, variance, models, config)
-            columns['refused_z'][track] = np.nan
+            known = _restart_depth(known, track, own.value, variance, models, config)
+            columns['rejected_z'][track] = np.nan
         else:
-            columns['refused_z'][track] = known.stamp_ns, own.value, variance
+            columns['rejected_z'][track] = known.stamp_ns, own.value, variance
             doubted += 1
     after = HeightCounts(seen + len(tracks), doubted, outside)
-    return known.put(**columns).remember(heights=after)
+    return known.with_columns(**columns).with_memory(heights=after)
 
 
-def _at_height(
+def _restart_depth(
     known: Known, track: int, value: float, variance: float, models: ModelSet, config: DiverConfig
 ) -> Known:
     """Return the tracks after one forgot what it knew of z, and begins at `value`."""
-    own = known.rows_of(track)
-    rows = known.rows.take(own)
-    x, P = models.common(rows.blocks)
+    own = known.row_indices(track)
+    rows = known.rows.select(own)
+    x, P = models.to_common(rows.blocks)
     for row in range(len(rows)):
-        _set(x[row], P[row], models.height, value, variance, config)
-    return known.replace(rows=with_rows(known.rows, own, models.blocks(x, P), rows.mu, rows.logw))
+        reset_depth(x[row], P[row], models.height, value, variance, config)
+    return known.replace(
+        rows=replace_rows(known.rows, own, models.to_blocks(x, P), rows.mu, rows.logw)
+    )
 
 
-def with_rows(
+def replace_rows(
     rows: Rows, own: np.ndarray, blocks: tuple[Gaussians, ...], mu: FloatArray, logw: FloatArray
 ) -> Rows:
     """Return the table with other states, models and weights of the rows `own` (k,)."""
@@ -222,7 +226,7 @@ def with_rows(
     return rows.replace(blocks=tuple(merged), mu=all_mu, logw=all_logw)
 
 
-def _updated(
+def _update_track(
     known: Known,
     track: int,
     height: Height,
@@ -239,12 +243,12 @@ def _updated(
     share: probability that the number is the track's. Below 1 each model becomes the mixture of
     what it is with it and without.
     """
-    own = known.rows_of(track)
-    rows, value = known.rows.take(own), height.value - float(height.gain @ z)
-    weight = rows.weight_among_themselves()[:, None] * rows.mu
-    masks = layout.estimated(models)
+    own = known.row_indices(track)
+    rows, value = known.rows.select(own), height.value - float(height.gain @ z)
+    weight = rows.normalized_weight()[:, None] * rows.mu
+    masks = layout.estimated_masks(models)
     parts = [
-        _compared(block, part.seen, part.height, height, value)
+        _depth_innovations(block, part.fix_matrix, part.height, height, value)
         for part, block in zip(models.parts, rows.blocks)
     ]
     v, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
@@ -259,16 +263,16 @@ def _updated(
     blocks = []
     for part, block, mask, (PHt, nu, s) in zip(models.parts, rows.blocks, masks, parts):
         certain = share * density[:, part.models] / (weight * density).sum()
-        blocks.append(_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
-    sound, repairs = repaired(tuple(blocks))
-    rows, total = rows.replace(blocks=sound).with_models(factor)
+        blocks.append(_update_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
+    sound, repairs = repair_covariances(tuple(blocks))
+    rows, total = rows.replace(blocks=sound).multiply_models(factor)
     with np.errstate(divide='ignore'):
         logw = np.maximum(rows.logw + np.log(total), LEAST_LOG)
-    known = known.replace(rows=with_rows(known.rows, own, rows.blocks, rows.mu, logw))
-    return known.counted(repairs=repairs), nis
+    known = known.replace(rows=replace_rows(known.rows, own, rows.blocks, rows.mu, logw))
+    return known.add_counts(repairs=repairs), nis
 
 
-def _compared(
+def _depth_innovations(
     block: Gaussians, seen: FloatArray, place: int, height: Height, value: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return PHt (N, n, m), innovation (N, m) and its variance (N, m) of ``z - gain (x, y)``."""
@@ -279,7 +283,7 @@ def _compared(
     return PHt, value - (h * block.x).sum(axis=1), (h * PHt).sum(axis=1) + height.rest
 
 
-def _scalar(
+def _update_scalar(
     block: Gaussians,
     PHt: FloatArray,
     v: FloatArray,
@@ -308,7 +312,7 @@ def _scalar(
 # -- rows ----------------------------------------------------------------------------------------
 
 
-def _of_rows(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _row_depths(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weight, mean and variance of z of each row, (N,) each."""
     z, variance = (
         np.concatenate(parts, axis=1)
@@ -324,12 +328,12 @@ def _of_rows(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, Floa
     return rows.weight, mean, np.maximum(square - mean * mean, 0.0)
 
 
-def ambiguous(known: Known, models: ModelSet) -> BoolArray:
+def ambiguous_depths(known: Known, models: ModelSet) -> BoolArray:
     """Return which divers (T,) may be at another depth as well."""
     two = np.zeros(len(known), bool)
-    weights, means, variances = _of_rows(known.rows, models)
+    weights, means, variances = _row_depths(known.rows, models)
     for track in range(len(known)):
-        own = known.rows_of(track)
+        own = known.row_indices(track)
         weight, mean, variance = weights[own], means[own], variances[own]
         counts = np.flatnonzero(weight > POSSIBLE / 10.0)
         order = counts[np.argsort(mean[counts], kind='stable')]
@@ -340,43 +344,43 @@ def ambiguous(known: Known, models: ModelSet) -> BoolArray:
     return two
 
 
-def spread(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
+def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
     """Return the tracks as `seen` will find them: with the rows spread where they agree and the
     paths bend within what they believe."""
     echo = seen.echo
-    if models.height < 0 or models.copies == 1 or not len(known) or not echo.any():
+    if models.height < 0 or models.rows_per_track == 1 or not len(known) or not echo.any():
         return known
-    weights, means, variances = _of_rows(known.rows, models)
+    weights, means, variances = _row_depths(known.rows, models)
     measured = seen.measured
     for track in range(len(known)):
-        own = known.rows_of(track)
+        own = known.row_indices(track)
         weight, mean, variance = weights[own], means[own], variances[own]
         middle = float(weight @ mean)
         between, within = float(weight @ (mean - middle) ** 2), float(weight @ variance)
         if not between < AGREE * within:
             continue
-        rows = known.rows.take(own)
+        rows = known.rows.select(own)
         x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
         place = np.append(np.einsum('r,rm,ram->a', weight, rows.mu, x), middle)
-        bend = _bend(place, measured.rx[echo])
+        bend = _path_curvature(place, measured.rx[echo])
         if not seen.passive:
-            bend = bend + _bend(place, measured.tx[echo])
+            bend = bend + _path_curvature(place, measured.tx[echo])
         deviation = 0.5 * bend * (within + between) / np.sqrt(measured.variance[echo])
         if deviation.max() > BENT:
-            new = _spread(rows, layout.mask, models)
-            known = known.replace(rows=with_rows(known.rows, own, *new))
-            known = spread_anew(known, track)
+            new = _spread_rows(rows, layout.mask, models)
+            known = known.replace(rows=replace_rows(known.rows, own, *new))
+            known = count_respread(known, track)
     return known
 
 
-def spread_anew(known: Known, track: int) -> Known:
+def count_respread(known: Known, track: int) -> Known:
     """Return the tracks with one more spread of the rows of a track."""
-    spreads = known['spreads'].copy()
+    spreads = known['respreads'].copy()
     spreads[track] += 1
-    return known.put(spreads=spreads)
+    return known.with_columns(respreads=spreads)
 
 
-def _bend(place: FloatArray, instrument: FloatArray) -> FloatArray:
+def _path_curvature(place: FloatArray, instrument: FloatArray) -> FloatArray:
     """Return the second derivative (C,) in z of the distance from `place` (3,) to instruments (C,
     3), not nearer than a metre, 1/m."""
     apart = instrument - place
@@ -384,16 +388,16 @@ def _bend(place: FloatArray, instrument: FloatArray) -> FloatArray:
     return np.asarray((1.0 - np.minimum(apart[:, 2] / distance, 1.0) ** 2) / distance)
 
 
-def _spread(
+def _spread_rows(
     rows: Rows, estimated: BoolArray, models: ModelSet
 ) -> tuple[tuple[Gaussians, ...], FloatArray, FloatArray]:
     """Return states, models (K, M) and weights (K,) of the K rows of a track, with what all rows
     believe spread over them; estimated (n,): see `estimation.consider`."""
     place = models.height
-    each = rows.weight_among_themselves()[:, None] * rows.mu
+    each = rows.normalized_weight()[:, None] * rows.mu
     K, total = len(each), each.sum(axis=0)
     share = np.where(total > 0.0, each / np.where(total > 0.0, total, 1.0), 1.0 / K)
-    x, P = models.common(rows.blocks)
+    x, P = models.to_common(rows.blocks)
     mean = np.einsum('km,kma->ma', share, x)
     apart = x - mean
     whole = np.einsum('km,kmab->mab', share, P + apart[..., :, None] * apart[..., None, :])
@@ -404,4 +408,4 @@ def _spread(
     narrow = whole - (steps**2).mean() * line[:, :, None] * line[:, None, :] * moved
     at = mean + steps[:, None, None] * np.where(estimated, line, 0.0)
     covariance = np.tile(add_jitter(narrow)[0], (K, 1, 1, 1))
-    return models.blocks(at, covariance), np.tile(total, (K, 1)), np.full(K, -math.log(K))
+    return models.to_blocks(at, covariance), np.tile(total, (K, 1)), np.full(K, -math.log(K))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is published of the divers, and what a user has to know of the input."""
+"""What is published_state of the divers, and what a user has to know of the input."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
 from . import births, clutter, depth, offsets
 from .config import DiverConfig
-from .fixes import scale_of, stated_weight
-from .forgetting import PUBLISHES
-from .known import Known, of_rows
+from .fixes import estimated_scales, weight_without_small_scales
+from .known import Known, row_outputs
 from .models import FAMILIES, HOVER, ModelSet
+from .pruning import PUBLISH_EXISTENCE
 
 
 def estimate_of(
     known: Known, models: ModelSet, config: DiverConfig, frame_id: str, origin: Origin | None
 ) -> Estimate:
-    """Return what is published of a scan; origin: where the frame lies on Earth, None when that is
+    """Return what is published_state of a scan; origin: where the frame lies on Earth, None when that is
     not known."""
     # Of tracks whose hits are counted the existence is NaN.
-    known = known.only(~(known['existence'] <= PUBLISHES))
-    mean, covariance = published(known, models)
+    known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
+    mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
-        covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
+        covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -49,10 +49,10 @@ def estimate_of(
         'track_state': known.life.status,
         **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
         'target_id': known['target_id'].astype(np.int32),
-        **of_families(known, models),
+        **family_extras(known, models),
     }
-    if models.height >= 0 and models.copies > 1:
-        extras['depth_ambiguous'] = depth.ambiguous(known, models).astype(np.uint8)
+    if models.height >= 0 and models.rows_per_track > 1:
+        extras['depth_ambiguous'] = depth.ambiguous_depths(known, models).astype(np.uint8)
     if origin is not None:
         place = origin.geodetic(xyz)
         extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
@@ -64,12 +64,12 @@ def estimate_of(
         state=mean,
         covariance=covariance,
         model_names=models.names,
-        probabilities=known.rows.models(),
+        probabilities=known.rows.model_probabilities(),
         extras=extras,
     )
 
 
-def published(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
     """Return mean (T, q) and covariance (T, q, q): where all rows say, and how far off that may be
     for those that say how well a place is known.
 
@@ -79,24 +79,24 @@ def published(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
     are apart. If they are better, this is cautious.
     """
     maps = tuple(part.outputs for part in models.parts)
-    rows, each = known.rows, of_rows(known.rows, maps)
+    rows, each = known.rows, row_outputs(known.rows, maps)
     mean, covariance = rows.combine(*each, rows.weight)
     if len(models.scales) > 1:
-        own, covariance = rows.combine(*each, stated_weight(rows))
+        own, covariance = rows.combine(*each, weight_without_small_scales(rows))
         off = mean - own
         covariance = covariance + off[:, :, None] * off[:, None, :]
     return mean, covariance
 
 
-def of_families(known: Known, models: ModelSet) -> dict[str, FloatArray]:
-    """Return what is published of families beside the probabilities of their models."""
+def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
+    """Return what is published_state of families beside the probabilities of their models."""
     if models.families is None:
         return {}
-    each = known.rows.models()
+    each = known.rows.model_probabilities()
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = scale_of(known.rows)
+    out['covariance_scale'] = estimated_scales(known.rows)
     return out
 
 
@@ -134,6 +134,6 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=more),
         *memory['offsets'].warnings(config),
-        *births.no_room(known, config),
+        *births.start_warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]

@@ -66,13 +66,13 @@ class FixConsistency(NamedTuple):
     scale: float = 1.0
     evidence: float = 0.0
 
-    def after(self, white: FloatArray, before: FloatArray) -> FixConsistency:
+    def with_fixes(self, white: FloatArray, before: FloatArray) -> FixConsistency:
         """Return the sums with whitened innovations (k, 2), and those of the fix `before` (k, 2)
         of the same tracks, NaN for none, of which about the last `MEMORY` count.
 
         An innovation longer than `FARTHEST` allows is a sharp turn and says nothing of noise: it
         is shortened to that."""
-        white, before = _shortened(white), _shortened(before)
+        white, before = _shorten(white), _shorten(before)
         paired = np.isfinite(before).all(axis=1)
         own, earlier = white[paired], before[paired]
         total = self.number + len(white)
@@ -132,7 +132,7 @@ class FixConsistency(NamedTuple):
         return []
 
 
-def watch(
+def whiten_innovations(
     mean: FloatArray,
     covariance: FloatArray,
     z: FloatArray,
@@ -156,10 +156,10 @@ def watch(
         second = (z[:, 1] - mean[:, 1] - b * first) / np.sqrt(S[:, 1, 1] - b * b)
     white = np.column_stack([first, second])
     firm = ~tentative & np.isfinite(white).all(axis=1)
-    return white, known.after(white[firm], before[firm])
+    return white, known.with_fixes(white[firm], before[firm])
 
 
-def _shortened(white: FloatArray) -> FloatArray:
+def _shorten(white: FloatArray) -> FloatArray:
     """Return whitened innovations (k, 2) that are no longer than `FARTHEST` allows."""
     square = np.square(white).sum(axis=1, keepdims=True)
     with np.errstate(invalid='ignore', divide='ignore'):

@@ -136,13 +136,13 @@ class Layout:
     def size(self) -> int:
         return self.n + len(self.variances)
 
-    def estimated(self, models: ModelSet) -> tuple[BoolArray | None, ...]:
+    def estimated_masks(self, models: ModelSet) -> tuple[BoolArray | None, ...]:
         """Return `mask` for the components of each block, None where an update may move all."""
         if self.mask.all():
             return (None,) * len(models.parts)
-        return tuple(self.mask[part.places(self.n, self.size)] for part in models.parts)
+        return tuple(self.mask[part.indices(self.n, self.size)] for part in models.parts)
 
-    def columns(
+    def measurement_columns(
         self, models: ModelSet, receivers: np.ndarray, passive: bool, bearing: BoolArray
     ) -> IntArray:
         """Return (C, 7) for `acoustics.arrivals_3d.observe`, of which some are a `bearing` (C,);
@@ -159,7 +159,7 @@ class Layout:
             out[:, EMISSION] = self.size
         return out
 
-    def widened(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_new_constants(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return states (..., m) and covariances (..., m, m), m <= n + q, with the constants that
         are new at their prior."""
         m, size = x.shape[-1], self.size
@@ -171,7 +171,7 @@ class Layout:
         covariance[..., new, new] = self.variances[m - self.n :]
         return wide, covariance
 
-    def of_rows(self, rows: Rows, models: ModelSet) -> Rows:
+    def rows_with_new_constants(self, rows: Rows, models: ModelSet) -> Rows:
         """Return the rows with the constants that are new at their prior."""
         known = rows.blocks[0].x.shape[1] - len(models.parts[0].components)
         new = self.variances[known:]
@@ -188,7 +188,7 @@ class Layout:
             blocks.append(Gaussians(wide, covariance))
         return rows.replace(blocks=tuple(blocks))
 
-    def turned(
+    def rotate_about_sensor(
         self, rows: Rows, models: ModelSet, sensor: str, place: FloatArray, *, back: bool = False
     ) -> Rows:
         """Return the rows with positions as a `sensor` at `place` (2,) shows them: turned about it
@@ -201,7 +201,7 @@ class Layout:
             return rows
         sign, blocks = -1.0 if back else 1.0, []
         for part, (x, P) in zip(models.parts, rows.blocks):
-            at = part.at(self.bearings[sensor], self.n)
+            at = part.index_of(self.bearings[sensor], self.n)
             angle, arm = sign * x[:, at], x[:, :2] - place[:, None]
             cos, sin = np.cos(angle), np.sin(angle)
             turned = np.stack(
@@ -213,16 +213,16 @@ class Layout:
             T = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
             # The rows of the position, then its columns.
             left = P.copy()
-            left[:, :2] = _product(T, P[:, :2]) + slope[:, :, None] * P[:, None, at]
+            left[:, :2] = _multiply(T, P[:, :2]) + slope[:, :, None] * P[:, None, at]
             covariance = left.copy()
             columns = np.swapaxes(left, 1, 2)
-            across = _product(T, columns[:, :2]) + slope[:, :, None] * columns[:, None, at]
+            across = _multiply(T, columns[:, :2]) + slope[:, :, None] * columns[:, None, at]
             covariance[:, :, :2] = np.swapaxes(across, 1, 2)
             covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
             blocks.append(Gaussians(moved, covariance))
         return rows.replace(blocks=tuple(blocks))
 
 
-def _product(T: FloatArray, P: FloatArray) -> FloatArray:
+def _multiply(T: FloatArray, P: FloatArray) -> FloatArray:
     """Return T P, (N, 2, n, m), of matrices T (N, 2, 2, m) and P (N, 2, n, m)."""
     return np.asarray((T[:, :, :, None] * P[:, None]).sum(axis=2))

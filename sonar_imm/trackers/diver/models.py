@@ -87,7 +87,7 @@ LIVELY, QUIET = (0.05, 0.6), (0.03,)
 LIVELY_STAY = 0.85
 """Probability of keeping the model of the lively family over a reference step."""
 
-PACE_TIME = 60.0
+SPEED_MEMORY = 60.0
 """Time within which a diver who stands forgets his pace, s, as `brisk` does: else who stands for
 minutes is taken for one who swims at a crawl, and keeps to that when he goes on."""
 
@@ -114,18 +114,18 @@ class Part:
     models: slice
     components: IndexArray
     outputs: FloatArray
-    seen: FloatArray
+    fix_matrix: FloatArray
     measured: Measured
     height: int
 
-    def at(self, place: int, common: int) -> int:
+    def index_of(self, place: int, common: int) -> int:
         """Return where the component stands that is at `place` among all, of which `common` are
         the models' and the others stand behind them."""
         if place >= common:
             return len(self.components) + place - common
         return self.components.tolist().index(place)
 
-    def places(self, common: int, size: int) -> IndexArray:
+    def indices(self, common: int, size: int) -> IndexArray:
         """Return where the components of the block stand among `size`, of which `common` are the
         models'."""
         return np.append(self.components, np.arange(common, size))
@@ -161,20 +161,20 @@ class ModelSet:
     _cache: OrderedDict[float, tuple[Moves, ...]] = field(factory=OrderedDict, init=False)
 
     def __attrs_post_init__(self) -> None:
-        object.__setattr__(self, 'parts', self._blocks())
-        object.__setattr__(self, 'bank', self._bank())
+        object.__setattr__(self, 'parts', self._build_parts())
+        object.__setattr__(self, 'bank', self._build_bank())
 
     @property
     def n(self) -> int:
         return int(self.E.shape[2])
 
     @property
-    def copies(self) -> int:
+    def rows_per_track(self) -> int:
         """Rows with which a track begins."""
         return max(len(self.starts), len(self.scales))
 
     @property
-    def fix(self) -> FloatArray:
+    def fix_matrix(self) -> FloatArray:
         """(M, 2, n): what a fix measures of the common components."""
         if self.bias < 0:
             return self.E[:, :2]
@@ -191,20 +191,20 @@ class ModelSet:
         found = self._cache.get(dt)
         if found is None:
             F, Q, B = (np.moveaxis(part, 0, -1) for part in self._motion(dt))
-            found = tuple(self._of_part(part, F, Q, B) for part in self.parts)
+            found = tuple(self._block_moves(part, F, Q, B) for part in self.parts)
             self._cache[dt] = found
             if len(self._cache) > _CACHED_STEPS:
                 self._cache.popitem(last=False)
         return found
 
     @staticmethod
-    def _of_part(part: Part, F: FloatArray, Q: FloatArray, B: FloatArray) -> Moves:
+    def _block_moves(part: Part, F: FloatArray, Q: FloatArray, B: FloatArray) -> Moves:
         at, own = part.components, part.models
         square = np.ix_(at, at)
         F, Q, B = F[square][..., own], Q[square][..., own], B[at][..., own]
         return Moves(*map(np.ascontiguousarray, (F, Q, B)))
 
-    def new_tracks(
+    def initial_states(
         self,
         position: FloatArray,
         covariance: FloatArray,
@@ -214,7 +214,7 @@ class ModelSet:
         """Return x (k, K, M, n), P (k, K, M, n, n), mu (k, K, M) of tracks first seen at
         `position` (k, 2) with `covariance` (k, 2, 2), which the rows multiply where it is that of
         what was `measured`."""
-        M, n, K = len(self.names), self.n, self.copies
+        M, n, K = len(self.names), self.n, self.rows_per_track
         shape = len(position), K, M
         x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
         x[..., :2], x[..., 2:] = position[:, None, None], self.start_mean
@@ -233,14 +233,14 @@ class ModelSet:
             P[..., :2, there] = P[..., there, :2] = -shared
         return x, P, np.broadcast_to(self.initial, shape).copy()
 
-    def rows(self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray) -> Rows:
+    def make_rows(self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray) -> Rows:
         """Return the table of T targets with K rows each: x (T, K, M, n), P (T, K, M, n, n), mu
         (T, K, M), logw (T, K)."""
         T, K, M, size = x.shape
         scale = np.resize(np.array(self.scales), K)
         start = np.resize(np.arange(len(self.starts)), K)
         return Rows(
-            self.blocks(x.reshape(T * K, M, size), P.reshape(T * K, M, size, size)),
+            self.to_blocks(x.reshape(T * K, M, size), P.reshape(T * K, M, size, size)),
             mu.reshape(T * K, M),
             logw.reshape(T * K),
             np.repeat(np.arange(T), K),
@@ -248,16 +248,16 @@ class ModelSet:
             {'scale': np.tile(scale, T), 'start': np.tile(start, T)},
         )
 
-    def blocks(self, x: FloatArray, P: FloatArray) -> tuple[Gaussians, ...]:
+    def to_blocks(self, x: FloatArray, P: FloatArray) -> tuple[Gaussians, ...]:
         """Return the blocks of states in common components: x (N, M, n), P (N, M, n, n)."""
         found = []
         for part in self.parts:
-            at = part.places(self.n, x.shape[-1])
+            at = part.indices(self.n, x.shape[-1])
             own = x[:, part.models][..., at], P[:, part.models][..., at[:, None], at]
             found.append(Gaussians(*(np.ascontiguousarray(np.moveaxis(a, 1, -1)) for a in own)))
         return tuple(found)
 
-    def common(self, blocks: tuple[Gaussians, ...]) -> tuple[FloatArray, FloatArray]:
+    def to_common(self, blocks: tuple[Gaussians, ...]) -> tuple[FloatArray, FloatArray]:
         """Return x (N, M, n) and P (N, M, n, n) in common components; of one that a model lacks,
         mean 0 and variance 1."""
         N = len(blocks[0].x)
@@ -265,26 +265,26 @@ class ModelSet:
         x, P = np.zeros((N, len(self.names), size)), np.zeros((N, len(self.names), size, size))
         P[..., range(size), range(size)] = 1.0
         for part, block in zip(self.parts, blocks):
-            at = part.places(self.n, size)
+            at = part.indices(self.n, size)
             own = np.arange(part.models.start, part.models.stop)
             x[:, own[:, None], at] = np.moveaxis(block.x, -1, 1)
             P[:, own[:, None, None], at[:, None], at] = np.moveaxis(block.P, -1, 1)
         return x, P
 
-    def _blocks(self) -> tuple[Part, ...]:
+    def _build_parts(self) -> tuple[Part, ...]:
         every = np.arange(self.n)
         if self.families is None:
-            return (self._part(slice(0, len(self.names)), every),)
+            return (self._build_part(slice(0, len(self.names)), every),)
         first = int((self.families.kind != VELOCITY).sum())
         # A heading has (x, y, s), a velocity (x, y, vx, vy); behind these all have the same.
         return (
-            self._part(slice(0, first), np.delete(every, 3)),
-            self._part(slice(first, len(self.names)), every),
+            self._build_part(slice(0, first), np.delete(every, 3)),
+            self._build_part(slice(first, len(self.names)), every),
         )
 
-    def _part(self, models: slice, components: IndexArray) -> Part:
+    def _build_part(self, models: slice, components: IndexArray) -> Part:
         at = components.tolist()
-        seen = np.moveaxis(self.fix[models][..., components], 0, -1)
+        seen = np.moveaxis(self.fix_matrix[models][..., components], 0, -1)
         measured: Measured = ((0,), (1,))
         if self.bias >= 0:
             measured = (0, at.index(self.bias)), (1, at.index(self.bias + 1))
@@ -293,7 +293,7 @@ class ModelSet:
         parts = np.ascontiguousarray(outputs), np.ascontiguousarray(seen)
         return Part(models, components, *parts, measured, height)
 
-    def _bank(self) -> Bank:
+    def _build_bank(self) -> Bank:
         kinds = self.families
         if kinds is None:
             return Bank(np.zeros((2, len(self.names))))
@@ -305,14 +305,14 @@ class ModelSet:
 def build_models(config: DiverConfig) -> ModelSet:
     """Return the model set that `config` names, with the depth and the bias of fixes that it asks
     for."""
-    built_in = {'families': _families, 'heading_speed': _heading_speed}
-    models = built_in.get(config.model_set, _own)(config)
+    built_in = {'families': _build_families, 'heading_speed': _build_heading_speed}
+    models = built_in.get(config.model_set, _package_models)(config)
     if config.dimensions == 3:
         models = with_depth(models, config)
     return with_fix_bias(models, config) if config.fix_bias_std > 0.0 else models
 
 
-def rate_chain(config: DiverConfig, matrix: FloatArray) -> markov.RateChain:
+def build_chain(config: DiverConfig, matrix: FloatArray) -> markov.RateChain:
     """Return the chain of `matrix` (M, M), or of the one that the parameters state."""
     if config.transition_matrix:
         matrix = np.reshape(config.transition_matrix, matrix.shape)
@@ -326,7 +326,7 @@ def initial_probabilities(config: DiverConfig, models: int) -> FloatArray:
     return np.full(models, 1.0 / models)
 
 
-def _own(config: DiverConfig) -> ModelSet:
+def _package_models(config: DiverConfig) -> ModelSet:
     own = diver_models(config.model_set, config)
     names = own.joint.outputs
     E = np.zeros((len(own.joint.names), len(OUTPUTS), len(own.mean)))
@@ -336,7 +336,7 @@ def _own(config: DiverConfig) -> ModelSet:
     return ModelSet(
         own.joint.names,
         E,
-        rate_chain(config, own.transition),
+        build_chain(config, own.transition),
         own.mean[2:],
         own.variance[2:],
         initial_probabilities(config, len(E)),
@@ -347,7 +347,7 @@ def _own(config: DiverConfig) -> ModelSet:
 # -- headings ------------------------------------------------------------------------------------
 
 
-def headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+def heading_vectors(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """Return unit vectors along u (M, 2) and to the left of w (M, 2) each heading, and their
     names."""
     angle = 2.0 * np.pi * np.arange(config.directions) / config.directions
@@ -357,13 +357,13 @@ def headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ..
     return u, w, tuple(f'heading_{each:03d}' for each in degrees)
 
 
-def _outer(v: FloatArray) -> FloatArray:
+def _outer_products(v: FloatArray) -> FloatArray:
     """Return v v^T for each row: (M, 2) -> (M, 2, 2)."""
     return np.asarray(v[:, :, None] * v[:, None, :])
 
 
-def _heading_speed(config: DiverConfig) -> ModelSet:
-    u, w, names = headings(config)
+def _build_heading_speed(config: DiverConfig) -> ModelSet:
+    u, w, names = heading_vectors(config)
     P = markov.persistent_headings(
         config.directions, config.stay_probability, config.heading_concentration
     )
@@ -374,12 +374,12 @@ def _heading_speed(config: DiverConfig) -> ModelSet:
     E = np.zeros((M, 4, 3))
     E[:, :2, :2] = np.eye(2)
     E[:, 2:, 2] = u
-    wander = config.lateral_noise**2 * _outer(w)
+    wander = config.lateral_noise**2 * _outer_products(w)
     if config.hover:
         wander[-1] = config.hover_noise**2 * np.eye(2)
     speed_rate = config.speed_noise**2 / T
     # Irregular stamps ask for a new step at each fix.
-    still, along, nothing = np.tile(np.eye(3), (M, 1, 1)), _outer(u), np.zeros((M, 3))
+    still, along, nothing = np.tile(np.eye(3), (M, 1, 1)), _outer_products(u), np.zeros((M, 3))
 
     def motion(dt: float) -> Motion:
         F, Q = still.copy(), np.zeros((M, 3, 3))
@@ -392,7 +392,7 @@ def _heading_speed(config: DiverConfig) -> ModelSet:
     return ModelSet(
         names,
         E,
-        rate_chain(config, P),
+        build_chain(config, P),
         np.array([config.speed_mean]),
         np.array([config.speed_std**2]),
         initial_probabilities(config, M),
@@ -403,19 +403,19 @@ def _heading_speed(config: DiverConfig) -> ModelSet:
 # -- families ------------------------------------------------------------------------------------
 
 
-def _families(config: DiverConfig) -> ModelSet:
+def _build_families(config: DiverConfig) -> ModelSet:
     plain = evolve(
         config, model_set='heading_speed', transition_matrix=(), initial_probabilities=()
     )
     steady, brisk = (
-        _heading_speed(evolve(plain, speed_noise=noise))
+        _build_heading_speed(evolve(plain, speed_noise=noise))
         for noise in (config.speed_noise, config.brisk_speed_noise)
     )
     noises = config.acceleration_noise or (*LIVELY, *QUIET)
     count, moving = len(steady.names), len(noises)
     family = np.repeat(np.arange(4), [count, count, len(LIVELY), len(QUIET)])
     M, T = len(family), config.reference_step
-    u, _, _ = headings(config)
+    u, _, _ = heading_vectors(config)
     units = np.zeros((M, 2))
     units[: config.directions] = units[count : count + config.directions] = u
     own = np.where(np.arange(count) < config.directions, HEADING, HOVER)
@@ -428,7 +428,7 @@ def _families(config: DiverConfig) -> ModelSet:
     hovers = np.flatnonzero(kind == HOVER)
     # A pace that is forgotten has the spread of `speed_std` in the end, or that of its own noise.
     noise = np.square([config.speed_noise, config.brisk_speed_noise])[: len(hovers)] / T
-    forgotten = np.maximum(0.5 * PACE_TIME * noise, speed[1])
+    forgotten = np.maximum(0.5 * SPEED_MEMORY * noise, speed[1])
 
     def motion(dt: float) -> Motion:
         F, Q, B = np.zeros((M, 4, 4)), np.zeros((M, 4, 4)), np.zeros((M, 4))
@@ -436,9 +436,9 @@ def _families(config: DiverConfig) -> ModelSet:
         for first, models in ((0, steady), (count, brisk)):
             rows = slice(first, first + count)
             F[rows, :3, :3], Q[rows, :3, :3], _ = models.motion(dt)
-        kept = math.exp(-dt / PACE_TIME)
+        kept = math.exp(-dt / SPEED_MEMORY)
         F[hovers, 2, 2], B[hovers, 2] = kept, (1.0 - kept) * speed[0]
-        Q[hovers, 2, 2] = -math.expm1(-2.0 * dt / PACE_TIME) * forgotten
+        Q[hovers, 2, 2] = -math.expm1(-2.0 * dt / SPEED_MEMORY) * forgotten
         F[2 * count :, :2, 2:] = dt * np.eye(2)
         for row, noise in enumerate(noises, start=2 * count):
             Q[row] = white_acceleration(noise**2 * T, 0.0, dt)
@@ -448,14 +448,14 @@ def _families(config: DiverConfig) -> ModelSet:
     start_mean[: 2 * count, 0] = speed[0]
     start_variance[: 2 * count] = speed[1], 1.0
     if config.transition_matrix:
-        chain = rate_chain(config, np.eye(M))
+        chain = build_chain(config, np.eye(M))
     else:
         rates = markov.RateChain(markov.persistent(len(LIVELY), LIVELY_STAY), T).generator
         generators = [
             markov.RateChain(models.chain.matrix, T).generator for models in (steady, brisk)
         ]
         generators += [rates, np.zeros((len(QUIET), len(QUIET)))]
-        generator = _between(family, generators, config.family_switch_rate)
+        generator = family_generator(family, generators, config.family_switch_rate)
         chain = markov.RateChain.of_generator(generator, T)
     if config.initial_probabilities:
         initial = initial_probabilities(config, M)
@@ -476,7 +476,7 @@ def _families(config: DiverConfig) -> ModelSet:
     )
 
 
-def _between(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
+def family_generator(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
     """Return the generator (M, M) of chains that go from each family to each other one at `rate` /
     3, evenly to its models; between the first two the place in the family is kept."""
     size = np.bincount(family)
@@ -521,14 +521,16 @@ def with_depth(base: ModelSet, config: DiverConfig) -> ModelSet:
     def motion(dt: float) -> Motion:
         fade, added = gauss_markov(config.vertical_speed_std, config.vertical_speed_time, dt)
         way = config.vertical_speed_time * (1.0 - fade)
-        return _joined(base.motion(dt), np.array([[1.0, way], [0.0, fade]]), np.diag([0.0, added]))
+        return _join_motions(
+            base.motion(dt), np.array([[1.0, way], [0.0, fade]]), np.diag([0.0, added])
+        )
 
     spread = max(PART_SPREAD * width**2 / 12.0, 1e-4)
     return evolve(
         base,
         E=E,
-        start_mean=_appended(base.start_mean, [starts[0], 0.0]),
-        start_variance=_appended(base.start_variance, [spread, rate]),
+        start_mean=_append_start(base.start_mean, [starts[0], 0.0]),
+        start_variance=_append_start(base.start_variance, [spread, rate]),
         motion=motion,
         outputs=('px', 'py', 'pz', 'vx', 'vy', 'vz'),
         height=n,
@@ -543,25 +545,25 @@ def with_fix_bias(base: ModelSet, config: DiverConfig) -> ModelSet:
 
     def motion(dt: float) -> Motion:
         fade, added = gauss_markov(std, config.fix_bias_time, dt)
-        return _joined(base.motion(dt), fade * np.eye(2), added * np.eye(2))
+        return _join_motions(base.motion(dt), fade * np.eye(2), added * np.eye(2))
 
     return evolve(
         base,
         E=E,
-        start_mean=_appended(base.start_mean, [0.0, 0.0]),
-        start_variance=_appended(base.start_variance, [std**2, std**2]),
+        start_mean=_append_start(base.start_mean, [0.0, 0.0]),
+        start_variance=_append_start(base.start_variance, [std**2, std**2]),
         motion=motion,
         bias=n,
     )
 
 
-def _appended(start: FloatArray, more: list[float]) -> FloatArray:
+def _append_start(start: FloatArray, more: list[float]) -> FloatArray:
     """Return `start` (n,) or (M, n) with the same further components for all models."""
     there = np.broadcast_to(more, (*start.shape[:-1], len(more)))
     return np.concatenate([start, there], axis=-1)
 
 
-def _joined(base: Motion, F: FloatArray, Q: FloatArray) -> Motion:
+def _join_motions(base: Motion, F: FloatArray, Q: FloatArray) -> Motion:
     """Return the motion of more components beside those of `base`, on which nothing of it
     depends."""
     M, n = base.B.shape

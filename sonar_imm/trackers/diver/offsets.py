@@ -64,7 +64,7 @@ MOST_PAIRS = 24
 """Pairs that are looked at: those that are heard first. The evidence grows with their square."""
 
 WILD, CAPPED = 20.0, 3.0
-"""Metres beyond which an echo is another's, and the most standard deviations of `t`, for each of
+"""Metres beyond which an echo is another's, and the chi2_limit standard deviations of `t`, for each of
 its dimensions, that count: an outlier is no evidence of what lasts."""
 
 STEPS, FARTHEST = 2, 30.0
@@ -104,7 +104,7 @@ class RecentPairs(NamedTuple):
     variance: Annotated[FloatArray, 'p'] = np.zeros(0)
     age: Annotated[FloatArray, 'p'] = np.zeros(0)
 
-    def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
+    def with_ping(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
         """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
         rows = {
             pair: (self.tx[k], self.rx[k], self.variance[k], self.age[k] + 1.0)
@@ -122,7 +122,7 @@ class RecentPairs(NamedTuple):
         columns = (np.array(column) for column in zip(*(rows[pair] for pair in pairs)))
         return RecentPairs(tuple(pairs), *columns)
 
-    def spread(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
+    def assumed_covariance(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
         """What `ASSUMED` errors do to a place (3,), of whose coordinates the first `known` are
         states: (known, known), m^2."""
         tag = bool(np.isnan(self.tx[0, 0]))
@@ -142,7 +142,7 @@ class RecentPairs(NamedTuple):
         return np.asarray(moved @ moved.T)
 
 
-class Offsets(NamedTuple):
+class BiasTest(NamedTuple):
     """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
     = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
     square and freedom: of all t, and how many there were."""
@@ -154,9 +154,9 @@ class Offsets(NamedTuple):
     square: float = 0.0
     freedom: float = 0.0
 
-    def after(
+    def with_ping(
         self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
-    ) -> Offsets:
+    ) -> BiasTest:
         """With a ping of a diver at x (2,) or, where depth is a state, (3,): `echoes` (C,) of it
         that may be his, `ids` (rows of the message, 2) of transmitters and receivers."""
         chosen = np.flatnonzero(echoes)
@@ -166,7 +166,7 @@ class Offsets(NamedTuple):
         named = [(int(a), int(b)) for a, b in ids[ping.row[chosen]]]
         new = [pair for pair in dict.fromkeys(named) if pair not in self.pairs]
         now = self._with_pairs(new[: MOST_PAIRS - len(self.pairs)])
-        fitted = _fitted(ping, chosen, x, config)
+        fitted = _fit_position(ping, chosen, x, config)
         if fitted is None:
             return now
         place, residual, H, length = fitted
@@ -179,7 +179,7 @@ class Offsets(NamedTuple):
         span = config.depth_max - config.depth_min
         for at, share in enumerate(DEPTHS):
             deep = np.append(place[:2], -config.depth_min - share * span)
-            D[:, at] = _lengths(ping, chosen, deep) - length
+            D[:, at] = _path_lengths(ping, chosen, deep) - length
         D[:, SOUND_SPEED] = length
         std = np.sqrt(ping.measured.variance[chosen])
         N = np.linalg.qr(H / std[:, None], mode='complete')[0][:, k:]
@@ -188,7 +188,7 @@ class Offsets(NamedTuple):
         keep = 1.0 - 1.0 / MEMORY
         lengths = now.length.copy()
         lengths[column[column >= 0]] = length[column >= 0]
-        return Offsets(
+        return BiasTest(
             now.pairs,
             keep * now.score + shown.T @ t,
             keep**2 * now.variance + shown.T @ shown,
@@ -197,7 +197,7 @@ class Offsets(NamedTuple):
             keep**2 * now.freedom + len(t),
         )
 
-    def _with_pairs(self, new: list[tuple[int, int]]) -> Offsets:
+    def _with_pairs(self, new: list[tuple[int, int]]) -> BiasTest:
         if not new:
             return self
         size, K = len(new), len(self.score)
@@ -216,7 +216,7 @@ class Offsets(NamedTuple):
         if self.freedom < ENOUGH:
             return {}
         V, s = self.variance, self.score
-        # What is stated of the pairs; of geometric weights, w sums to at most twice w^2.
+        # What is stated of the pairs; of geometric weights, w sums to at chi2_limit twice w^2.
         off = config.receiver_position_std**2
         off += (config.receiver_clock_std * config.sound_speed) ** 2
         stated = off * np.eye(len(self.pairs))
@@ -240,7 +240,7 @@ class Offsets(NamedTuple):
     def warnings(self, config: DiverConfig) -> list[str]:
         """A sentence where there is evidence of errors that last and are larger than stated."""
         found = self.evidence(config)
-        beyond = [value / most(rank) for value, rank in found.values()]
+        beyond = [value / chi2_limit(rank) for value, rank in found.values()]
         if not found or max(beyond) <= 1.0:
             return []
         largest = found[EVERY][0]
@@ -258,22 +258,22 @@ class Offsets(NamedTuple):
         ]
 
 
-def most(rank: int) -> float:
+def chi2_limit(rank: int) -> float:
     """What a chi-square of `rank` degrees of freedom stays below but for `SIGMAS`, by the cube
     root of Wilson and Hilferty."""
     spread = 2.0 / (9.0 * rank)
     return rank * (1.0 - spread + SIGMAS * math.sqrt(spread)) ** 3
 
 
-def watched(
-    found: Offsets,
+def accumulate_residuals(
+    found: BiasTest,
     recent: RecentPairs,
     places: Mapping[int, FloatArray],
     took: Mapping[int, BoolArray],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
-) -> tuple[Offsets, RecentPairs]:
+) -> tuple[BiasTest, RecentPairs]:
     """Return the evidence `found` and that of a ping `seen`, of which tracks `took` (C,)
     measurements each, only of those whose places (2 or 3,) are given; and the pairs heard lately.
 
@@ -286,13 +286,13 @@ def watched(
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
-    recent = recent.after(seen, taken, ids)
+    recent = recent.with_ping(seen, taken, ids)
     for track, place in places.items():
         good = took[track]
         echo = np.flatnonzero(seen.echo)
         mine = good[echo]
         whole = place if len(place) == 3 else np.append(place, config.target_z)
-        late = seen.measured.value[echo] - _lengths(seen, echo, whole)
+        late = seen.measured.value[echo] - _path_lengths(seen, echo, whole)
         if ping.passive and mine.any():
             late -= np.median(late[mine])
         off = np.where(mine, -1.0, np.abs(late))
@@ -301,11 +301,11 @@ def watched(
         for node in np.unique(seen.measured.node[echo[usable]]):
             members = np.flatnonzero(usable & (seen.measured.node[echo] == node))
             echoes[echo[members[off[members].argmin()]]] = True
-        found = found.after(seen, echoes, ids, place, config)
+        found = found.with_ping(seen, echoes, ids, place, config)
     return found, recent
 
 
-def widened(
+def with_assumed_errors(
     recent: RecentPairs, mean: FloatArray, covariance: FloatArray, config: DiverConfig
 ) -> FloatArray:
     """Return the covariances (T, q, q) of outputs mean (T, q), position first, with what is
@@ -318,11 +318,13 @@ def widened(
     covariance, known = covariance.copy(), 2
     for t, row in enumerate(mean):
         place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
-        covariance[t, :known, :known] += recent.spread(place, known, config.sound_speed)
+        covariance[t, :known, :known] += recent.assumed_covariance(
+            place, known, config.sound_speed
+        )
     return covariance
 
 
-def _fitted(
+def _fit_position(
     ping: Ping, chosen: IndexArray, x: FloatArray, config: DiverConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
     """Where the echoes `chosen` (C,) put a diver who is near x (2 or 3,): place (3,), residual
@@ -352,7 +354,7 @@ def _fitted(
     return None
 
 
-def _lengths(ping: Ping, chosen: IndexArray, place: FloatArray) -> FloatArray:
+def _path_lengths(ping: Ping, chosen: IndexArray, place: FloatArray) -> FloatArray:
     measured = ping.measured
     tx = None if ping.passive else measured.tx[chosen]
     return arrival_paths(place, tx, measured.rx[chosen]).length

@@ -41,9 +41,9 @@ from .models import ModelSet
 
 if TYPE_CHECKING:
     from .births import Birth
-    from .coverage import Seen
+    from .coverage import DetectionProbability
     from .fixes import Association, Pairs
-    from .known import Known, Step
+    from .known import Known, Prediction
 
 LEAST_VAR_TOA = 1e-13
 """Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance
@@ -78,7 +78,9 @@ class Heights(NamedTuple):
     rest: FloatArray
 
     @classmethod
-    def of(cls, position: FloatArray, covariance: FloatArray, factor: float) -> Heights | None:
+    def from_fixes(
+        cls, position: FloatArray, covariance: FloatArray, factor: float
+    ) -> Heights | None:
         """Of fixes at `position` (D, 3) with `covariance` (D, 3, 3) times `factor`; None where no
         one states z."""
         variance = covariance[:, 2, 2]
@@ -125,18 +127,18 @@ class Group:
     R: FloatArray
     config: DiverConfig
     target_id: IntArray | None
-    whole: bool
+    is_complete: bool
     heights: Heights | None = None
     sensor: str = ''
     seen_from: FloatArray | None = None
-    learnt: float = CLUTTER
-    seen: Seen | None = field(default=None, init=False)
+    learnt_clutter: float = CLUTTER
+    detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
-    found: Association | None = field(default=None, init=False)
+    association: Association | None = field(default=None, init=False)
     births: list[Birth] = field(factory=list, init=False)
 
     @property
-    def turned_by(self) -> tuple[str, FloatArray] | None:
+    def rotation_sensor(self) -> tuple[str, FloatArray] | None:
         """The name and the place (2,) of a sensor whose bearings may be off, None where they are
         not, or nobody knows where it stands."""
         if not self.config.bearing_bias_std_deg or self.seen_from is None:
@@ -146,14 +148,18 @@ class Group:
     @property
     def clutter(self) -> float:
         """The density of false fixes, 1/m^2."""
-        return self.config.clutter_density or self.learnt
+        return self.config.clutter_density or self.learnt_clutter
 
     @property
     def birth_density(self) -> float:
         """The density of new divers, 1/m^2: where that of false fixes is learnt, not many more.
         Else a sensor that gives none has its fixes doubted for divers that may yet come."""
         stated = self.config.birth_density
-        return stated if self.config.clutter_density else min(stated, MOST_BIRTHS * self.learnt)
+        return (
+            stated
+            if self.config.clutter_density
+            else min(stated, MOST_BIRTHS * self.learnt_clutter)
+        )
 
 
 @define(eq=False)
@@ -165,7 +171,7 @@ class Scan:
     whether a diver of whom nothing is known at this stamp was missed.
 
     What stages tell later ones: before, what was known before the scan, and step, how the time to
-    it was crossed (the prediction); births, where a ping shows a new diver.
+    it was predict_over (the prediction); births, where a ping shows a new diver.
     """
 
     fixes: list[Group]
@@ -173,12 +179,12 @@ class Scan:
     starts: list[Start]
     names: list[int]
     complete: bool
-    before: Known = field(init=False)
-    step: Step = field(init=False)
+    previous: Known = field(init=False)
+    prediction: Prediction = field(init=False)
     births: list[Birth] = field(factory=list, init=False)
 
     @classmethod
-    def of(
+    def from_items(
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
@@ -187,34 +193,34 @@ class Scan:
         """The scan of `items`; clutter: of each sensor, where it is learnt."""
         fixes, names = position_groups(items, config), []
         for group in fixes if config.pairing != 'gnn' else ():
-            found = clutter.of(group.sensor)
+            found = clutter.get(group.sensor)
             if group.target_id is None and found is not None:
-                group.learnt = found.density
+                group.learnt_clutter = found.density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()
         pings: list[Arrivals] = []
         starts: list[Start] = []
-        complete = any(group.whole and group.target_id is None for group in fixes)
+        complete = any(group.is_complete and group.target_id is None for group in fixes)
         for item in items:
             if isinstance(item, Arrivals):
-                pings += _of_each_tag(item.in_order())
+                pings += _split_by_tag(item.in_order())
             elif isinstance(item, Start):
                 starts.append(item)
         for ping in pings:
-            name = name_of(ping)
+            name = tag_id(ping)
             complete |= config.fixes_are_scans and name == NOBODY
             if name != NOBODY:
                 names.append(name)
         return cls(fixes, pings, starts, names, complete)
 
 
-def name_of(ping: Arrivals) -> int:
+def tag_id(ping: Arrivals) -> int:
     """The number of the tag whose ping it is; `NOBODY` for echoes, and for a tag without one."""
     return int(ping.tx_id[0]) if ping.passive and int(ping.tx_id[0]) != 0 else NOBODY
 
 
-def _of_each_tag(ping: Arrivals) -> list[Arrivals]:
+def _split_by_tag(ping: Arrivals) -> list[Arrivals]:
     """A ping of several tags as one for each of them."""
     tags = np.unique(ping.tx_id) if ping.passive else ping.tx_id[:1]
     return [ping.only(ping.tx_id == tag) for tag in tags] if len(tags) > 1 else [ping]
@@ -238,29 +244,29 @@ def position_groups(items: Sequence[Measurement], config: DiverConfig) -> list[G
             if fix.target_id == NOBODY:
                 nameless.append(fix)
             else:
-                group = _group(scan_of(fix), np.arange(1), own, named=True)
-                groups.append(_seen_from(fix, group))
+                group = _make_group(scan_of(fix), np.arange(1), own, named=True)
+                groups.append(_with_sensor_position(fix, group))
         if nameless:
-            groups.append(_together(nameless, own))
+            groups.append(_group_single_fixes(nameless, own))
     for item in items:
         if isinstance(item, Fixes):
-            groups += _named_and_nameless(item, config.of_sensor(item.sensor))
+            groups += _split_by_id(item, config.of_sensor(item.sensor))
     return groups
 
 
-def _named_and_nameless(scan: Fixes, config: DiverConfig) -> list[Group]:
+def _split_by_id(scan: Fixes, config: DiverConfig) -> list[Group]:
     if scan.target_id is None:
-        return [_group(scan, np.arange(len(scan)), config, named=False)]
+        return [_make_group(scan, np.arange(len(scan)), config, named=False)]
     known = np.flatnonzero(scan.target_id != NOBODY)
     _, first = np.unique(scan.target_id[known], return_index=True)
-    groups = [_group(scan, known[first], config, named=True)] if len(known) else []
+    groups = [_make_group(scan, known[first], config, named=True)] if len(known) else []
     if len(known) < len(scan) or not len(scan):
         nameless = np.flatnonzero(scan.target_id == NOBODY)
-        groups.append(_group(scan, nameless, config, named=False))
+        groups.append(_make_group(scan, nameless, config, named=False))
     return groups
 
 
-def _group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -> Group:
+def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -> Group:
     """The rows of a scan, with their names or as all that there was to see."""
     position, covariance = scan.position[rows], np.full((len(rows), 3, 3), np.nan)
     if scan.covariance is not None:
@@ -269,17 +275,17 @@ def _group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -
     if not (stated := np.isfinite(R)).all():
         R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
     heights = (
-        Heights.of(position, covariance, config.covariance_scale)
+        Heights.from_fixes(position, covariance, config.covariance_scale)
         if config.dimensions == 3
         else None
     )
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
-    named_rows = target_id, not named, heights, scan.sensor, _place(config)
+    named_rows = target_id, not named, heights, scan.sensor, _sensor_position(config)
     return Group(z, R * config.covariance_scale, config, *named_rows)
 
 
-def _together(fixes: Sequence[Fix], config: DiverConfig) -> Group:
+def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     """Single fixes of one sensor as one group."""
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
@@ -292,17 +298,21 @@ def _together(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
         whole = [nothing if fix.covariance is None else fix.covariance for fix in fixes]
-        heights = Heights.of(np.array([fix.position for fix in fixes]), np.array(whole), factor)
+        heights = Heights.from_fixes(
+            np.array([fix.position for fix in fixes]), np.array(whole), factor
+        )
     more = None, config.fixes_are_scans, heights, fixes[0].sensor
-    return _seen_from(fixes[0], Group(z, R * factor, config, *more, _place(config)))
+    return _with_sensor_position(
+        fixes[0], Group(z, R * factor, config, *more, _sensor_position(config))
+    )
 
 
-def _seen_from(fix: Fix, group: Group) -> Group:
+def _with_sensor_position(fix: Fix, group: Group) -> Group:
     """A group of fixes with the place of the sensor that `fix` states."""
     return group if fix.seen_from is None else evolve(group, seen_from=fix.seen_from)
 
 
-def _place(config: DiverConfig) -> FloatArray | None:
+def _sensor_position(config: DiverConfig) -> FloatArray | None:
     """Where a sensor with these parameters stands."""
     return np.array(config.coverage_sector[:2]) if config.coverage_sector else None
 
@@ -319,9 +329,9 @@ class Ping(NamedTuple):
     passive: bool
     pairs: int
 
-    def only(self, keep: BoolArray) -> Ping:
+    def select(self, keep: BoolArray) -> Ping:
         """The measurements `keep` (C,), without those whose parent is not kept."""
-        keep = self.kept(keep)
+        keep = self.without_orphans(keep)
         place = np.cumsum(keep) - 1
         left = PingMeasurements._make(
             np.ascontiguousarray(column[keep]) for column in self.measured
@@ -330,17 +340,17 @@ class Ping(NamedTuple):
         pairs = len(np.unique(left.node[left.kind <= ONE_WAY]))
         return Ping(left, self.row[keep], self.passive, pairs)
 
-    def kept(self, keep: BoolArray) -> BoolArray:
+    def without_orphans(self, keep: BoolArray) -> BoolArray:
         """`keep` (C,) without those whose parent is not kept."""
         parent = self.measured.parent
         orphaned = (parent >= 0) & ~keep[parent]
         return np.asarray(keep & ~orphaned)
 
-    def compared(self, keep: BoolArray) -> Ping:
+    def subsample(self, keep: BoolArray) -> Ping:
         """As `only`, but at most `MOST_MEASUREMENTS`, evenly chosen."""
         if np.count_nonzero(keep) > MOST_MEASUREMENTS:
-            keep = np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep)))
-        return self.only(keep)
+            keep = np.isin(np.arange(len(keep)), subsample(np.flatnonzero(keep)))
+        return self.select(keep)
 
     @property
     def nodes(self) -> IntArray:
@@ -365,7 +375,7 @@ def ping_measurements(
     if not ping.passive:
         usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
     if ping.passive:
-        usable = spread(usable[np.argsort(ping.rx_id[usable], kind='stable')])
+        usable = subsample(usable[np.argsort(ping.rx_id[usable], kind='stable')])
     speed = config.sound_speed
     first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
     variance = toa_variance(ping, config)[usable] * speed**2
@@ -408,7 +418,9 @@ def ping_measurements(
         density=columns[5].astype(np.float64),
         tx=np.ascontiguousarray(ping.tx[row_of]),
         rx=np.ascontiguousarray(ping.rx[row_of]),
-        columns=layout.columns(models, ping.rx_id[row_of], ping.passive, columns[2] == BEARING),
+        columns=layout.measurement_columns(
+            models, ping.rx_id[row_of], ping.passive, columns[2] == BEARING
+        ),
     )
     return Ping(measured, row_of, ping.passive, int(new.sum()))
 
@@ -424,7 +436,7 @@ def _depth_reports(ping: Arrivals, rows: IndexArray) -> list[tuple[float, float,
     return [(*report, reports[report]) for report in sorted(reports)]
 
 
-def spread(rows: IndexArray) -> IndexArray:
+def subsample(rows: IndexArray) -> IndexArray:
     """At most `MOST_MEASUREMENTS` of the rows (n,), evenly chosen, in their order."""
     if len(rows) <= MOST_MEASUREMENTS:
         return rows

@@ -32,7 +32,7 @@ from ...estimation.arrays import FloatArray, IndexArray
 from ...estimation.rows import Borrowed, Rows
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from .known import crossed, Known, Step
+from .known import Known, predict_over, Prediction
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
@@ -43,12 +43,12 @@ every 29 s, it made estimates worse."""
 
 class _Scan(NamedTuple):
     """A scan in common components: known; x (N, M, n), P (N, M, n, n) of its rows; steps: those
-    that crossed the time to it, and the same of them."""
+    that predict_over the time to it, and the same of them."""
 
     known: Known
     x: FloatArray
     P: FloatArray
-    steps: tuple[Step, ...]
+    steps: tuple[Prediction, ...]
     between: tuple[tuple[FloatArray, FloatArray], ...]
 
 
@@ -130,29 +130,32 @@ class SmoothingDiverTracker(DiverTracker):
         """
         if not self._passed:
             return []
-        scans = self._scans()
+        scans = self._build_scans()
         found: dict[tuple[int, int], _Smoothed] = {}
-        for track_id, first, last in self._passes(scans):
+        for track_id, first, last in self._find_passes(scans):
             self._smooth(scans, track_id, first, last, found)
-        return [self._estimate(self._told(scan, k, found)) for k, scan in enumerate(scans)]
+        return [
+            self._estimate(self._with_smoothed_rows(scan, k, found))
+            for k, scan in enumerate(scans)
+        ]
 
-    def _scans(self) -> list[_Scan]:
+    def _build_scans(self) -> list[_Scan]:
         """All scans, with the constants of all instruments, and how each was reached."""
         newest = self._passed[max(self._passed)]
         layout = self._layouts(newest)
         scans: list[_Scan] = []
         for stamp in sorted(self._passed):
             known = self._passed[stamp]
-            known = known.replace(rows=layout.of_rows(known.rows, self.models))
+            known = known.replace(rows=layout.rows_with_new_constants(known.rows, self.models))
             before = scans[-1].known if scans else known
             dt = (known.stamp_ns - before.stamp_ns) * 1e-9
             crossing = self.models, self._chain, before.rows, before['learnt']
-            steps = tuple(crossed(*crossing, dt, self.config.longest_step))
-            between = tuple(self.models.common(step.rows.blocks) for step in steps[:-1])
-            scans.append(_Scan(known, *self.models.common(known.rows.blocks), steps, between))
+            steps = tuple(predict_over(*crossing, dt, self.config.longest_step))
+            between = tuple(self.models.to_common(step.rows.blocks) for step in steps[:-1])
+            scans.append(_Scan(known, *self.models.to_common(known.rows.blocks), steps, between))
         return scans
 
-    def _passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:
+    def _find_passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:
         """Identity, first and last scan of each track, cut where a gap is too long to look across,
         and where its rows have no past of their own."""
         passes: list[tuple[int, int, int]] = []
@@ -169,7 +172,7 @@ class SmoothingDiverTracker(DiverTracker):
                 cut = not k or not len(came) or long
                 cut |= bool((rows.parent[rows.target == track] < 0).any())
                 if not cut:
-                    cut = before['spreads'][came[0]] != scan.known['spreads'][track]
+                    cut = before['respreads'][came[0]] != scan.known['respreads'][track]
                 if cut:
                     if track_id in open_:
                         passes.append((track_id, open_[track_id], k - 1))
@@ -187,11 +190,11 @@ class SmoothingDiverTracker(DiverTracker):
         """Smooth the rows that a track ends a pass with, and put them into `found` by scan and
         identity."""
         end = scans[last].known.rows
-        rows: IndexArray = np.flatnonzero(end.target == _place(scans[last].known, track_id))
-        weight = end.take(rows).weight_among_themselves()
+        rows: IndexArray = np.flatnonzero(end.target == _track_index(scans[last].known, track_id))
+        weight = end.select(rows).normalized_weight()
         for row, share in zip(rows.tolist(), weight.tolist()):
-            path = self._path(scans, track_id, row, first, last)
-            x, P, mu = self._along(path)
+            path = self._trace_path(scans, track_id, row, first, last)
+            x, P, mu = self._smooth_path(path)
             key = {name: column[row] for name, column in end.key.items()}
             for k, number in enumerate(path.scans):
                 if number is None:
@@ -202,7 +205,7 @@ class SmoothingDiverTracker(DiverTracker):
                 for column, value in zip(columns, (x[k], P[k], mu[k], logw, key)):
                     column.append(value)
 
-    def _path(
+    def _trace_path(
         self, scans: Sequence[_Scan], track_id: int, row: int, first: int, last: int
     ) -> _Path:
         """The forward pass that leads to a row of the `last` scan."""
@@ -215,20 +218,23 @@ class SmoothingDiverTracker(DiverTracker):
             transition, dt = self.models.chain.matrix, 0.0
             if number > first:
                 came = chain[last - number + 1]
-                at = _place(scans[number - 1].known, track_id)
+                at = _track_index(scans[number - 1].known, track_id)
                 for step, (x, P) in zip(scan.steps, scan.between):
-                    mu, used = step.rows.mu[came], _of_track(step.transition, at)
+                    mu, used = step.rows.mu[came], _track_transition(step.transition, at)
                     path.add(None, x[came], P[came], mu, used, step.dt)
-                transition, dt = _of_track(scan.steps[-1].transition, at), scan.steps[-1].dt
+                transition, dt = (
+                    _track_transition(scan.steps[-1].transition, at),
+                    scan.steps[-1].dt,
+                )
             mu = scan.known.rows.mu[own]
             path.add(number, scan.x[own], scan.P[own], mu, transition, dt)
         return path
 
-    def _along(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _smooth_path(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
         """x (K, M, n), P (K, M, n, n), mu (K, M) of a path, smoothed."""
         x, P, mu = np.stack(path.x), np.stack(path.P), np.stack(path.mu)
-        moves, transition = self._moves(path, x.shape[-1]), np.stack(path.transition)
-        blocks = self._families()
+        moves, transition = self._stack_motions(path, x.shape[-1]), np.stack(path.transition)
+        blocks = self._family_slices()
         weights = _family_weights(mu, transition, blocks)
         for block, weight in zip(blocks, weights.T):
             total = mu[:, block].sum(axis=1, keepdims=True)
@@ -249,7 +255,7 @@ class SmoothingDiverTracker(DiverTracker):
             mu[-1] = path.mu[-1]
         return x, P, mu
 
-    def _families(self) -> list[slice]:
+    def _family_slices(self) -> list[slice]:
         """The places of models with states of the same components that switch between each
         other."""
         kinds = self.models.families
@@ -258,7 +264,7 @@ class SmoothingDiverTracker(DiverTracker):
         ends = np.cumsum(np.bincount(kinds.family)).tolist()
         return [slice(first, last) for first, last in zip([0, *ends], ends)]
 
-    def _moves(self, path: _Path, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _stack_motions(self, path: _Path, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, Q (K, M, size, size) and B (K, M, size): the motion, and constants that stay."""
         moves = [self.models.motion(dt) for dt in path.dt]
         F, Q, B = (np.stack(parts) for parts in zip(*moves))
@@ -271,7 +277,9 @@ class SmoothingDiverTracker(DiverTracker):
         F_all[..., range(n, size), range(n, size)] = 1.0
         return F_all, Q_all, B_all
 
-    def _told(self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]) -> Known:
+    def _with_smoothed_rows(
+        self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]
+    ) -> Known:
         """What is known of a scan, given all data."""
         known = scan.known
         parts = [found[number, track_id] for track_id in known.life.track_id.tolist()]
@@ -283,15 +291,15 @@ class SmoothingDiverTracker(DiverTracker):
         )
         keys = [key for part in parts for key in part.key]
         key = {name: np.array([each[name] for each in keys]) for name in known.rows.key}
-        blocks, nobody = self.models.blocks(x, P), np.full(len(target), -1)
+        blocks, nobody = self.models.to_blocks(x, P), np.full(len(target), -1)
         rows = Rows(blocks, mu, logw, target, nobody, key)
-        return known.replace(rows=rows, borrowed=Borrowed.none())
+        return known.replace(rows=rows, borrowed=Borrowed.empty())
 
 
-def _place(known: Known, track_id: int) -> int:
+def _track_index(known: Known, track_id: int) -> int:
     return int(np.flatnonzero(known.life.track_id == track_id)[0])
 
 
-def _of_track(transition: FloatArray, track: int) -> FloatArray:
+def _track_transition(transition: FloatArray, track: int) -> FloatArray:
     """The matrix (M, M) of a track among transitions (T or 1, M, M)."""
     return transition[0 if len(transition) == 1 else track]

@@ -105,7 +105,7 @@ def test_what_is_considered_is_the_same_in_all_models_and_times():
     for scan in made.measurements:
         tracker.process(scan.measurement)
     known = tracker._stream.state
-    x, P = tracker.models.common(known.rows.blocks)
+    x, P = tracker.models.to_common(known.rows.blocks)
     layout = known.memory['instruments'].layout(config, tracker.models)
     assert layout.size == 4 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
     considered = slice(tracker.models.n, layout.size)
@@ -127,7 +127,7 @@ def test_receivers_that_come_later_bring_their_prior():
     assert [receiver for receiver, _ in first.known] == [3, 7]
     both = first.with_receivers(ping, config)
     assert [receiver for receiver, _ in both.known] == [3, 7, 0, 1, 2]
-    x, P = both.layout(config, build_models(config)).widened(np.ones((2, 6)), np.ones((2, 6, 6)))
+    x, P = both.layout(config, build_models(config)).with_new_constants(np.ones((2, 6)), np.ones((2, 6, 6)))
     assert x.shape == (2, 9) and (P[:, :6, 6:] == 0.0).all()
     np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
