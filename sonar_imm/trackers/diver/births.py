@@ -12,12 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where new divers may be, and how a track begins there.
+"""New tracks: their positions and initial states.
 
-A track begins at a fix that no track took, at a position that the free rows of a ping can explain,
-or where somebody says that a diver is. Such a start is no measurement: it is birth_from_start, so its
-track is confirmed at once. Tracks without a name that it agrees with give way to it, or the diver
-would have two; with a single diver, all do.
+A track starts at an unassociated fix, at a position that explains the free rows of a ping, or at a
+`Start` message. A start is not a measurement: its track is confirmed at once. Tracks without an ID
+that agree with a start end, to avoid duplicates; with a single target, all such tracks end.
 """
 
 from __future__ import annotations
@@ -56,38 +55,43 @@ from .scan import (
 )
 
 SEED_PAIRS = 3
-"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
-it."""
+"""Number of transmitter-receiver pairs that seed a position. At least one more pair must agree."""
 
 MAX_COMBINATIONS = 200
-"""Combinations of echoes tried for one position."""
+"""Maximum number of echo combinations per position."""
 
 LOST = 1e-9
-"""A ping as improbable of a track as this says that the track was somewhere else."""
+"""Probability of a ping below which its track is wrong."""
 
 MOST_FOUND = 10
-"""Positions found by combining the echoes of one ping; those of others are found in later ones."""
+"""Maximum number of positions from combined echoes of one ping."""
 
 
 class Birth(NamedTuple):
-    """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
-    which it is, None for a fix; the probability that there is a diver, NaN where its hits will
-    tell; whose track it is; whether it is measured, and no start; what is stated of z there; the
-    name and the place (2,) of the sensor, None where it may not be turned."""
+    """Position of a possible new track."""
 
     position: FloatArray
+    """(2,) m."""
     covariance: FloatArray
+    """(2, 2) m^2."""
     ping: Arrivals | None = None
+    """The ping of the position; None for a fix."""
     rows: IndexArray | None = None
+    """Rows of the ping that give the position."""
     existence: float = math.nan
+    """Probability that the target exists; NaN if hits are counted."""
     target_id: int = NOBODY
+    """ID of the target, or `NOBODY`."""
     measured: bool = True
+    """False for a `Start` message."""
     height: Height | None = None
+    """The z of the fix; None if the fix has no z."""
     seen_by: tuple[str, FloatArray] | None = None
+    """Name and position (2,) of a sensor with a bearing error; None for others."""
 
 
 def spawn_at_fixes(known: Known, group: Group) -> Known:
-    """Note every fix that no track took as a place to begin one. A stage of the tracker."""
+    """Add a birth for each unassociated fix. A stage of the tracker."""
     found = group.association
     assert found is not None
     for d in np.flatnonzero(found.free).tolist():
@@ -100,11 +104,11 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
 
 
 def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> list[Birth]:
-    """Positions from the rows (n,) of a ping that are `free`.
+    """Return births from the `free` (n,) rows of a ping.
 
-    With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
-    which live until later pings tell them apart. With several, combinations of echoes of a few
-    pairs are tried; one that more pairs agree with is a position, and takes its echoes out.
+    With at most one echo per transmitter-receiver pair, this is one fix and its ghosts, which
+    later pings resolve. With several echoes, combinations of a few pairs are tried. A position
+    that more pairs agree with is accepted, and its echoes are removed.
     """
     rows = np.flatnonzero(free & np.isfinite(ping.toa))
     births: list[Birth] = []
@@ -123,6 +127,7 @@ def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> li
 
 
 def _rows_by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
+    """Return the rows of each transmitter-receiver pair."""
     pair = np.column_stack([ping.tx_id, ping.rx_id])[rows]
     return [rows[(pair == each).all(axis=1)] for each in np.unique(pair, axis=0)]
 
@@ -130,7 +135,7 @@ def _rows_by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
 def _locate_births(
     ping: Arrivals, rows: IndexArray, config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
-    """The fix of `rows` and its alternatives, and the rows it used."""
+    """Return births at the fix of `rows` and its alternatives, and the used rows."""
     rows = subsample(rows)
     fix = locate_fix(ping, rows, config)
     if fix is None:
@@ -145,7 +150,8 @@ def _locate_births(
 def _find_best_combination(
     ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
-    """The fix that most pairs agree with, at least one more than seeded it."""
+    """Return the births that most pairs agree with, at least one more than the seeds, and their
+    rows."""
     best: tuple[list[Birth], IndexArray] = ([], np.empty(0, np.intp))
     if len(pairs) <= SEED_PAIRS:
         return best
@@ -162,7 +168,7 @@ def _find_best_combination(
 def _select_agreeing(
     ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig
 ) -> IndexArray:
-    """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
+    """Return the echo of each pair nearest to the prediction for `birth`, within 3 sigma."""
     position, covariance = birth.position, birth.covariance
     height = float(np.mean(start_depths(config)))
     expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
@@ -176,9 +182,9 @@ def _select_agreeing(
 
 
 def locate_fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
-    """The fix that `rows` of the ping give by themselves, None when they give none to believe.
+    """Return the fix of the `rows` of a ping alone; None without a plausible fix.
 
-    With depth as a state it is the best of those at the heights where the models begin.
+    With depth as a state, return the best fix over the start depths.
     """
     variance = toa_variance(ping, config)[rows] + systematic_variance(ping, config)[rows]
     best: Localisation | None = None
@@ -199,7 +205,7 @@ def locate_fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localis
     return best
 
 
-# -- tracks that begin ---------------------------------------------------------------------------
+# -- new tracks ----------------------------------------------------------------------------------
 
 
 def spawn_stage(
@@ -210,8 +216,8 @@ def spawn_stage(
     features: Mapping[str, Feature],
     rules: TrackRules,
 ) -> Callable[[Known, Scan], Known]:
-    """Return the stage that begins a tentative track at each birth, as long as there is room, and
-    a confirmed one where somebody says that a diver is."""
+    """Return the stage that starts a tentative track at each birth up to the limit, and a
+    confirmed one at each start."""
 
     def with_tracks(known: Known, found: Sequence[Birth]) -> Known:
         layout = layouts(known)
@@ -241,12 +247,12 @@ def spawn_stage(
 
 
 def max_total_tracks(config: DiverConfig) -> int:
-    """Return how many tracks there may be, tentative ones and all."""
+    """Return the maximum number of tracks, including tentative ones."""
     return 10 + 5 * config.max_tracks
 
 
 def without_duplicate_ids(births: Sequence[Birth]) -> list[Birth]:
-    """Return the births without a second one of the same name."""
+    """Return the births without repeated target IDs."""
     names: set[int] = set()
     first = []
     for birth in births:
@@ -259,12 +265,12 @@ def without_duplicate_ids(births: Sequence[Birth]) -> list[Birth]:
 def birth_rows(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Rows:
-    """Return the rows of tracks that begin, all seen by one sensor."""
+    """Return the rows of new tracks of one sensor."""
     plain = models.height < 0 and layout.size == models.n
     if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
         position = np.array([birth.position for birth in births])
         covariance = np.array([birth.covariance for birth in births])
-        # A start comes alone.
+        # A start is a group of one birth.
         parts = models.initial_states(position, covariance, measured=births[0].measured)
         x, P = layout.with_new_constants(*parts[:2])
         mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.rows_per_track))
@@ -292,8 +298,7 @@ def birth_rows(
 
 
 def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
-    """Give P (..., M, n, n) of tracks that begin at a fix the velocities that such a track may
-    have, in place."""
+    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
     if models.families is not None:
         moving = np.flatnonzero(models.families.kind == VELOCITY)
         P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
@@ -302,7 +307,7 @@ def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig)
 def _birth_states(
     birth: Birth, models: ModelSet, layout: Layout, config: DiverConfig, plain: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one track."""
+    """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one new track."""
     where = birth.position[None]
     logw = np.full((1, models.rows_per_track), -math.log(models.rows_per_track))
     if birth.ping is None or birth.rows is None or plain:
@@ -313,7 +318,7 @@ def _birth_states(
     x, P, mu = models.initial_states(where, np.eye(2)[None] * FAR**2, False)
     x, P = layout.with_new_constants(x, P)
     ping = ping_measurements(birth.ping, birth.rows, config, models, layout)
-    # All models of a row begin alike: one of each is enough to ask.
+    # All models of a row start equal: one model of each row is enough.
     begins = np.ascontiguousarray(x[0, :, 0]), np.ascontiguousarray(P[0, :, 0])
     own, covariance, evidence = begin_from_ping(*begins, ping, birth.position, config, layout)
     if np.isfinite(evidence).any():
@@ -322,7 +327,7 @@ def _birth_states(
     at, spread_at = x.copy(), P.copy()
     at[0], spread_at[0] = own[:, None], covariance[:, None]
     if models.families is not None:
-        # But for how it moves, of which a ping says nothing.
+        # A ping contains no information about the motion.
         moves = slice(2, 4)
         at[..., moves] = x[..., moves]
         spread_at[..., moves, :] = P[..., moves, :]
@@ -338,10 +343,11 @@ def restart_track(
     layout: Layout,
     config: DiverConfig,
 ) -> Known:
-    """Return the tracks after a ping, whose rows (n,) are taken but for those that are `free`.
-    With depth as a state, a track that took what was all but impossible begins anew where the ping
-    alone puts it: an update over such a way is far from linear, and what it makes of the depth is
-    nothing known."""
+    """Restart a track whose update by a ping was far too improbable, with depth as a state.
+
+    The track restarts at the position of the ping alone: the update is nonlinear over such a
+    distance, and its depth would be wrong. free: (n,) False for the rows of the track.
+    """
     hit, rows = np.flatnonzero(known['nis_dof']), np.flatnonzero(~free)
     if models.height < 0 or len(hit) != 1:
         return known
@@ -361,7 +367,7 @@ def restart_track(
 
 
 def birth_from_start(start: Start, config: DiverConfig) -> Birth:
-    """Return the birth of a track where somebody says that a diver is."""
+    """Return the birth of a track at a start message."""
     height = None
     if config.dimensions == 3:
         stated = Heights.from_fixes(start.position[None], start.covariance[None], 1.0)
@@ -373,8 +379,10 @@ def birth_from_start(start: Start, config: DiverConfig) -> Birth:
 def make_room(
     known: Known, start: Start, config: DiverConfig, models: ModelSet
 ) -> tuple[Known, bool]:
-    """Return the tracks without those that give way to `start`, and whether there is room for its
-    own."""
+    """Remove the tracks that give way to `start`.
+
+    Return the state and whether a new track fits.
+    """
     going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
         going &= _agrees_with_start(known, start, config, models)
@@ -385,26 +393,27 @@ def make_room(
 
 
 def confirm_newest(known: Known) -> Known:
-    """Return the tracks with the newest one confirmed."""
+    """Return the state with its newest track confirmed."""
     status = known.life.status.copy()
     status[-1] = CONFIRMED
     return known.replace(life=evolve(known.life, status=status))
 
 
 def start_warnings(known: Known, config: DiverConfig) -> list[str]:
-    """Return what a user has to know of starts that began no track."""
+    """Return a warning about starts without a track."""
     count = known.counts.get('not_started', 0)
     if not count:
         return []
     return [
-        f'{count} starts began no track: there are max_tracks ({config.max_tracks}) confirmed ones'
+        f'{count} starts ignored: max_tracks ({config.max_tracks}) tracks are confirmed. Increase '
+        'max_tracks'
     ]
 
 
 def _agrees_with_start(
     known: Known, start: Start, config: DiverConfig, models: ModelSet
 ) -> BoolArray:
-    """Return which tracks (T,) may be where the start is."""
+    """Return which tracks (T,) agree with the start position."""
     mean, covariance = track_positions(known, models)
     apart = start.position[:2] - mean
     squared = np.einsum(

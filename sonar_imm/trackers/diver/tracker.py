@@ -12,24 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Divers from multistatic fixes or raw arrival times.
+"""Diver tracker for multistatic fixes and raw arrival times.
 
-A diver swims slowly and turns often. The tracker runs a motion model for each of sixteen headings
-and some for what else a diver does (`models`) in an interacting multiple model filter, and lets
-the data correct the probabilities of rotation_stage. It does so under several assumptions at once, each a
-row of one table (`estimation.rows`): what the stated covariances are worth, or how deep the diver
-is.
+A diver swims slowly and turns often. The tracker runs motion models for 16 headings, hovering and
+other motions (`models`) in an interacting multiple model filter. The data adapt the transition
+probabilities. Several assumptions run in parallel as rows of one table (`estimation.rows`): scales
+of the measurement covariances, or start depths.
 
-The measurements of a stamp, a `Scan`, go through stages, each a function of what is known:
+The measurements of one stamp form a `Scan`. It passes through stages, each a function of the
+state:
 
-    predict -> for each group of fixes: whose are they? -> update
-            -> for each ping: the same (`arrivals`)
-            -> learn -> forget -> begin
+    predict -> for each group of fixes: associate -> update
+            -> for each ping: associate and update (`arrivals`)
+            -> update transitions -> update IDs -> prune -> spawn
 
-The stages are put together once, from the parameters. What is known after a scan is one immutable
-value, `Known`, so that a late measurement is put in its place by computing the scans after it
-again (`intake.stream`). Positions that are not metres in the frame of the tracks are brought into
-it first (`georeferencing`).
+The stages are assembled once from the parameters. The state after a scan is one immutable value,
+`Known`. For a late measurement, the later scans are recomputed (`intake.stream`). Positions that
+are not in metres in the track frame are converted first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -75,15 +74,17 @@ from .scan import Group, Scan
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
 
 SCORE_MEMORY = 0.9
-"""Share of its score a track keeps from scan to scan."""
+"""Factor on the score of a track at each scan."""
 
 GroupStage = Callable[[Known, Group], Known]
 ScanStage = Callable[[Known, Scan], Known]
 
 
 class DiverTracker:
-    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`,
-    `Start`, and what `georeferencing` makes fixes of."""
+    """Tracker of divers, boats and ships, with the interface `trackers.Tracker`.
+
+    `process` accepts `Fix`, `Fixes`, `Arrivals`, `Start`, and the inputs of `georeferencing`.
+    """
 
     STATE = ('_stream', '_georeferencer')
 
@@ -103,7 +104,7 @@ class DiverTracker:
         self.reset()
 
     def _apply_config(self, config: DiverConfig) -> None:
-        """Put together what follows from the parameters, once and not in every scan."""
+        """Build everything that depends on the parameters, once per change."""
         self.config, models = config, self.models
         self.rules = track_rules(config)
         layout = lru_cache(maxsize=16)(partial(Instruments.layout, config=config, models=models))
@@ -173,15 +174,17 @@ class DiverTracker:
         )
 
     def restored(self) -> None:
-        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
-        is none of these models."""
+        """Recompute the states from the oldest saved one.
+
+        :raises ValueError: the saved state belongs to other models.
+        """
         base, nobody = self._stream.base, self._empty_state(Tracks.none(self.rules))
         base.require_like(nobody, len(self._layouts(base).variances))
         self._stream.restored()
 
     @property
     def origin(self) -> Origin | None:
-        """Where the frame of the tracks lies on Earth, None when that is not known."""
+        """Geodetic origin of the track frame; None if unknown."""
         return self._georeferencer.origin
 
     @property
@@ -201,7 +204,7 @@ class DiverTracker:
         return estimate.health(self._stream.state, len(self._georeferencer))
 
     def warnings(self) -> list[str]:
-        """What of the input cannot be true or used, in sentences for the user."""
+        """Return warnings about implausible or unused input."""
         own = estimate.warnings(self._stream.state, self.config)
         return [*self._georeferencer.warnings(), *own]
 
@@ -209,7 +212,7 @@ class DiverTracker:
         return [self._estimate(known) for _, known in self._revise(measurement)]
 
     def _revise(self, measurement: Measurement) -> list[tuple[int, Known]]:
-        """The stamps and values that are new or changed, oldest first."""
+        """Return the new or changed states with their stamps, oldest first."""
         revised: dict[int, Known] = {}
         for ready in self._georeferencer.georeference(measurement):
             revised.update(self._stream.revise(ready))
@@ -222,7 +225,7 @@ class DiverTracker:
     # -- one scan ------------------------------------------------------------------------------
 
     def _process_scan(self, before: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
-        """What is known after all measurements of one stamp. Pure."""
+        """Return the state after all measurements of one stamp. Pure function."""
         scan = Scan.from_items(items, self.config, before.memory['clutter'])
         known = self._predict(before, scan, stamp_ns)
         for group in scan.fixes:
@@ -235,7 +238,7 @@ class DiverTracker:
         return known
 
     def _predict(self, before: Known, scan: Scan, stamp_ns: int) -> Known:
-        """The tracks as this scan should show them; the step that led there stands in `scan`."""
+        """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
         start = before if not len(before) else fixes.redistribute_weights(before)
         crossing = self.models, self._chain, start.rows, before['learnt']
@@ -243,7 +246,7 @@ class DiverTracker:
         transition = np.linalg.matrix_power(steps[-1].transition, len(steps))
         scan.previous = before
         scan.prediction = steps[-1]._replace(transition=transition, dt=dt)
-        # The error of the sound speed has its place in the state before any ping.
+        # The sound speed error is part of the state before the first ping.
         rows = self._layouts(before).rows_with_new_constants(steps[-1].rows, self.models)
         count = len(before)
         columns = {
@@ -256,8 +259,8 @@ class DiverTracker:
         return known.add_counts(repairs=sum(step.repairs for step in steps))
 
     def _process_ping(self, known: Known, scan: Scan, ping: Arrivals) -> Known:
-        """The tracks after a ping, and where it shows new ones."""
-        from . import arrivals  # and the search for positions, which fixes do not need
+        """Update the tracks by a ping, and store the births it shows."""
+        from . import arrivals  # imported late: not needed for fixes
 
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
@@ -268,8 +271,10 @@ class DiverTracker:
         return known
 
     def _update_transitions(self, known: Known, scan: Scan) -> Known:
-        """What the hits say of the transitions, and of the stated variances of arrivals where no
-        fix says the same."""
+        """Update the transition counts by the hits.
+
+        Also update the NIS of arrivals, except in scans with fixes.
+        """
         before, step, hit = scan.previous, scan.prediction, known['nis_dof'] > 0
         learnt = self._chain.learn(
             before['learnt'],
@@ -285,21 +290,23 @@ class DiverTracker:
         sure = hit & (known.life.status != TENTATIVE)
         nis, dof = known['nis'][sure], known['nis_dof'][sure]
         more = known.memory['excess']
-        if not len(self._layouts(known).variances):  # what lasts is no evidence twice
+        if not len(self._layouts(known).variances):  # without estimated instrument errors
             more = excess(more, nis, dof)
         return known.with_memory(arrivals=known.memory['arrivals'].after(nis, dof), excess=more)
 
 
 def select_stages(*stages: object) -> tuple:
-    """Return the stages that the parameters ask for: those that are not False or None."""
+    """Return the stages that are enabled, without False and None."""
     return tuple(stage for stage in stages if stage)
 
 
 def rotation_stage(
     models: ModelSet, layout: Callable[[Instruments], Layout], *, back: bool = False
 ) -> GroupStage:
-    """Return the stage that turns the tracks as a sensor shows them whose bearings may all be off,
-    or back."""
+    """Return the stage that rotates tracks by the bearing error of a sensor about its position.
+
+    back: rotate back.
+    """
 
     def turn(known: Known, group: Group) -> Known:
         if group.rotation_sensor is None:
