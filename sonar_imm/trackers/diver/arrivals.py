@@ -12,20 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What becomes of the divers by a ping: which measurements are whose, and the update by them.
+"""Association of arrivals with tracks, and the update by a ping.
 
-Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets (`explanations`), more of them by `heavy_tails`. So are the arrivals of a tag,
-however few: its time of emission is unknown, so that among three or four receivers no subset is
-refuted by the others, and what decides is whether the whole lies where the ping by itself would
-put it.
+For up to `MOST_SUBSETS` transmitter-receiver pairs, all inlier and outlier subsets of the echoes
+are evaluated (`explanations`); for more pairs, `heavy_tails` is used. Pings of a tag always use
+`heavy_tails`: with the unknown emission time, three or four receivers cannot reject a subset.
 
-A track takes the measurements that its best explanation calls good. So association and update are
-one step here: an `Explanation` says what each track that takes part becomes, and
-`apply_updates` is the value in which that has happened.
+A track takes the measurements that its best explanation accepts. Association and update are one
+step: an `Explanation` holds the update of each track, and `apply_updates` returns the new state.
 
-All rows of a track are explained at once, as one list of hypotheses: a hypothesis is a row and a
-model. So every assumption has a row here, also one that fixes had made improbable.
+All rows of a track are evaluated as one list of hypotheses, each a row and a model. So borrowed
+assumptions get a row first.
 """
 
 from __future__ import annotations
@@ -62,84 +59,94 @@ from .models import ModelSet, start_depths
 from .scan import MOST_MEASUREMENTS, Ping, ping_measurements, tag_id
 
 MOST_SUBSETS = 6
-"""Most transmitter-receiver pairs heard whose subsets are all tried."""
+"""Maximum number of received transmitter-receiver pairs for subsets."""
 
 EMISSION_STD = 1e3
-"""Standard deviation of a tag's emission, m of path, about where the arrivals put it: flat beside
-any residual."""
+"""Prior standard deviation of the emission of a tag, m of path, about the arrivals: flat compared
+to residuals."""
 
 FAR = 1e3
-"""Standard deviation, m, of a position of which nothing is known but where the receivers are."""
+"""Standard deviation, m, of an unknown position about the receivers."""
 
 GOOD_RESIDUAL = 3.0
-"""Standard deviations at which an arrival, weighed by heavy tails, is as good as wild."""
+"""Residual in standard deviations at which an arrival is equally likely an outlier, with heavy
+tails."""
 
 OPTIMA = 3
-"""Best positions of the ping by itself from which every model starts too."""
+"""Number of best positions of the ping alone from which every model also starts."""
 
 DISTINCT = 1.0
-"""Metres within which two of them are the same."""
+"""Distance, m, within which two of these positions are equal."""
 
 NEAR = 28.0
-"""NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`explanations`."""
+"""Maximum NIS of an echo of a track; beyond, `explanations` drops its weight."""
 
 TAKEN = 0.5
-"""Probability of being good from which a measurement counts as a track's."""
+"""Minimum inlier probability of a measurement that a track takes."""
 
 EVERYWHERE: Mapping[str, coverage.Coverage] = {}
-"""Nothing is stated of what a sensor covers."""
+"""No configured coverage."""
 
 EXCLUDED = -1
-"""Rank of a track that takes no part in a message."""
+"""Rank of a track that is not updated by a ping."""
 
 
 class Mixture(NamedTuple):
-    """One diver: L hypotheses, x (L, n), P (L, n, n) with probabilities mu (L,), and by what
-    `scale` (L,) each multiplies the variances of measurements."""
+    """L hypotheses of one track."""
 
     x: FloatArray
+    """(L, n) states."""
     P: FloatArray
+    """(L, n, n) covariances."""
     mu: FloatArray
+    """(L,) probabilities."""
     scale: FloatArray
+    """(L,) covariance scales."""
 
     @property
     def published_weights(self) -> FloatArray:
-        """mu (L,) of the hypotheses that say how well a place is known."""
+        """mu (L,), normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
         mu = np.where(self.scale >= MIN_PUBLISHED_SCALE, self.mu, 0.0)
         total = mu.sum()
         return np.asarray(mu / total) if total > 0.0 else self.mu
 
 
 class PingUpdate(NamedTuple):
-    """A diver after a ping; log (L,): logarithms of the probabilities of the hypotheses; good
-    (C,): how sure each measurement is this diver's; log_evidence, comparable between divers of the
-    same ping; repairs: covariances repaired (`estimation.covariance`)."""
+    """A track after a ping."""
 
     after: Mixture
+    """Updated hypotheses."""
     log: FloatArray
+    """(L,) logarithms of their probabilities."""
     good: FloatArray
+    """(C,) inlier probability of each measurement."""
     log_evidence: float
+    """Log evidence of the ping, comparable between tracks."""
     repairs: int
+    """Number of repaired covariances."""
 
 
 class TrackUpdate(NamedTuple):
-    """What a track becomes by the measurements of a ping that it takes: after; good (C,): those;
-    nis of dof of them, 0 for too few."""
+    """A track after its measurements of a ping."""
 
     after: PingUpdate
     good: BoolArray
+    """(C,) True for measurements that the track takes."""
     nis: float
+    """NIS of these measurements."""
     dof: int
+    """Their degrees of freedom; 0 if there are too few."""
 
 
 class Explanation(NamedTuple):
-    """What a ping is to the tracks: updates by track, in the order in which they chose; taken
-    (C,): the measurements that are a track's; score (T,)."""
+    """Association of a ping with T tracks."""
 
     updates: dict[int, TrackUpdate]
+    """Updates by track index, in order of choice."""
     taken: BoolArray
+    """(C,) True for measurements of any track."""
     score: FloatArray
+    """(T,) new scores."""
 
 
 # -- all tracks ----------------------------------------------------------------------------------
@@ -152,8 +159,10 @@ def associate_and_update(
     models: ModelSet,
     covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
 ) -> tuple[Known, BoolArray]:
-    """Return the tracks after a ping, and the rows (n,) of it that are no track's; covered: what
-    is stated of sensors. A tag whose name is known has a track of its own or begins one."""
+    """Update the tracks by a ping. Return the state and the free rows (n,) of the ping.
+
+    A tag with an ID updates or starts a track of its own. covered: coverage by sensor name.
+    """
     before, seen, where = known['nis_dof'], None, coverage.sensor_coverage(covered, '', config)
     if where is not None:
         seen = coverage.detection_probability(known, models, where, config.detection_probability)
@@ -173,7 +182,8 @@ def _associate_ping(
     models: ModelSet,
     detected: coverage.DetectionProbability | None,
 ) -> tuple[Known, BoolArray]:
-    """`associate_and_update` of what was heard; detected: None where that is equally probable."""
+    """Update the tracks by received arrivals. detected: detection probabilities; None if
+    constant."""
     name, rows, free = tag_id(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(known['target_id'] == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
@@ -200,7 +210,7 @@ def _associate_ping(
         looks = 1 if ping.passive else len(seen.nodes)
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.nominal))
     free[seen.row[taken & seen.echo]] = False
-    free &= free.all() or not ping.passive  # a tag's are of one track, also those not used
+    free &= free.all() or not ping.passive  # all arrivals of a tag belong to one track
     known = apply_updates(known, updates, models)
     return _accumulate_residuals(known, updates, ping, seen, config, models).with_columns(
         score=score
@@ -215,8 +225,7 @@ def _accumulate_residuals(
     config: DiverConfig,
     models: ModelSet,
 ) -> Known:
-    """Return the tracks with what the ping says of errors that last, by the confirmed tracks that
-    took of it."""
+    """Update the test for instrument errors, from confirmed tracks."""
     took = {track: update.good for track, update in updates.items() if update.dof}
     axes = [0, 1] if models.height < 0 else [0, 1, models.height]
     at = {}
@@ -240,14 +249,14 @@ def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
 
 
 def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSet) -> Known:
-    """Return the tracks after they have taken what they take."""
+    """Return the state with the updated tracks."""
     if not updates:
         return known
     nis, nis_dof, repairs = known['nis'].copy(), known['nis_dof'].copy(), 0
     rows, M = known.rows, len(models.names)
     for track, update in updates.items():
         after, own = update.after.after, known.row_indices(track)
-        # A ping of many arrivals can be e^700 times as probable in one row as in another.
+        # In logarithms: likelihood ratios of rows can exceed e^700.
         n, log = after.x.shape[-1], update.after.log.reshape(-1, M)
         top = log.max(axis=1, keepdims=True)
         inside = np.exp(log - np.where(np.isfinite(top), top, 0.0))
@@ -272,11 +281,10 @@ def _explain_echoes(
     config: DiverConfig,
     layout: Layout,
 ) -> Explanation:
-    """Which tracks take which echoes of one transmission.
+    """Associate the echoes of one transmission with tracks.
 
-    Tracks that can explain more of the pairs choose first, and among those the confirmed ones: a
-    ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
-    of the pairs is not what the ping shows; for it nothing happened.
+    Tracks that explain more pairs choose first, confirmed before tentative ones: a ghost fits only
+    the echoes it was made of. A track with fewer than half of the pairs is not updated.
     """
     x, P, mu, _ = (np.concatenate(column) for column in zip(*mixtures))
     likelihood, nis = fit_each(x, P, config.target_z, ping.measured)
@@ -307,7 +315,7 @@ def _choose_by_rank(
     near: BoolArray,
     pairs: list[IndexArray],
 ) -> tuple[Explanation, IntArray]:
-    """Let the tracks choose by `rank` (T,); also how many pairs each track (T,) took one of."""
+    """Let tracks choose by `rank` (T,). Also return the number of pairs (T,) of each track."""
     p = config.detection_probability
     taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
     updates: dict[int, TrackUpdate] = {}
@@ -342,8 +350,10 @@ def _assign_owners(
     pairs: list[IndexArray],
     config: DiverConfig,
 ) -> IntArray:
-    """The track each measurement (C,) is kept for, -1 for none: where several tracks choose at
-    once, each pair's echoes are assigned from the prediction."""
+    """Return the track of each measurement (C,), -1 for none.
+
+    Tracks of equal rank are assigned the echoes of each pair.
+    """
     owner = np.full(fit.shape[1], -1)
     if len(tracks) > 1:
         for members in pairs:
@@ -366,11 +376,11 @@ def _explain_tag(
     config: DiverConfig,
     layout: Layout,
 ) -> Explanation:
-    """Which track takes a tag's ping, all of it.
+    """Associate the whole ping of a tag with one track.
 
-    A single diver known to be there is given every ping. Otherwise it is the track that explains
-    the ping best of those that need not jump for it. Confirmed tracks come first; others are asked
-    where less than half of the arrivals fit the one chosen.
+    With `max_tracks: 1` the existing track takes every ping. Otherwise the track with the best
+    explanation inside its gate takes it. Confirmed tracks choose first; tentative tracks choose if
+    the first track explains fewer than half of the arrivals.
     """
     score = known['score'] + np.log1p(-config.detection_probability)
     updates: dict[int, TrackUpdate] = {}
@@ -394,7 +404,7 @@ def _best_for_tag(
     config: DiverConfig,
     layout: Layout,
 ) -> tuple[int, PingUpdate] | None:
-    """Return which of `tracks` explains a tag's ping best, and what becomes of it."""
+    """Return the track that explains the ping of a tag best, and its update."""
     best: tuple[int, PingUpdate] | None = None
     for track in tracks.tolist():
         after = update_by_ping(mixtures[track], ping, config, layout)
@@ -408,7 +418,7 @@ def _best_for_tag(
 
 
 def _is_reachable(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
-    """Return whether the diver after a ping is where the prediction allows it to be."""
+    """Return whether the updated position is inside the gate of the prediction."""
     mean = before.mu @ before.x[:, :2]
     apart = before.x[:, :2] - mean
     covariance = np.einsum('l,lab->ab', before.mu, before.P[:, :2, :2])
@@ -424,8 +434,7 @@ def _is_reachable(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
 def _update_track(
     before: Mixture, ping: Ping, config: DiverConfig, layout: Layout
 ) -> TrackUpdate | None:
-    """Return what a track takes of the measurements it may have; None where no model can explain
-    them."""
+    """Update a track by its possible measurements; None if no model explains them."""
     after = update_by_ping(before, ping, config, layout) if ping.echo.any() else None
     return None if after is None else make_track_update(before, after, ping, config)
 
@@ -433,7 +442,7 @@ def _update_track(
 def make_track_update(
     before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig
 ) -> TrackUpdate:
-    """Return what a track takes, `before` it and after."""
+    """Return the update of a track with its measurements and their NIS."""
     good = np.asarray(after.good > TAKEN)
     nis, dof = 0.0, 0
     if (good & ping.echo).sum() > int(ping.passive):
@@ -444,10 +453,10 @@ def make_track_update(
 
 
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """Return ``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
+    """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
 
-    Beside what is expected of exact arrivals after a long silence their own variances are lost in
-    rounding, and S can have no inverse. Its eigenvalues in units of the variances are 1 at least.
+    After a long gap, rounding can make S singular for exact arrivals. Then use eigenvalues in
+    units of the variances, which are at least 1.
     """
     S = covariance + np.diag(variance)
     if is_psd(S) or not np.isfinite(S).all():
@@ -461,10 +470,10 @@ def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArra
 def update_by_ping(
     before: Mixture, ping: Ping, config: DiverConfig, layout: Layout
 ) -> PingUpdate | None:
-    """Return a diver updated by all of a ping; None where no hypothesis can be.
+    """Update a track by a whole ping; None if no hypothesis is possible.
 
-    Of more than `MOST_MEASUREMENTS` those are used that are nearest to what is expected; the
-    others are good where they fit what became of the diver.
+    Above `MOST_MEASUREMENTS`, use those nearest to the prediction, and test the others against the
+    result.
     """
     if len(ping.row) > MOST_MEASUREMENTS:
         _, nis = fit_measurements(*before[:3], config.target_z, ping.measured)
@@ -489,7 +498,7 @@ def update_by_ping(
         starts = find_optima(ping, config)
         heavy = measured, starts, DEGREES
         x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
-        # The densities of scaled expected_residuals are those of the expected_residuals but for this.
+        # Jacobian of the scaled residuals.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
         squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
@@ -510,7 +519,7 @@ def update_by_ping(
 
 
 def _repair(P: FloatArray) -> tuple[FloatArray, int]:
-    """Return covariances P (L, n, n) that keep to the limit, and how many did not."""
+    """Return covariances P (L, n, n) within the limits, and the number of repairs."""
     out, spoilt = add_jitter(P)
     return out, int((spoilt & np.isfinite(P).all(axis=(1, 2))).sum())
 
@@ -523,9 +532,12 @@ def begin_from_ping(
     config: DiverConfig,
     layout: Layout,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A new diver near `position` (2,): x (K, n + q), P (K, n + q, n + q), of which nothing is
-    known of the position, updated by all the arrivals tell, also how the errors of position,
-    depth and instruments go together; and the log-evidence (K,)."""
+    """Return x (K, n + q), P (K, n + q, n + q) and log evidence (K,) of a new track near
+    `position` (2,).
+
+    The prior of the position is flat. The result contains the correlations of position, depth and
+    instrument errors.
+    """
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
         uniform = np.full(len(x), 1.0 / len(x))
@@ -539,8 +551,8 @@ def begin_from_ping(
 def expected_residuals(
     before: Mixture, ping: Ping, height: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return expected_residuals (C,) of a diver's measurements, the covariance (C, C) expected of them
-    without their own variances, and how many of them are independent."""
+    """Return residuals (C,), their covariance (C, C) without the measurement variances, and the
+    degrees of freedom."""
     x, P, mu = before.x, before.P, before.published_weights
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
@@ -549,7 +561,7 @@ def expected_residuals(
 
 
 def find_optima(ping: Ping, config: DiverConfig) -> FloatArray:
-    """The best positions (k, 2) of the ping by itself, with heavy tails and no prior."""
+    """Return the best positions (k, 2) of the ping alone, with heavy tails and no prior."""
     echo = ping.select(ping.echo).measured
     columns = np.full_like(echo.columns, -1)
     columns[:, 0], columns[:, 1] = 0, 1
@@ -574,8 +586,8 @@ def find_optima(ping: Ping, config: DiverConfig) -> FloatArray:
 
 
 def _start_positions(measured: PingMeasurements, passive: bool) -> FloatArray:
-    """Eleven positions (11, 2): round the earliest receivers, or round the ellipse of the shortest
-    path."""
+    """Return start positions (11, 2): around the earliest receivers, or on the ellipse of the
+    shortest path."""
     order = np.argsort(measured.value, kind='stable')
     if passive:
         near = measured.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
@@ -605,8 +617,7 @@ def _with_emission(
     mask: BoolArray,
     height: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """x, P and mask with the emission of a tag as a last component, flat about where the arrivals
-    put it."""
+    """Append the emission of a tag to x, P and mask, with a flat prior at the arrivals."""
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P

@@ -12,21 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where a sensor sees: the probability of detection as a function of the place of a diver.
+"""Coverage: the detection probability of a sensor as a function of the target position.
 
-A diver outside the sector of a sonar is not missed, one inside who is not seen is. So with a
-stated coverage
+Targets outside the sector of a sonar cannot be detected, so they count no miss. With a configured
+coverage
 
-* a track is missed with the probability that its whole density gives, ``p_t = E[p(x)]``, and has
-  caused a fix at z with the probability of detection there, ``p(z)`` (`DetectionProbability`);
-* of a track that was missed what remains is ``(1 - p(x)) N(x; m, P)``, model by model: its density
-  leaves what the sensor covers, as that of a diver who has left does (`missed`). Expectations are
-  means over `POINTS` of a normal distribution;
-* misses are counted by what they say: with the stated `detection_probability` p a miss is one,
-  where it was p_t it is ``ln(1 - p_t) / ln(1 - p)`` of one (feature `looks`).
+* a track is detected with the mean probability over its density, ``p_t = E[p(x)]``, and a fix at z
+  has the detection probability ``p(z)`` (`DetectionProbability`);
+* a miss changes the density of each model to ``(1 - p(x)) N(x; m, P)``, so that a target that left
+  the coverage is predicted outside (`apply_misses`). Expectations are means over `POINTS`;
+* a miss has the weight ``ln(1 - p_t) / ln(1 - p)``, with p the configured `detection_probability`
+  (feature `miss_weight`).
 
-The probability is a `Coverage`: `detection_probability` inside a sector, or a table over x and y
-or over the range, read from a file.
+A `Coverage` is a sector with constant probability, or a table over x and y or over range, read
+from a file.
 """
 
 from __future__ import annotations
@@ -51,37 +50,39 @@ from .models import ModelSet
 from .scan import Group
 
 FEATURES = {'miss_weight': Feature(0.0)}
-"""Parts of a miss that have not been counted yet."""
+"""miss_weight: accumulated weight of misses that are not counted yet."""
 
 POINTS_OF_MODEL = 64
-"""Places of a model at which the probability is asked for."""
+"""Number of points per model."""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Golden ratio."""
 
 LEAST = 0.01
-"""Probability of detection at a fix, however far outside it is: what is stated is not exact."""
+"""Minimum detection probability at a fix, because coverages are not exact."""
 
 MOST = 0.9999
-"""Most probable detection of a track."""
+"""Maximum detection probability."""
 
 LEAST_LOOK = 0.25
-"""Of a miss that a miss of a tentative track counts at least: what is rarely seen is not confirmed
-for long."""
+"""Minimum miss weight of a tentative track, so that rarely detected tracks end."""
 
 FAR_OUT = 2.5
-"""By what the points of the whole track are stretched: where the probability is the same at all of
-them it is not asked of each model."""
+"""Stretch of the points of a track. If the probability is constant over the stretched points, the
+models are not evaluated."""
 
 NOWHERE, NO_COVARIANCE = np.empty((0, 2)), np.empty((0, 2, 2))
 """No fixes."""
 
 COLUMNS = (('x', 'y', 'probability'), ('range', 'probability'))
-"""Headers of a table."""
+"""Headers of a table file."""
 
 
 def _points() -> FloatArray:
-    """(64, 2) points of equal weight, with the mean and covariance of a normal distribution: a
-    Fibonacci lattice, so that an edge from any side cuts them one by one."""
+    """Return (64, 2) points of equal weight with the moments of a standard normal distribution.
+
+    A Fibonacci lattice, so that an edge of any direction crosses the points one by one.
+    """
     place = (np.arange(POINTS_OF_MODEL) + 0.5) / POINTS_OF_MODEL
     other = (place + np.arange(POINTS_OF_MODEL) * GOLDEN) % 1.0
     quantile = [[NormalDist().inv_cdf(u) for u in axis.tolist()] for axis in (place, other)]
@@ -95,15 +96,18 @@ POINTS = _points()
 
 
 class Table(NamedTuple):
-    """Probabilities (rows, columns) at x (rows,) and y (columns,), in between bilinear, 0 outside;
-    of a table over the range x is the range and y empty."""
+    """Bilinear table of probabilities, 0 outside."""
 
     x: FloatArray
+    """(rows,) x, m, or range, m."""
     y: FloatArray
+    """(columns,) y, m; empty for a table over range."""
     probability: FloatArray
+    """(rows, columns)."""
 
     def interpolate(self, place: FloatArray, distance: FloatArray) -> FloatArray:
-        """The probability (...,) at places (..., 2), so far (...,) from the sensor."""
+        """Return the probability (...,) at positions (..., 2), at `distance` (...,) from the
+        sensor."""
         if not len(self.y):
             return np.interp(distance, self.x, self.probability[:, 0], right=0.0)
         found = np.zeros(place.shape[:-1])
@@ -116,8 +120,8 @@ class Table(NamedTuple):
 
 
 def _find_cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatArray, BoolArray]:
-    """The cell of each value on a rising axis, how far along it the value is, and whether it is on
-    the axis at all."""
+    """Return the cell of each value on a rising axis, the fraction in the cell, and whether the
+    value is on the axis."""
     cell = np.clip(np.searchsorted(axis, value, side='right') - 1, 0, len(axis) - 2)
     along = np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)
     return cell, along, (value >= axis[0]) & (value <= axis[-1])
@@ -125,18 +129,23 @@ def _find_cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatAr
 
 @frozen(eq=False)
 class Coverage:
-    """What a sensor covers: place (2,) of it; direction and half of the width of the sector, rad;
-    least and greatest range, m; table: None where the sector is all that is stated."""
+    """Coverage of one sensor."""
 
     place: FloatArray
+    """(2,) sensor position, m."""
     direction: float
+    """Centre of the sector, rad."""
     half_width: float
+    """Half width of the sector, rad."""
     least: float
+    """Minimum range, m."""
     greatest: float
+    """Maximum range, m."""
     table: Table | None
+    """Table of probabilities; None for a constant probability."""
 
     def probability(self, place: FloatArray, detection_probability: float) -> FloatArray:
-        """The probability (...,) that a diver at `place` (..., 2) is detected."""
+        """Return the detection probability (...,) of a target at `place` (..., 2)."""
         apart = place - self.place
         distance = np.hypot(apart[..., 0], apart[..., 1])
         inside = (distance >= self.least) & (distance <= self.greatest)
@@ -150,8 +159,12 @@ class Coverage:
 
 
 def configured_coverage(config: DiverConfig) -> dict[str, Coverage]:
-    """What is stated of each sensor by its name, of all others under ''; a sensor that sees
-    everywhere is not there. Raises ConfigError for a file that cannot be read."""
+    """Return the coverage by sensor name, with '' for all other sensors.
+
+    Sensors without limits are absent.
+
+    :raises ConfigError: a coverage file cannot be read.
+    """
     found = {}
     for sensor in ('', *config.sensors):
         own = config.of_sensor(sensor)
@@ -161,6 +174,7 @@ def configured_coverage(config: DiverConfig) -> dict[str, Coverage]:
 
 
 def _build_coverage(sector: tuple[float, ...], file: str) -> Coverage:
+    """Build the coverage from a sector and a file."""
     x, y, direction, width, least, greatest = sector or (0.0, 0.0, 0.0, 360.0, 0.0, math.inf)
     turn, half = math.radians(direction), 0.5 * math.radians(width)
     table = _read_table(file) if file else None
@@ -168,7 +182,10 @@ def _build_coverage(sector: tuple[float, ...], file: str) -> Coverage:
 
 
 def _read_table(file: str) -> Table:
-    """The table in a CSV file. Raises ConfigError with what is wrong with it."""
+    """Read the table in a CSV file.
+
+    :raises ConfigError: the file is invalid.
+    """
     try:
         with Path(file).expanduser().open(newline='', encoding='utf-8') as stream:
             rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if row]
@@ -186,7 +203,7 @@ def _read_table(file: str) -> Table:
 
 
 def _arrange_table(table: FloatArray) -> Table:
-    """The rows (n, 2 or 3) of a file as a table, in whatever order they are."""
+    """Build a table from the rows (n, 2 or 3) of a file, in any order."""
     axes = [np.unique(column) for column in table[:, :-1].T]
     shape = [len(axis) for axis in axes]
     if math.prod(shape) != len(table) or min(shape) < 2:
@@ -201,41 +218,42 @@ def _arrange_table(table: FloatArray) -> Table:
     return Table(axes[0], axes[1], grid)
 
 
-# -- what it says of tracks ----------------------------------------------------------------------
+# -- tracks --------------------------------------------------------------------------------------
 
 
 class DetectionProbability(NamedTuple):
-    """Probability of detection by what `coverage` states: usual, as the parameters have it; tracks
-    (T,): of each track; fixes (D,): of a diver where each fix is."""
+    """Detection probabilities of one sensor at one scan."""
 
     coverage: Coverage
     nominal: float
+    """Configured detection probability."""
     tracks: FloatArray
+    """(T,) detection probability of each track."""
     fixes: FloatArray
+    """(D,) detection probability at the position of each fix."""
 
     @property
     def log_ratio(self) -> FloatArray:
-        """(T, D) what is to be added to the log densities of fixes, so that rules for the usual
-        probability hold for these."""
+        """(T, D) correction of the log density of fixes, for gates based on the nominal
+        probability."""
         usual = math.log(self.nominal) - math.log1p(-self.nominal)
         return np.log(self.fixes)[None] - np.log1p(-self.tracks)[:, None] - usual
 
     @property
     def is_outside(self) -> BoolArray:
-        """(T,) whether a track is where the sensor does not see."""
+        """(T,) True for tracks outside the coverage."""
         return np.asarray(2.0 * self.tracks < self.nominal)
 
     @property
     def miss_weight(self) -> FloatArray:
-        """(T,) how many misses of the usual probability one of each track is worth, 1 at most."""
+        """(T,) weight of a miss, relative to a miss at the nominal probability; at most 1."""
         return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.nominal), 1.0)
 
 
 def detection_stage(
     stated: Mapping[str, Coverage], models: ModelSet
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that notes how probable the fixes of a group are, by what is `stated` of
-    sensors."""
+    """Return the stage that computes the detection probabilities of a group of fixes."""
 
     def detect(known: Known, group: Group) -> Known:
         coverage = sensor_coverage(stated, group.sensor, group.config)
@@ -250,8 +268,8 @@ def detection_stage(
 def miss_stage(
     models: ModelSet, moves_all: Callable[[Known], bool]
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that says what it means for tracks that a sensor looked and did not see
-    them; moves_all: whether an update may move all of the state."""
+    """Return the stage that applies misses. moves_all: whether an update may change the whole
+    state."""
 
     def miss(known: Known, group: Group) -> Known:
         if not group.is_complete or group.target_id is not None:
@@ -268,7 +286,7 @@ def miss_stage(
 def sensor_coverage(
     stated: Mapping[str, Coverage], sensor: str, config: DiverConfig
 ) -> Coverage | None:
-    """Return what is `stated` of a sensor, None where it sees everywhere."""
+    """Return the coverage of a sensor; None for no limits."""
     return stated.get(sensor if sensor in config.sensors else '')
 
 
@@ -280,8 +298,10 @@ def detection_probability(
     z: FloatArray = NOWHERE,
     R: FloatArray = NO_COVARIANCE,
 ) -> DetectionProbability:
-    """Return how probable a detection is of the tracks, and of a diver where fixes z (D, 2), R (D,
-    2, 2) are; p: where the sensor sees as it should."""
+    """Return the detection probabilities of tracks, and at fixes z (D, 2), R (D, 2, 2).
+
+    p: nominal probability inside the coverage.
+    """
     tentative = known.life.status == TENTATIVE
     tracks, same = _constant_probability(
         known, models, coverage, p, np.where(tentative, 1.0, FAR_OUT)
@@ -310,10 +330,11 @@ def apply_misses(
     share: FloatArray,
     moves_all: bool,
 ) -> Known:
-    """Return the tracks after a look that did not show them, with the probability `share` (T,).
+    """Update the tracks by a miss, which has the probability `share` (T,).
 
-    seen: None for a sensor that sees everywhere; where an update may not move all of the state,
-    only models and rows are weighed.
+    :param seen: None for a sensor without limits.
+    :param moves_all: False if an update may not change the whole state. Then only models and rows
+        are weighted.
     """
     if seen is None:
         return known.with_columns(miss_weight=known['miss_weight'] + 1.0)
@@ -338,7 +359,7 @@ def apply_misses(
         blocks.append(_condition_on_miss(block, own, points, left) if moves_all else block)
     rows, total = rows.replace(blocks=tuple(blocks)).multiply_models(factor)
     logw = rows.logw + np.log(np.maximum(total, 1e-300))
-    # Borrowed weights lie beside those of the rows; the sum of both stays.
+    # Keep the total weight of rows, because borrowed weights do not change.
     sums = rows.log_sum(known.rows.logw) - rows.log_sum(logw)
     return known.replace(rows=rows.replace(logw=logw + sums[rows.target]))
 
@@ -346,15 +367,15 @@ def apply_misses(
 def _condition_on_miss(
     block: Gaussians, own: np.ndarray, points: FloatArray, left: FloatArray
 ) -> Gaussians:
-    """Return a block whose rows `own` (k,) lie where a look left them: points (k, m, 64, 2) with
-    weights `left` (k, m, 64)."""
+    """Condition the rows `own` (k,) of a block on a miss: points (k, m, 64, 2), weights `left` (k,
+    m, 64)."""
     weight = left / left.sum(axis=-1, keepdims=True)
     mean = np.einsum('rmk,rmka->rma', weight, points)
     apart = points - mean[:, :, None]
     spread = np.einsum('rmk,rmka,rmkb->rmab', weight, apart, apart)
     x, P = (np.moveaxis(part, -1, 1) for part in block.select(own))
     before = P[..., :2, :2]
-    # What is known of the place moves the rest by its regression on the place.
+    # Other components move by their regression on the position.
     gain = np.swapaxes(np.linalg.solve(before, P[..., :2, :]), -1, -2)
     moved = x + np.einsum('rmna,rma->rmn', gain, mean - x[..., :2])
     grown = P + gain @ (spread - before) @ np.swapaxes(gain, -1, -2)
@@ -373,8 +394,8 @@ def _model_points(block: Gaussians) -> FloatArray:
 def _constant_probability(
     known: Known, models: ModelSet, coverage: Coverage, p: float, stretch: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability of detection (T,) all over each track, `stretch` (T,) times as far as
-    its points, and whether it is the same there."""
+    """Return the detection probability (T,) at each track, and whether it is constant over the
+    points stretched by `stretch` (T,)."""
     if not len(known):
         return np.empty(0), np.empty(0, np.bool_)
     mean, covariance = track_positions(known, models)
@@ -383,8 +404,8 @@ def _constant_probability(
 
 
 def _sigma_points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(..., 64, 2) points of normal distributions, mean (..., n), covariance (..., n, n), of which
-    the first two are the place."""
+    """Return (..., 64, 2) points of normal distributions, mean (..., n), covariance (..., n, n),
+    position first."""
     # By the Cholesky factor, written out.
     a = np.sqrt(np.maximum(covariance[..., 0, 0], 1e-12))
     b = covariance[..., 1, 0] / a

@@ -12,28 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Depth as a state (`dimensions: 3`): what fixes say of z, and when its rows are spread anew.
+"""Depth as a state (`dimensions: 3`): update by fix heights, and depth hypotheses.
 
-*Fixes.* Association and the update by x and y are the same with z and without. Then z is one more
-number for the track that took the fix: z less what the errors of x and y, which are known by now,
-have to do with its own. With ``R`` the covariance of the fix, split into that of x and y, of z,
-and between them,
+*Fixes.* Association and the update by x and y ignore z. Then z updates the track of the fix as one
+more scalar, corrected by the known errors of x and y. With ``R`` the covariance of the fix, split
+into (x, y), z and their cross-covariance,
 
     z - g (x, y) = z_track - g (x, y)_track + e,    g = R_z,xy R_xy^-1,    var e = R_zz - g R_xy,z
 
-where e has nothing to do with the errors of x and y. So the two updates in turn are the one by all
-three coordinates. It weighs the models too, and with them the rows of the track.
+where e is uncorrelated with the errors of x and y. The two updates equal one update by all three
+coordinates. The likelihood of z also weights models and rows.
 
-z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
-z alone. What is rejected is remembered; the next fix that agrees with it says that the depth was
-wrong, and z begins there.
+z has a gate of its own with one coordinate, because a surface echo is wrong in z only. A rejected
+z is stored; if the next rejected z agrees, the depth restarts there.
 
-*Rows.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
-Far away all rows of a track, each of which began in its part of the water column, may come to
-agree on a depth that is not well known. When the diver then comes near, one Gaussian cannot become
-two depths, and all rows may go to the wrong one. So rows that agree are spread over what they
-believe, before a ping that bends within it: the Gaussian becomes the sum of narrower ones with the
-same mean and variance, and the arrivals choose.
+*Rows.* Path lengths depend on (z - z_receiver)^2, so arrivals cannot tell a target above the
+receivers from one below. At long range all rows may agree on an uncertain depth. When the target
+then comes near, one Gaussian cannot split into two depths, and all rows may converge to the wrong
+one. Therefore rows that agree are spread before a ping whose paths bend within their variance. The
+Gaussian becomes a sum of narrower ones with the same mean and variance, and the arrivals weight
+them.
 """
 
 from __future__ import annotations
@@ -59,54 +57,56 @@ FEATURES = {
     'rejected_z': Feature(math.nan, (3,)),
     'respreads': Feature(0, kind=np.int64),
 }
-"""Stamp, z and variance of the last height of a fix that was not believed; how often the rows were
-spread anew."""
+"""rejected_z: stamp, z and variance of the last rejected fix height, NaN for none; respreads:
+number of times the rows were spread."""
 
 DOUBTED = 0.1
-"""Share of the heights of fixes from which what is doubted of them is said, after `MANY` of
-them."""
+"""Fraction of implausible fix heights that triggers a warning, once `MANY` heights were
+received."""
 
 MANY = 20
+"""Minimum number of fix heights for a warning."""
 
 BEYOND = 3.0
-"""Standard deviations by which a fix lies above or below the water column, so that it was stated
-wrong."""
+"""Standard deviations outside the water column at which a height is implausible."""
 
 AGREE = 0.5
-"""Rows agree whose means vary by less than this share of the variance that they have."""
+"""Rows agree if the variance of their means is below this fraction of their variance."""
 
 BENT = 0.1
-"""Standard deviations of an arrival by which the path may bend within what is believed of z,
-before the rows are spread. What one ping does not see many do: the bend is the same in all."""
+"""Path curvature over the z uncertainty, in standard deviations of an arrival, at which rows are
+spread. It is below 1 because the effect is equal in all pings."""
 
 APART, POSSIBLE = 2.0, 0.05
-"""There are two depths where the rows above a gap and those below weigh more than `POSSIBLE`
-each. A gap is wider than `APART` times the standard deviations of both its neighbours together."""
+"""A depth is ambiguous if the rows above and below a gap each weigh more than `POSSIBLE`. A gap is
+wider than `APART` times the summed standard deviations of its neighbours."""
 
 
 class HeightCounts(NamedTuple):
-    """How many heights of fixes there were for tracks, how many of them were rejected, and how many
-    lie outside `depth_min` to `depth_max`."""
+    """Counters of the fix heights of tracks."""
 
     seen: int = 0
+    """Number of heights."""
     rejected: int = 0
+    """Number of heights rejected by the gate."""
     outside: int = 0
+    """Number of heights outside `depth_min` to `depth_max`."""
 
     def warnings(self, config: DiverConfig) -> list[str]:
-        """Sentences for the user."""
+        """Return warnings about implausible heights."""
         if self.seen < MANY:
             return []
         found = []
         if self.outside > DOUBTED * self.seen:
             found.append(
-                f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
-                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
+                f'{self.outside} of {self.seen} fix heights are outside depth_min '
+                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m). Set these, or '
                 'origin_height for positions in latitude and longitude'
             )
         if self.rejected > DOUBTED * self.seen:
             found.append(
-                f'{self.rejected} of {self.seen} heights of fixes were rejected: z misses by more '
-                'than it states, or the divers go up and down faster than vertical_speed_std'
+                f'{self.rejected} of {self.seen} fix heights were rejected: their variances are '
+                'too small, or targets move faster than vertical_speed_std. Check both'
             )
         return found
 
@@ -119,9 +119,11 @@ def begin_depth(
     place: int,
     config: DiverConfig,
 ) -> None:
-    """Let a new track, x (M, n), P (M, n, n) in place, begin at the z that its fix states; its x
-    and y have `covariance` (2, 2). Not where the water column, of `depth_min` to `depth_max`, says
-    more than the fix, and does not contradict it: then z begins as without a fix."""
+    """Set the depth of a new track to the z of its fix: x (M, n), P (M, n, n), in place.
+
+    Keep the depth hypotheses if the water column is narrower than the fix uncertainty and contains
+    the fix. covariance: (2, 2) of x and y.
+    """
     variance = height.variance(covariance)
     width = config.depth_max - config.depth_min
     if variance <= width**2 / 12.0 or _is_outside(height.value, variance, config):
@@ -130,6 +132,7 @@ def begin_depth(
 
 
 def _is_outside(value: float, variance: float, config: DiverConfig) -> bool:
+    """Return whether a height is outside the water column."""
     room = BEYOND * math.sqrt(variance)
     return not -config.depth_max - room <= value <= -config.depth_min + room
 
@@ -137,7 +140,7 @@ def _is_outside(value: float, variance: float, config: DiverConfig) -> bool:
 def reset_depth(
     x: FloatArray, P: FloatArray, place: int, value: float, variance: float, config: DiverConfig
 ) -> None:
-    """Forget what x (M, n), P (M, n, n) know of z and its rate, which follows it."""
+    """Reset z and its rate in x (M, n), P (M, n, n), in place."""
     own = slice(place, place + 2)
     P[:, own, :] = P[:, :, own] = 0.0
     x[:, place], x[:, place + 1] = value, 0.0
@@ -147,7 +150,7 @@ def reset_depth(
 def depth_stage(
     models: ModelSet, layouts: Callable[[Known], Layout], config: DiverConfig
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that updates tracks by the heights of the fixes that are theirs."""
+    """Return the stage that updates tracks by the heights of their fixes."""
 
     def update_heights(known: Known, group: Group) -> Known:
         return update_depth(known, group, models, layouts(known), config)
@@ -158,7 +161,7 @@ def depth_stage(
 def update_depth(
     known: Known, group: Group, models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Known:
-    """Return the tracks after the heights of the fixes of a group that are theirs."""
+    """Update tracks by the heights of their fixes."""
     heights, found = group.heights, group.association
     assert found is not None
     tracks = np.flatnonzero(found.hit)
@@ -201,7 +204,7 @@ def update_depth(
 def _restart_depth(
     known: Known, track: int, value: float, variance: float, models: ModelSet, config: DiverConfig
 ) -> Known:
-    """Return the tracks after one forgot what it knew of z, and begins at `value`."""
+    """Restart the depth of one track at `value`."""
     own = known.row_indices(track)
     rows = known.rows.select(own)
     x, P = models.to_common(rows.blocks)
@@ -236,12 +239,11 @@ def _update_track(
     layout: Layout,
     threshold: float,
 ) -> tuple[Known, float]:
-    """Return the tracks after one was updated by one number, z of a fix less its `gain` times the
-    x and y (2,) of that fix, and the NIS of its mixture, by which nothing changes where it is
-    above `threshold`.
+    """Update one track by a scalar: z of a fix less its `gain` times x and y (2,) of the fix.
 
-    share: probability that the number is the track's. Below 1 each model becomes the mixture of
-    what it is with it and without.
+    :param share: probability that the fix belongs to the track. Below 1, each model becomes a
+        mixture.
+    :returns: the new state and the NIS of the mixture. A NIS above `threshold` changes nothing.
     """
     own = known.row_indices(track)
     rows, value = known.rows.select(own), height.value - float(height.gain @ z)
@@ -275,7 +277,8 @@ def _update_track(
 def _depth_innovations(
     block: Gaussians, seen: FloatArray, place: int, height: Height, value: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return PHt (N, n, m), innovation (N, m) and its variance (N, m) of ``z - gain (x, y)``."""
+    """Return PHt (N, n, m), innovation (N, m) and innovation variance (N, m) of ``z - gain (x,
+    y)``."""
     h = np.zeros((block.x.shape[1], block.x.shape[2]))
     h[: len(seen[0])] = -height.gain[0] * seen[0] - height.gain[1] * seen[1]
     h[place] += 1.0
@@ -293,8 +296,7 @@ def _update_scalar(
     without: float,
     estimated: BoolArray | None,
 ) -> Gaussians:
-    """Return the block after one number: in each model the mixture of what it is with it, with the
-    weight `certain` (N, m), and `without`."""
+    """Update a block by a scalar, as a mixture with weights `certain` (N, m) and `without`."""
     K = PHt / np.where(S > 0.0, S, 1.0)[:, None]
     if estimated is not None:
         K[:, ~estimated] = 0.0
@@ -313,7 +315,7 @@ def _update_scalar(
 
 
 def _row_depths(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weight, mean and variance of z of each row, (N,) each."""
+    """Return weight, mean z and variance of z of each row, (N,) each."""
     z, variance = (
         np.concatenate(parts, axis=1)
         for parts in zip(
@@ -329,7 +331,7 @@ def _row_depths(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, F
 
 
 def ambiguous_depths(known: Known, models: ModelSet) -> BoolArray:
-    """Return which divers (T,) may be at another depth as well."""
+    """Return which tracks (T,) have a second possible depth."""
     two = np.zeros(len(known), bool)
     weights, means, variances = _row_depths(known.rows, models)
     for track in range(len(known)):
@@ -345,8 +347,8 @@ def ambiguous_depths(known: Known, models: ModelSet) -> BoolArray:
 
 
 def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
-    """Return the tracks as `seen` will find them: with the rows spread where they agree and the
-    paths bend within what they believe."""
+    """Spread the rows of tracks that agree, if the paths of the ping bend within their
+    uncertainty."""
     echo = seen.echo
     if models.height < 0 or models.rows_per_track == 1 or not len(known) or not echo.any():
         return known
@@ -374,15 +376,15 @@ def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) 
 
 
 def count_respread(known: Known, track: int) -> Known:
-    """Return the tracks with one more spread of the rows of a track."""
+    """Return the state with one more spread of a track."""
     spreads = known['respreads'].copy()
     spreads[track] += 1
     return known.with_columns(respreads=spreads)
 
 
 def _path_curvature(place: FloatArray, instrument: FloatArray) -> FloatArray:
-    """Return the second derivative (C,) in z of the distance from `place` (3,) to instruments (C,
-    3), not nearer than a metre, 1/m."""
+    """Return d^2(distance)/dz^2 (C,), 1/m, from `place` (3,) to instruments (C, 3); distances from
+    1 m."""
     apart = instrument - place
     distance = np.maximum(np.sqrt((apart * apart).sum(axis=1)), 1.0)
     return np.asarray((1.0 - np.minimum(apart[:, 2] / distance, 1.0) ** 2) / distance)
@@ -391,8 +393,11 @@ def _path_curvature(place: FloatArray, instrument: FloatArray) -> FloatArray:
 def _spread_rows(
     rows: Rows, estimated: BoolArray, models: ModelSet
 ) -> tuple[tuple[Gaussians, ...], FloatArray, FloatArray]:
-    """Return states, models (K, M) and weights (K,) of the K rows of a track, with what all rows
-    believe spread over them; estimated (n,): see `estimation.consider`."""
+    """Return states, models (K, M) and log weights (K,) of K rows spread over the depth of a
+    track.
+
+    estimated: (n,) mask, see `estimation.consider`.
+    """
     place = models.height
     each = rows.normalized_weight()[:, None] * rows.mu
     K, total = len(each), each.sum(axis=0)
@@ -403,7 +408,7 @@ def _spread_rows(
     whole = np.einsum('km,kmab->mab', share, P + apart[..., :, None] * apart[..., None, :])
     line = whole[:, place] / np.sqrt(whole[:, place, place])[:, None]
     moved = estimated[:, None] | estimated[None, :]
-    # Standard deviations: what lies between the rows does not lie within them.
+    # The variance between the rows is subtracted from the variance within them.
     steps = np.linspace(-1.0, 1.0, K)
     narrow = whole - (steps**2).mean() * line[:, :, None] * line[:, None, :] * moved
     at = mean + steps[:, None, None] * np.where(estimated, line, 0.0)

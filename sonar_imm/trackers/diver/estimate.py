@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is published_state of the divers, and what a user has to know of the input."""
+"""Published estimates and warnings of the diver tracker."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ from .pruning import PUBLISH_EXISTENCE
 def estimate_of(
     known: Known, models: ModelSet, config: DiverConfig, frame_id: str, origin: Origin | None
 ) -> Estimate:
-    """Return what is published_state of a scan; origin: where the frame lies on Earth, None when that is
-    not known."""
-    # Of tracks whose hits are counted the existence is NaN.
+    """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
+    # The existence is NaN for tracks confirmed by hits.
     known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
     mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
@@ -70,13 +69,13 @@ def estimate_of(
 
 
 def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, q) and covariance (T, q, q): where all rows say, and how far off that may be
-    for those that say how well a place is known.
+    """Return mean (T, q) and covariance (T, q, q) of the published state.
 
-    Fixes that are better than stated look like fixes whose errors last. If they are as stated, the
-    row that says so is the optimal filter: its error is uncorrelated with all that is computed of
-    the data, so that of the mean of all rows has its covariance and the square of how far the two
-    are apart. If they are better, this is cautious.
+    All rows contribute to the mean. Only rows with scale >= 1 contribute to the covariance,
+    because fixes that are better than reported look like fixes with time-correlated errors. If the
+    reported covariances are correct, the row of scale 1 is the optimal filter, whose error is
+    uncorrelated with all other estimates. The covariance of the mean is then its covariance plus
+    the squared difference. If fixes are better, the result is conservative.
     """
     maps = tuple(part.outputs for part in models.parts)
     rows, each = known.rows, row_outputs(known.rows, maps)
@@ -89,7 +88,7 @@ def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatAr
 
 
 def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
-    """Return what is published_state of families beside the probabilities of their models."""
+    """Return the extra columns of families."""
     if models.families is None:
         return {}
     each = known.rows.model_probabilities()
@@ -101,7 +100,8 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
 
 
 def health(known: Known, waiting: int) -> dict[str, float]:
-    """Return numbers for diagnostics; waiting: fixes that wait for the vessel."""
+    """Return the numbers for diagnostics. waiting: number of fixes that wait for the vessel
+    pose."""
     hit = known['nis_dof'] > 0
     mean = float(np.mean(known['nis'][hit] / known['nis_dof'][hit])) if hit.any() else float('nan')
     return {
@@ -119,14 +119,14 @@ def health(known: Known, waiting: int) -> dict[str, float]:
 
 
 def warnings(known: Known, config: DiverConfig) -> list[str]:
-    """Return what of the input cannot be true or used, in sentences for the user."""
+    """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
     unstated = [name for name in stds if not getattr(config, name)]
     if config.dimensions == 2:
         unstated.insert(0, 'target_z (or dimensions: 3)')
     if unstated:
-        advice += ', or state what is not exact: ' + ', '.join(unstated)
+        advice += ', or set instrument errors: ' + ', '.join(unstated)
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
     more = memory['excess'] >= ENOUGH
     return [

@@ -12,18 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tracks whose name is known, and what to do when a diver is also seen without one.
+"""Target IDs of tracks, and merging of duplicates of a target with an ID.
 
-A named track takes its part of the fixes that have no name, so that a diver with a transponder on
-a sonar is one track. A second track can stand beside it all the same:
-the sonar may have seen the diver before the transponder was heard. Two divers that swim together
-are seen together, now and then at least; a single diver never is. So a nameless track that stays
-beside a named one, for so many scans that two divers would have been seen together once but for a
-probability of `MISTAKEN`, is the same diver: the confirmed or older of the two goes on, with the
-name.
+A track with an ID also takes fixes without ID, so a diver with a transponder on a sonar is one
+track. A second track can exist beside it, for example if the sonar detected the diver before the
+first transponder message. Two targets that swim together are sometimes detected together; one
+target never is. So if a track without ID stays near a track with ID for `scans_to_merge` scans
+without such a detection, both are one target. The confirmed or older track continues with the ID.
 
-A name lasts as long as something says it: after `max_coast` without a fix of its own a track that
-still is seen goes on without its name.
+A track loses its ID after `max_coast` without a measurement of this ID.
 """
 
 from __future__ import annotations
@@ -42,30 +39,29 @@ from .models import ModelSet
 from .scan import Group, Scan
 
 FEATURES = {'target_id': Feature(NOBODY, kind=np.int64)}
-"""Whose track it is, `NOBODY` where that is not known."""
+"""target_id: ID of the target, `NOBODY` if unknown."""
 
 BESIDE = 4.0
-"""Mahalanobis distance squared within which a nameless track is beside a named one."""
+"""Squared Mahalanobis distance at which a track without ID is near a track with ID."""
 
 MISTAKEN = 1e-3
-"""Probability that two divers side by side are taken for one."""
+"""Probability of merging two targets that swim together."""
 
 
 class LastNamed(NamedTuple):
-    """The stamp of the last measurement of each name."""
+    """Stamp, ns, of the last measurement of each ID."""
 
     stamps: dict[int, int] = {}
 
 
 def scans_to_merge(detection_probability: float) -> int:
-    """Return after how many scans a track never seen together with the one beside it is the same
-    diver."""
+    """Return the number of scans without a joint detection after which two tracks are merged."""
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
 def id_times_stage(max_coast: float) -> Callable[[Known, Scan], Known]:
-    """Return the stage that takes in the names of a scan, and forgets those that nothing has said
-    for `max_coast` seconds."""
+    """Return the stage that updates the ID times and removes IDs older than `max_coast`
+    seconds."""
 
     def update_id_times(known: Known, scan: Scan) -> Known:
         named: LastNamed = known.memory['last_named']
@@ -87,8 +83,7 @@ def id_times_stage(max_coast: float) -> Callable[[Known, Scan], Known]:
 
 
 def merge_stage(models: ModelSet) -> Callable[[Known, Scan], Known]:
-    """Return the stage that ends the tracks that are divers with a name once more, and puts that
-    name where it belongs."""
+    """Return the stage that merges duplicates of targets with an ID."""
 
     def merge(known: Known, scan: Scan) -> Known:
         return (
@@ -99,7 +94,7 @@ def merge_stage(models: ModelSet) -> Callable[[Known, Scan], Known]:
 
 
 def merge_duplicates(known: Known, scan: Scan, models: ModelSet) -> Known:
-    """Return the tracks without those that are divers with a name once more."""
+    """Merge tracks without ID into the track of the same target with ID."""
     seen = [group for group in scan.fixes if group.target_id is None and group.is_complete]
     target_id = known['target_id'].copy()
     nameless, named = (np.flatnonzero((target_id == NOBODY) == free) for free in (True, False))
@@ -132,8 +127,8 @@ def merge_duplicates(known: Known, scan: Scan, models: ModelSet) -> Known:
 
 
 def _is_preferred(known: Known, row: int, other: int) -> bool:
-    """Return whether of two tracks of one diver the first goes on: confirmed before tentative,
-    then older."""
+    """Return whether the first of two tracks continues: confirmed before tentative, then the older
+    one."""
     tentative = known.life.status == TrackStatus.TENTATIVE
     if tentative[row] != tentative[other]:
         return bool(tentative[other])
@@ -141,8 +136,7 @@ def _is_preferred(known: Known, row: int, other: int) -> bool:
 
 
 def fixes_near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return which fixes (D,) of a scan are near one of two tracks: mean (2, 2), covariance (2, 2,
-    2)."""
+    """Return which fixes (D,) are near one of two tracks: mean (2, 2), covariance (2, 2, 2)."""
     apart = group.z[:, None] - mean[None]
     distance = mahalanobis_squared(apart, covariance[None] + group.R[:, None])
     threshold = gate_threshold(group.config.gate_probability, 2)
@@ -150,6 +144,6 @@ def fixes_near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolAr
 
 
 def mahalanobis_squared(apart: FloatArray, S: FloatArray) -> FloatArray:
-    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2,
+    """Return squared Mahalanobis distances (...,) of vectors (..., 2) under covariances (..., 2,
     2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

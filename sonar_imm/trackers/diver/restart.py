@@ -47,7 +47,7 @@ MISTAKEN = 0.02
 """Maximum expected number of false fixes near a rejected fix for a restart."""
 
 REACH = 13.8
-"""Squared Mahalanobis distance of two agreeing fixes."""
+"""Squared Mahalanobis distance within which two fixes are near each other."""
 
 
 def restart_stage(

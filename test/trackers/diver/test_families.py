@@ -226,9 +226,9 @@ def test_scale_of_the_stated_covariances(stated):
     scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
     warned = ' '.join(tracker.warnings())
     if stated < 1.0:
-        assert 3.0 < scale < 10.0 and 'times as far as they state' in warned
+        assert 3.0 < scale < 10.0 and 'fix covariances too small' in warned
     else:
-        assert 1.0 <= scale < 1.6 and 'times as far as they state' not in warned
+        assert 1.0 <= scale < 1.6 and 'fix covariances too small' not in warned
 
 
 def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known():

@@ -226,7 +226,7 @@ def test_heights_that_are_wild_all_the_time_are_said():
     tracker = DiverTracker(DiverConfig(dimensions=3, max_tracks=1, depth_max=100.0))
     fixes = [fix(k, -10.0 - 30.0 * (k % 3 == 0), spatial(0.09)) for k in range(1, 40)]
     assert last(tracker, fixes).state[0, Z] == pytest.approx(-10.0, abs=1.0)
-    assert [text for text in tracker.warnings() if 'were refused' in text]
+    assert [text for text in tracker.warnings() if 'were rejected' in text]
 
 
 def test_late_fixes_give_the_bits_of_sorted_ones():

@@ -127,7 +127,9 @@ def test_receivers_that_come_later_bring_their_prior():
     assert [receiver for receiver, _ in first.known] == [3, 7]
     both = first.with_receivers(ping, config)
     assert [receiver for receiver, _ in both.known] == [3, 7, 0, 1, 2]
-    x, P = both.layout(config, build_models(config)).with_new_constants(np.ones((2, 6)), np.ones((2, 6, 6)))
+    x, P = both.layout(config, build_models(config)).with_new_constants(
+        np.ones((2, 6)), np.ones((2, 6, 6))
+    )
     assert x.shape == (2, 9) and (P[:, :6, 6:] == 0.0).all()
     np.testing.assert_allclose(P[0, 6:, 6:], 1.5**2 * np.eye(3))
 
