@@ -92,10 +92,10 @@ class Birth(NamedTuple):
 
 def spawn_at_fixes(known: Known, group: Group) -> Known:
     """Add a birth for each unassociated fix. A stage of the tracker."""
-    found = group.association
-    assert found is not None
-    for d in np.flatnonzero(found.free).tolist():
-        existence = math.nan if found.existence is None else float(found.existence[d])
+    association = group.association
+    assert association is not None
+    for d in np.flatnonzero(association.free).tolist():
+        existence = math.nan if association.existence is None else float(association.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height

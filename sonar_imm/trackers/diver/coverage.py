@@ -274,10 +274,10 @@ def miss_stage(
     def miss(known: Known, group: Group) -> Known:
         if not group.is_complete or group.target_id is not None:
             return known
-        found = group.association
-        assert found is not None
-        exists = np.maximum(found.exists, 1e-300)
-        share = np.where(found.hit, 0.0, np.minimum(found.missed / exists, 1.0))
+        association = group.association
+        assert association is not None
+        exists = np.maximum(association.exists, 1e-300)
+        share = np.where(association.hit, 0.0, np.minimum(association.missed / exists, 1.0))
         return apply_misses(known, models, group.detection, share, moves_all(known))
 
     return miss
@@ -308,16 +308,16 @@ def detection_probability(
     )
     if not same.all():
         rows = known.rows
-        asked = np.flatnonzero(~same[rows.target])
+        selected = np.flatnonzero(~same[rows.target])
         at = np.concatenate(
             [
-                coverage.probability(_model_points(block.select(asked)), p).mean(axis=-1)
+                coverage.probability(_model_points(block.select(selected)), p).mean(axis=-1)
                 for block in rows.blocks
             ],
             axis=1,
         )
-        of_row = rows.weight[asked] * (rows.mu[asked] * at).sum(axis=1)
-        whole = np.bincount(rows.target[asked], of_row, minlength=len(known))
+        of_row = rows.weight[selected] * (rows.mu[selected] * at).sum(axis=1)
+        whole = np.bincount(rows.target[selected], of_row, minlength=len(known))
         tracks = np.where(same, tracks, whole)
     there = coverage.probability(_sigma_points(z, R), p).mean(axis=1)
     return DetectionProbability(coverage, p, np.minimum(tracks, MOST), np.clip(there, LEAST, MOST))
@@ -342,13 +342,13 @@ def apply_misses(
     tentative = known.life.status == TENTATIVE
     looks = np.where(tentative, np.maximum(seen.miss_weight, LEAST_LOOK), seen.miss_weight)
     known = known.with_columns(miss_weight=known['miss_weight'] + looks)
-    asked = (share > 0.0) & ~tentative
-    if not asked.any():
+    selected = (share > 0.0) & ~tentative
+    if not selected.any():
         return known
     far_out = np.full(len(known), FAR_OUT)
-    asked &= ~_constant_probability(known, models, coverage, p, far_out)[1]
+    selected &= ~_constant_probability(known, models, coverage, p, far_out)[1]
     rows = known.rows
-    own = np.flatnonzero(asked[rows.target])
+    own = np.flatnonzero(selected[rows.target])
     if not len(own):
         return known
     factor, blocks = np.ones(rows.mu.shape), []

@@ -162,23 +162,23 @@ def update_depth(
     known: Known, group: Group, models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Known:
     """Update tracks by the heights of their fixes."""
-    heights, found = group.heights, group.association
-    assert found is not None
-    tracks = np.flatnonzero(found.hit)
+    heights, association = group.heights, group.association
+    assert association is not None
+    tracks = np.flatnonzero(association.hit)
     if heights is None or not len(tracks):
         return known
-    tracks = tracks[np.isfinite(heights.value[found.fix[tracks]])]
+    tracks = tracks[np.isfinite(heights.value[association.fix[tracks]])]
     threshold = gate_threshold(config.gate_probability, 1)
     columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'rejected_z')}
     counts: HeightCounts = known.memory['heights']
     seen, doubted, outside = counts
     for track in tracks.tolist():
-        fix = int(found.fix[track])
+        fix = int(association.fix[track])
         own = heights.row(fix)
         assert own is not None
         share = 1.0
-        if found.is_joint:
-            share = min(found.beta[track, fix] / found.exists[track], 1.0)
+        if association.is_joint:
+            share = min(association.beta[track, fix] / association.exists[track], 1.0)
         known, nis = _update_track(
             known, track, own, group.z[fix], share, models, layout, threshold
         )

@@ -122,17 +122,17 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
-    unstated = [name for name in stds if not getattr(config, name)]
+    unset = [name for name in stds if not getattr(config, name)]
     if config.dimensions == 2:
-        unstated.insert(0, 'target_z (or dimensions: 3)')
-    if unstated:
-        advice += ', or set instrument errors: ' + ', '.join(unstated)
+        unset.insert(0, 'target_z (or dimensions: 3)')
+    if unset:
+        advice += ', or set instrument errors: ' + ', '.join(unset)
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
-    more = memory['excess'] >= ENOUGH
+    exceeds = memory['excess'] >= ENOUGH
     return [
         *memory['fixes'].warnings(config.fix_bias_std > 0.0),
         *memory['heights'].warnings(config),
-        *memory['arrivals'].warnings('arrivals', advice, more_than_stated=more),
+        *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),

@@ -86,8 +86,8 @@ FAR = 80.0
 bound decreases with the distance, so it still ranks tracks."""
 
 MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
-"""Minimum probability of a model that opens the gate. A single assignment needs rare models, or it
-loses tracks in sharp turns; joint association does not."""
+"""Minimum probability of a model that opens the gate. A single assignment needs rare models, or
+it loses tracks in sharp turns; joint association does not."""
 
 MIN_DETECTION_PROBABILITY = 1e-9
 """Lower bound of the detection probability of a track outside the coverage, because ratios are
@@ -191,10 +191,10 @@ class Association(NamedTuple):
 # -- comparison ----------------------------------------------------------------------------------
 
 
-def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs:
+def compare(known: Known, group: Group, models: ModelSet, min_probability: float) -> Pairs:
     """Compare the fixes of a group with rows near them, or with the tracks of the same ID.
 
-    :param opens: minimum model probability, see `MIN_MODEL_PROBABILITY`.
+    :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
     rows, z, R = known.rows, group.z, group.R
     among = Assumptions.from_rows(rows, known.borrowed)
@@ -214,7 +214,7 @@ def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs
     whole = log_sum(among.logw[:, None] + table, among.target)
     nis = None
     if models.families is None:
-        probable = (rows.mu * np.exp(rows.logw)[:, None])[row] >= opens
+        probable = (rows.mu * np.exp(rows.logw)[:, None])[row] >= min_probability
         least = np.concatenate([each.nis for each in compared], axis=1)
         least = np.where(probable, least, np.inf).min(axis=1, initial=np.inf)
         nis = np.full(whole.shape, np.inf)
@@ -291,15 +291,15 @@ def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
 def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group], Known]:
     """Return the stage that compares and associates fixes: by ID if fixes have IDs, otherwise by
     `pairing`."""
-    pair, opens = (
+    pair, min_probability = (
         {'jipda': associate_jipda, 'gnn': associate_gnn}[pairing],
         MIN_MODEL_PROBABILITY[pairing],
     )
 
     def associate(known: Known, group: Group) -> Known:
-        group.pairs = compare(known, group, models, opens)
-        way = pair if group.target_id is None else associate_by_id
-        group.association = way(known, group, group.pairs)
+        group.pairs = compare(known, group, models, min_probability)
+        associate_pairs = pair if group.target_id is None else associate_by_id
+        group.association = associate_pairs(known, group, group.pairs)
         return known
 
     return associate
@@ -378,19 +378,19 @@ def update_stage(
     that an update may change, one per block."""
 
     def update(known: Known, group: Group) -> Known:
-        found, pairs = group.association, group.pairs
-        assert found is not None and pairs is not None
-        known = _record_innovations(known, group, found, models)
-        columns = {'score': found.score}
-        if found.is_joint:
+        association, pairs = group.association, group.pairs
+        assert association is not None and pairs is not None
+        known = _record_innovations(known, group, association, models)
+        columns = {'score': association.score}
+        if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
             named = known['target_id'] != NOBODY
-            columns['existence'] = np.where(named, known['existence'], found.exists)
-            columns['evidence'] = known['evidence'] + found.beta.sum(axis=1)
+            columns['existence'] = np.where(named, known['existence'], association.exists)
+            columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
         known = known.with_columns(**columns)
-        if not (found.beta > 0.0).any():
+        if not (association.beta > 0.0).any():
             return known
-        return update_tracks(known, pairs, found, models, estimated(known))
+        return update_tracks(known, pairs, association, models, estimated(known))
 
     return update
 
@@ -398,16 +398,16 @@ def update_stage(
 def update_tracks(
     known: Known,
     pairs: Pairs,
-    found: Association,
+    association: Association,
     models: ModelSet,
     estimated: tuple[BoolArray | None, ...],
 ) -> Known:
     """Update the tracks by the fixes, with the probabilities of the association."""
     among = pairs.among
-    exists = np.where(found.exists > 0.0, found.exists, 1.0)
-    missed = np.where(found.beta.any(axis=1), found.missed / exists, 1.0)
+    exists = np.where(association.exists > 0.0, association.exists, 1.0)
+    missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
     track = among.target[pairs.assumption]
-    weight = found.beta[track, pairs.fix] / exists[track]
+    weight = association.beta[track, pairs.fix] / exists[track]
     used = np.flatnonzero((weight > 0.0) & (pairs.log > -np.inf))
     assumption, weight = pairs.assumption[used], weight[used]
     whole = pairs.track_log[track[used], pairs.fix[used]]
@@ -508,12 +508,14 @@ def redistribute_weights(known: Known) -> Known:
     )
 
 
-def _record_innovations(known: Known, group: Group, found: Association, models: ModelSet) -> Known:
+def _record_innovations(
+    known: Known, group: Group, association: Association, models: ModelSet
+) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
-    tracks = np.flatnonzero(found.hit)
+    tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
-    fix = found.fix[tracks]
+    fix = association.fix[tracks]
     seen = tuple(part.fix_matrix for part in models.parts)
     mean, covariance = known.rows.combine(
         *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)

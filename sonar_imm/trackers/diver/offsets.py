@@ -256,13 +256,13 @@ class BiasTest(NamedTuple):
         likely = [
             name for name, (value, _) in found.items() if name != EVERY and value > SHARE * largest
         ]
-        unstated = [f'{name} (now {getattr(config, name):g})' for name in STDS]
+        unset = [f'{name} (now {getattr(config, name):g})' for name in STDS]
         if config.dimensions == 2:
-            unstated.insert(0, DEPTH)
+            unset.insert(0, DEPTH)
         cause = f'Likely cause: {" or ".join(likely)}. ' if likely else ''
         return [
             f'arrival residuals are constant over pings: chi-square {largest:.3g} (expected '
-            f'{found[EVERY][1]}), so covariances are too small. {cause}Set ' + ', '.join(unstated)
+            f'{found[EVERY][1]}), so covariances are too small. {cause}Set ' + ', '.join(unset)
         ]
 
 

@@ -59,8 +59,8 @@ def restart_stage(
     """Return the stage that restarts lost tracks and then repeats the association."""
 
     def restart(known: Known, group: Group) -> Known:
-        known, begun = restart_lost_tracks(known, group, models, chain, layouts(known))
-        return associate(known, group) if begun else known
+        known, restarted = restart_lost_tracks(known, group, models, chain, layouts(known))
+        return associate(known, group) if restarted else known
 
     return restart
 
@@ -74,18 +74,18 @@ def restart_lost_tracks(
 
     :returns: the new state, and whether any track restarted.
     """
-    found, seen, rejected = group.association, group.detection, known['rejected']
-    assert found is not None and group.pairs is not None
+    association, seen, rejected = group.association, group.detection, known['rejected']
+    assert association is not None and group.pairs is not None
     if not len(known):
         return known, False
-    hit, firm = found.hit, known.life.status != TENTATIVE
-    left = found.beta[firm].sum(axis=0) < 0.5
-    if found.is_joint and seen is not None:
+    hit, firm = association.hit, known.life.status != TENTATIVE
+    left = association.beta[firm].sum(axis=0) < 0.5
+    if association.is_joint and seen is not None:
         hit = hit | ~seen.is_outside
     if hit.any():
         rejected = rejected.copy()
         rejected[hit] = np.nan
-    begun: dict[int, Rows] = {}
+    restarted: dict[int, Rows] = {}
     for track, row in _rejected_fixes(known, group, hit, left, group.pairs.track_log):
         z, R, new = group.z[row], group.R[row], None
         hidden = seen is not None and seen.is_outside[track]
@@ -98,10 +98,10 @@ def restart_lost_tracks(
         if new is None:
             rejected[track] = known.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
         else:
-            begun[track], rejected[track] = new, np.nan
-    for track, new in begun.items():
+            restarted[track], rejected[track] = new, np.nan
+    for track, new in restarted.items():
         known = known.with_rows_of(track, new)
-    return known.with_columns(rejected=rejected), bool(begun)
+    return known.with_columns(rejected=rejected), bool(restarted)
 
 
 def _rejected_fixes(

@@ -149,12 +149,20 @@ class SmoothingDiverTracker(DiverTracker):
         for stamp in sorted(self._passed):
             known = self._passed[stamp]
             known = known.replace(rows=layout.rows_with_new_constants(known.rows, self.models))
-            before = scans[-1].known if scans else known
-            dt = (known.stamp_ns - before.stamp_ns) * 1e-9
-            crossing = self.models, self._chain, before.rows, before['learnt']
-            steps = tuple(predict_over(*crossing, dt, self.config.longest_step))
+            previous = scans[-1].known if scans else known
+            dt = (known.stamp_ns - previous.stamp_ns) * 1e-9
+            steps = predict_over(
+                self.models,
+                self._chain,
+                previous.rows,
+                previous['learnt'],
+                dt,
+                self.config.longest_step,
+            )
             between = tuple(self.models.to_common(step.rows.blocks) for step in steps[:-1])
-            scans.append(_Scan(known, *self.models.to_common(known.rows.blocks), steps, between))
+            scans.append(
+                _Scan(known, *self.models.to_common(known.rows.blocks), tuple(steps), between)
+            )
         return scans
 
     def _find_passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:

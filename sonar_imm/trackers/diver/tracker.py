@@ -205,8 +205,8 @@ class DiverTracker:
 
     def warnings(self) -> list[str]:
         """Return warnings about implausible or unused input."""
-        own = estimate.warnings(self._stream.state, self.config)
-        return [*self._georeferencer.warnings(), *own]
+        tracker_warnings = estimate.warnings(self._stream.state, self.config)
+        return [*self._georeferencer.warnings(), *tracker_warnings]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(known) for _, known in self._revise(measurement)]
@@ -224,10 +224,10 @@ class DiverTracker:
 
     # -- one scan ------------------------------------------------------------------------------
 
-    def _process_scan(self, before: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
+    def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, before.memory['clutter'])
-        known = self._predict(before, scan, stamp_ns)
+        scan = Scan.from_items(items, self.config, previous.memory['clutter'])
+        known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:
                 known = stage(known, group)
@@ -237,23 +237,24 @@ class DiverTracker:
             known = last(known, scan)
         return known
 
-    def _predict(self, before: Known, scan: Scan, stamp_ns: int) -> Known:
+    def _predict(self, previous: Known, scan: Scan, stamp_ns: int) -> Known:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
-        dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        start = before if not len(before) else fixes.redistribute_weights(before)
-        crossing = self.models, self._chain, start.rows, before['learnt']
-        steps = predict_over(*crossing, dt, self.config.longest_step)
+        dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
+        start = previous if not len(previous) else fixes.redistribute_weights(previous)
+        steps = predict_over(
+            self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
+        )
         transition = np.linalg.matrix_power(steps[-1].transition, len(steps))
-        scan.previous = before
+        scan.previous = previous
         scan.prediction = steps[-1]._replace(transition=transition, dt=dt)
         # The sound speed error is part of the state before the first ping.
-        rows = self._layouts(before).rows_with_new_constants(steps[-1].rows, self.models)
-        count = len(before)
+        rows = self._layouts(previous).rows_with_new_constants(steps[-1].rows, self.models)
+        count = len(previous)
         columns = {
             'nis': np.full(count, 0.0),
             'nis_dof': np.zeros(count, np.uint16),
-            'score': SCORE_MEMORY * before['score'],
-            'existence': before['existence'] * math.exp(-dt / self.config.survival_time),
+            'score': SCORE_MEMORY * previous['score'],
+            'existence': previous['existence'] * math.exp(-dt / self.config.survival_time),
         }
         known = start.replace(stamp_ns=stamp_ns, rows=rows).with_columns(**columns)
         return known.add_counts(repairs=sum(step.repairs for step in steps))
@@ -275,11 +276,11 @@ class DiverTracker:
 
         Also update the NIS of arrivals, except in scans with fixes.
         """
-        before, step, hit = scan.previous, scan.prediction, known['nis_dof'] > 0
+        previous, step, hit = scan.previous, scan.prediction, known['nis_dof'] > 0
         learnt = self._chain.learn(
-            before['learnt'],
+            previous['learnt'],
             step.transition,
-            before.rows.model_probabilities(),
+            previous.rows.model_probabilities(),
             known.rows.model_probabilities(),
             step.dt,
             np.flatnonzero(hit),
@@ -287,12 +288,12 @@ class DiverTracker:
         known = known.with_columns(learnt=learnt, nis=np.where(hit, known['nis'], np.nan))
         if not scan.pings or scan.fixes:
             return known
-        sure = hit & (known.life.status != TENTATIVE)
-        nis, dof = known['nis'][sure], known['nis_dof'][sure]
-        more = known.memory['excess']
+        confirmed = hit & (known.life.status != TENTATIVE)
+        nis, dof = known['nis'][confirmed], known['nis_dof'][confirmed]
+        cusum = known.memory['excess']
         if not len(self._layouts(known).variances):  # without estimated instrument errors
-            more = excess(more, nis, dof)
-        return known.with_memory(arrivals=known.memory['arrivals'].after(nis, dof), excess=more)
+            cusum = excess(cusum, nis, dof)
+        return known.with_memory(arrivals=known.memory['arrivals'].after(nis, dof), excess=cusum)
 
 
 def select_stages(*stages: object) -> tuple:

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """z of fixes, against linear Kalman filters, in its statistics and where it is wrong; rows of
-a track that are respread_depths over depth."""
+a track that are spread over depth."""
 
 import math
 
@@ -45,7 +45,7 @@ CV = {
     'gate_probability': 0.999999,
 }
 Z, W = 2, 5
-"""Of z and its rate in the published_state state."""
+"""Of z and its rate in the published state."""
 
 
 def spatial(variance, *across):
