@@ -148,9 +148,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     family_switch_rate: float = constant(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
     covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
-        'families: factors by which copies of the filter multiply the covariances of all '
-        'measurements; those below 1 say where the diver is, but not how well that is known; with '
-        'dimensions 3: one copy, times 1',
+        'families: factors by which scaled filters multiply the covariances of all measurements; '
+        'the published covariance is that of filters from 1 on; with dimensions 3: one filter, '
+        'scale 1',
         range=(0.01, 1e4), kind='float[]')
     adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',

@@ -53,6 +53,7 @@ from ...estimation.rows import (
     reduce_targets,
     restore_rows,
     ROW_AGAIN,
+    ROW_LOST,
     Rows,
 )
 from ...measurements import NOBODY
@@ -429,7 +430,7 @@ def update_tracks(
         factors.append(factor)
     sound, repairs = repair_covariances(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    rows, borrowed = restore_rows(rows, borrowed, 'scale', borrowed.logw > math.log(ROW_AGAIN))
+    rows, borrowed = restore_rows(rows, borrowed, 'scale', _can_restore(rows, borrowed))
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
@@ -449,19 +450,30 @@ def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tup
 
 
 def _protected_rows(rows: Rows) -> BoolArray:
-    """Return which rows (N,) are kept at any weight.
+    """Return which rows (N,) are kept at any total weight.
 
-    These are rows with a start depth, the heaviest row of each track, and its heaviest row with a
-    scale of at least `MIN_PUBLISHED_SCALE`.
+    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
+    scales of at least `MIN_PUBLISHED_SCALE`.
     """
-    scale = rows.key['scale']
-    stays = rows.key['start'] > 0
-    first = rows.first
-    for counted in (np.ones(len(rows), np.bool_), scale >= MIN_PUBLISHED_SCALE):
-        log = np.where(counted, rows.logw, -np.inf)
-        heaviest = log == np.maximum.reduceat(log, first)[rows.target]
-        stays = stays | (heaviest & counted)
-    return stays
+    first, scale = rows.first, rows.key['scale']
+    # A start depth is a state: all rows of such a track are kept, also the first.
+    protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
+    is_published = scale >= MIN_PUBLISHED_SCALE
+    return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
+
+
+def _can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
+    """Return which assumptions (B,) have sufficient weight for a row.
+
+    For scales of at least `MIN_PUBLISHED_SCALE`, the weight among these scales is sufficient.
+    """
+    is_published = rows.key['scale'] >= MIN_PUBLISHED_SCALE
+    total = np.add.reduceat(np.where(is_published, np.exp(rows.logw), 0.0), rows.first)
+    total = total[borrowed.target]
+    is_published = borrowed.key >= MIN_PUBLISHED_SCALE
+    least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
+    return np.asarray(np.exp(borrowed.logw) > least)
 
 
 def weight_without_small_scales(rows: Rows) -> FloatArray:

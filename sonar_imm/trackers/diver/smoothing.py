@@ -202,8 +202,7 @@ class SmoothingDiverTracker(DiverTracker):
         """Smooth the final rows of a pass, and add them to `found` by scan and track ID."""
         end = scans[last].known.rows
         rows: IndexArray = np.flatnonzero(end.target == _track_index(scans[last].known, track_id))
-        weight = end.select(rows).normalized_weight()
-        for row, share in zip(rows.tolist(), weight.tolist()):
+        for row in rows.tolist():
             path = self._trace_path(scans, track_id, row, first, last)
             x, P, mu = self._smooth_path(path)
             key = {name: column[row] for name, column in end.key.items()}
@@ -211,9 +210,8 @@ class SmoothingDiverTracker(DiverTracker):
                 if number is None:
                     continue
                 kept = found.setdefault((number, track_id), _Smoothed([], [], [], [], []))
-                logw = float(np.log(max(share, 1e-300)))
                 columns: tuple[list[Any], ...] = tuple(kept)
-                for column, value in zip(columns, (x[k], P[k], mu[k], logw, key)):
+                for column, value in zip(columns, (x[k], P[k], mu[k], end.logw[row], key)):
                     column.append(value)
 
     def _trace_path(

@@ -240,7 +240,8 @@ class DiverTracker:
     def _predict(self, previous: Known, scan: Scan, stamp_ns: int) -> Known:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
-        start = previous if not len(previous) else fixes.redistribute_weights(previous)
+        has_scales = len(previous) and len(self.models.scales) > 1
+        start = fixes.redistribute_weights(previous) if has_scales else previous
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )

@@ -95,7 +95,11 @@ class Scored(DiverTracker):
         super()._apply_config(config)
         # A track that begins anew at a fix is asked once more: that is no prediction of it.
         after = self._group_stages.index(self._associate) + 1
-        self._group_stages = (*self._group_stages[:after], self._scoring, *self._group_stages[after:])
+        self._group_stages = (
+            *self._group_stages[:after],
+            self._scoring,
+            *self._group_stages[after:],
+        )
 
     def _process_scan(self, before: Known, stamp_ns: int, items: Any) -> Known:
         self.scores[stamp_ns] = (0.0, 0)

@@ -26,13 +26,15 @@ from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
 from sonar_imm.trackers.diver.births import restart_track
+from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous_depths, respread_depths
 from sonar_imm.trackers.diver.estimate import published_state
+from sonar_imm.trackers.diver.fixes import _protected_rows
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.known import track_outputs
 from sonar_imm.trackers.diver.models import build_models, START_DEPTHS
-from sonar_imm.trackers.diver.scan import ping_measurements
+from sonar_imm.trackers.diver.scan import ping_measurements, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -386,6 +388,21 @@ def errors(estimates, places, settled):
         error = estimate.state[0, :3] - places[estimate.stamp_ns][:3]
         rows.append([error[2], error @ np.linalg.solve(estimate.covariance[0, :3, :3], error)])
     return np.array(rows)
+
+
+def test_depth_hypotheses_neither_exchange_weight_nor_borrow():
+    """They are states: one that has become improbable stays, and time alone moves no weight."""
+    scene = simulate(scenario('at_depth'), 3)
+    tracker = DiverTracker(DiverConfig(dimensions=3))
+    for item in scene.measurements:
+        tracker.process(item.measurement)
+        known = tracker._stream.state
+        assert len(known.rows) == START_DEPTHS * len(known) and not len(known.borrowed)
+    improbable = known.rows.replace(logw=np.log([1e-6, 0.5, 0.5 - 1e-6]))
+    assert _protected_rows(improbable).all()
+    scan = Scan.from_items([], tracker.config, Clutters())
+    after = tracker._predict(known, scan, known.stamp_ns + 10**9)
+    np.testing.assert_array_equal(after.rows.logw, known.rows.logw)
 
 
 @pytest.mark.parametrize('seed', [1017, 1018])
