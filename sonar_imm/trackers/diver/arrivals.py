@@ -15,13 +15,11 @@
 """Association of arrivals with tracks, and the update by a ping.
 
 For up to `MOST_SUBSETS` transmitter-receiver pairs, all inlier and outlier subsets of the echoes
-are evaluated (`explanations`); for more pairs, `heavy_tails` is used. Pings of a tag always use
-`heavy_tails`: with the unknown emission time, three or four receivers cannot reject a subset.
+are evaluated (`explanations`); for more pairs, `heavy_tails` is used, and for every ping of a tag:
+with the unknown emission time, three or four receivers cannot reject a subset.
 
-A track takes the measurements that its best explanation accepts. Association and update are one
-step: an `Explanation` holds the update of each track, and `apply_updates` returns the new state.
-
-All rows of a track are evaluated as one list of hypotheses, each a row and a model. So borrowed
+A track takes the measurements that its best explanation accepts, so association and update are one
+step. All rows of a track are evaluated as one list of hypotheses, each a row and a model; borrowed
 assumptions get a row first.
 """
 
@@ -62,24 +60,22 @@ MOST_SUBSETS = 6
 """Maximum number of received transmitter-receiver pairs for subsets."""
 
 EMISSION_STD = 1e3
-"""Prior standard deviation of the emission of a tag, m of path, about the arrivals: flat compared
-to residuals."""
+"""Prior standard deviation of a tag emission about the arrivals, m of path."""
 
 FAR = 1e3
 """Standard deviation, m, of an unknown position about the receivers."""
 
 GOOD_RESIDUAL = 3.0
-"""Residual in standard deviations at which an arrival is equally likely an outlier, with heavy
-tails."""
+"""Residual, in standard deviations, of an arrival that is equally likely an outlier."""
 
 OPTIMA = 3
-"""Number of best positions of the ping alone from which every model also starts."""
+"""Number of best positions of the ping alone from which models also start."""
 
 DISTINCT = 1.0
 """Distance, m, within which two of these positions are equal."""
 
 NEAR = 28.0
-"""Maximum NIS of an echo of a track; beyond, `explanations` drops its weight."""
+"""Maximum NIS of an echo of a track; beyond, its weight is negligible."""
 
 TAKEN = 0.5
 """Minimum inlier probability of a measurement that a track takes."""
@@ -159,19 +155,18 @@ def associate_and_update(
     models: ModelSet,
     covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
 ) -> tuple[Known, BoolArray]:
-    """Update the tracks by a ping. Return the state and the free rows (n,) of the ping.
+    """Update the tracks by a ping, and return its free rows (n,). covered: coverage by sensor.
 
-    A tag with an ID updates or starts a track of its own. covered: coverage by sensor name.
+    A tag with an ID updates or starts a track of its own.
     """
     before, seen, where = known['nis_dof'], None, coverage.sensor_coverage(covered, '', config)
     if where is not None:
         seen = coverage.detection_probability(known, models, where, config.detection_probability)
     known, free = _associate_ping(known, ping, config, models, seen)
     if covered and config.fixes_are_scans and tag_id(ping) == NOBODY:
-        share = (known['nis_dof'] == before) & (known['target_id'] == NOBODY)
-        all_moves = known.memory['instruments'].layout(config, models).mask.all()
-        share = share.astype(np.float64)
-        known = coverage.apply_misses(known, models, seen, share, bool(all_moves))
+        missed = (known['nis_dof'] == before) & (known['target_id'] == NOBODY)
+        all_moves = bool(known.memory['instruments'].layout(config, models).mask.all())
+        known = coverage.apply_misses(known, models, seen, missed.astype(np.float64), all_moves)
     return known, free
 
 
@@ -182,8 +177,7 @@ def _associate_ping(
     models: ModelSet,
     detected: coverage.DetectionProbability | None,
 ) -> tuple[Known, BoolArray]:
-    """Update the tracks by received arrivals. detected: detection probabilities; None if
-    constant."""
+    """Update the tracks by received arrivals. detected: None for a constant probability."""
     name, rows, free = tag_id(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(known['target_id'] == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
@@ -211,10 +205,8 @@ def _associate_ping(
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.nominal))
     free[seen.row[taken & seen.echo]] = False
     free &= free.all() or not ping.passive  # all arrivals of a tag belong to one track
-    known = apply_updates(known, updates, models)
-    return _accumulate_residuals(known, updates, ping, seen, config, models).with_columns(
-        score=score
-    ), free
+    known = apply_updates(known, updates, models).with_columns(score=score)
+    return _accumulate_residuals(known, updates, ping, seen, config, models), free
 
 
 def _accumulate_residuals(
@@ -284,7 +276,7 @@ def _explain_echoes(
     """Associate the echoes of one transmission with tracks.
 
     Tracks that explain more pairs choose first, confirmed before tentative ones: a ghost fits only
-    the echoes it was made of. A track with fewer than half of the pairs is not updated.
+    its own echoes. A track with fewer than half of the pairs is not updated.
     """
     x, P, mu, _ = (np.concatenate(column) for column in zip(*mixtures))
     likelihood, nis = fit_each(x, P, config.target_z, ping.measured)
@@ -320,8 +312,7 @@ def _choose_by_rank(
     taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
     updates: dict[int, TrackUpdate] = {}
     score = known['score'] + len(pairs) * np.log1p(-p)
-    gain = np.log(p / (1.0 - p))
-    gain -= 0.5 * np.log(config.usual_clutter)
+    gain = np.log(p / (1.0 - p)) - 0.5 * np.log(config.usual_clutter)
     for turn in np.unique(rank[rank != EXCLUDED]):
         tracks = np.flatnonzero(rank == turn)
         owner = _assign_owners(tracks, fit, near & ~taken, pairs, config)
@@ -350,9 +341,9 @@ def _assign_owners(
     pairs: list[IndexArray],
     config: DiverConfig,
 ) -> IntArray:
-    """Return the track of each measurement (C,), -1 for none.
+    """Assign the echoes of each pair to tracks of equal rank.
 
-    Tracks of equal rank are assigned the echoes of each pair.
+    Return the track (C,), -1 for none.
     """
     owner = np.full(fit.shape[1], -1)
     if len(tracks) > 1:
@@ -378,9 +369,9 @@ def _explain_tag(
 ) -> Explanation:
     """Associate the whole ping of a tag with one track.
 
-    With `max_tracks: 1` the existing track takes every ping. Otherwise the track with the best
-    explanation inside its gate takes it. Confirmed tracks choose first; tentative tracks choose if
-    the first track explains fewer than half of the arrivals.
+    With `max_tracks: 1` the existing track takes every ping. Otherwise the best explanation inside
+    the gate does: confirmed tracks first, then tentative ones if fewer than half of the arrivals
+    fit.
     """
     score = known['score'] + np.log1p(-config.detection_probability)
     updates: dict[int, TrackUpdate] = {}
@@ -455,8 +446,7 @@ def make_track_update(
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
     """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
 
-    After a long gap, rounding can make S singular for exact arrivals. Then use eigenvalues in
-    units of the variances, which are at least 1.
+    If rounding makes S singular, use eigenvalues in units of the variances.
     """
     S = covariance + np.diag(variance)
     if is_psd(S) or not np.isfinite(S).all():
@@ -472,8 +462,7 @@ def update_by_ping(
 ) -> PingUpdate | None:
     """Update a track by a whole ping; None if no hypothesis is possible.
 
-    Above `MOST_MEASUREMENTS`, use those nearest to the prediction, and test the others against the
-    result.
+    Above `MOST_MEASUREMENTS`, use those nearest to the prediction and test the others.
     """
     if len(ping.row) > MOST_MEASUREMENTS:
         _, nis = fit_measurements(*before[:3], config.target_z, ping.measured)
@@ -495,8 +484,7 @@ def update_by_ping(
     if not (scale == 1.0).all():
         measured = measured._replace(variance=scale[:, None] * measured.variance)
     if ping.passive or ping.pairs > MOST_SUBSETS:
-        starts = find_optima(ping, config)
-        heavy = measured, starts, DEGREES
+        heavy = measured, find_optima(ping, config), DEGREES
         x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
         # Jacobian of the scaled residuals.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
@@ -533,10 +521,10 @@ def begin_from_ping(
     layout: Layout,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return x (K, n + q), P (K, n + q, n + q) and log evidence (K,) of a new track near
-    `position` (2,).
+    `position`.
 
-    The prior of the position is flat. The result contains the correlations of position, depth and
-    instrument errors.
+    The prior of the position (2,) is flat. P includes correlations with depth and instrument
+    errors.
     """
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
@@ -551,8 +539,7 @@ def begin_from_ping(
 def expected_residuals(
     before: Mixture, ping: Ping, height: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return residuals (C,), their covariance (C, C) without the measurement variances, and the
-    degrees of freedom."""
+    """Return residuals (C,), their prior covariance (C, C), and the degrees of freedom."""
     x, P, mu = before.x, before.P, before.published_weights
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
@@ -586,8 +573,7 @@ def find_optima(ping: Ping, config: DiverConfig) -> FloatArray:
 
 
 def _start_positions(measured: PingMeasurements, passive: bool) -> FloatArray:
-    """Return start positions (11, 2): around the earliest receivers, or on the ellipse of the
-    shortest path."""
+    """Return (11, 2): around the earliest receivers, or on the ellipse of the shortest path."""
     order = np.argsort(measured.value, kind='stable')
     if passive:
         near = measured.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
@@ -617,7 +603,7 @@ def _with_emission(
     mask: BoolArray,
     height: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Append the emission of a tag to x, P and mask, with a flat prior at the arrivals."""
+    """Append the emission of a tag to x, P and mask, with a flat prior."""
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P

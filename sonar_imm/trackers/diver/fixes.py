@@ -292,14 +292,12 @@ def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
 def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group], Known]:
     """Return the stage that compares and associates fixes: by ID if fixes have IDs, otherwise by
     `pairing`."""
-    pair, min_probability = (
-        {'jipda': associate_jipda, 'gnn': associate_gnn}[pairing],
-        MIN_MODEL_PROBABILITY[pairing],
-    )
+    by_density = {'jipda': associate_jipda, 'gnn': associate_gnn}[pairing]
+    min_probability = MIN_MODEL_PROBABILITY[pairing]
 
     def associate(known: Known, group: Group) -> Known:
         group.pairs = compare(known, group, models, min_probability)
-        associate_pairs = pair if group.target_id is None else associate_by_id
+        associate_pairs = by_density if group.target_id is None else associate_by_id
         group.association = associate_pairs(known, group, group.pairs)
         return known
 
