@@ -129,10 +129,10 @@ def test_a_single_cause_that_explains_it_all_is_named():
     deep = np.array([np.linalg.norm(RECEIVERS - [*p, -10.0], axis=1) for p in places])
     deep += np.hypot(np.hypot(*places.T), 10.0)[:, None] - np.array([legs(p) for p in places])
     found, config = evidence(places, received, noise + deep)
-    assert 'target_z (or dimensions: 3) would explain it' in found.warnings(config)[0]
+    assert 'Likely cause: target_z (or dimensions: 3)' in found.warnings(config)[0]
     slow = 0.01 * np.array([legs(place) for place in places])
     found, config = evidence(places, received, noise + slow)
-    assert 'sound_speed would explain it' in found.warnings(config)[0]
+    assert 'Likely cause: sound_speed' in found.warnings(config)[0]
     assert found.warnings(DiverConfig(sound_speed_std=15.0)) == []
 
 
