@@ -209,7 +209,7 @@ def test_arrivals_that_miss_name_what_was_not_stated():
         more, lasting = tracker.warnings()
         assert named in more and 'receiver_position_std' in more
         assert ('sound_speed_std' in more) == (not config)
-        assert 'Likely cause: target_z (or dimensions: 3)' in lasting
+        assert 'target_z (or dimensions: 3). Set' in lasting
 
 
 @pytest.mark.statistics
