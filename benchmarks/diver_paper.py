@@ -54,7 +54,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import average_bounds, nees
 from sonar_imm.estimation.motion import Model, Motion
 from sonar_imm.estimation.smoothing import imm_smooth
-from sonar_imm.trackers.diver.models import build_models, headings, ModelSet
+from sonar_imm.trackers.diver.models import build_models, heading_vectors, ModelSet
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm.truth import TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -131,7 +131,7 @@ class WorldHeadings(OwnSet):
     speed, noise = 1.0, 0.19
 
     def __init__(self, config: DiverConfig):
-        u, _, names = headings(config)
+        u, _, names = heading_vectors(config)
         T, variance = config.reference_step, self.noise**2
 
         def step(along: FloatArray, x: FloatArray, dt: float) -> Motion:
@@ -152,7 +152,7 @@ class RelativeHeadings(OwnSet):
     noise = 0.1
 
     def __init__(self, config: DiverConfig):
-        u, w, _ = headings(config)
+        u, w, _ = heading_vectors(config)
         M, rate = len(u), self.noise**2 / config.reference_step
 
         def step(R: FloatArray, x: FloatArray, dt: float) -> Motion:
@@ -252,7 +252,7 @@ class PaperChain:
     def __init__(self, prior: FloatArray, form: str, guard: float = 0.7):
         self.prior, self.factor, self.guard = prior, EQUATION[form], guard
 
-    def fresh(self, targets: int) -> FloatArray:
+    def initial_counts(self, targets: int) -> FloatArray:
         """Transition matrices (targets, M, M)."""
         return np.tile(self.prior, (targets, 1, 1))
 
@@ -361,10 +361,10 @@ def forward(
     models: ModelSet, chain: AdaptiveChain | PaperChain, z: np.ndarray, R: np.ndarray
 ) -> Iterator[Step]:
     """Filter N runs of K fixes, one a second, at once."""
-    x, P, mu = (part[:, 0] for part in models.new_tracks(z[:, 0], R[:, 0]))
+    x, P, mu = (part[:, 0] for part in models.initial_states(z[:, 0], R[:, 0]))
     F, Q, B = models.motion(1.0)
     H = models.E[:, :2]
-    learnt = chain.fresh(len(z))
+    learnt = chain.initial_counts(len(z))
     yield Step(*imm.combine(x, P, mu, models.E), x, P, mu, chain.transition(learnt, 1.0))
     for k in range(1, z.shape[1]):
         transition, before = chain.transition(learnt, 1.0), mu

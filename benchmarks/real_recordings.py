@@ -30,7 +30,7 @@ from msg_adapters.estimates import read_estimate
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.trackers.diver.births import locate
+from sonar_imm.trackers.diver.births import locate_fix
 from sonar_imm.trackers.diver.tracker import DiverConfig
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
@@ -117,7 +117,7 @@ def raw_fixes(items: list, config: DiverConfig) -> list[Estimate]:
             covariance = config.covariance_scale * item.covariance[:2, :2]
             rows.append((item.stamp_ns, item.position[:2], covariance))
         elif isinstance(item, Arrivals):
-            fix = locate(item, np.arange(len(item)), config)
+            fix = locate_fix(item, np.arange(len(item)), config)
             rows += [(item.stamp_ns, fix.position, fix.covariance)] if fix else []
     alone = {'track_state': np.ones(1, np.uint8)}
     return [

@@ -12,19 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Transition probabilities that are learnt from the data, for each target by itself.
+"""Transition probabilities that adapt to the data of each target.
 
-Learning does not change the chain. It gives a *correction*, a factor for each transition, that is
-applied to the matrix of the next step: ``P(dt) = rownorm(P0(dt) * correction)``. So it works at
-irregular steps too.
+The chain itself does not change. Each transition gets a *correction* factor on the matrix of the
+next step: ``P(dt) = rownorm(P0(dt) * correction)``. So adaptation works at irregular steps.
 
-The correction is that of a Dirichlet prior: expected transitions ``n_ij += W_ij mu_j``, W the
-mixing weights, on top of a prior worth `weight` transitions per row, against those that the
-nominal chain predicts. At a constant step it is ``P = rownorm(n + weight P0)``, the mean of the
-posterior.
+The correction follows from a Dirichlet prior. Expected transitions ``n_ij += W_ij mu_j``, W the
+mixing weights, plus a prior of `weight` transitions per row, are divided by the transitions
+predicted by the nominal chain. At a constant step, ``P = rownorm(n + weight P0)``, the posterior
+mean.
 
-Where the models are families, a target learns inside each family only: how often it goes from one
-to another is too rare to be learnt from one target.
+With families of models, only transitions inside each family adapt: transitions between families
+are too rare.
 """
 
 from __future__ import annotations
@@ -37,22 +36,24 @@ from .arrays import FloatArray, IndexArray, IntArray
 
 
 class Chain(Protocol):
-    """A Markov chain over models, such as `markov.RateChain`."""
+    """A Markov chain of models, such as `markov.RateChain`."""
 
     matrix: FloatArray
     step: float
 
     def transition(self, dt: float) -> FloatArray:
-        """P(dt), (M, M)."""
+        """Return P(dt), (M, M)."""
         ...
 
 
 class AdaptiveChain:
-    """A chain and the way the data of T targets correct it. What was learnt is a value that the
-    caller keeps: `fresh` makes it, `learn` updates it.
+    """A chain with corrections from the data of T targets.
 
-    weight: how many transitions per row the prior is worth; family (M,): the family of each model,
-    where targets learn inside of families only; learns: False for the chain as it is.
+    The caller stores the transition counts: `initial_counts` creates them, `learn` updates them.
+
+    :param weight: number of transitions per row of the prior.
+    :param family: (M,) family of each model, for adaptation inside families only.
+    :param learns: False for the nominal chain.
     """
 
     def __init__(
@@ -67,19 +68,21 @@ class AdaptiveChain:
         self.weight = weight
         M = len(chain.matrix)
         family = np.zeros(M, np.int64) if family is None else family
-        # The E transitions that can be learnt, row by row.
+        # The E adaptive transitions, row by row.
         self._i, self._j = np.nonzero((family[:, None] == family) & learns)
         self._first = np.flatnonzero(np.diff(self._i, prepend=-1))
         self._prior = weight * chain.matrix[self._i, self._j]
 
-    def fresh(self, targets: int) -> FloatArray:
-        """Return what is known before anything was learnt: (targets, 2, E), transitions seen and
-        expected, of the E that can be learnt."""
+    def initial_counts(self, targets: int) -> FloatArray:
+        """Return initial counts (targets, 2, E): observed and expected transitions of E adaptive
+        ones."""
         return np.zeros((targets, 2, len(self._i)))
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
-        """Return the matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing
-        can be learnt."""
+        """Return the matrices of a step of dt seconds:
+
+        (targets, M, M), or (1, M, M) without adaptation.
+        """
         nominal = self.chain.transition(dt)
         if not len(self._i):
             return np.array(nominal[None])
@@ -106,10 +109,14 @@ class AdaptiveChain:
         dt: float,
         hit: IndexArray | None = None,
     ) -> FloatArray:
-        """Return what is learnt after a step that used `transition` (targets or 1, M, M) and took
-        the model probabilities (targets, M) from `mu_before` to `mu_after`. Only the targets `hit`
-        (all by default), which were measured, learn: a miss holds no information on
-        transitions."""
+        """Return the transition counts after a step.
+
+        :param transition: (targets or 1, M, M) used in the step.
+        :param mu_before: (targets, M) model probabilities before the step.
+        :param mu_after: (targets, M) model probabilities after the update.
+        :param hit: indices of measured targets, all by default. A miss contains no information on
+            transitions.
+        """
         if not len(self._i):
             return learnt
         hit = np.arange(len(learnt)) if hit is None else hit

@@ -12,29 +12,29 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A bank of motion models with different states, for many filters at once: mix, predict, weigh,
-update, combine.
+"""Bank of motion models with different states, for many filters at once.
 
-A *row* is one interacting multiple model filter under one assumption, for example one scale of the
-measurement covariances; a target may have several rows. The M models of a row lie in blocks, and
-the models of a block share the components of their state. The arrays of a block are
+Operations: mix, predict, weigh, update, combine. A *row* is one interacting multiple model filter
+under one assumption, for example a covariance scale; a target may have several rows. The M models
+of a row lie in blocks. The models of a block have the same state components. The arrays of a block
+are
 
     x (N, n, m), P (N, n, n, m): N rows, n components, m models,
 
-with the model last, because numpy runs along the last axis: every operation below runs along tens
-of models instead of three or four components. ``mu (N, M)`` holds the probabilities of all models,
-block by block, and ``transition (N or 1, M, M)`` is ``Pr(model j now | model i before)``.
+with the model last, because numpy is fastest along the last axis, and there are tens of models but
+only three or four components. ``mu (N, M)`` holds the model probabilities, block by block.
+``transition (N or 1, M, M)`` is ``Pr(model j now | model i before)``.
 
-`mix` works on raw moments about a centre of the row, ``E[d]`` and ``E[d d']``, because these are
-what a mixture adds up: the moments of all models times the mixing weights are one matrix product
-per row. Between blocks, the moments of a model are first expressed in the components of the other
-block (its *image*):
+`mix` works on raw moments about a centre of the row, ``E[d]`` and ``E[d d']``, because the moments
+of a mixture are weighted sums: one matrix product per row. Between blocks, the moments of a model
+are first converted to the components of the other block (its *image*):
 
 - heading or hover -> velocity: ``v = s u``, with the spread of a sector across. This is linear in
   the raw moments.
-- velocity -> heading: the velocity is conditioned on pointing along the heading (a scalar update),
-  and the probability of going to a heading is shared among the headings by how well they fit.
-- velocity -> hover: the speed is drawn from its prior.
+- velocity -> heading: the velocity is conditioned on the direction of the heading (a scalar
+  update). The probability of a transition to a heading is distributed by the likelihood of each
+  heading.
+- velocity -> hover: the speed has its prior.
 
 Source: docs/diver.md, 'Families'.
 """
@@ -56,51 +56,55 @@ __all__ = [
     'Bank',
     'combine',
     'compare',
-    'expected',
     'Gaussians',
     'Innovations',
     'mix',
     'Moves',
     'predict',
+    'predict_fix',
     'update',
     'weigh',
 ]
 
 DEAD = 1e-300
-"""A model that is reached with no more than this probability is given the mixture of all."""
+"""Probability up to which a predicted model gets the mixture of all models."""
 
 LEAST_ACROSS = 1e-9
-"""Variance, (m/s)^2, that a velocity across a heading has at least."""
+"""Minimum variance of a velocity across a heading, (m/s)^2."""
 
 X, Y, S, VX, VY = 0, 1, 2, 2, 3
-"""Places of the components: position and speed of a heading, position and velocity."""
+"""Component indices: position and speed of a heading, position and velocity."""
 
 LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Gaussians(NamedTuple):
-    """Means x (N, n, m) and covariances P (N, n, n, m) of one block of models."""
+    """Means and covariances of one block of models."""
 
     x: Annotated[FloatArray, 'Nnm']
+    """(N, n, m)."""
     P: Annotated[FloatArray, 'Nnnm']
+    """(N, n, n, m)."""
 
-    def rows(self, chosen: IndexArray | BoolArray) -> Gaussians:
+    def select(self, chosen: IndexArray | BoolArray) -> Gaussians:
         """Return the `chosen` rows."""
         return Gaussians(self.x[chosen], self.P[chosen])
 
 
 @frozen(eq=False, slots=False)
 class Moves:
-    """One step of a block, x <- F x + B + N(0, Q): F, Q (n, n, m), B (n, m). Components of the
-    state behind the first n are constants."""
+    """One step of a block, x <- F x + B + N(0, Q). Components after the first n are constants."""
 
     F: FloatArray
+    """(n, n, m)."""
     Q: FloatArray
+    """(n, n, m)."""
     B: FloatArray
+    """(n, m)."""
 
     @cached_property
     def changing(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
-        """The components that F changes, and those of which each is then made."""
+        """Components that F changes, each with the components of its new value."""
         n = len(self.B)
         rows = [tuple(k for k in range(n) if self.F[i, k].any()) for i in range(n)]
         still = [(self.F[i, i] == 1.0).all() for i in range(n)]
@@ -109,24 +113,25 @@ class Moves:
 
 @frozen(eq=False)
 class Bank:
-    """What `mix` has to know of the models.
+    """Model data for `mix`.
 
-    Without velocities there is one block, whose models share all components.
-
-    units: (2, a) unit vectors of the a models of the first block: (0, 0) for a hover. velocities:
-    number of models of the second block. speed, speed_variance: prior of the speed, for what
-    becomes a hover. sector: half the width of a heading's sector, as a variance, rad^2.
+    Without velocities there is one block, whose models have the same components.
     """
 
     units: FloatArray
+    """(2, a) unit vectors of the a models of the first block; (0, 0) for a hover."""
     velocities: int = 0
+    """Number of models of the second block."""
     speed: float = 0.0
+    """Prior mean of the speed of a hover, m/s."""
     speed_variance: float = 1.0
+    """Prior variance of the speed, (m/s)^2."""
     sector: float = 0.0
+    """Variance of the direction in a heading sector, rad^2."""
     directions: FloatArray = field(init=False)
-    """(2, D) the headings that differ."""
+    """(2, D) distinct headings."""
     direction: IndexArray = field(init=False)
-    """(a,) of each model its place among `directions`, D for a hover."""
+    """(a,) index of each model in `directions`; D for a hover."""
 
     def __attrs_post_init__(self) -> None:
         moving = np.hypot(*self.units) > 0.5
@@ -138,7 +143,7 @@ class Bank:
 
     @property
     def hovers(self) -> BoolArray:
-        """(a,) True for models of the first block that have no heading."""
+        """(a,) True for models of the first block without a heading."""
         return self.direction == self.directions.shape[1]
 
 
@@ -148,34 +153,36 @@ class Bank:
 def mix(
     bank: Bank, blocks: Sequence[Gaussians], mu: FloatArray, transition: FloatArray
 ) -> tuple[list[Gaussians], FloatArray]:
-    """Mix the models of each row: return the blocks, and the predicted probabilities c (N, M).
+    """Mix the models of each row. Return the blocks and the predicted probabilities c (N, M).
 
-    ``c_j = sum_i W_ij``, ``W_ij = transition_ij mu_i``, and model j gets mean and covariance of
-    the mixture of all images with the weights ``W_ij / c_j``.
+    ``c_j = sum_i W_ij``, ``W_ij = transition_ij mu_i``. Model j gets mean and covariance of the
+    mixture of all images with weights ``W_ij / c_j``.
     """
     W = transition * mu[:, :, None]
     a = bank.units.shape[1]
     centre = _centre(blocks[0], mu[:, :a])
     if bank.velocities:
-        # Moments about the origin lose the digits of a position, but not those of a speed, and
-        # those of a velocity follow from them.
+        # A centre is needed for the digits of a position, not for those of a speed.
         centre[:, S] = 0.0
-    moments = [_moments(block, _padded(centre, k)) for k, block in enumerate(blocks)]
+    moments = [_moments(block, _pad_centre(centre, k)) for k, block in enumerate(blocks)]
     images = None
     if bank.velocities:
-        images, fit = _as_headings(bank, blocks[1], centre)
+        images, fit = _to_headings(bank, blocks[1], centre)
         _share_by_direction(W, fit, bank, a)
     c = W.sum(axis=1)
     dead = c <= DEAD
     W = np.where(dead[:, None], mu[:, :, None], W / np.where(dead, 1.0, c)[:, None])
     mixed = moments[0] @ W[:, :a, :a]
     if images is None:
-        return [_unpacked(mixed, _padded(centre, 0))], c
+        return [_unpack_moments(mixed, _pad_centre(centre, 0))], c
     for k in range(bank.velocities):
         mixed += images[:, :, k, bank.direction] * W[:, None, a + k, :a]
-    as_velocities = _as_velocities(bank, moments[0], blocks[0].x.shape[1])
+    as_velocities = _to_velocities(bank, moments[0], blocks[0].x.shape[1])
     moving = moments[1] @ W[:, a:, a:] + as_velocities @ W[:, :a, a:]
-    return [_unpacked(mixed, _padded(centre, 0)), _unpacked(moving, _padded(centre, 1))], c
+    return [
+        _unpack_moments(mixed, _pad_centre(centre, 0)),
+        _unpack_moments(moving, _pad_centre(centre, 1)),
+    ], c
 
 
 def _centre(block: Gaussians, mu: FloatArray) -> FloatArray:
@@ -185,7 +192,7 @@ def _centre(block: Gaussians, mu: FloatArray) -> FloatArray:
     return np.asarray((block.x @ weight[..., None])[..., 0])
 
 
-def _padded(centre: FloatArray, block: int) -> FloatArray:
+def _pad_centre(centre: FloatArray, block: int) -> FloatArray:
     """Return the centre (N, n, 1) in the components of a block: a velocity has one more."""
     if block == 0:
         return centre[..., None]
@@ -194,19 +201,20 @@ def _padded(centre: FloatArray, block: int) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _upper(n: int) -> tuple[IndexArray, IndexArray]:
+    """Return the indices of the upper triangle."""
     return np.triu_indices(n)
 
 
 def _moments(block: Gaussians, centre: FloatArray) -> FloatArray:
-    """Return first and second raw moments about `centre` (N, n, 1) as (N, n + n (n + 1) / 2, m),
-    of the second the upper triangle."""
+    """Return raw moments about `centre` (N, n, 1) as (N, n + n (n + 1) / 2, m): first, then the
+    upper triangle of the second."""
     i, j = _upper(block.x.shape[1])
     d = block.x - centre
     return np.concatenate([d, block.P[:, i, j] + d[:, i] * d[:, j]], axis=1)
 
 
-def _unpacked(moments: FloatArray, centre: FloatArray) -> Gaussians:
-    """Return mean and covariance of raw moments about `centre` (N, n, 1)."""
+def _unpack_moments(moments: FloatArray, centre: FloatArray) -> Gaussians:
+    """Return mean and covariance from raw moments about `centre` (N, n, 1)."""
     n = centre.shape[1]
     i, j = _upper(n)
     first = moments[:, :n]
@@ -218,9 +226,10 @@ def _unpacked(moments: FloatArray, centre: FloatArray) -> Gaussians:
 
 @lru_cache(maxsize=16)
 def _velocity_places(n: int) -> tuple[tuple[IndexArray, IndexArray], ...]:
-    """Return where the packed moments of n components of a heading stand among those of a
-    velocity, as pairs (place in the heading's, place in the velocity's): what has no speed in it,
-    what is multiplied by u_x, what by u_y."""
+    """Return pairs of indices (heading moment, velocity moment) of n heading components.
+
+    Three pairs: moments without speed, moments to multiply by u_x, and by u_y.
+    """
     i, j = _upper(n)
     of_velocity = zip(*(part.tolist() for part in _upper(n + 1)))
     big = {pair: place for place, pair in enumerate(of_velocity, start=n + 1)}
@@ -243,8 +252,8 @@ def _velocity_places(n: int) -> tuple[tuple[IndexArray, IndexArray], ...]:
     return tuple((each[0], each[1]) for each in pairs)
 
 
-def _as_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
-    """Return the moments (N, q', a) of headings and hovers in the components of a velocity."""
+def _to_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
+    """Return the moments (N, q', a) of headings and hovers in velocity components."""
     (source, target), *along = _velocity_places(n)
     size = n + 1
     out = np.zeros((len(moments), size + size * (size + 1) // 2, moments.shape[-1]))
@@ -267,14 +276,14 @@ def _as_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
     return out
 
 
-def _as_headings(
+def _to_headings(
     bank: Bank, block: Gaussians, centre: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the moments (N, q, b, D + 1) of b velocities as each of D headings and as a hover,
-    and the logarithms (N, b, D) of how well each heading fits."""
+    """Return the moments (N, q, b, D + 1) of b velocities as D headings and a hover, and the log
+    likelihoods (N, b, D) of the headings."""
     x, P = block.x[..., None], block.P[..., None]  # (N, n', b, 1), (N, n', n', b, 1)
     ux, uy = bank.directions
-    own = slice(0, VY + 1)  # what stands behind the velocity is not conditioned
+    own = slice(0, VY + 1)  # components after the velocity are not conditioned
     g = ux * P[:, :, VY] - uy * P[:, :, VX]
     speed, across = ux * x[:, VX] + uy * x[:, VY], ux * x[:, VY] - uy * x[:, VX]
     along = ux * ux * P[:, VX, VX] + 2.0 * ux * uy * P[:, VX, VY] + uy * uy * P[:, VY, VY]
@@ -289,7 +298,7 @@ def _as_headings(
     x2, P2 = _with_speed(x1, P1, ux, uy)
     fit = -0.5 * (across * across / variance + LOG_2PI + np.log(variance))
     fit = fit + _log_positive_part(x2[:, S], P2[:, S, S])
-    hover = _as_hover(bank, block)
+    hover = _to_hover(bank, block)
     x2 = np.concatenate([x2, hover.x[..., None]], axis=-1)
     P2 = np.concatenate([P2, hover.P[..., None]], axis=-1)
     return _moments(Gaussians(x2, P2), centre[..., None, None]), fit
@@ -298,9 +307,9 @@ def _as_headings(
 def _with_speed(
     x: FloatArray, P: FloatArray, ux: FloatArray, uy: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states (N, n', ...) and covariances (N, n', n', ...) with the speed along (ux, uy) in
-    place of the velocity."""
-    kept = _but_velocity(x.shape[1])
+    """Replace the velocity of states (N, n', ...) and covariances (N, n', n', ...) by the speed
+    along (ux, uy)."""
+    kept = _without_velocity(x.shape[1])
     n, behind = x.shape[1] - 1, np.delete(np.arange(x.shape[1] - 1), S)
     x1 = np.empty((len(x), n, *x.shape[2:]))
     x1[:, behind], x1[:, S] = x[:, kept], ux * x[:, VX] + uy * x[:, VY]
@@ -313,14 +322,15 @@ def _with_speed(
 
 
 @lru_cache(maxsize=16)
-def _but_velocity(n: int) -> IndexArray:
+def _without_velocity(n: int) -> IndexArray:
+    """Return the indices of all components except the velocity."""
     return np.delete(np.arange(n), [VX, VY])
 
 
-def _as_hover(bank: Bank, block: Gaussians) -> Gaussians:
-    """Return the velocities with the speed of the prior, uncorrelated with all else."""
+def _to_hover(bank: Bank, block: Gaussians) -> Gaussians:
+    """Replace the velocities by the prior speed, uncorrelated with other components."""
     N, n, m = block.x.shape
-    kept, behind = _but_velocity(n), np.delete(np.arange(n - 1), S)
+    kept, behind = _without_velocity(n), np.delete(np.arange(n - 1), S)
     x, P = np.empty((N, n - 1, m)), np.zeros((N, n - 1, n - 1, m))
     x[:, behind], x[:, S] = block.x[:, kept], bank.speed
     P[:, behind[:, None], behind] = block.P[:, kept[:, None], kept]
@@ -329,8 +339,11 @@ def _as_hover(bank: Bank, block: Gaussians) -> Gaussians:
 
 
 def _share_by_direction(W: FloatArray, fit: FloatArray, bank: Bank, a: int) -> None:
-    """Share what goes from each velocity to headings in W (N, M, M) by how well each heading fits,
-    in place; hovers keep their own."""
+    """Distribute the transitions from velocities to headings in W (N, M, M) by likelihood, in
+    place.
+
+    Hovers do not change.
+    """
     moving = np.flatnonzero(~bank.hovers)
     best = fit.max(axis=-1, keepdims=True)
     known = np.isfinite(best)
@@ -354,10 +367,10 @@ def _log_positive_part(mean: FloatArray, variance: FloatArray) -> FloatArray:
 
 
 def predict(block: Gaussians, moves: Moves) -> Gaussians:
-    """Return the block after a step: ``F x + B``, ``F P F' + Q``.
+    """Predict the block over a step: ``F x + B``, ``F P F' + Q``.
 
-    Most entries of F are 0 or on the diagonal, so that only the others cost anything. What stands
-    behind the components of `moves` is constant.
+    Only entries of F outside the identity are computed. Components after those of `moves` are
+    constant.
     """
     n, F, changing = len(moves.B), moves.F, moves.changing
     x, left = block.x.copy(), block.P.copy()
@@ -375,33 +388,34 @@ def predict(block: Gaussians, moves: Moves) -> Gaussians:
 # -- measurements --------------------------------------------------------------------------------
 
 Measured = tuple[tuple[int, ...], ...]
-"""Of each measured value, the components whose sum it is: ((0,), (1,)) for a position, ((0, 4),
-(1, 5)) for one with an error that is part of the state."""
+"""The components whose sum is each measured value: ((0,), (1,)) for a position, ((0, 4), (1, 5))
+with a bias in the state."""
 
 POSITION: Measured = ((X,), (Y,))
 
 
 class Innovations(NamedTuple):
-    """What p pairs of a row and a measurement of two values say of each of m models.
-
-    v (p, 2, m): innovations; S (p, 3, m): xx, xy, yy of their covariance; R (p, 2, 2); nis, log
-    (p, m): normalised squares and ln N(v; 0, S), infinity and -infinity where S is no covariance.
-    """
+    """Comparison of p pairs of a row and a measurement of two values, for each of m models."""
 
     v: FloatArray
+    """(p, 2, m) innovations."""
     S: FloatArray
+    """(p, 3, m) xx, xy, yy of their covariance."""
     R: FloatArray
+    """(p, 2, 2) measurement covariance."""
     nis: FloatArray
+    """(p, m) normalised innovation squared; infinity if S is invalid."""
     log: FloatArray
+    """(p, m) ln N(v; 0, S); -infinity if S is invalid."""
 
-    def only(self, chosen: IndexArray | BoolArray) -> Innovations:
+    def select(self, chosen: IndexArray | BoolArray) -> Innovations:
         """Return the `chosen` pairs."""
         return Innovations._make(part[chosen] for part in self)
 
 
-def expected(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
-    """Return what each model expects of a measurement, (N, 2, m), and the covariance of that, (N,
-    3, m): xx, xy, yy."""
+def predict_fix(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
+    """Return the predicted measurement (N, 2, m) of each model, and its covariance (N, 3, m): xx,
+    xy, yy."""
     PHt = np.swapaxes(_measure(block.P, measured), 1, 2)
     HPHt = _measure(PHt, measured)
     S = np.stack([HPHt[:, 0, 0], HPHt[:, 0, 1], HPHt[:, 1, 1]], axis=1)
@@ -415,16 +429,15 @@ def weigh(
     R: FloatArray,
     measured: Measured = POSITION,
 ) -> Innovations:
-    """Compare the models of each pair's row with its measurement: row (p,), z (p, 2), R (p, 2,
-    2)."""
-    return compare(*expected(block, measured), row, z, R)
+    """Compare the models of each row with a measurement: row (p,), z (p, 2), R (p, 2, 2)."""
+    return compare(*predict_fix(block, measured), row, z, R)
 
 
 def compare(
     h: FloatArray, S: FloatArray, row: IndexArray, z: FloatArray, R: FloatArray
 ) -> Innovations:
-    """Compare each pair's measurement with what its row expects: h, S as of `expected`, the rest
-    as in `weigh`."""
+    """Compare measurements with predictions h, S of `predict_fix`; other arguments as in
+    `weigh`."""
     v = z[..., None] - h[row]
     S = S[row] + np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1)[..., None]
     a, b, d = S[:, 0], S[:, 1], S[:, 2]
@@ -455,16 +468,16 @@ def update(
     measured: Measured = POSITION,
     estimated: BoolArray | None = None,
 ) -> tuple[Gaussians, FloatArray]:
-    """Update the models of each row by all measurements that may be its own.
+    """Update the models of each row by its measurements.
 
-    :param row: (p,) of each pair, in rising order.
-    :param ratio: (p, m) probability that the pair is true, times the density of its measurement
-        under each model over that under the whole target.
-    :param missed: (N,) probability that none of the measurements is the target's.
-    :param estimated: (n,) False for components that are only considered (Schmidt): an update does
-        not move them.
-    :returns: the block, moment-matched over the measurements and none, and the weights (N, m) by
-        which the probabilities of models and row have to be multiplied.
+    :param row: (p,) row of each pair, in rising order.
+    :param ratio: (p, m) probability of the pair, times the likelihood ratio of each model to the
+        whole target.
+    :param missed: (N,) probability that no measurement belongs to the target.
+    :param estimated: (n,) False for considered components (Schmidt), which an update does not
+        change.
+    :returns: the moment-matched block, and the factors (N, m) of the model probabilities and row
+        weight.
     """
     weight = np.repeat(missed[:, None], ratio.shape[1], axis=1)
     if not len(row):
@@ -477,9 +490,9 @@ def update(
     at = np.repeat(np.arange(len(rows)), np.diff([*first, len(row)]))
     share = np.where(alive[at], ratio / scale[at], 0.0)
     none = np.where(alive, missed[rows, None] / scale, 1.0)
-    shift, after = _conditioned(block, pairs, row, measured, estimated)
+    shift, after = _condition(block, pairs, row, measured, estimated)
     mean = np.add.reduceat(share[:, None] * shift, first)
-    # About the new mean: what a sharp measurement leaves is lost beside the square of a shift.
+    # Moments about the new mean: a small posterior variance is lost beside a squared shift.
     apart = shift - mean[at]
     spread = after + apart[:, :, None] * apart[:, None]
     P = none[:, None, None] * (block.P[rows] + mean[:, :, None] * mean[:, None])
@@ -490,15 +503,15 @@ def update(
     return Gaussians(x1, P1), weight
 
 
-def _conditioned(
+def _condition(
     block: Gaussians,
     pairs: Innovations,
     row: IndexArray,
     measured: Measured,
     estimated: BoolArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return by how much each pair moves the means (p, n, m), and the covariances (p, n, n, m)
-    after it, in Joseph's form."""
+    """Return the mean shifts (p, n, m) and posterior covariances (p, n, n, m) of each pair, in
+    Joseph form."""
     a, b, d = (pairs.S[:, None, k] for k in range(3))
     P = block.P[row]
     PHt = np.swapaxes(_measure(P, measured), 1, 2)
@@ -525,10 +538,10 @@ def combine(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (N, q) and covariance (N, q, q) of the mixture of all models of each row.
 
-    outputs: of each block (q, n, m), the outputs of each model in its components.
+    outputs: (q, n, m) output maps of each block.
     """
     means = [np.einsum('qnm,Nnm->Nqm', E, b.x) for E, b in zip(outputs, blocks)]
-    # In two steps: numpy would look for the order at each call.
+    # In two steps, because numpy would search the contraction order at each call.
     spreads = [
         np.einsum('Nqbm,rbm->Nqrm', np.einsum('qam,Nabm->Nqbm', E, b.P), E)
         for E, b in zip(outputs, blocks)

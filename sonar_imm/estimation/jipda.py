@@ -14,23 +14,23 @@
 
 """Joint integrated probabilistic data association with the IMM filter (Musicki and Evans 2004).
 
-Where targets cross and false detections abound, choosing one pairing and forgetting the others
-loses identities. Here every joint event, in which each track takes at most one detection and each
-detection goes to at most one track, is weighed,
+With crossing targets and clutter, a single assignment loses track identities. Instead, every joint
+event, in which each track has at most one detection and each detection belongs to at most one
+track, has the weight
 
     Pr(event) ~ prod_assigned r_t P_D f_ti / lambda * prod_missed (1 - r_t P_D),
 
-with r_t the probability that the target of track t exists, ``f_ti = sum_j c_j N(z_i; h_j, S_j)``
-the likelihood of detection i in the mixture of the track's models, and lambda the density of false
-detections and new targets together. The sums over the events are
+with r_t the existence probability of track t, ``f_ti = sum_j c_j N(z_i; h_j, S_j)`` the likelihood
+of detection i in the model mixture of the track, and lambda the density of false detections and
+new targets. The sums over the events are
 
     beta_ti         the target exists and caused detection i,
     missed_t        it exists and was not detected: Pr(no detection) r (1 - P_D) / (1 - r P_D),
     r_t             the new probability of existence: beta summed, plus missed.
 
-`associate` computes these sums exactly, without visiting the events (`marginals`). Within a
-track, model j shares detection i in proportion to N_ji (`bank.update`), ``beta_i|j ~ beta_i N_ji /
-f_i`` and ``mu_j ~ c_j (beta_0 + sum_i beta_i N_ji / f_i)``, moment-matched in each model.
+`associate` computes these sums exactly, without enumerating events (`marginals`). Within a track,
+model j shares detection i in proportion to N_ji (`bank.update`), ``beta_i|j ~ beta_i N_ji / f_i``
+and ``mu_j ~ c_j (beta_0 + sum_i beta_i N_ji / f_i)``, moment-matched in each model.
 """
 
 from __future__ import annotations
@@ -47,28 +47,31 @@ def associate(
     existence: FloatArray,
     detection_probability: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return beta (T, D), missed (T,) and the new existence (T,) of the joint events above.
+    """Return beta (T, D), missed (T,) and the new existence (T,) of the joint events.
 
     :param ratio: (T, D) f / lambda.
-    :param possible: (T, D) False for pairs that are no part of any event.
+    :param possible: (T, D) False for pairs outside the gate.
     :param existence: (T,) before the scan.
-    :param detection_probability: (T,) of a target that exists.
+    :param detection_probability: (T,) of an existing target.
     """
     detected = existence * detection_probability
     beta, none = marginals(detected[:, None] * ratio, 1.0 - detected, possible)
     missed = none * existence * (1.0 - detection_probability) / (1.0 - detected)
-    # What is rounded adds up to a little more than 1.
+    # Rounding errors can give slightly more than 1.
     return beta, missed, np.minimum(missed + beta.sum(axis=1), 1.0)
 
 
 def nearest_older(
     mean: FloatArray, covariance: FloatArray, ids: IntArray, free: BoolArray, firm: BoolArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return for each track (T,) the older one that is nearest, -1 for none, and how far it is
-    (Mahalanobis distance squared of their difference).
+    """Return the nearest older track of each track (T,), -1 for none, and the squared Mahalanobis
+    distance.
 
-    mean (T, 2), covariance (T, 2, 2); ids (T,) rise with age; of `free` (T,) tracks alone; a
-    `firm` (T,) one is compared with firm ones only.
+    :param mean: (T, 2).
+    :param covariance: (T, 2, 2).
+    :param ids: (T,) rising with age.
+    :param free: (T,) True for tracks that are compared.
+    :param firm: (T,) True for tracks that are compared with firm tracks only.
     """
     if not len(ids):
         return np.empty(0, np.int64), np.empty(0)

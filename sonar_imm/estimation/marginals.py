@@ -12,27 +12,27 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Exact probabilities of association, without visiting the joint events.
+"""Exact association probabilities, without enumerating joint events.
 
-In a joint event each track takes at most one detection and each detection goes to at most one
+In a joint event each track has at most one detection and each detection belongs to at most one
 track. Its weight is a product over tracks,
 
     w(event) = prod_assigned a[t, d] * prod_missed m[t],
 
-and the probability of a pair is the sum over the events that hold it. There are too many events to
-visit: 12 tracks and 12 detections have 8e11. Their sum needs only the *set* of detections that the
-first k tracks have used (a permanent by dynamic programming over sets):
+and the probability of a pair is the sum over the events that contain it. There are too many events
+to enumerate: 8e11 for 12 tracks and 12 detections. The sum needs only the *set* of detections used
+by the first k tracks (a permanent by dynamic programming over sets):
 
     forward[k + 1][U] = m[k] forward[k][U] + sum_{d in U} a[k, d] forward[k][U - d]
 
-`backward` is the same from the last track on, and the sum over all events that hold the pair
-(k, d) is ``sum_U forward[k][U] a[k, d] backward[k + 1][U + d]``. Each step is one vector operation
-of 2^d elements. Where a cluster has fewer tracks than detections the two change roles, so that the
-cost is 2^min(tracks, detections).
+`backward` is the same from the last track on. The sum over all events with the pair (k, d) is
+``sum_U forward[k][U] a[k, d] backward[k + 1][U + d]``. Each step is one vector operation of 2^d
+elements. In a cluster with fewer tracks than detections, both are exchanged, so the cost is
+2^min(tracks, detections).
 
-Tracks that share no detection do not influence each other: `clusters` splits the problem. A
-cluster of a single track has a closed form. One that is larger than `LARGEST` on both sides loses
-its least probable pairs and is split anew.
+Tracks without a common detection are independent: `clusters` splits the problem. A cluster of one
+track has a closed form. A cluster larger than `LARGEST` on both sides loses its least probable
+pairs and is split again.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 __all__ = ['clusters', 'marginals']
 
 LARGEST = 12
-"""Tracks, or detections, of a cluster that is computed exactly."""
+"""Maximum number of tracks or detections of an exact cluster."""
 
 DROPPED = 0.3
-"""Share of the pairs that a larger cluster loses at a time, the least probable first."""
+"""Fraction of the pairs that a larger cluster loses at a time, the least probable first."""
 
 
 def marginals(
@@ -68,7 +68,7 @@ def marginals(
     ([[0.75, 0.0]], [0.25])
     """
     weight = np.where(possible, assigned, 0.0)
-    # A row may be scaled at will: its factor is in every event.
+    # Scaling a row does not change the result: its factor is in every event.
     largest = np.maximum(weight.max(axis=1, initial=0.0), missed)
     weight, alone = weight / largest[:, None], missed / largest
     together = list(_small_clusters(weight, alone))
@@ -80,8 +80,9 @@ def marginals(
 
 
 def clusters(possible: BoolArray) -> IntArray:
-    """Return for each track the first track of its cluster (T,): tracks that share a detection,
-    directly or by others between them. A track without a detection is alone.
+    """Return the first track of the cluster of each track (T,).
+
+    Tracks with a common detection, directly or through other tracks, form a cluster.
 
     >>> import numpy as np
     >>> clusters(np.array([[True, False], [False, True], [True, False]])).tolist()
@@ -102,7 +103,7 @@ def clusters(possible: BoolArray) -> IntArray:
 
 
 def _each_alone(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the marginals (T, D) and (T,) of tracks that share no detection."""
+    """Return the marginals (T, D) and (T,) of tracks without common detections."""
     total = alone + weight.sum(axis=1)
     return weight / total[:, None], alone / total
 
@@ -110,7 +111,8 @@ def _each_alone(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, Floa
 def _small_clusters(
     weight: FloatArray, alone: FloatArray
 ) -> Iterator[tuple[IndexArray, IndexArray]]:
-    """Yield tracks and detections of each cluster of several tracks that can be computed exactly.
+    """Yield tracks and detections of each exact cluster of several tracks.
+
     Pairs that a larger cluster loses are set to 0 in `weight`, in place.
     """
     waiting = [np.arange(len(weight))]
@@ -136,13 +138,14 @@ def _exact(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArra
     t, d = weight.shape
     if d <= t:
         return _over_sets(weight, alone)
-    # Detections in turn, sets of tracks. A detection that is nobody's weighs 1; a track without
-    # one is a track that is in no set at the end, with its weight taken out of all others.
+    # Loop over detections, with sets of tracks. A detection of no track weighs 1. A track without
+    # a detection is in no set at the end; its weight is divided out of all others.
     pair, _, unused = _steps((weight / alone[:, None]).T, np.ones(d))
     return pair.T, unused
 
 
 def _over_sets(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the marginals over sets of detections."""
     pair, none, _ = _steps(weight, alone)
     return pair, none
 
@@ -152,7 +155,8 @@ def _steps(a: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
     :param a: (steps, k) weight of each row with each column.
     :param m: (steps,) weight of each row without a column.
-    :returns: pair (steps, k), none (steps,), and unused (k,): that a column is in no pair.
+    :returns: pair (steps, k), none (steps,), and unused (k,), the probability that a column is in
+        no pair.
     """
     steps, k = a.shape
     without, with_it = _subsets(k)
@@ -181,8 +185,10 @@ def _steps(a: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
 @lru_cache(maxsize=LARGEST + 1)
 def _subsets(k: int) -> tuple[tuple[IndexArray, ...], tuple[IndexArray, ...]]:
-    """Return for each of k elements the sets without it, and the same sets with it: sets are the
-    bits of a number."""
+    """Return the sets without each of k elements, and the same sets with it.
+
+    Sets are bit masks.
+    """
     numbers = np.arange(1 << k)
     without = tuple(numbers[(numbers >> bit) & 1 == 0] for bit in range(k))
     return without, tuple(sets | (1 << bit) for bit, sets in enumerate(without))

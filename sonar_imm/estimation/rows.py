@@ -12,22 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The table of rows: a target is a weighted set of filters, each under one assumption.
+"""Table of rows: a target is a weighted set of filters, each under one assumption.
 
-A row is one filter of a `bank` under one assumption: a scale of the covariances, a depth at which
-the target began, a side of the array, an offset of a sensor. The rows of all targets lie in one
-table, so that every verb runs over all of them at once; rows that belong to the same target lie
-side by side.
+A row is one filter of a `bank` under one assumption, for example a covariance scale, a start
+depth, a side of the array, or a sensor offset. The rows of all targets lie in one table, so each
+operation covers all of them at once. The rows of a target are adjacent.
 
-Rows begin and end at run time. `Rows.key` says what a row assumes, by name. `parent` is the row of
-the table before that it came from, so that a smoother can follow it back.
+Rows are added and removed at run time. `Rows.key` names the assumptions of each row. `parent` is
+the row of the previous table that a row came from, for smoothing.
 
-*Borrowing.* A scale of the covariances changes how a filter goes on, not what it is. So a scale
-that has become improbable need not be computed: it loses its row and keeps its weight in a list
-(`Borrowed`), reckoned from a row of the same target. When it becomes probable again, it gets a
-copy of that row. Nothing else may borrow: a start depth *is* its state.
+*Borrowing.* A covariance scale changes the future of a filter, not its current state. So a row of
+an improbable scale is removed, and its weight is kept in a list (`Borrowed`) and updated from
+another row of the target. When the scale becomes probable again, it gets a copy of that row. Other
+assumptions cannot borrow: a start depth is the state itself.
 
-No array in a table is ever written again: tables of earlier scans share them.
+Arrays are never changed in place, because tables of earlier scans share them.
 """
 
 from __future__ import annotations
@@ -41,50 +40,50 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'of_targets', 'revived', 'Rows', 'thinned']
+__all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
 
 LEAST_LOG = -345.0
-"""Logarithm of the weight, 1e-150, that a row keeps: it may become true later."""
+"""Minimum logarithm of a row weight, 1e-150, so that a row can recover."""
 
 ROW_LOST, ROW_AGAIN = 1e-4, 1e-3
-"""Weights below which an assumption that may borrow loses its row, and above which it gets one
+"""Weight below which a borrowing assumption loses its row, and weight above which it gets a row
 again."""
 
 
 @frozen(eq=False, slots=False)
 class Rows:
-    """N rows of M models each, of T targets, each of which has at least one.
-
-    blocks: states of the models, see `bank`; mu (N, M): probabilities of the models in each row,
-    which sum to one; logw (N,): logarithms of the weights of the rows, which sum to one for each
-    target, but for what is `Borrowed`; target (N,): the place of the target, in rising order;
-    parent (N,): the row of the table before, -1 for none; key: what each row assumes, by name,
-    (N,) each.
-    """
+    """N rows of M models each, of T targets with at least one row each."""
 
     blocks: tuple[Gaussians, ...]
+    """States of the models, see `bank`."""
     mu: Annotated[FloatArray, 'NM']
+    """(N, M) model probabilities of each row; the sum of a row is one."""
     logw: Annotated[FloatArray, 'N']
+    """(N,) logarithms of the row weights. The sum over a target is one, with its `Borrowed`
+    weights."""
     target: Annotated[IntArray, 'N']
+    """(N,) target index, in rising order."""
     parent: Annotated[IntArray, 'N']
+    """(N,) row of the previous table; -1 for none."""
     key: dict[str, np.ndarray] = field(factory=dict)
+    """Assumptions of each row by name, (N,) each."""
 
     def __len__(self) -> int:
         return len(self.mu)
 
     @cached_property
     def first(self) -> IndexArray:
-        """(T,) the first row of each target."""
-        return _first(self.target)
+        """(T,) first row of each target."""
+        return _first_rows(self.target)
 
     @cached_property
     def weight(self) -> FloatArray:
-        """(N,) the weights of the rows of each target; they sum to one."""
-        return self.weights_of(np.ones(len(self), np.bool_))
+        """(N,) row weights, normalised for each target."""
+        return self.weights_among(np.ones(len(self), np.bool_))
 
-    def weights_of(self, counted: BoolArray) -> FloatArray:
-        """Return the weights (N,) of the rows among those that are `counted` (N,), of targets that
-        have none of these among all."""
+    def weights_among(self, counted: BoolArray) -> FloatArray:
+        """Return weights (N,) normalised over the `counted` (N,) rows of a target, or over all its
+        rows if none is counted."""
         if not len(self):
             return np.empty(0)
         first = self.first
@@ -92,16 +91,15 @@ class Rows:
         weight = np.where(counted | none[self.target], np.exp(self.logw), 0.0)
         return weight / np.add.reduceat(weight, first)[self.target]
 
-    def weight_among_themselves(self) -> FloatArray:
-        """Return the weights (N,) of the rows of one target, whatever its place."""
+    def normalized_weight(self) -> FloatArray:
+        """Return the weights (N,) normalised over the whole table, for rows of one target."""
         weight = np.exp(self.logw - self.logw.max())
         return np.asarray(weight / weight.sum())
 
-    def take(self, rows: IndexArray) -> Rows:
-        """Return those rows, in that order, each as often as it is named; `parent` says which they
-        were."""
+    def select(self, rows: IndexArray) -> Rows:
+        """Return the rows of the given indices, which may repeat. `parent` holds the indices."""
         return Rows(
-            tuple(block.rows(rows) for block in self.blocks),
+            tuple(block.select(rows) for block in self.blocks),
             self.mu[rows],
             self.logw[rows],
             self.target[rows],
@@ -109,17 +107,19 @@ class Rows:
             {name: column[rows] for name, column in self.key.items()},
         )
 
-    def of_targets(self, kept: BoolArray) -> Rows:
-        """Return the rows of the targets where `kept` (T,) is True, which are numbered anew; their
-        parents stay."""
+    def select_targets(self, kept: BoolArray) -> Rows:
+        """Return the rows of the targets selected by `kept` (T,), renumbered.
+
+        Parents do not change.
+        """
         rows = np.flatnonzero(kept[self.target])
         renumbered = (np.cumsum(kept) - 1)[self.target[rows]]
-        return evolve(self.take(rows), target=renumbered, parent=self.parent[rows])
+        return evolve(self.select(rows), target=renumbered, parent=self.parent[rows])
 
     def append(self, new: Rows) -> Rows:
-        """Return the table with more rows, of targets already there or of new ones.
+        """Append rows of existing or new targets.
 
-        Raises ValueError when the new rows assume something else by name.
+        :raises ValueError: the new rows have other keys.
         """
         if set(new.key) != set(self.key):
             raise ValueError(f'rows with {sorted(new.key)} do not fit {sorted(self.key)}')
@@ -138,18 +138,20 @@ class Rows:
         if (np.diff(both.target) >= 0).all():
             return both
         order = np.argsort(both.target, kind='stable')
-        return evolve(both.take(order), parent=both.parent[order])
+        return evolve(both.select(order), parent=both.parent[order])
 
-    def in_place_of(self, target: int, new: Rows) -> Rows:
-        """Return the table in which `new` are the rows of one target, without parents."""
-        left = self.take(np.flatnonzero(self.target != target))
+    def replace_target(self, target: int, new: Rows) -> Rows:
+        """Replace all rows of one target by `new`, without parents."""
+        left = self.select(np.flatnonzero(self.target != target))
         left = evolve(left, parent=self.parent[left.parent])
         count = len(new)
         return left.append(evolve(new, target=np.full(count, target), parent=np.full(count, -1)))
 
-    def with_models(self, factor: FloatArray) -> tuple[Rows, FloatArray]:
-        """Return the rows after the probabilities of their models were multiplied by `factor` (N,
-        M), and by what (N,) that multiplied the weight of each row."""
+    def multiply_models(self, factor: FloatArray) -> tuple[Rows, FloatArray]:
+        """Multiply the model probabilities by `factor` (N, M).
+
+        Return the rows and the sum (N,) of each row before normalisation.
+        """
         mu = self.mu * factor
         total = mu.sum(axis=1)
         known = total > 0.0
@@ -157,14 +159,14 @@ class Rows:
         return evolve(self, mu=mu), total
 
     def log_sum(self, log: FloatArray) -> FloatArray:
-        """Return ln sum exp (T, ...) over the rows of each target of `log` (N, ...)."""
+        """Return ln sum exp (T, ...) of `log` (N, ...) over the rows of each target."""
         return log_sum(log, self.target)
 
     def combine(
         self, mean: FloatArray, covariance: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return mean (T, q) and covariance (T, q, q) of each target, of those of its rows (N, q),
-        (N, q, q) with `weight` (N,)."""
+        """Return mean (T, q) and covariance (T, q, q) of each target, from its rows (N, q), (N, q,
+        q) with `weight` (N,)."""
         if not len(self):
             return mean, covariance
         w, first = weight[:, None], self.first
@@ -173,8 +175,8 @@ class Rows:
         spread = covariance + d[:, :, None] * d[:, None]
         return centre, np.add.reduceat(w[..., None] * spread, first)
 
-    def models(self) -> FloatArray:
-        """Return the probabilities (T, M) of the models of each target, over all its rows."""
+    def model_probabilities(self) -> FloatArray:
+        """Return the model probabilities (T, M) of each target over all its rows."""
         if not len(self):
             return self.mu
         return np.asarray(np.add.reduceat(self.weight[:, None] * self.mu, self.first))
@@ -184,27 +186,32 @@ class Rows:
         return evolve(self, **changes)
 
 
-def _first(target: IntArray) -> IndexArray:
-    """Return where each target begins, of targets (A,) in rising order."""
+def _first_rows(target: IntArray) -> IndexArray:
+    """Return the first index of each target. target: (A,) in rising order."""
     changes = np.ones(len(target), np.bool_)
     np.not_equal(target[1:], target[:-1], out=changes[1:])
     return changes.nonzero()[0]
 
 
-def of_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
-    """Return what a verb such as ``np.maximum`` makes of all that belongs to each target, (T,
-    ...): values (A, ...), target (A,) in rising order, each of T there."""
+def reduce_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
+    """Reduce values (A, ...) of each target by a ufunc such as ``np.maximum``, to (T, ...).
+    target:
+
+    (A,) in rising order.
+    """
     if not len(values):
         return values
-    return np.asarray(verb.reduceat(values, _first(target)))
+    return np.asarray(verb.reduceat(values, _first_rows(target)))
 
 
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
-    """Return ln sum exp (T, ...) of what belongs to each target: log (A, ...), target (A,) in
-    rising order, each of T there."""
+    """Return ln sum exp (T, ...) of log (A, ...) over each target. target:
+
+    (A,) in rising order.
+    """
     if not len(log):
         return np.empty((0, *log.shape[1:]))
-    first = _first(target)
+    first = _first_rows(target)
     top = np.maximum.reduceat(log, first)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):
@@ -213,34 +220,36 @@ def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
 
 @frozen(eq=False)
 class Borrowed:
-    """Assumptions without a row of their own: target (B,), the `key` (B,) they are known by, and
-    the logarithms of their weights (B,)."""
+    """B assumptions without a row of their own."""
 
     target: Annotated[IntArray, 'b']
+    """(B,) target index."""
     key: Annotated[FloatArray, 'b']
+    """(B,) value of the assumption."""
     logw: Annotated[FloatArray, 'b']
+    """(B,) logarithms of the weights."""
 
     @classmethod
-    def none(cls) -> Borrowed:
+    def empty(cls) -> Borrowed:
         """Return an empty list."""
         return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
     def __len__(self) -> int:
         return len(self.target)
 
-    def of_targets(self, kept: BoolArray) -> Borrowed:
-        """Return those of the targets where `kept` (T,) is True, which are numbered anew."""
+    def select_targets(self, kept: BoolArray) -> Borrowed:
+        """Return the assumptions of the targets selected by `kept` (T,), renumbered."""
         own = kept[self.target]
         return Borrowed((np.cumsum(kept) - 1)[self.target[own]], self.key[own], self.logw[own])
 
-    def without(self, target: int) -> Borrowed:
-        """Return those of all other targets."""
+    def without_target(self, target: int) -> Borrowed:
+        """Return the assumptions of all other targets."""
         other = self.target != target
         return Borrowed(self.target[other], self.key[other], self.logw[other])
 
-    def lender(self, rows: Rows, name: str) -> IndexArray:
-        """Return the row (B,) of the same target that each is reckoned from: the nearest by the
-        logarithm of the key `name`, of two as near the heavier."""
+    def find_lenders(self, rows: Rows, name: str) -> IndexArray:
+        """Return the row (B,) that each assumption borrows: the nearest by the logarithm of the
+        key `name`, the heavier of two."""
         if not len(self):
             return np.empty(0, np.intp)
         apart = np.abs(np.log(rows.key[name]) - np.log(self.key)[:, None])
@@ -248,11 +257,14 @@ class Borrowed:
         return np.asarray(apart.argmin(axis=1))
 
 
-def thinned(
+def drop_weightless_rows(
     rows: Rows, borrowed: Borrowed, name: str, stays: BoolArray
 ) -> tuple[Rows, Borrowed, IndexArray]:
-    """Return rows and list after rows that lost their weight were left out, but for those that
-    `stays` (N,), and which rows are left. name: of the key that may borrow."""
+    """Move rows of negligible weight to the borrowed list, except rows that `stays` (N,).
+
+    :param name: key that can borrow.
+    :returns: the rows, the list, and the indices of the remaining rows.
+    """
     lost = (rows.logw < np.log(ROW_LOST)) & ~stays
     left = np.flatnonzero(~lost)
     if len(left) == len(rows):
@@ -260,17 +272,22 @@ def thinned(
     target = np.concatenate([borrowed.target, rows.target[lost]])
     key = np.concatenate([borrowed.key, rows.key[name][lost]])
     new = Borrowed(target, key, np.concatenate([borrowed.logw, rows.logw[lost]]))
-    return evolve(rows.take(left), parent=rows.parent[left]), new, left
+    return evolve(rows.select(left), parent=rows.parent[left]), new, left
 
 
-def revived(rows: Rows, borrowed: Borrowed, name: str, again: BoolArray) -> tuple[Rows, Borrowed]:
-    """Return rows and list after assumptions `again` (B,) got a row, a copy of their lender."""
+def restore_rows(
+    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
+) -> tuple[Rows, Borrowed]:
+    """Give the assumptions `again` (B,) a row, a copy of their lender.
+
+    Return the rows and the list.
+    """
     if not again.any():
         return rows, borrowed
     back, waiting = (
         Borrowed(borrowed.target[own], borrowed.key[own], borrowed.logw[own])
         for own in (again, ~again)
     )
-    lender = back.lender(rows, name)
-    copies = evolve(rows.take(lender), logw=back.logw, parent=rows.parent[lender])
+    lender = back.find_lenders(rows, name)
+    copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
     return rows.append(evolve(copies, key={**copies.key, name: back.key})), waiting

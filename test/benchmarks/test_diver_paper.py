@@ -35,7 +35,7 @@ VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 
 def learnt(chain, mu):
     """The matrix (3, 3) after the model probabilities mu (K, 1, 3) in turn."""
-    P = chain.fresh(1)
+    P = chain.initial_counts(1)
     for before, after in zip(mu[:-1], mu[1:]):
         P = chain.learn(P, chain.transition(P, 1.0), before, after, 1.0)
     return chain.transition(P, 1.0)[0]
@@ -84,7 +84,7 @@ def test_the_guarded_product_in_a_filter_is_that_of_the_reference():
         names = (name for name in reference if name.startswith('A6_world16_adaptA_guard/'))
         given = {name.partition('/')[2]: reference[name] for name in names}
     models = SimpleNamespace(
-        new_tracks=lambda z, R: tuple(given[name][None, None] for name in ('x0', 'P0', 'mu0')),
+        initial_states=lambda z, R: tuple(given[name][None, None] for name in ('x0', 'P0', 'mu0')),
         motion=lambda dt: Motion(given['F'], given['Q'], given['B']),
         E=given['E'],
     )
@@ -114,7 +114,7 @@ def test_world_headings_are_those_of_the_reference(monkeypatch):
 def test_world_headings_compose_in_position():
     """Their velocity is drawn afresh at each step; the law of the position composes."""
     models = build_models(DiverConfig(model_set='bench_world_headings'))
-    (x,), (P,), _ = models.new_tracks(
+    (x,), (P,), _ = models.initial_states(
         np.array([[3.0, -2.0]]), np.array([[[2.0, 0.5], [0.5, 1.0]]])
     )
     long_x, long_P, _ = imm.predict(x, P, *models.motion(1.0))

@@ -48,7 +48,7 @@ def simplex(rng, *shape):
 def test_counts_at_a_constant_step_are_the_dirichlet_posterior_mean():
     rng = np.random.default_rng(1)
     chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=3.0)
-    learnt, counts, P = chain.fresh(1), np.zeros((3, 3)), PRIOR
+    learnt, counts, P = chain.initial_counts(1), np.zeros((3, 3)), PRIOR
     for _ in range(20):
         before, after = simplex(rng, 1), simplex(rng, 1)
         joint = P * before[0][:, None]
@@ -65,7 +65,7 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
     rng = np.random.default_rng(2)
     truth = markov.RateChain([[0.6, 0.3, 0.1], [0.1, 0.8, 0.1], [0.05, 0.35, 0.6]], 1.0)
     chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), weight=2.0)
-    learnt, model = chain.fresh(1), 0
+    learnt, model = chain.initial_counts(1), 0
     for dt in rng.uniform(0.4, 0.9, 20_000):
         after = rng.choice(3, p=truth.transition(dt)[model])
         learnt = chain.learn(
@@ -80,7 +80,7 @@ def test_counting_a_chain_that_is_seen_recovers_it_at_any_step():
 def test_fixed_learns_nothing():
     chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), learns=False)
     learnt = chain.learn(
-        chain.fresh(4), PRIOR[None], np.ones((4, 3)) / 3, np.ones((4, 3)) / 3, 1.0
+        chain.initial_counts(4), PRIOR[None], np.ones((4, 3)) / 3, np.ones((4, 3)) / 3, 1.0
     )
     np.testing.assert_array_equal(chain.transition(learnt, 1.0), PRIOR[None])
 
@@ -89,7 +89,7 @@ def test_impossible_transitions_stay_impossible():
     prior = np.array([[0.9, 0.1, 0.0], [0.0, 0.9, 0.1], [0.1, 0.0, 0.9]])
     chain = AdaptiveChain(Constant(prior))
     rng = np.random.default_rng(3)
-    learnt = chain.fresh(2)
+    learnt = chain.initial_counts(2)
     for _ in range(10):
         before, after = simplex(rng, 2), simplex(rng, 2)
         learnt = chain.learn(learnt, chain.transition(learnt, 1.0), before, after, 1.0)
@@ -116,7 +116,7 @@ def test_what_is_learnt_is_what_the_plain_forms_say(M, families, shared):
     family = np.arange(M) % families
     chain = AdaptiveChain(Constant(nominal), weight=2.0, family=family)
     inside = family[:, None] == family[None]
-    learnt = chain.fresh(5)
+    learnt = chain.initial_counts(5)
     learnt += rng.uniform(0.0, 3.0, learnt.shape) * (nominal[inside] > 0.0)
     whole = np.zeros((5, 2, M, M))
     whole[:, :, inside] = learnt

@@ -79,7 +79,7 @@ def test_rows_do_not_influence_each_other():
     together, c = verbs.mix(BANK, many, weights, transition())
     for row in range(5):
         alone, c_alone = verbs.mix(
-            BANK, [b.rows([row]) for b in many], weights[[row]], transition()
+            BANK, [b.select([row]) for b in many], weights[[row]], transition()
         )
         np.testing.assert_allclose(c[row], c_alone[0], rtol=1e-12)
         for found, right in zip(together, alone):
@@ -129,7 +129,7 @@ def test_a_velocity_given_its_heading_is_what_samples_say(seed):
     P = root.T @ root + 0.02 * np.eye(4)
     alone = Bank(np.array([[1.0], [0.0]]), velocities=1, sector=BANK.sector)
     block = Gaussians(x[None, :, None], P[None, :, :, None])
-    moments, _ = verbs._as_headings(alone, block, np.zeros((1, 3)))
+    moments, _ = verbs._to_headings(alone, block, np.zeros((1, 3)))
     samples = rng.multivariate_normal(x, P, 200_000)
     variance = BANK.sector * (x[2] ** 2 + P[2, 2]) + verbs.LEAST_ACROSS
     weight = np.exp(-0.5 * samples[:, 3] ** 2 / variance)

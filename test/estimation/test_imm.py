@@ -112,7 +112,7 @@ def run_case(engine, get, case):
     # The reference starts its counts at N0 P0 and adds N0 P0 again: worth two N0 in all.
     chain = AdaptiveChain(FixedChain(P0), weight=2.0 * options.get('N0', 1.0), learns=learns)
     x, P, mu = (get(case, key)[None].copy() for key in ('x0', 'P0', 'mu0'))
-    learnt, H = chain.fresh(1), np.ascontiguousarray(E[:, :2])
+    learnt, H = chain.initial_counts(1), np.ascontiguousarray(E[:, :2])
     rows = []
     for k in range(len(Z)):
         transition, before = chain.transition(learnt, 1.0), mu

@@ -24,7 +24,7 @@ import pytest
 
 from sonar_imm.estimation import bank
 from sonar_imm.estimation.bank import Gaussians
-from sonar_imm.estimation.rows import Borrowed, revived, ROW_LOST, Rows, thinned
+from sonar_imm.estimation.rows import Borrowed, drop_weightless_rows, restore_rows, ROW_LOST, Rows
 
 of_any = given(st.integers(0, 2**32 - 1))
 SCALES = np.array([0.1, 1.0, 3.0, 10.0, 30.0])
@@ -88,7 +88,7 @@ def test_targets_that_go_are_numbered_anew_with_their_rows(seed):
     kept = rng.uniform(size=len(tags)) < 0.6
     if not kept.any():
         kept[0] = True
-    left, lent = rows.of_targets(kept), borrowed.of_targets(kept)
+    left, lent = rows.select_targets(kept), borrowed.select_targets(kept)
     require_whole(left, tags[kept])
     assert set(left.key['tag']) == set(tags[kept])
     before = by_name(rows, rows.parent)
@@ -107,13 +107,13 @@ def test_new_rows_stand_beside_those_of_their_target(seed):
     new, *_ = table(seed + 1, np.append(tags[rng.integers(T)], more))
     target = np.searchsorted(np.append(tags, more), new.key['tag'])
     order = np.argsort(target, kind='stable')
-    new = evolve(new.take(order), target=target[order], parent=np.full(len(new), -1))
+    new = evolve(new.select(order), target=target[order], parent=np.full(len(new), -1))
     both = rows.append(new)
     require_whole(both, np.append(tags, more))
     due = by_name(rows, rows.parent) | by_name(new, new.parent)
     assert by_name(both, both.parent) == due
     with pytest.raises(ValueError, match='rows with .* do not fit'):
-        rows.append(rows.take(np.array([0])).replace(key={}))
+        rows.append(rows.select(np.array([0])).replace(key={}))
 
 
 @of_any
@@ -122,14 +122,14 @@ def test_the_rows_of_one_target_are_replaced(seed):
     tags = np.unique(rows.key['tag'])
     target = int(rng.integers(len(tags)))
     new, *_ = table(seed + 1, tags[[target]])
-    after = rows.in_place_of(target, new)
+    after = rows.replace_target(target, new)
     require_whole(after, tags)
     due = dict.fromkeys(new.key['name'].tolist(), -1)
     other = rows.target != target
     due |= {int(name): int(row) for name, row in zip(rows.key['name'][other], rows.parent[other])}
     assert by_name(after, after.parent) == due
-    assert not (borrowed.without(target).target == target).any()
-    assert len(borrowed.without(target)) == np.count_nonzero(borrowed.target != target)
+    assert not (borrowed.without_target(target).target == target).any()
+    assert len(borrowed.without_target(target)) == np.count_nonzero(borrowed.target != target)
 
 
 @of_any
@@ -137,7 +137,7 @@ def test_a_row_that_is_lost_keeps_its_weight_and_gets_a_row_again(seed):
     rows, borrowed, rng = table(seed)
     tags, total = np.unique(rows.key['tag']), weights(rows, borrowed)
     stays = rows.logw == np.maximum.reduceat(rows.logw, rows.first)[rows.target]
-    thin, lent, left = thinned(rows, borrowed, 'scale', stays)
+    thin, lent, left = drop_weightless_rows(rows, borrowed, 'scale', stays)
     require_whole(thin, tags)
     np.testing.assert_allclose(weights(thin, lent), total, atol=1e-12)
     assert np.array_equal(thin.key['name'], rows.key['name'][left])
@@ -145,7 +145,7 @@ def test_a_row_that_is_lost_keeps_its_weight_and_gets_a_row_again(seed):
     assert (stays | (rows.logw >= math.log(ROW_LOST)))[left].all()
     assert len(thin) + len(lent) == len(rows) + len(borrowed)
     again = rng.uniform(size=len(lent)) < 0.5
-    back, waiting = revived(thin, lent, 'scale', again)
+    back, waiting = restore_rows(thin, lent, 'scale', again)
     # A copy has the name of its lender, which is one of its own target.
     require_whole(back, tags)
     np.testing.assert_allclose(weights(back, waiting), total, atol=1e-12)
@@ -155,7 +155,7 @@ def test_a_row_that_is_lost_keeps_its_weight_and_gets_a_row_again(seed):
         assert sorted(scales) == sorted(own)
     parents = by_name(thin, thin.parent)
     assert all(parents[int(n)] == p for n, p in zip(back.key['name'], back.parent))
-    lender = lent.lender(thin, 'scale')
+    lender = lent.find_lenders(thin, 'scale')
     assert np.array_equal(thin.target[lender], lent.target)
     for b, row in enumerate(lender):
         near = np.abs(np.log(thin.key['scale'] / lent.key[b]))[thin.target == lent.target[b]]
@@ -167,7 +167,7 @@ def test_weights_of_the_rows_of_a_target_sum_to_one(seed):
     rows, _, rng = table(seed)
     np.testing.assert_allclose(np.add.reduceat(rows.weight, rows.first), 1.0)
     counted = rng.uniform(size=len(rows)) < 0.5
-    some = rows.weights_of(counted)
+    some = rows.weights_among(counted)
     for k in range(rows.target.max() + 1):
         own = rows.target == k
         chosen = own & counted if (own & counted).any() else own
@@ -180,7 +180,7 @@ def test_models_and_rows_are_weighed_by_bayes(seed):
     rows, _, rng = table(seed)
     factor = rng.uniform(0.0, 2.0, rows.mu.shape)
     factor[0] = 0.0  # what no model explains keeps its models
-    after, total = rows.with_models(factor)
+    after, total = rows.multiply_models(factor)
     np.testing.assert_allclose(total, (rows.mu * factor).sum(axis=1))
     np.testing.assert_array_equal(after.mu[0], rows.mu[0])
     np.testing.assert_allclose(after.mu[1:] * total[1:, None], (rows.mu * factor)[1:])
@@ -204,4 +204,4 @@ def test_the_mixture_of_rows_is_that_of_all_their_models(seed):
         due_P = np.einsum('k,kab->ab', weight, spread + d[:, :, None] * d[:, None])
         np.testing.assert_allclose(mean[target], due, rtol=1e-9)
         np.testing.assert_allclose(covariance[target], due_P, rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(rows.models().sum(axis=1), 1.0)
+    np.testing.assert_allclose(rows.model_probabilities().sum(axis=1), 1.0)

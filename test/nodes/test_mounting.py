@@ -28,7 +28,7 @@ from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
-from sonar_imm.trackers.diver.known import places
+from sonar_imm.trackers.diver.known import track_positions
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 from sonar_imm_tools.simulation.obstacle import simulator as ahead
@@ -146,7 +146,7 @@ def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, t
     tracker = again.node.tracker
     known = tracker._stream.state
     assert not again.node._meter.refused
-    assert places(known, tracker.models)[0][:, 0] == pytest.approx([105.4], abs=0.3)
+    assert track_positions(known, tracker.models)[0][:, 0] == pytest.approx([105.4], abs=0.3)
     assert known.life.track_id.tolist() == [1] and known.life.status.tolist() == [1]
     again.send(*fix_at('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
     assert len(tracker._stream.state) == 1

@@ -12,20 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What becomes of the divers by a ping: which measurements are whose, and the update by them.
+"""Association of arrivals with tracks, and the update by a ping.
 
-Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets (`explanations`), more of them by `heavy_tails`. So are the arrivals of a tag,
-however few: its time of emission is unknown, so that among three or four receivers no subset is
-refuted by the others, and what decides is whether the whole lies where the ping by itself would
-put it.
+For up to `MOST_SUBSETS` transmitter-receiver pairs, all inlier and outlier subsets of the echoes
+are evaluated (`explanations`); for more pairs, `heavy_tails` is used, and for every ping of a tag:
+with the unknown emission time, three or four receivers cannot reject a subset.
 
-A track takes the measurements that its best explanation calls good. So association and update are
-one step here: an `Explanation` says what each track that takes part becomes, and
-`with_takings` is the value in which that has happened.
-
-All rows of a track are explained at once, as one list of hypotheses: a hypothesis is a row and a
-model. So every assumption has a row here, also one that fixes had made improbable.
+A track takes the measurements that its best explanation accepts, so association and update are one
+step. All rows of a track are evaluated as one list of hypotheses, each a row and a model; borrowed
+assumptions get a row first.
 """
 
 from __future__ import annotations
@@ -40,11 +35,11 @@ from ...acoustics.arrivals_3d import EMISSION
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
 from ...estimation.covariance import add_jitter, is_psd
-from ...estimation.rows import LEAST_LOG, revived
+from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
 from . import coverage, offsets
 from .config import DiverConfig
-from .depth import spread, with_rows
+from .depth import replace_rows, respread_depths
 from .explanations import (
     expect_measurements,
     expect_residuals,
@@ -54,92 +49,100 @@ from .explanations import (
     PingMeasurements,
     subset_ping,
 )
-from .fixes import STATED
+from .fixes import MIN_PUBLISHED_SCALE
 from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
-from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
+from .scan import MOST_MEASUREMENTS, Ping, ping_measurements, tag_id
 
 MOST_SUBSETS = 6
-"""Most transmitter-receiver pairs heard whose subsets are all tried."""
+"""Maximum number of received transmitter-receiver pairs for subsets."""
 
 EMISSION_STD = 1e3
-"""Standard deviation of a tag's emission, m of path, about where the arrivals put it: flat beside
-any residual."""
+"""Prior standard deviation of a tag emission about the arrivals, m of path."""
 
 FAR = 1e3
-"""Standard deviation, m, of a position of which nothing is known but where the receivers are."""
+"""Standard deviation, m, of an unknown position about the receivers."""
 
 GOOD_RESIDUAL = 3.0
-"""Standard deviations at which an arrival, weighed by heavy tails, is as good as wild."""
+"""Residual, in standard deviations, of an arrival that is equally likely an outlier."""
 
 OPTIMA = 3
-"""Best positions of the ping by itself from which every model starts too."""
+"""Number of best positions of the ping alone from which models also start."""
 
 DISTINCT = 1.0
-"""Metres within which two of them are the same."""
+"""Distance, m, within which two of these positions are equal."""
 
 NEAR = 28.0
-"""NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`explanations`."""
+"""Maximum NIS of an echo of a track; beyond, its weight is negligible."""
 
 TAKEN = 0.5
-"""Probability of being good from which a measurement counts as a track's."""
+"""Minimum inlier probability of a measurement that a track takes."""
 
 EVERYWHERE: Mapping[str, coverage.Coverage] = {}
-"""Nothing is stated of what a sensor covers."""
+"""No configured coverage."""
 
 EXCLUDED = -1
-"""Rank of a track that takes no part in a message."""
+"""Rank of a track that is not updated by a ping."""
 
 
 class Mixture(NamedTuple):
-    """One diver: L hypotheses, x (L, n), P (L, n, n) with probabilities mu (L,), and by what
-    `scale` (L,) each multiplies the variances of measurements."""
+    """L hypotheses of one track."""
 
     x: FloatArray
+    """(L, n) states."""
     P: FloatArray
+    """(L, n, n) covariances."""
     mu: FloatArray
+    """(L,) probabilities."""
     scale: FloatArray
+    """(L,) covariance scales."""
 
     @property
-    def stated(self) -> FloatArray:
-        """mu (L,) of the hypotheses that say how well a place is known."""
-        mu = np.where(self.scale >= STATED, self.mu, 0.0)
+    def published_weights(self) -> FloatArray:
+        """mu (L,), normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
+        mu = np.where(self.scale >= MIN_PUBLISHED_SCALE, self.mu, 0.0)
         total = mu.sum()
         return np.asarray(mu / total) if total > 0.0 else self.mu
 
 
 class PingUpdate(NamedTuple):
-    """A diver after a ping; log (L,): logarithms of the probabilities of the hypotheses; good
-    (C,): how sure each measurement is this diver's; log_evidence, comparable between divers of the
-    same ping; repairs: covariances repaired (`estimation.covariance`)."""
+    """A track after a ping."""
 
     after: Mixture
+    """Updated hypotheses."""
     log: FloatArray
+    """(L,) logarithms of their probabilities."""
     good: FloatArray
+    """(C,) inlier probability of each measurement."""
     log_evidence: float
+    """Log evidence of the ping, comparable between tracks."""
     repairs: int
+    """Number of repaired covariances."""
 
 
-class Taking(NamedTuple):
-    """What a track becomes by the measurements of a ping that it takes: after; good (C,): those;
-    nis of dof of them, 0 for too few."""
+class TrackUpdate(NamedTuple):
+    """A track after its measurements of a ping."""
 
     after: PingUpdate
     good: BoolArray
+    """(C,) True for measurements that the track takes."""
     nis: float
+    """NIS of these measurements."""
     dof: int
+    """Their degrees of freedom; 0 if there are too few."""
 
 
 class Explanation(NamedTuple):
-    """What a ping is to the tracks: takings by track, in the order in which they chose; taken
-    (C,): the measurements that are a track's; score (T,)."""
+    """Association of a ping with T tracks."""
 
-    takings: dict[int, Taking]
+    updates: dict[int, TrackUpdate]
+    """Updates by track index, in order of choice."""
     taken: BoolArray
+    """(C,) True for measurements of any track."""
     score: FloatArray
+    """(T,) new scores."""
 
 
 # -- all tracks ----------------------------------------------------------------------------------
@@ -152,113 +155,115 @@ def associate_and_update(
     models: ModelSet,
     covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
 ) -> tuple[Known, BoolArray]:
-    """Return the tracks after a ping, and the rows (n,) of it that are no track's; covered: what
-    is stated of sensors. A tag whose name is known has a track of its own or begins one."""
-    before, seen, where = known['nis_dof'], None, coverage.of_sensor(covered, '', config)
+    """Update the tracks by a ping, and return its free rows (n,). covered: coverage by sensor.
+
+    A tag with an ID updates or starts a track of its own.
+    """
+    before, seen, where = known['nis_dof'], None, coverage.sensor_coverage(covered, '', config)
     if where is not None:
-        seen = coverage.seen(known, models, where, config.detection_probability)
-    known, free = _by_ping(known, ping, config, models, seen)
-    if covered and config.fixes_are_scans and name_of(ping) == NOBODY:
-        share = (known['nis_dof'] == before) & (known['target_id'] == NOBODY)
-        all_moves = known.memory['instruments'].layout(config, models).mask.all()
-        share = share.astype(np.float64)
-        known = coverage.missed(known, models, seen, share, bool(all_moves))
+        seen = coverage.detection_probability(known, models, where, config.detection_probability)
+    known, free = _associate_ping(known, ping, config, models, seen)
+    if covered and config.fixes_are_scans and tag_id(ping) == NOBODY:
+        missed = (known['nis_dof'] == before) & (known['target_id'] == NOBODY)
+        all_moves = bool(known.memory['instruments'].layout(config, models).mask.all())
+        known = coverage.apply_misses(known, models, seen, missed.astype(np.float64), all_moves)
     return known, free
 
 
-def _by_ping(
+def _associate_ping(
     known: Known,
     ping: Arrivals,
     config: DiverConfig,
     models: ModelSet,
-    detected: coverage.Seen | None,
+    detected: coverage.DetectionProbability | None,
 ) -> tuple[Known, BoolArray]:
-    """`associate_and_update` of what was heard; detected: None where that is equally probable."""
-    name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
+    """Update the tracks by received arrivals. detected: None for a constant probability."""
+    name, rows, free = tag_id(ping), np.arange(len(ping)), np.ones(len(ping), bool)
     own = np.flatnonzero(known['target_id'] == name) if name != NOBODY else rows[:0]
     if name != NOBODY and not len(own):
         return known, free
     instruments = known.memory['instruments'].with_receivers(ping, config)
     layout = instruments.layout(config, models)
     every = np.ones(len(known.borrowed), np.bool_)
-    table, borrowed = revived(known.rows, known.borrowed, 'scale', every)
-    known = known.replace(rows=layout.of_rows(table, models), borrowed=borrowed)
-    known = known.remember(instruments=instruments)
+    table, borrowed = restore_rows(known.rows, known.borrowed, 'scale', every)
+    known = known.replace(rows=layout.rows_with_new_constants(table, models), borrowed=borrowed)
+    known = known.with_memory(instruments=instruments)
     seen = ping_measurements(ping, rows, config, models, layout)
     if not len(known) or seen.pairs <= int(ping.passive):
         return known, free & (name == NOBODY)
-    known = spread(known, seen, layout, models)
-    mixtures = [mixture_of(known, track, models) for track in range(len(known))]
+    known = respread_depths(known, seen, layout, models)
+    mixtures = [track_mixture(known, track, models) for track in range(len(known))]
     if name != NOBODY:
-        taking = _taking(mixtures[int(own[0])], seen, config, layout)
-        takings = {} if taking is None else {int(own[0]): taking}
-        known = with_takings(known, takings, models)
-        return _watched(known, takings, ping, seen, config, models), ~free
+        update = _update_track(mixtures[int(own[0])], seen, config, layout)
+        updates = {} if update is None else {int(own[0]): update}
+        known = apply_updates(known, updates, models)
+        return _accumulate_residuals(known, updates, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
-    takings, taken, score = explain(known, mixtures, seen, config, layout)
+    updates, taken, score = explain(known, mixtures, seen, config, layout)
     if detected is not None:
         looks = 1 if ping.passive else len(seen.nodes)
-        score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.usual))
+        score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.nominal))
     free[seen.row[taken & seen.echo]] = False
-    free &= free.all() or not ping.passive  # a tag's are of one track, also those not used
-    known = with_takings(known, takings, models)
-    return _watched(known, takings, ping, seen, config, models).put(score=score), free
+    free &= free.all() or not ping.passive  # all arrivals of a tag belong to one track
+    known = apply_updates(known, updates, models).with_columns(score=score)
+    return _accumulate_residuals(known, updates, ping, seen, config, models), free
 
 
-def _watched(
+def _accumulate_residuals(
     known: Known,
-    takings: dict[int, Taking],
+    updates: dict[int, TrackUpdate],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
     models: ModelSet,
 ) -> Known:
-    """Return the tracks with what the ping says of errors that last, by the confirmed tracks that
-    took of it."""
-    took = {track: taking.good for track, taking in takings.items() if taking.dof}
+    """Update the test for instrument errors, from confirmed tracks."""
+    took = {track: update.good for track, update in updates.items() if update.dof}
     axes = [0, 1] if models.height < 0 else [0, 1, models.height]
     at = {}
     for track in took:
         if known.life.status[track] != TENTATIVE:
-            after = takings[track].after.after
+            after = updates[track].after.after
             at[track] = after.x[after.mu.argmax(), axes]
     memory = known.memory['offsets'], known.memory['recent']
-    found, recent = offsets.watched(*memory, at, took, ping, seen, config)
-    return known.remember(offsets=found, recent=recent)
+    found, recent = offsets.accumulate_residuals(*memory, at, took, ping, seen, config)
+    return known.with_memory(offsets=found, recent=recent)
 
 
-def mixture_of(known: Known, track: int, models: ModelSet) -> Mixture:
+def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
     """Return the hypotheses of a track, row by row."""
-    rows = known.rows.take(known.rows_of(track))
-    x, P = models.common(rows.blocks)
+    rows = known.rows.select(known.row_indices(track))
+    x, P = models.to_common(rows.blocks)
     N, M, n = x.shape
-    mu = rows.weight_among_themselves()[:, None] * rows.mu
+    mu = rows.normalized_weight()[:, None] * rows.mu
     scale = np.repeat(rows.key['scale'], M)
     return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
 
 
-def with_takings(known: Known, takings: dict[int, Taking], models: ModelSet) -> Known:
-    """Return the tracks after they have taken what they take."""
-    if not takings:
+def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSet) -> Known:
+    """Return the state with the updated tracks."""
+    if not updates:
         return known
     nis, nis_dof, repairs = known['nis'].copy(), known['nis_dof'].copy(), 0
     rows, M = known.rows, len(models.names)
-    for track, taking in takings.items():
-        after, own = taking.after.after, known.rows_of(track)
-        # A ping of many arrivals can be e^700 times as probable in one row as in another.
-        n, log = after.x.shape[-1], taking.after.log.reshape(-1, M)
+    for track, update in updates.items():
+        after, own = update.after.after, known.row_indices(track)
+        # In logarithms: likelihood ratios of rows can exceed e^700.
+        n, log = after.x.shape[-1], update.after.log.reshape(-1, M)
         top = log.max(axis=1, keepdims=True)
         inside = np.exp(log - np.where(np.isfinite(top), top, 0.0))
         weight = inside.sum(axis=1, keepdims=True)
         inside = np.where(weight > 0.0, inside / np.where(weight > 0.0, weight, 1.0), rows.mu[own])
-        blocks = models.blocks(after.x.reshape(-1, M, n), after.P.reshape(-1, M, n, n))
+        blocks = models.to_blocks(after.x.reshape(-1, M, n), after.P.reshape(-1, M, n, n))
         with np.errstate(divide='ignore'):
             logw = np.maximum((top + np.log(weight))[:, 0], LEAST_LOG)
-        rows = with_rows(rows, own, blocks, inside, logw)
-        nis[track] += taking.nis
-        nis_dof[track] += np.uint16(taking.dof)
-        repairs += taking.after.repairs
-    return known.replace(rows=rows).put(nis=nis, nis_dof=nis_dof).counted(repairs=repairs)
+        rows = replace_rows(rows, own, blocks, inside, logw)
+        nis[track] += update.nis
+        nis_dof[track] += np.uint16(update.dof)
+        repairs += update.after.repairs
+    return (
+        known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof).add_counts(repairs=repairs)
+    )
 
 
 def _explain_echoes(
@@ -268,11 +273,10 @@ def _explain_echoes(
     config: DiverConfig,
     layout: Layout,
 ) -> Explanation:
-    """Which tracks take which echoes of one transmission.
+    """Associate the echoes of one transmission with tracks.
 
-    Tracks that can explain more of the pairs choose first, and among those the confirmed ones: a
-    ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
-    of the pairs is not what the ping shows; for it nothing happened.
+    Tracks that explain more pairs choose first, confirmed before tentative ones: a ghost fits only
+    its own echoes. A track with fewer than half of the pairs is not updated.
     """
     x, P, mu, _ = (np.concatenate(column) for column in zip(*mixtures))
     likelihood, nis = fit_each(x, P, config.target_z, ping.measured)
@@ -282,15 +286,17 @@ def _explain_echoes(
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (known.life.status == TENTATIVE)
-    explained_first, hits = _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)
+    explained_first, hits = _choose_by_rank(
+        known, mixtures, ping, config, layout, rank, fit, near, pairs
+    )
     doubtful = (hits > 0) & (2 * hits < len(pairs))
     if not doubtful.any():
         return explained_first
     rank = np.where(doubtful, EXCLUDED, rank)
-    return _by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)[0]
+    return _choose_by_rank(known, mixtures, ping, config, layout, rank, fit, near, pairs)[0]
 
 
-def _by_rank(
+def _choose_by_rank(
     known: Known,
     mixtures: Sequence[Mixture],
     ping: Ping,
@@ -301,43 +307,44 @@ def _by_rank(
     near: BoolArray,
     pairs: list[IndexArray],
 ) -> tuple[Explanation, IntArray]:
-    """Let the tracks choose by `rank` (T,); also how many pairs each track (T,) took one of."""
+    """Let tracks choose by `rank` (T,). Also return the number of pairs (T,) of each track."""
     p = config.detection_probability
     taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
-    takings: dict[int, Taking] = {}
+    updates: dict[int, TrackUpdate] = {}
     score = known['score'] + len(pairs) * np.log1p(-p)
-    gain = np.log(p / (1.0 - p))
-    gain -= 0.5 * np.log(config.usual_clutter)
+    gain = np.log(p / (1.0 - p)) - 0.5 * np.log(config.usual_clutter)
     for turn in np.unique(rank[rank != EXCLUDED]):
         tracks = np.flatnonzero(rank == turn)
-        owner = _owners(tracks, fit, near & ~taken, pairs, config)
+        owner = _assign_owners(tracks, fit, near & ~taken, pairs, config)
         found = np.zeros(len(taken), bool)
         for track in tracks.tolist():
-            mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
+            mine = ping.without_orphans(~taken & ~found & ((owner < 0) | (owner == track)))
             index = np.flatnonzero(mine)
-            taking = _taking(mixtures[track], ping.only(mine), config, layout)
-            if taking is not None:
-                index = index[taking.good]
+            update = _update_track(mixtures[track], ping.select(mine), config, layout)
+            if update is not None:
+                index = index[update.good]
                 good = np.zeros(len(taken), bool)
                 good[index] = True
-                takings[track] = taking._replace(good=good)
+                updates[track] = update._replace(good=good)
                 found |= good
                 echoes = index[ping.echo[index]]
                 hits[track] = len(echoes)
                 score[track] += fit[track, echoes].sum() + gain * len(echoes)
         taken |= found
-    return Explanation(takings, taken, score), hits
+    return Explanation(updates, taken, score), hits
 
 
-def _owners(
+def _assign_owners(
     tracks: IndexArray,
     fit: FloatArray,
     near: BoolArray,
     pairs: list[IndexArray],
     config: DiverConfig,
 ) -> IntArray:
-    """The track each measurement (C,) is kept for, -1 for none: where several tracks choose at
-    once, each pair's echoes are assigned from the prediction."""
+    """Assign the echoes of each pair to tracks of equal rank.
+
+    Return the track (C,), -1 for none.
+    """
     owner = np.full(fit.shape[1], -1)
     if len(tracks) > 1:
         for members in pairs:
@@ -360,25 +367,25 @@ def _explain_tag(
     config: DiverConfig,
     layout: Layout,
 ) -> Explanation:
-    """Which track takes a tag's ping, all of it.
+    """Associate the whole ping of a tag with one track.
 
-    A single diver known to be there is given every ping. Otherwise it is the track that explains
-    the ping best of those that need not jump for it. Confirmed tracks come first; others are asked
-    where less than half of the arrivals fit the one chosen.
+    With `max_tracks: 1` the existing track takes every ping. Otherwise the best explanation inside
+    the gate does: confirmed tracks first, then tentative ones if fewer than half of the arrivals
+    fit.
     """
     score = known['score'] + np.log1p(-config.detection_probability)
-    takings: dict[int, Taking] = {}
+    updates: dict[int, TrackUpdate] = {}
     tentative = known.life.status == TENTATIVE
     for turn in (~tentative, tentative):
         best = _best_for_tag(mixtures, np.flatnonzero(turn), ping, config, layout)
         if best is not None:
             track, after = best
-            taking = taking_of(mixtures[track], after, ping, config)
-            takings[track] = taking
-            score[track] += float(taking.good.sum())
-            if 2 * taking.good.sum() >= len(taking.good):
-                return Explanation(takings, np.ones(len(ping.row), bool), score)
-    return Explanation(takings, np.zeros(len(ping.row), bool), score)
+            update = make_track_update(mixtures[track], after, ping, config)
+            updates[track] = update
+            score[track] += float(update.good.sum())
+            if 2 * update.good.sum() >= len(update.good):
+                return Explanation(updates, np.ones(len(ping.row), bool), score)
+    return Explanation(updates, np.zeros(len(ping.row), bool), score)
 
 
 def _best_for_tag(
@@ -388,21 +395,21 @@ def _best_for_tag(
     config: DiverConfig,
     layout: Layout,
 ) -> tuple[int, PingUpdate] | None:
-    """Return which of `tracks` explains a tag's ping best, and what becomes of it."""
+    """Return the track that explains the ping of a tag best, and its update."""
     best: tuple[int, PingUpdate] | None = None
     for track in tracks.tolist():
         after = update_by_ping(mixtures[track], ping, config, layout)
         if after is None:
             continue
-        if not (config.max_tracks == 1 or _allowed(mixtures[track], after.after, config)):
+        if not (config.max_tracks == 1 or _is_reachable(mixtures[track], after.after, config)):
             continue
         if best is None or after.log_evidence > best[1].log_evidence:
             best = track, after
     return best
 
 
-def _allowed(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
-    """Return whether the diver after a ping is where the prediction allows it to be."""
+def _is_reachable(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
+    """Return whether the updated position is inside the gate of the prediction."""
     mean = before.mu @ before.x[:, :2]
     apart = before.x[:, :2] - mean
     covariance = np.einsum('l,lab->ab', before.mu, before.P[:, :2, :2])
@@ -415,29 +422,31 @@ def _allowed(before: Mixture, after: Mixture, config: DiverConfig) -> bool:
 # -- one track -----------------------------------------------------------------------------------
 
 
-def _taking(before: Mixture, ping: Ping, config: DiverConfig, layout: Layout) -> Taking | None:
-    """Return what a track takes of the measurements it may have; None where no model can explain
-    them."""
+def _update_track(
+    before: Mixture, ping: Ping, config: DiverConfig, layout: Layout
+) -> TrackUpdate | None:
+    """Update a track by its possible measurements; None if no model explains them."""
     after = update_by_ping(before, ping, config, layout) if ping.echo.any() else None
-    return None if after is None else taking_of(before, after, ping, config)
+    return None if after is None else make_track_update(before, after, ping, config)
 
 
-def taking_of(before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig) -> Taking:
-    """Return what a track takes, `before` it and after."""
+def make_track_update(
+    before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig
+) -> TrackUpdate:
+    """Return the update of a track with its measurements and their NIS."""
     good = np.asarray(after.good > TAKEN)
     nis, dof = 0.0, 0
     if (good & ping.echo).sum() > int(ping.passive):
-        own = ping.compared(good)
-        residual, covariance, dof = residuals(before, own, config.target_z)
+        own = ping.subsample(good)
+        residual, covariance, dof = expected_residuals(before, own, config.target_z)
         nis = _joint_nis(residual, covariance, own.measured.variance)
-    return Taking(after, good, nis, dof)
+    return TrackUpdate(after, good, nis, dof)
 
 
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """Return ``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
+    """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
 
-    Beside what is expected of exact arrivals after a long silence their own variances are lost in
-    rounding, and S can have no inverse. Its eigenvalues in units of the variances are 1 at least.
+    If rounding makes S singular, use eigenvalues in units of the variances.
     """
     S = covariance + np.diag(variance)
     if is_psd(S) or not np.isfinite(S).all():
@@ -451,17 +460,16 @@ def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArra
 def update_by_ping(
     before: Mixture, ping: Ping, config: DiverConfig, layout: Layout
 ) -> PingUpdate | None:
-    """Return a diver updated by all of a ping; None where no hypothesis can be.
+    """Update a track by a whole ping; None if no hypothesis is possible.
 
-    Of more than `MOST_MEASUREMENTS` those are used that are nearest to what is expected; the
-    others are good where they fit what became of the diver.
+    Above `MOST_MEASUREMENTS`, use those nearest to the prediction and test the others.
     """
     if len(ping.row) > MOST_MEASUREMENTS:
         _, nis = fit_measurements(*before[:3], config.target_z, ping.measured)
         keep = np.zeros(len(nis), bool)
         keep[np.argsort(nis, kind='stable')[:MOST_MEASUREMENTS]] = True
-        keep = ping.kept(keep)
-        found = update_by_ping(before, ping.only(keep), config, layout)
+        keep = ping.without_orphans(keep)
+        found = update_by_ping(before, ping.select(keep), config, layout)
         if found is None:
             return None
         _, nis = fit_measurements(*found.after[:3], config.target_z, ping.measured)
@@ -476,10 +484,9 @@ def update_by_ping(
     if not (scale == 1.0).all():
         measured = measured._replace(variance=scale[:, None] * measured.variance)
     if ping.passive or ping.pairs > MOST_SUBSETS:
-        starts = optima(ping, config)
-        heavy = measured, starts, DEGREES
+        heavy = measured, find_optima(ping, config), DEGREES
         x, P, evidence, weights = student_t_ping(x, P, mask, config.target_z, *heavy)
-        # The densities of scaled residuals are those of the residuals but for this.
+        # Jacobian of the scaled residuals.
         evidence = evidence - 0.5 * len(ping.row) * np.log(scale)
         squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
@@ -493,14 +500,14 @@ def update_by_ping(
         return None
     share = np.exp(weight - best)
     updated = share / share.sum()
-    P, repairs = _repaired(P[:, :n, :n])
+    P, repairs = _repair(P[:, :n, :n])
     after = Mixture(x[:, :n].copy(), P, updated, scale)
     log_evidence = float(best + np.log(share.sum()))
     return PingUpdate(after, weight - log_evidence, updated @ good, log_evidence, repairs)
 
 
-def _repaired(P: FloatArray) -> tuple[FloatArray, int]:
-    """Return covariances P (L, n, n) that keep to the limit, and how many did not."""
+def _repair(P: FloatArray) -> tuple[FloatArray, int]:
+    """Return covariances P (L, n, n) within the limits, and the number of repairs."""
     out, spoilt = add_jitter(P)
     return out, int((spoilt & np.isfinite(P).all(axis=(1, 2))).sum())
 
@@ -513,9 +520,12 @@ def begin_from_ping(
     config: DiverConfig,
     layout: Layout,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A new diver near `position` (2,): x (K, n + q), P (K, n + q, n + q), of which nothing is
-    known of the position, updated by all the arrivals tell, also how the errors of position,
-    depth and instruments go together; and the log-evidence (K,)."""
+    """Return x (K, n + q), P (K, n + q, n + q) and log evidence (K,) of a new track near
+    `position`.
+
+    The prior of the position (2,) is flat. P includes correlations with depth and instrument
+    errors.
+    """
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
         uniform = np.full(len(x), 1.0 / len(x))
@@ -523,34 +533,35 @@ def begin_from_ping(
     at, covariance, evidence, _ = student_t_ping(
         x, P, mask, config.target_z, ping.measured, position[None], DEGREES
     )
-    return at[:, :n], _repaired(covariance[:, :n, :n])[0], evidence
+    return at[:, :n], _repair(covariance[:, :n, :n])[0], evidence
 
 
-def residuals(before: Mixture, ping: Ping, height: float) -> tuple[FloatArray, FloatArray, int]:
-    """Return residuals (C,) of a diver's measurements, the covariance (C, C) expected of them
-    without their own variances, and how many of them are independent."""
-    x, P, mu = before.x, before.P, before.stated
+def expected_residuals(
+    before: Mixture, ping: Ping, height: float
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return residuals (C,), their prior covariance (C, C), and the degrees of freedom."""
+    x, P, mu = before.x, before.P, before.published_weights
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
     residual, covariance = expect_measurements(x, P, mu, height, ping.measured)
     return residual, covariance, len(residual) - int(ping.passive)
 
 
-def optima(ping: Ping, config: DiverConfig) -> FloatArray:
-    """The best positions (k, 2) of the ping by itself, with heavy tails and no prior."""
-    echo = ping.only(ping.echo).measured
+def find_optima(ping: Ping, config: DiverConfig) -> FloatArray:
+    """Return the best positions (k, 2) of the ping alone, with heavy tails and no prior."""
+    echo = ping.select(ping.echo).measured
     columns = np.full_like(echo.columns, -1)
     columns[:, 0], columns[:, 1] = 0, 1
     if ping.passive:
         columns[:, EMISSION] = 2
     measured = echo._replace(columns=columns)
-    starts = _starts(measured, ping.passive)
+    starts = _start_positions(measured, ping.passive)
     size = 3 if ping.passive else 2
     mean = np.zeros(size)
     mean[:2] = measured.rx[:, :2].mean(axis=0)
-    spread = np.diag([FAR**2, FAR**2, (10.0 * FAR) ** 2][:size])
+    respread_depths = np.diag([FAR**2, FAR**2, (10.0 * FAR) ** 2][:size])
     height = float(np.mean(start_depths(config)))
-    found, value = student_t_maxima(mean, spread, starts, measured, height, DEGREES)
+    found, value = student_t_maxima(mean, respread_depths, starts, measured, height, DEGREES)
     kept: list[FloatArray] = []
     for k in np.argsort(-value, kind='stable'):
         place = found[k, :2]
@@ -561,9 +572,8 @@ def optima(ping: Ping, config: DiverConfig) -> FloatArray:
     return np.array(kept)
 
 
-def _starts(measured: PingMeasurements, passive: bool) -> FloatArray:
-    """Eleven positions (11, 2): round the earliest receivers, or round the ellipse of the shortest
-    path."""
+def _start_positions(measured: PingMeasurements, passive: bool) -> FloatArray:
+    """Return (11, 2): around the earliest receivers, or on the ellipse of the shortest path."""
     order = np.argsort(measured.value, kind='stable')
     if passive:
         near = measured.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
@@ -593,8 +603,7 @@ def _with_emission(
     mask: BoolArray,
     height: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """x, P and mask with the emission of a tag as a last component, flat about where the arrivals
-    put it."""
+    """Append the emission of a tag to x, P and mask, with a flat prior."""
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P

@@ -12,12 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where new divers may be, and how a track begins there.
+"""New tracks: their positions and initial states.
 
-A track begins at a fix that no track took, at a position that the free rows of a ping can explain,
-or where somebody says that a diver is. Such a start is no measurement: it is believed, so its
-track is confirmed at once. Tracks without a name that it agrees with give way to it, or the diver
-would have two; with a single diver, all do.
+A track starts at an unassociated fix, at a position that explains the free rows of a ping, or at a
+`Start` message. A start is not a measurement: its track is confirmed at once. Tracks without an ID
+that agree with a start end, to avoid duplicates; with a single target, all such tracks end.
 """
 
 from __future__ import annotations
@@ -40,81 +39,86 @@ from ...measurements import Arrivals, NOBODY, Start
 from . import depth
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, places
+from .known import Feature, Known, track_positions
 from .models import ModelSet, start_depths, VELOCITY
 from .scan import (
     bearing_variance,
     Group,
     Height,
     Heights,
-    name_of,
     ping_measurements,
     Scan,
-    spread,
+    subsample,
     systematic_variance,
+    tag_id,
     toa_variance,
 )
 
 SEED_PAIRS = 3
-"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
-it."""
+"""Number of transmitter-receiver pairs that seed a position. At least one more pair must agree."""
 
 MAX_COMBINATIONS = 200
-"""Combinations of echoes tried for one position."""
+"""Maximum number of echo combinations per position."""
 
 LOST = 1e-9
-"""A ping as improbable of a track as this says that the track was somewhere else."""
+"""Probability of a ping below which its track is wrong."""
 
 MOST_FOUND = 10
-"""Positions found by combining the echoes of one ping; those of others are found in later ones."""
+"""Maximum number of positions from combined echoes of one ping."""
 
 
 class Birth(NamedTuple):
-    """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
-    which it is, None for a fix; the probability that there is a diver, NaN where its hits will
-    tell; whose track it is; whether it is measured, and no start; what is stated of z there; the
-    name and the place (2,) of the sensor, None where it may not be turned."""
+    """Position of a possible new track."""
 
     position: FloatArray
+    """(2,) m."""
     covariance: FloatArray
+    """(2, 2) m^2."""
     ping: Arrivals | None = None
+    """The ping of the position; None for a fix."""
     rows: IndexArray | None = None
+    """Rows of the ping that give the position."""
     existence: float = math.nan
+    """Probability that the target exists; NaN if hits are counted."""
     target_id: int = NOBODY
+    """ID of the target, or `NOBODY`."""
     measured: bool = True
+    """False for a `Start` message."""
     height: Height | None = None
+    """The z of the fix; None if the fix has no z."""
     seen_by: tuple[str, FloatArray] | None = None
+    """Name and position (2,) of a sensor with a bearing error; None for others."""
 
 
-def at_fixes(known: Known, group: Group) -> Known:
-    """Note every fix that no track took as a place to begin one. A stage of the tracker."""
-    found = group.found
-    assert found is not None
-    for d in np.flatnonzero(found.free).tolist():
-        existence = math.nan if found.existence is None else float(found.existence[d])
+def spawn_at_fixes(known: Known, group: Group) -> Known:
+    """Add a birth for each unassociated fix. A stage of the tracker."""
+    association = group.association
+    assert association is not None
+    for d in np.flatnonzero(association.free).tolist():
+        existence = math.nan if association.existence is None else float(association.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height
-        group.births.append(Birth(*place, group.turned_by))
+        group.births.append(Birth(*place, group.rotation_sensor))
     return known
 
 
 def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> list[Birth]:
-    """Positions from the rows (n,) of a ping that are `free`.
+    """Return births from the `free` (n,) rows of a ping.
 
-    With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
-    which live until later pings tell them apart. With several, combinations of echoes of a few
-    pairs are tried; one that more pairs agree with is a position, and takes its echoes out.
+    With at most one echo per transmitter-receiver pair, this is one fix and its ghosts, which
+    later pings resolve. With several echoes, combinations of a few pairs are tried. A position
+    that more pairs agree with is accepted, and its echoes are removed.
     """
     rows = np.flatnonzero(free & np.isfinite(ping.toa))
     births: list[Birth] = []
     for _ in range(MOST_FOUND):
         if not len(rows):
             break
-        pairs = [rows] if ping.passive else _by_pair(ping, rows)
+        pairs = [rows] if ping.passive else _rows_by_pair(ping, rows)
         if ping.passive or max(len(pair) for pair in pairs) == 1:
-            return births + _fix(ping, rows, config)[0]
-        found, used = _best_combination(ping, pairs, config)
+            return births + _locate_births(ping, rows, config)[0]
+        found, used = _find_best_combination(ping, pairs, config)
         if not found:
             return births
         births += found
@@ -122,45 +126,49 @@ def births_from_ping(ping: Arrivals, free: BoolArray, config: DiverConfig) -> li
     return births
 
 
-def _by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
+def _rows_by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
+    """Return the rows of each transmitter-receiver pair."""
     pair = np.column_stack([ping.tx_id, ping.rx_id])[rows]
     return [rows[(pair == each).all(axis=1)] for each in np.unique(pair, axis=0)]
 
 
-def _fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> tuple[list[Birth], IndexArray]:
-    """The fix of `rows` and its alternatives, and the rows it used."""
-    rows = spread(rows)
-    fix = locate(ping, rows, config)
+def _locate_births(
+    ping: Arrivals, rows: IndexArray, config: DiverConfig
+) -> tuple[list[Birth], IndexArray]:
+    """Return births at the fix of `rows` and its alternatives, and the used rows."""
+    rows = subsample(rows)
+    fix = locate_fix(ping, rows, config)
     if fix is None:
         return [], rows[:0]
     used = rows[fix.used | fix.used_bearing]
-    name = name_of(ping)
+    name = tag_id(ping)
     places = [(fix.position, fix.covariance)]
     places += [(place.position, place.covariance) for place in fix.alternatives]
     return [Birth(*place, ping, used, target_id=name) for place in places], rows[fix.used]
 
 
-def _best_combination(
+def _find_best_combination(
     ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig
 ) -> tuple[list[Birth], IndexArray]:
-    """The fix that most pairs agree with, at least one more than seeded it."""
+    """Return the births that most pairs agree with, at least one more than the seeds, and their
+    rows."""
     best: tuple[list[Birth], IndexArray] = ([], np.empty(0, np.intp))
     if len(pairs) <= SEED_PAIRS:
         return best
     seeding = sorted(pairs, key=len)[:SEED_PAIRS]
     for seed in islice(product(*seeding), MAX_COMBINATIONS):
-        for birth in _fix(ping, np.array(seed), config)[0]:
-            agreeing = _agreeing(ping, pairs, birth, config)
+        for birth in _locate_births(ping, np.array(seed), config)[0]:
+            agreeing = _select_agreeing(ping, pairs, birth, config)
             if len(agreeing) > max(SEED_PAIRS, len(best[1])):
-                refined = _fix(ping, agreeing, config)
+                refined = _locate_births(ping, agreeing, config)
                 best = refined if len(refined[1]) > len(best[1]) else best
     return best
 
 
-def _agreeing(
+def _select_agreeing(
     ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig
 ) -> IndexArray:
-    """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
+    """Return the echo of each pair nearest to the prediction for `birth`, within 3 sigma."""
     position, covariance = birth.position, birth.covariance
     height = float(np.mean(start_depths(config)))
     expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
@@ -173,10 +181,10 @@ def _agreeing(
     return nearest[nis[nearest] <= 9.0]
 
 
-def locate(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
-    """The fix that `rows` of the ping give by themselves, None when they give none to believe.
+def locate_fix(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisation | None:
+    """Return the fix of the `rows` of a ping alone; None without a plausible fix.
 
-    With depth as a state it is the best of those at the heights where the models begin.
+    With depth as a state, return the best fix over the start depths.
     """
     variance = toa_variance(ping, config)[rows] + systematic_variance(ping, config)[rows]
     best: Localisation | None = None
@@ -197,10 +205,10 @@ def locate(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Localisatio
     return best
 
 
-# -- tracks that begin ---------------------------------------------------------------------------
+# -- new tracks ----------------------------------------------------------------------------------
 
 
-def beginning(
+def spawn_stage(
     models: ModelSet,
     config: DiverConfig,
     layouts: Callable[[Known], Layout],
@@ -208,43 +216,43 @@ def beginning(
     features: Mapping[str, Feature],
     rules: TrackRules,
 ) -> Callable[[Known, Scan], Known]:
-    """Return the stage that begins a tentative track at each birth, as long as there is room, and
-    a confirmed one where somebody says that a diver is."""
+    """Return the stage that starts a tentative track at each birth up to the limit, and a
+    confirmed one at each start."""
 
     def with_tracks(known: Known, found: Sequence[Birth]) -> Known:
         layout = layouts(known)
         for _, group in groupby(found, key=lambda birth: birth.seen_by and birth.seen_by[0]):
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
-            columns['learnt'] = chain.fresh(len(births))
+            columns['learnt'] = chain.initial_counts(len(births))
             columns['existence'] = [birth.existence for birth in births]
             columns['target_id'] = [birth.target_id for birth in births]
             life = known.life.born(len(births), known.stamp_ns, rules)
-            rows = rows_of(births, models, layout, config)
+            rows = birth_rows(births, models, layout, config)
             known = known.with_tracks(life, rows, columns)
         return known
 
-    def begin(known: Known, scan: Scan) -> Known:
+    def spawn(known: Known, scan: Scan) -> Known:
         found = [birth for group in scan.fixes for birth in group.births] + scan.births
         if found:
-            room = max(0, most_tracks(config) - len(known))
-            known = with_tracks(known, each_name_once(found)[:room])
+            room = max(0, max_total_tracks(config) - len(known))
+            known = with_tracks(known, without_duplicate_ids(found)[:room])
         for start in scan.starts:
             known, free = make_room(known, start, config, models)
             if free:
-                known = confirmed(with_tracks(known, [believed(start, config)]))
+                known = confirm_newest(with_tracks(known, [birth_from_start(start, config)]))
         return known
 
-    return begin
+    return spawn
 
 
-def most_tracks(config: DiverConfig) -> int:
-    """Return how many tracks there may be, tentative ones and all."""
+def max_total_tracks(config: DiverConfig) -> int:
+    """Return the maximum number of tracks, including tentative ones."""
     return 10 + 5 * config.max_tracks
 
 
-def each_name_once(births: Sequence[Birth]) -> list[Birth]:
-    """Return the births without a second one of the same name."""
+def without_duplicate_ids(births: Sequence[Birth]) -> list[Birth]:
+    """Return the births without repeated target IDs."""
     names: set[int] = set()
     first = []
     for birth in births:
@@ -254,27 +262,27 @@ def each_name_once(births: Sequence[Birth]) -> list[Birth]:
     return first
 
 
-def rows_of(
+def birth_rows(
     births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Rows:
-    """Return the rows of tracks that begin, all seen by one sensor."""
+    """Return the rows of new tracks of one sensor."""
     plain = models.height < 0 and layout.size == models.n
     if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
         position = np.array([birth.position for birth in births])
         covariance = np.array([birth.covariance for birth in births])
-        # A start comes alone.
-        parts = models.new_tracks(position, covariance, measured=births[0].measured)
-        x, P = layout.widened(*parts[:2])
-        mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.copies))
+        # A start is a group of one birth.
+        parts = models.initial_states(position, covariance, measured=births[0].measured)
+        x, P = layout.with_new_constants(*parts[:2])
+        mu, logw = parts[2], np.full(x.shape[:2], -math.log(models.rows_per_track))
     else:
-        each = [_of_birth(birth, models, layout, config, plain) for birth in births]
+        each = [_birth_states(birth, models, layout, config, plain) for birth in births]
         x, P, mu, logw = (np.concatenate(part) for part in zip(*each))
     for track, birth in enumerate(births):
         if birth.ping is None and birth.measured:
             with_velocities_at_fix(P[track], models, config)
         if models.height >= 0 and birth.height is not None:
             for row in range(x.shape[1]):
-                depth.begin(
+                depth.begin_depth(
                     x[track, row],
                     P[track, row],
                     birth.height,
@@ -282,34 +290,35 @@ def rows_of(
                     models.height,
                     config,
                 )
-    rows = models.rows(x, P, mu, logw)
+    rows = models.make_rows(x, P, mu, logw)
     seen_by = births[0].seen_by
-    return rows if seen_by is None else layout.turned(rows, models, *seen_by, back=True)
+    return (
+        rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)
+    )
 
 
 def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
-    """Give P (..., M, n, n) of tracks that begin at a fix the velocities that such a track may
-    have, in place."""
+    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
     if models.families is not None:
         moving = np.flatnonzero(models.families.kind == VELOCITY)
         P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
 
 
-def _of_birth(
+def _birth_states(
     birth: Birth, models: ModelSet, layout: Layout, config: DiverConfig, plain: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one track."""
+    """Return x (1, K, M, n), P, mu (1, K, M) and logw (1, K) of one new track."""
     where = birth.position[None]
-    logw = np.full((1, models.copies), -math.log(models.copies))
+    logw = np.full((1, models.rows_per_track), -math.log(models.rows_per_track))
     if birth.ping is None or birth.rows is None or plain:
-        x, P, mu = models.new_tracks(where, birth.covariance[None], birth.ping is None)
-        return *layout.widened(x, P), mu, logw
+        x, P, mu = models.initial_states(where, birth.covariance[None], birth.ping is None)
+        return *layout.with_new_constants(x, P), mu, logw
     from .arrivals import begin_from_ping, FAR
 
-    x, P, mu = models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
-    x, P = layout.widened(x, P)
+    x, P, mu = models.initial_states(where, np.eye(2)[None] * FAR**2, False)
+    x, P = layout.with_new_constants(x, P)
     ping = ping_measurements(birth.ping, birth.rows, config, models, layout)
-    # All models of a row begin alike: one of each is enough to ask.
+    # All models of a row start equal: one model of each row is enough.
     begins = np.ascontiguousarray(x[0, :, 0]), np.ascontiguousarray(P[0, :, 0])
     own, covariance, evidence = begin_from_ping(*begins, ping, birth.position, config, layout)
     if np.isfinite(evidence).any():
@@ -318,7 +327,7 @@ def _of_birth(
     at, spread_at = x.copy(), P.copy()
     at[0], spread_at[0] = own[:, None], covariance[:, None]
     if models.families is not None:
-        # But for how it moves, of which a ping says nothing.
+        # A ping contains no information about the motion.
         moves = slice(2, 4)
         at[..., moves] = x[..., moves]
         spread_at[..., moves, :] = P[..., moves, :]
@@ -326,7 +335,7 @@ def _of_birth(
     return at, spread_at, mu, logw
 
 
-def begun_anew(
+def restart_track(
     known: Known,
     ping: Arrivals,
     free: BoolArray,
@@ -334,10 +343,11 @@ def begun_anew(
     layout: Layout,
     config: DiverConfig,
 ) -> Known:
-    """Return the tracks after a ping, whose rows (n,) are taken but for those that are `free`.
-    With depth as a state, a track that took what was all but impossible begins anew where the ping
-    alone puts it: an update over such a way is far from linear, and what it makes of the depth is
-    nothing known."""
+    """Restart a track whose update by a ping was far too improbable, with depth as a state.
+
+    The track restarts at the position of the ping alone: the update is nonlinear over such a
+    distance, and its depth would be wrong. free: (n,) False for the rows of the track.
+    """
     hit, rows = np.flatnonzero(known['nis_dof']), np.flatnonzero(~free)
     if models.height < 0 or len(hit) != 1:
         return known
@@ -345,22 +355,22 @@ def begun_anew(
     dof = int(known['nis_dof'][track])
     if dof < SEED_PAIRS or known['nis'][track] <= gate_threshold(1.0 - LOST, dof):
         return known
-    mean, covariance = places(known, models)
+    mean, covariance = track_positions(known, models)
     birth = Birth(mean[track], covariance[track], ping, rows)
-    new = rows_of([birth], models, layout, config)
+    new = birth_rows([birth], models, layout, config)
     if not all(np.isfinite(part).all() for block in new.blocks for part in block):
         return known
-    return depth.spread_anew(known.with_rows_of(track, new), track)
+    return depth.count_respread(known.with_rows_of(track, new), track)
 
 
 # -- starts --------------------------------------------------------------------------------------
 
 
-def believed(start: Start, config: DiverConfig) -> Birth:
-    """Return the birth of a track where somebody says that a diver is."""
+def birth_from_start(start: Start, config: DiverConfig) -> Birth:
+    """Return the birth of a track at a start message."""
     height = None
     if config.dimensions == 3:
-        stated = Heights.of(start.position[None], start.covariance[None], 1.0)
+        stated = Heights.from_fixes(start.position[None], start.covariance[None], 1.0)
         height = stated and stated.row(0)
     plane = start.position[:2], start.covariance[:2, :2]
     return Birth(*plane, measured=False, height=height)
@@ -369,37 +379,42 @@ def believed(start: Start, config: DiverConfig) -> Birth:
 def make_room(
     known: Known, start: Start, config: DiverConfig, models: ModelSet
 ) -> tuple[Known, bool]:
-    """Return the tracks without those that give way to `start`, and whether there is room for its
-    own."""
+    """Remove the tracks that give way to `start`.
+
+    Return the state and whether a new track fits.
+    """
     going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
-        going &= _agree(known, start, config, models)
-    left = known.only(~going)
+        going &= _agrees_with_start(known, start, config, models)
+    left = known.select(~going)
     if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
         return left, True
-    return known.counted(not_started=1), False
+    return known.add_counts(not_started=1), False
 
 
-def confirmed(known: Known) -> Known:
-    """Return the tracks with the newest one confirmed."""
+def confirm_newest(known: Known) -> Known:
+    """Return the state with its newest track confirmed."""
     status = known.life.status.copy()
     status[-1] = CONFIRMED
     return known.replace(life=evolve(known.life, status=status))
 
 
-def no_room(known: Known, config: DiverConfig) -> list[str]:
-    """Return what a user has to know of starts that began no track."""
+def start_warnings(known: Known, config: DiverConfig) -> list[str]:
+    """Return a warning about starts without a track."""
     count = known.counts.get('not_started', 0)
     if not count:
         return []
     return [
-        f'{count} starts began no track: there are max_tracks ({config.max_tracks}) confirmed ones'
+        f'{count} starts ignored: max_tracks ({config.max_tracks}) tracks are confirmed. Increase '
+        'max_tracks'
     ]
 
 
-def _agree(known: Known, start: Start, config: DiverConfig, models: ModelSet) -> BoolArray:
-    """Return which tracks (T,) may be where the start is."""
-    mean, covariance = places(known, models)
+def _agrees_with_start(
+    known: Known, start: Start, config: DiverConfig, models: ModelSet
+) -> BoolArray:
+    """Return which tracks (T,) agree with the start position."""
+    mean, covariance = track_positions(known, models)
     apart = start.position[:2] - mean
     squared = np.einsum(
         'ta,ta->t',

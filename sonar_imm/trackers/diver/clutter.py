@@ -12,17 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How many false fixes a sensor shows, learnt from those that nobody took: `clutter_density: 0`.
+"""Estimation of the clutter density from unassociated fixes (`clutter_density: 0`).
 
-The density is a number per scan divided by an area. The number is that of the fixes that are no
-track's, each with the probability of that. The first fix of a diver is nobody's either: it is
-taken back once his track is confirmed. The area is that of a rectangle in which fixes spread as
-the false ones did, `12 sqrt(det C)` of their covariance C (a disc has `4 pi sqrt(det C)`), so that
-it needs not be stated, and a sensor that moves takes it along.
+The density is the number of false fixes per scan and area. Each fix counts with its probability of
+belonging to no track. The first fix of a target also counts as false until its track is confirmed.
+The area is a rectangle, ``12 sqrt(det C)`` of the covariance C of the false fixes (a disc has ``4
+pi sqrt(det C)``). It needs no parameter and follows a moving sensor.
 
-Before anything was seen there are `PRIOR_SCANS` scans of `PRIOR_AREA` with the density
-`CLUTTER`. A tenth of that is the least that is believed: a sensor without a false fix so far may
-show some.
+The prior is `PRIOR_SCANS` scans over `PRIOR_AREA` with density `CLUTTER`. The lower limit is a
+tenth of `CLUTTER`.
 """
 
 from __future__ import annotations
@@ -42,57 +40,62 @@ if TYPE_CHECKING:
     from .scan import Group, Scan
 
 MOST = 1e-2
-"""The greatest that is believed, per square metre: one within the usual gate of a fix good to a
-metre in every other scan. Whoever has more has to state it."""
+"""Upper limit of the density, 1/m^2: one false fix in every second scan inside a typical gate of a
+fix with 1 m error. For more clutter, set `clutter_density`."""
 
 LEAST = 0.1 * CLUTTER
-"""The least that is believed."""
+"""Lower limit of the density, 1/m^2."""
 
 PRIOR_SCANS, PRIOR_AREA = 5.0, 4e4
-"""Scans, and m^2, that what is known at first is worth."""
+"""Weight of the prior: scans, and area in m^2."""
 
 ENOUGH, EVIDENT = 20.0, 0.5
-"""Scans, and false fixes in each, from which `gnn` says that it should not ignore them."""
+"""Minimum number of scans, and of false fixes per scan, for a warning with `gnn`."""
 
 ALL = 0.9
-"""False fixes in each scan that are all of them, where there is no track."""
+"""False fixes per scan above which no fix is associated."""
 
 MOST_SENSORS = 20
-"""Sensors that are remembered, those that showed a scan last."""
+"""Maximum number of sensors; the most recent ones are kept."""
 
 MEMORY = 100.0
-"""Scans after which what was seen counts for 1/e."""
+"""Scans after which the weight of a scan is 1/e."""
 
 
 class Clutter(NamedTuple):
-    """What a sensor showed, older scans counting for less: scans; false: expected number of false
-    fixes in them; placed: the number whose mean (x, y) and scatter (xx, xy, yy) is known."""
+    """Exponentially weighted clutter statistics of one sensor."""
 
     scans: float = 0.0
+    """Number of scans."""
     false: float = 0.0
+    """Expected number of false fixes."""
     placed: float = 0.0
+    """Number of fixes in the mean and scatter."""
     x: float = 0.0
+    """Mean x, m."""
     y: float = 0.0
+    """Mean y, m."""
     xx: float = 0.0
+    """Scatter, m^2."""
     xy: float = 0.0
     yy: float = 0.0
 
     @property
     def area(self) -> float:
-        """m^2 in which false fixes lie."""
+        """Area of the false fixes, m^2."""
         prior, number = PRIOR_AREA / 12.0, 1.0 + self.placed
         a, b = (prior + self.xx) / number, (prior + self.yy) / number
         return 12.0 * math.sqrt(max(a * b - (self.xy / number) ** 2, 0.0)) + 1.0
 
     @property
     def density(self) -> float:
-        """Of false fixes, per square metre and scan."""
+        """Number of false fixes per m^2 and scan."""
         number = CLUTTER * PRIOR_SCANS * PRIOR_AREA + max(self.false, 0.0)
         found = number / ((PRIOR_SCANS + self.scans) * self.area)
         return min(max(found, LEAST), MOST)
 
-    def after(self, z: FloatArray, false: FloatArray) -> Clutter:
-        """With a scan of fixes z (D, 2), each false with a probability (D,)."""
+    def with_scan(self, z: FloatArray, false: FloatArray) -> Clutter:
+        """Add a scan of fixes z (D, 2), false with probability `false` (D,)."""
         kept = math.exp(-1.0 / MEMORY)
         added, old = float(false.sum()), kept * self.placed
         total = old + added
@@ -114,73 +117,72 @@ class Clutter(NamedTuple):
 
     @property
     def evident(self) -> bool:
-        """Whether there are many more false fixes than where nobody says how many."""
+        """True if there are many more false fixes than assumed by default."""
         many = self.false > EVIDENT * self.scans and self.density > 10.0 * CLUTTER
         return self.scans >= ENOUGH and many
 
 
 class Clutters(NamedTuple):
-    """What is known of each sensor that showed scans, `by_sensor`, the one heard last at the
-    end."""
+    """Clutter statistics by sensor name, most recent sensor last."""
 
     by_sensor: tuple[tuple[str, Clutter], ...] = ()
 
-    def of(self, sensor: str) -> Clutter | None:
-        """Return what is known of a sensor, None for nothing."""
+    def get(self, sensor: str) -> Clutter | None:
+        """Return the statistics of a sensor; None for none."""
         return dict(self.by_sensor).get(sensor)
 
-    def replaced(self, sensor: str, clutter: Clutter) -> Clutters:
-        """Return this with what is known of `sensor` now; the sensor silent for longest makes
-        room for it."""
+    def with_sensor(self, sensor: str, clutter: Clutter) -> Clutters:
+        """Replace the statistics of a sensor.
+
+        The oldest sensor is dropped above `MOST_SENSORS`.
+        """
         others = [item for item in self.by_sensor if item[0] != sensor]
         return Clutters((*others, (sensor, clutter))[-MOST_SENSORS:])
 
 
-def count(known: Known, group: Group) -> Known:
-    """Take in the false ones of a scan. A stage of the tracker."""
-    if group.config.clutter_density or group.target_id is not None or not group.whole:
+def count_clutter(known: Known, group: Group) -> Known:
+    """Add the false fixes of a scan. A stage of the tracker."""
+    if group.config.clutter_density or group.target_id is not None or not group.is_complete:
         return known
     clutters: Clutters = known.memory['clutter']
-    before = clutters.of(group.sensor) or Clutter()
-    assert group.found is not None
-    after = before.after(group.z, np.clip(1.0 - group.found.claimed, 0.0, 1.0))
-    return known.remember(clutter=clutters.replaced(group.sensor, after))
+    before = clutters.get(group.sensor) or Clutter()
+    assert group.association is not None
+    after = before.with_scan(group.z, np.clip(1.0 - group.association.claimed, 0.0, 1.0))
+    return known.with_memory(clutter=clutters.with_sensor(group.sensor, after))
 
 
-def without_first_fixes(known: Known, scan: Scan) -> Known:
-    """Take back the first fixes of tracks that this scan confirmed, which were counted as false
-    ones. A stage of the tracker."""
+def remove_first_fixes(known: Known, scan: Scan) -> Known:
+    """Subtract the first fixes of tracks that this scan confirmed. A stage of the tracker."""
     clutters: Clutters = known.memory['clutter']
-    sensor = next((group.sensor for group in scan.fixes if clutters.of(group.sensor)), None)
-    own = None if sensor is None else clutters.of(sensor)
+    sensor = next((group.sensor for group in scan.fixes if clutters.get(group.sensor)), None)
+    own = None if sensor is None else clutters.get(sensor)
     if sensor is None or own is None:
         return known
-    life, before = known.life, scan.before.life
+    life, before = known.life, scan.previous.life
     firm = life.track_id[(life.status != TENTATIVE) & (known['target_id'] == NOBODY)]
     new = len(set(firm.tolist()) - set(before.track_id[before.status != TENTATIVE].tolist()))
     if not new:
         return known
     after = own._replace(false=max(own.false - new, 0.0))
-    return known.remember(clutter=clutters.replaced(sensor, after))
+    return known.with_memory(clutter=clutters.with_sensor(sensor, after))
 
 
 def warnings(known: Clutters, config: DiverConfig, tracked: bool) -> list[str]:
-    """Sentences on fixes that no track takes, where nobody is `tracked`, and on false ones that
-    the association does not expect."""
+    """Return warnings about unassociated fixes and about clutter that `gnn` does not expect."""
     if not tracked and any(
         clutter.scans >= ENOUGH and clutter.false > ALL * clutter.scans
         for _, clutter in known.by_sensor
     ):
         return [
-            'no track takes the fixes: nobody is there, or they are further apart than a diver '
-            'gets; check units and stated covariances, or state target (boat, ship)'
+            'no track takes the fixes: there is no target, or the fixes are too far apart for a '
+            'diver. Check units and covariances, or set target (boat, ship)'
         ]
     if config.pairing != 'gnn':
         return []
     found = [clutter for _, clutter in known.by_sensor if clutter.evident]
     return [
-        f'{clutter.false / clutter.scans:.2g} fixes or more of each scan are of no diver '
-        f'({clutter.density:.1g} for each square metre), and association gnn expects '
-        f'{CLUTTER:g}: use association jipda, which learns this, or state clutter_density'
+        f'{clutter.false / clutter.scans:.2g} false fixes per scan ({clutter.density:.1g} per '
+        f'm^2), but association gnn expects {CLUTTER:g} per m^2. Use association jipda, or set '
+        'clutter_density'
         for clutter in found[:1]
     ]

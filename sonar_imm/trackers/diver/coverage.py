@@ -12,21 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where a sensor sees: the probability of detection as a function of the place of a diver.
+"""Coverage: the detection probability of a sensor as a function of the target position.
 
-A diver outside the sector of a sonar is not missed, one inside who is not seen is. So with a
-stated coverage
+Targets outside the sector of a sonar cannot be detected, so they count no miss. With a configured
+coverage
 
-* a track is missed with the probability that its whole density gives, ``p_t = E[p(x)]``, and has
-  caused a fix at z with the probability of detection there, ``p(z)`` (`Seen`);
-* of a track that was missed what remains is ``(1 - p(x)) N(x; m, P)``, model by model: its density
-  leaves what the sensor covers, as that of a diver who has left does (`missed`). Expectations are
-  means over `POINTS` of a normal distribution;
-* misses are counted by what they say: with the stated `detection_probability` p a miss is one,
-  where it was p_t it is ``ln(1 - p_t) / ln(1 - p)`` of one (feature `looks`).
+* a track is detected with the mean probability over its density, ``p_t = E[p(x)]``, and a fix at z
+  has the detection probability ``p(z)`` (`DetectionProbability`);
+* a miss changes the density of each model to ``(1 - p(x)) N(x; m, P)``, so that a target that left
+  the coverage is predicted outside (`apply_misses`). Expectations are means over `POINTS`;
+* a miss has the weight ``ln(1 - p_t) / ln(1 - p)``, with p the configured `detection_probability`
+  (feature `miss_weight`).
 
-The probability is a `Coverage`: `detection_probability` inside a sector, or a table over x and y
-or over the range, read from a file.
+A `Coverage` is a sector with constant probability, or a table over x and y or over range, read
+from a file.
 """
 
 from __future__ import annotations
@@ -46,42 +45,44 @@ from ...estimation.association import TENTATIVE
 from ...estimation.bank import Gaussians
 from ...parameters import ConfigError
 from .config import DiverConfig
-from .known import Feature, Known, places
+from .known import Feature, Known, track_positions
 from .models import ModelSet
 from .scan import Group
 
-FEATURES = {'looks': Feature(0.0)}
-"""Parts of a miss that have not been counted yet."""
+FEATURES = {'miss_weight': Feature(0.0)}
+"""miss_weight: accumulated weight of misses that are not counted yet."""
 
 POINTS_OF_MODEL = 64
-"""Places of a model at which the probability is asked for."""
+"""Number of points per model."""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Golden ratio."""
 
 LEAST = 0.01
-"""Probability of detection at a fix, however far outside it is: what is stated is not exact."""
+"""Minimum detection probability at a fix, because coverages are not exact."""
 
 MOST = 0.9999
-"""Most probable detection of a track."""
+"""Maximum detection probability."""
 
 LEAST_LOOK = 0.25
-"""Of a miss that a miss of a tentative track counts at least: what is rarely seen is not confirmed
-for long."""
+"""Minimum miss weight of a tentative track, so that rarely detected tracks end."""
 
 FAR_OUT = 2.5
-"""By what the points of the whole track are stretched: where the probability is the same at all of
-them it is not asked of each model."""
+"""Stretch of the points of a track. If the probability is constant over the stretched points, the
+models are not evaluated."""
 
 NOWHERE, NO_COVARIANCE = np.empty((0, 2)), np.empty((0, 2, 2))
 """No fixes."""
 
 COLUMNS = (('x', 'y', 'probability'), ('range', 'probability'))
-"""Headers of a table."""
+"""Headers of a table file."""
 
 
 def _points() -> FloatArray:
-    """(64, 2) points of equal weight, with the mean and covariance of a normal distribution: a
-    Fibonacci lattice, so that an edge from any side cuts them one by one."""
+    """Return (64, 2) points of equal weight with the moments of a standard normal distribution.
+
+    A Fibonacci lattice, so that an edge of any direction crosses the points one by one.
+    """
     place = (np.arange(POINTS_OF_MODEL) + 0.5) / POINTS_OF_MODEL
     other = (place + np.arange(POINTS_OF_MODEL) * GOLDEN) % 1.0
     quantile = [[NormalDist().inv_cdf(u) for u in axis.tolist()] for axis in (place, other)]
@@ -95,29 +96,32 @@ POINTS = _points()
 
 
 class Table(NamedTuple):
-    """Probabilities (rows, columns) at x (rows,) and y (columns,), in between bilinear, 0 outside;
-    of a table over the range x is the range and y empty."""
+    """Bilinear table of probabilities, 0 outside."""
 
     x: FloatArray
+    """(rows,) x, m, or range, m."""
     y: FloatArray
+    """(columns,) y, m; empty for a table over range."""
     probability: FloatArray
+    """(rows, columns)."""
 
-    def at(self, place: FloatArray, distance: FloatArray) -> FloatArray:
-        """The probability (...,) at places (..., 2), so far (...,) from the sensor."""
+    def interpolate(self, place: FloatArray, distance: FloatArray) -> FloatArray:
+        """Return the probability (...,) at positions (..., 2), at `distance` (...,) from the
+        sensor."""
         if not len(self.y):
             return np.interp(distance, self.x, self.probability[:, 0], right=0.0)
         found = np.zeros(place.shape[:-1])
-        row, u, inside_x = _cell(self.x, place[..., 0])
-        column, v, inside_y = _cell(self.y, place[..., 1])
+        row, u, inside_x = _find_cell(self.x, place[..., 0])
+        column, v, inside_y = _find_cell(self.y, place[..., 1])
         for a, weight_a in ((0, 1.0 - u), (1, u)):
             for b, weight_b in ((0, 1.0 - v), (1, v)):
                 found += weight_a * weight_b * self.probability[row + a, column + b]
         return np.where(inside_x & inside_y, found, 0.0)
 
 
-def _cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatArray, BoolArray]:
-    """The cell of each value on a rising axis, how far along it the value is, and whether it is on
-    the axis at all."""
+def _find_cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatArray, BoolArray]:
+    """Return the cell of each value on a rising axis, the fraction in the cell, and whether the
+    value is on the axis."""
     cell = np.clip(np.searchsorted(axis, value, side='right') - 1, 0, len(axis) - 2)
     along = np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)
     return cell, along, (value >= axis[0]) & (value <= axis[-1])
@@ -125,18 +129,23 @@ def _cell(axis: FloatArray, value: FloatArray) -> tuple[np.ndarray, FloatArray, 
 
 @frozen(eq=False)
 class Coverage:
-    """What a sensor covers: place (2,) of it; direction and half of the width of the sector, rad;
-    least and greatest range, m; table: None where the sector is all that is stated."""
+    """Coverage of one sensor."""
 
     place: FloatArray
+    """(2,) sensor position, m."""
     direction: float
+    """Centre of the sector, rad."""
     half_width: float
+    """Half width of the sector, rad."""
     least: float
+    """Minimum range, m."""
     greatest: float
+    """Maximum range, m."""
     table: Table | None
+    """Table of probabilities; None for a constant probability."""
 
     def probability(self, place: FloatArray, detection_probability: float) -> FloatArray:
-        """The probability (...,) that a diver at `place` (..., 2) is detected."""
+        """Return the detection probability (...,) of a target at `place` (..., 2)."""
         apart = place - self.place
         distance = np.hypot(apart[..., 0], apart[..., 1])
         inside = (distance >= self.least) & (distance <= self.greatest)
@@ -146,29 +155,37 @@ class Coverage:
             inside &= off <= self.half_width
         if self.table is None:
             return np.where(inside, detection_probability, 0.0)
-        return np.where(inside, self.table.at(place, distance), 0.0)
+        return np.where(inside, self.table.interpolate(place, distance), 0.0)
 
 
-def stated(config: DiverConfig) -> dict[str, Coverage]:
-    """What is stated of each sensor by its name, of all others under ''; a sensor that sees
-    everywhere is not there. Raises ConfigError for a file that cannot be read."""
+def configured_coverage(config: DiverConfig) -> dict[str, Coverage]:
+    """Return the coverage by sensor name, with '' for all other sensors.
+
+    Sensors without limits are absent.
+
+    :raises ConfigError: a coverage file cannot be read.
+    """
     found = {}
     for sensor in ('', *config.sensors):
         own = config.of_sensor(sensor)
         if own.coverage_sector or own.coverage_file:
-            found[sensor] = _coverage(own.coverage_sector, own.coverage_file)
+            found[sensor] = _build_coverage(own.coverage_sector, own.coverage_file)
     return found
 
 
-def _coverage(sector: tuple[float, ...], file: str) -> Coverage:
+def _build_coverage(sector: tuple[float, ...], file: str) -> Coverage:
+    """Build the coverage from a sector and a file."""
     x, y, direction, width, least, greatest = sector or (0.0, 0.0, 0.0, 360.0, 0.0, math.inf)
     turn, half = math.radians(direction), 0.5 * math.radians(width)
-    table = _table(file) if file else None
+    table = _read_table(file) if file else None
     return Coverage(np.array([x, y]), turn, half, least, greatest, table)
 
 
-def _table(file: str) -> Table:
-    """The table in a CSV file. Raises ConfigError with what is wrong with it."""
+def _read_table(file: str) -> Table:
+    """Read the table in a CSV file.
+
+    :raises ConfigError: the file is invalid.
+    """
     try:
         with Path(file).expanduser().open(newline='', encoding='utf-8') as stream:
             rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if row]
@@ -180,13 +197,13 @@ def _table(file: str) -> Table:
             raise ValueError('a line has not as many numbers as the first names')
         if ((table[:, -1] < 0.0) | (table[:, -1] > MOST)).any():
             raise ValueError(f'a probability is not between 0 and {MOST:g}')
-        return _arranged(table)
+        return _arrange_table(table)
     except (OSError, ValueError) as error:
         raise ConfigError(f"coverage_file '{file}' cannot be used: {error}") from None
 
 
-def _arranged(table: FloatArray) -> Table:
-    """The rows (n, 2 or 3) of a file as a table, in whatever order they are."""
+def _arrange_table(table: FloatArray) -> Table:
+    """Build a table from the rows (n, 2 or 3) of a file, in any order."""
     axes = [np.unique(column) for column in table[:, :-1].T]
     shape = [len(axis) for axis in axes]
     if math.prod(shape) != len(table) or min(shape) < 2:
@@ -201,150 +218,164 @@ def _arranged(table: FloatArray) -> Table:
     return Table(axes[0], axes[1], grid)
 
 
-# -- what it says of tracks ----------------------------------------------------------------------
+# -- tracks --------------------------------------------------------------------------------------
 
 
-class Seen(NamedTuple):
-    """Probability of detection by what `coverage` states: usual, as the parameters have it; tracks
-    (T,): of each track; fixes (D,): of a diver where each fix is."""
+class DetectionProbability(NamedTuple):
+    """Detection probabilities of one sensor at one scan."""
 
     coverage: Coverage
-    usual: float
+    nominal: float
+    """Configured detection probability."""
     tracks: FloatArray
+    """(T,) detection probability of each track."""
     fixes: FloatArray
+    """(D,) detection probability at the position of each fix."""
 
     @property
     def log_ratio(self) -> FloatArray:
-        """(T, D) what is to be added to the log densities of fixes, so that rules for the usual
-        probability hold for these."""
-        usual = math.log(self.usual) - math.log1p(-self.usual)
+        """(T, D) correction of the log density of fixes, for gates based on the nominal
+        probability."""
+        usual = math.log(self.nominal) - math.log1p(-self.nominal)
         return np.log(self.fixes)[None] - np.log1p(-self.tracks)[:, None] - usual
 
     @property
-    def unseen(self) -> BoolArray:
-        """(T,) whether a track is where the sensor does not see."""
-        return np.asarray(2.0 * self.tracks < self.usual)
+    def is_outside(self) -> BoolArray:
+        """(T,) True for tracks outside the coverage."""
+        return np.asarray(2.0 * self.tracks < self.nominal)
 
     @property
-    def looks(self) -> FloatArray:
-        """(T,) how many misses of the usual probability one of each track is worth, 1 at most."""
-        return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.usual), 1.0)
+    def miss_weight(self) -> FloatArray:
+        """(T,) weight of a miss, relative to a miss at the nominal probability; at most 1."""
+        return np.minimum(np.log1p(-self.tracks) / math.log1p(-self.nominal), 1.0)
 
 
-def detecting(stated: Mapping[str, Coverage], models: ModelSet) -> Callable[[Known, Group], Known]:
-    """Return the stage that notes how probable the fixes of a group are, by what is `stated` of
-    sensors."""
+def detection_stage(
+    stated: Mapping[str, Coverage], models: ModelSet
+) -> Callable[[Known, Group], Known]:
+    """Return the stage that computes the detection probabilities of a group of fixes."""
 
     def detect(known: Known, group: Group) -> Known:
-        coverage = of_sensor(stated, group.sensor, group.config)
+        coverage = sensor_coverage(stated, group.sensor, group.config)
         if coverage is not None and group.target_id is None:
             p = group.config.detection_probability
-            group.seen = seen(known, models, coverage, p, group.z, group.R)
+            group.detection = detection_probability(known, models, coverage, p, group.z, group.R)
         return known
 
     return detect
 
 
-def missing(
+def miss_stage(
     models: ModelSet, moves_all: Callable[[Known], bool]
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that says what it means for tracks that a sensor looked and did not see
-    them; moves_all: whether an update may move all of the state."""
+    """Return the stage that applies misses. moves_all: whether an update may change the whole
+    state."""
 
     def miss(known: Known, group: Group) -> Known:
-        if not group.whole or group.target_id is not None:
+        if not group.is_complete or group.target_id is not None:
             return known
-        found = group.found
-        assert found is not None
-        exists = np.maximum(found.exists, 1e-300)
-        share = np.where(found.hit, 0.0, np.minimum(found.missed / exists, 1.0))
-        return missed(known, models, group.seen, share, moves_all(known))
+        association = group.association
+        assert association is not None
+        exists = np.maximum(association.exists, 1e-300)
+        share = np.where(association.hit, 0.0, np.minimum(association.missed / exists, 1.0))
+        return apply_misses(known, models, group.detection, share, moves_all(known))
 
     return miss
 
 
-def of_sensor(stated: Mapping[str, Coverage], sensor: str, config: DiverConfig) -> Coverage | None:
-    """Return what is `stated` of a sensor, None where it sees everywhere."""
+def sensor_coverage(
+    stated: Mapping[str, Coverage], sensor: str, config: DiverConfig
+) -> Coverage | None:
+    """Return the coverage of a sensor; None for no limits."""
     return stated.get(sensor if sensor in config.sensors else '')
 
 
-def seen(
+def detection_probability(
     known: Known,
     models: ModelSet,
     coverage: Coverage,
     p: float,
     z: FloatArray = NOWHERE,
     R: FloatArray = NO_COVARIANCE,
-) -> Seen:
-    """Return how probable a detection is of the tracks, and of a diver where fixes z (D, 2), R (D,
-    2, 2) are; p: where the sensor sees as it should."""
+) -> DetectionProbability:
+    """Return the detection probabilities of tracks, and at fixes z (D, 2), R (D, 2, 2).
+
+    p: nominal probability inside the coverage.
+    """
     tentative = known.life.status == TENTATIVE
-    tracks, same = _constant(known, models, coverage, p, np.where(tentative, 1.0, FAR_OUT))
+    tracks, same = _constant_probability(
+        known, models, coverage, p, np.where(tentative, 1.0, FAR_OUT)
+    )
     if not same.all():
         rows = known.rows
-        asked = np.flatnonzero(~same[rows.target])
+        selected = np.flatnonzero(~same[rows.target])
         at = np.concatenate(
             [
-                coverage.probability(_of_models(block.rows(asked)), p).mean(axis=-1)
+                coverage.probability(_model_points(block.select(selected)), p).mean(axis=-1)
                 for block in rows.blocks
             ],
             axis=1,
         )
-        of_row = rows.weight[asked] * (rows.mu[asked] * at).sum(axis=1)
-        whole = np.bincount(rows.target[asked], of_row, minlength=len(known))
+        of_row = rows.weight[selected] * (rows.mu[selected] * at).sum(axis=1)
+        whole = np.bincount(rows.target[selected], of_row, minlength=len(known))
         tracks = np.where(same, tracks, whole)
-    there = coverage.probability(_places(z, R), p).mean(axis=1)
-    return Seen(coverage, p, np.minimum(tracks, MOST), np.clip(there, LEAST, MOST))
+    there = coverage.probability(_sigma_points(z, R), p).mean(axis=1)
+    return DetectionProbability(coverage, p, np.minimum(tracks, MOST), np.clip(there, LEAST, MOST))
 
 
-def missed(
-    known: Known, models: ModelSet, seen: Seen | None, share: FloatArray, moves_all: bool
+def apply_misses(
+    known: Known,
+    models: ModelSet,
+    seen: DetectionProbability | None,
+    share: FloatArray,
+    moves_all: bool,
 ) -> Known:
-    """Return the tracks after a look that did not show them, with the probability `share` (T,).
+    """Update the tracks by a miss, which has the probability `share` (T,).
 
-    seen: None for a sensor that sees everywhere; where an update may not move all of the state,
-    only models and rows are weighed.
+    :param seen: None for a sensor without limits.
+    :param moves_all: False if an update may not change the whole state. Then only models and rows
+        are weighted.
     """
     if seen is None:
-        return known.put(looks=known['looks'] + 1.0)
-    coverage, p = seen.coverage, seen.usual
+        return known.with_columns(miss_weight=known['miss_weight'] + 1.0)
+    coverage, p = seen.coverage, seen.nominal
     tentative = known.life.status == TENTATIVE
-    looks = np.where(tentative, np.maximum(seen.looks, LEAST_LOOK), seen.looks)
-    known = known.put(looks=known['looks'] + looks)
-    asked = (share > 0.0) & ~tentative
-    if not asked.any():
+    looks = np.where(tentative, np.maximum(seen.miss_weight, LEAST_LOOK), seen.miss_weight)
+    known = known.with_columns(miss_weight=known['miss_weight'] + looks)
+    selected = (share > 0.0) & ~tentative
+    if not selected.any():
         return known
     far_out = np.full(len(known), FAR_OUT)
-    asked &= ~_constant(known, models, coverage, p, far_out)[1]
+    selected &= ~_constant_probability(known, models, coverage, p, far_out)[1]
     rows = known.rows
-    own = np.flatnonzero(asked[rows.target])
+    own = np.flatnonzero(selected[rows.target])
     if not len(own):
         return known
     factor, blocks = np.ones(rows.mu.shape), []
     for part, block in zip(models.parts, rows.blocks):
-        points = _of_models(block.rows(own))
+        points = _model_points(block.select(own))
         left = 1.0 - share[rows.target[own], None, None] * coverage.probability(points, p)
         factor[own[:, None], np.arange(part.models.start, part.models.stop)] = left.mean(axis=-1)
-        blocks.append(_conditioned(block, own, points, left) if moves_all else block)
-    rows, total = rows.replace(blocks=tuple(blocks)).with_models(factor)
+        blocks.append(_condition_on_miss(block, own, points, left) if moves_all else block)
+    rows, total = rows.replace(blocks=tuple(blocks)).multiply_models(factor)
     logw = rows.logw + np.log(np.maximum(total, 1e-300))
-    # Borrowed weights lie beside those of the rows; the sum of both stays.
+    # Keep the total weight of rows, because borrowed weights do not change.
     sums = rows.log_sum(known.rows.logw) - rows.log_sum(logw)
     return known.replace(rows=rows.replace(logw=logw + sums[rows.target]))
 
 
-def _conditioned(
+def _condition_on_miss(
     block: Gaussians, own: np.ndarray, points: FloatArray, left: FloatArray
 ) -> Gaussians:
-    """Return a block whose rows `own` (k,) lie where a look left them: points (k, m, 64, 2) with
-    weights `left` (k, m, 64)."""
+    """Condition the rows `own` (k,) of a block on a miss: points (k, m, 64, 2), weights `left` (k,
+    m, 64)."""
     weight = left / left.sum(axis=-1, keepdims=True)
     mean = np.einsum('rmk,rmka->rma', weight, points)
     apart = points - mean[:, :, None]
     spread = np.einsum('rmk,rmka,rmkb->rmab', weight, apart, apart)
-    x, P = (np.moveaxis(part, -1, 1) for part in block.rows(own))
+    x, P = (np.moveaxis(part, -1, 1) for part in block.select(own))
     before = P[..., :2, :2]
-    # What is known of the place moves the rest by its regression on the place.
+    # Other components move by their regression on the position.
     gain = np.swapaxes(np.linalg.solve(before, P[..., :2, :]), -1, -2)
     moved = x + np.einsum('rmna,rma->rmn', gain, mean - x[..., :2])
     grown = P + gain @ (spread - before) @ np.swapaxes(gain, -1, -2)
@@ -354,27 +385,27 @@ def _conditioned(
     return Gaussians(after_x, after_P)
 
 
-def _of_models(block: Gaussians) -> FloatArray:
+def _model_points(block: Gaussians) -> FloatArray:
     """Return the points (N, m, 64, 2) of all models."""
     place, covariance = block.x[:, :2], block.P[:, :2, :2]
-    return _places(np.moveaxis(place, -1, 1), np.moveaxis(covariance, -1, 1))
+    return _sigma_points(np.moveaxis(place, -1, 1), np.moveaxis(covariance, -1, 1))
 
 
-def _constant(
+def _constant_probability(
     known: Known, models: ModelSet, coverage: Coverage, p: float, stretch: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability of detection (T,) all over each track, `stretch` (T,) times as far as
-    its points, and whether it is the same there."""
+    """Return the detection probability (T,) at each track, and whether it is constant over the
+    points stretched by `stretch` (T,)."""
     if not len(known):
         return np.empty(0), np.empty(0, np.bool_)
-    mean, covariance = places(known, models)
-    at = coverage.probability(_places(mean, stretch[:, None, None] ** 2 * covariance), p)
+    mean, covariance = track_positions(known, models)
+    at = coverage.probability(_sigma_points(mean, stretch[:, None, None] ** 2 * covariance), p)
     return at[:, 0], at.max(axis=1) == at.min(axis=1)
 
 
-def _places(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(..., 64, 2) points of normal distributions, mean (..., n), covariance (..., n, n), of which
-    the first two are the place."""
+def _sigma_points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (..., 64, 2) points of normal distributions, mean (..., n), covariance (..., n, n),
+    position first."""
     # By the Cholesky factor, written out.
     a = np.sqrt(np.maximum(covariance[..., 0, 0], 1e-12))
     b = covariance[..., 1, 0] / a

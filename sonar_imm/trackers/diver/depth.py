@@ -12,28 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Depth as a state (`dimensions: 3`): what fixes say of z, and when its rows are spread anew.
+"""Depth as a state (`dimensions: 3`): update by fix heights, and depth hypotheses.
 
-*Fixes.* Association and the update by x and y are the same with z and without. Then z is one more
-number for the track that took the fix: z less what the errors of x and y, which are known by now,
-have to do with its own. With ``R`` the covariance of the fix, split into that of x and y, of z,
-and between them,
+*Fixes.* Association and the update by x and y ignore z. Then z updates the track of the fix as one
+more scalar, corrected by the known errors of x and y. With ``R`` the covariance of the fix, split
+into (x, y), z and their cross-covariance,
 
     z - g (x, y) = z_track - g (x, y)_track + e,    g = R_z,xy R_xy^-1,    var e = R_zz - g R_xy,z
 
-where e has nothing to do with the errors of x and y. So the two updates in turn are the one by all
-three coordinates. It weighs the models too, and with them the rows of the track.
+where e is uncorrelated with the errors of x and y. The two updates equal one update by all three
+coordinates. The likelihood of z also weights models and rows.
 
-z has a gate of its own, one coordinate under the whole mixture: an echo from the surface is off in
-z alone. What is refused is remembered; the next fix that agrees with it says that the depth was
-wrong, and z begins there.
+z has a gate of its own with one coordinate, because a surface echo is wrong in z only. A rejected
+z is stored; if the next rejected z agrees, the depth restarts there.
 
-*Rows.* Arrivals see z by how paths bend, and what bends is blind to the side of the receivers.
-Far away all rows of a track, each of which began in its part of the water column, may come to
-agree on a depth that is not well known. When the diver then comes near, one Gaussian cannot become
-two depths, and all rows may go to the wrong one. So rows that agree are spread over what they
-believe, before a ping that bends within it: the Gaussian becomes the sum of narrower ones with the
-same mean and variance, and the arrivals choose.
+*Rows.* Path lengths depend on (z - z_receiver)^2, so arrivals cannot tell a target above the
+receivers from one below. At long range all rows may agree on an uncertain depth. When the target
+then comes near, one Gaussian cannot split into two depths, and all rows may converge to the wrong
+one. Therefore rows that agree are spread before a ping whose paths bend within their variance. The
+Gaussian becomes a sum of narrower ones with the same mean and variance, and the arrivals weight
+them.
 """
 
 from __future__ import annotations
@@ -51,67 +49,69 @@ from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, repaired
+from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .scan import Group, Height, Ping
 
 FEATURES = {
-    'refused_z': Feature(math.nan, (3,)),
-    'spreads': Feature(0, kind=np.int64),
+    'rejected_z': Feature(math.nan, (3,)),
+    'respreads': Feature(0, kind=np.int64),
 }
-"""Stamp, z and variance of the last height of a fix that was not believed; how often the rows were
-spread anew."""
+"""rejected_z: stamp, z and variance of the last rejected fix height, NaN for none; respreads:
+number of times the rows were spread."""
 
 DOUBTED = 0.1
-"""Share of the heights of fixes from which what is doubted of them is said, after `MANY` of
-them."""
+"""Fraction of implausible fix heights that triggers a warning, once `MANY` heights were
+received."""
 
 MANY = 20
+"""Minimum number of fix heights for a warning."""
 
 BEYOND = 3.0
-"""Standard deviations by which a fix lies above or below the water column, so that it was stated
-wrong."""
+"""Standard deviations outside the water column at which a height is implausible."""
 
 AGREE = 0.5
-"""Rows agree whose means vary by less than this share of the variance that they have."""
+"""Rows agree if the variance of their means is below this fraction of their variance."""
 
 BENT = 0.1
-"""Standard deviations of an arrival by which the path may bend within what is believed of z,
-before the rows are spread. What one ping does not see many do: the bend is the same in all."""
+"""Path curvature over the z uncertainty, in standard deviations of an arrival, at which rows are
+spread. It is below 1 because the effect is equal in all pings."""
 
 APART, POSSIBLE = 2.0, 0.05
-"""There are two depths where the rows above a gap and those below weigh more than `POSSIBLE`
-each. A gap is wider than `APART` times the standard deviations of both its neighbours together."""
+"""A depth is ambiguous if the rows above and below a gap each weigh more than `POSSIBLE`. A gap is
+wider than `APART` times the summed standard deviations of its neighbours."""
 
 
 class HeightCounts(NamedTuple):
-    """How many heights of fixes there were for tracks, how many of them were refused, and how many
-    lie outside `depth_min` to `depth_max`."""
+    """Counters of the fix heights of tracks."""
 
     seen: int = 0
-    refused: int = 0
+    """Number of heights."""
+    rejected: int = 0
+    """Number of heights rejected by the gate."""
     outside: int = 0
+    """Number of heights outside `depth_min` to `depth_max`."""
 
     def warnings(self, config: DiverConfig) -> list[str]:
-        """Sentences for the user."""
+        """Return warnings about implausible heights."""
         if self.seen < MANY:
             return []
         found = []
         if self.outside > DOUBTED * self.seen:
             found.append(
-                f'{self.outside} of {self.seen} heights of fixes lie outside depth_min '
-                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m): state these, or '
+                f'{self.outside} of {self.seen} fix heights are outside depth_min '
+                f'({config.depth_min:g} m) to depth_max ({config.depth_max:g} m). Set these, or '
                 'origin_height for positions in latitude and longitude'
             )
-        if self.refused > DOUBTED * self.seen:
+        if self.rejected > DOUBTED * self.seen:
             found.append(
-                f'{self.refused} of {self.seen} heights of fixes were refused: z misses by more '
-                'than it states, or the divers go up and down faster than vertical_speed_std'
+                f'{self.rejected} of {self.seen} fix heights were rejected: their variances are '
+                'too small, or targets move faster than vertical_speed_std. Check both'
             )
         return found
 
 
-def begin(
+def begin_depth(
     x: FloatArray,
     P: FloatArray,
     height: Height,
@@ -119,96 +119,103 @@ def begin(
     place: int,
     config: DiverConfig,
 ) -> None:
-    """Let a new track, x (M, n), P (M, n, n) in place, begin at the z that its fix states; its x
-    and y have `covariance` (2, 2). Not where the water column, of `depth_min` to `depth_max`, says
-    more than the fix, and does not contradict it: then z begins as without a fix."""
+    """Set the depth of a new track to the z of its fix: x (M, n), P (M, n, n), in place.
+
+    Keep the depth hypotheses if the water column is narrower than the fix uncertainty and contains
+    the fix. covariance: (2, 2) of x and y.
+    """
     variance = height.variance(covariance)
     width = config.depth_max - config.depth_min
-    if variance <= width**2 / 12.0 or _outside(height.value, variance, config):
-        _set(x, P, place, height.value, variance, config)
+    if variance <= width**2 / 12.0 or _is_outside(height.value, variance, config):
+        reset_depth(x, P, place, height.value, variance, config)
         P[:, :2, place] = P[:, place, :2] = covariance @ height.gain
 
 
-def _outside(value: float, variance: float, config: DiverConfig) -> bool:
+def _is_outside(value: float, variance: float, config: DiverConfig) -> bool:
+    """Return whether a height is outside the water column."""
     room = BEYOND * math.sqrt(variance)
     return not -config.depth_max - room <= value <= -config.depth_min + room
 
 
-def _set(
+def reset_depth(
     x: FloatArray, P: FloatArray, place: int, value: float, variance: float, config: DiverConfig
 ) -> None:
-    """Forget what x (M, n), P (M, n, n) know of z and its rate, which follows it."""
+    """Reset z and its rate in x (M, n), P (M, n, n), in place."""
     own = slice(place, place + 2)
     P[:, own, :] = P[:, :, own] = 0.0
     x[:, place], x[:, place + 1] = value, 0.0
     P[:, place, place], P[:, place + 1, place + 1] = variance, config.vertical_speed_std**2
 
 
-def updating(
+def depth_stage(
     models: ModelSet, layouts: Callable[[Known], Layout], config: DiverConfig
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that updates tracks by the heights of the fixes that are theirs."""
+    """Return the stage that updates tracks by the heights of their fixes."""
 
     def update_heights(known: Known, group: Group) -> Known:
-        return update(known, group, models, layouts(known), config)
+        return update_depth(known, group, models, layouts(known), config)
 
     return update_heights
 
 
-def update(
+def update_depth(
     known: Known, group: Group, models: ModelSet, layout: Layout, config: DiverConfig
 ) -> Known:
-    """Return the tracks after the heights of the fixes of a group that are theirs."""
-    heights, found = group.heights, group.found
-    assert found is not None
-    tracks = np.flatnonzero(found.hit)
+    """Update tracks by the heights of their fixes."""
+    heights, association = group.heights, group.association
+    assert association is not None
+    tracks = np.flatnonzero(association.hit)
     if heights is None or not len(tracks):
         return known
-    tracks = tracks[np.isfinite(heights.value[found.fix[tracks]])]
+    tracks = tracks[np.isfinite(heights.value[association.fix[tracks]])]
     threshold = gate_threshold(config.gate_probability, 1)
-    columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'refused_z')}
+    columns = {name: known[name].copy() for name in ('nis', 'nis_dof', 'rejected_z')}
     counts: HeightCounts = known.memory['heights']
     seen, doubted, outside = counts
     for track in tracks.tolist():
-        fix = int(found.fix[track])
+        fix = int(association.fix[track])
         own = heights.row(fix)
         assert own is not None
         share = 1.0
-        if found.weighed:
-            share = min(found.beta[track, fix] / found.exists[track], 1.0)
-        known, nis = _updated(known, track, own, group.z[fix], share, models, layout, threshold)
+        if association.is_joint:
+            share = min(association.beta[track, fix] / association.exists[track], 1.0)
+        known, nis = _update_track(
+            known, track, own, group.z[fix], share, models, layout, threshold
+        )
         variance = own.variance(group.R[fix])
-        outside += _outside(own.value, variance, config)
+        outside += _is_outside(own.value, variance, config)
         if nis <= threshold:
             columns['nis'][track] += nis
             columns['nis_dof'][track] += np.uint16(1)
-            columns['refused_z'][track] = np.nan
+            columns['rejected_z'][track] = np.nan
             continue
-        stamp, before, its = columns['refused_z'][track].tolist()
+        stamp, before, its = columns['rejected_z'][track].tolist()
         moved = config.vertical_speed_std * (known.stamp_ns - stamp) * 1e-9
         if (own.value - before) ** 2 <= threshold * (variance + its + moved**2):
-            known = _at_height(known, track, own.value, variance, models, config)
-            columns['refused_z'][track] = np.nan
+            known = _restart_depth(known, track, own.value, variance, models, config)
+            columns['rejected_z'][track] = np.nan
         else:
-            columns['refused_z'][track] = known.stamp_ns, own.value, variance
+            columns['rejected_z'][track] = known.stamp_ns, own.value, variance
             doubted += 1
     after = HeightCounts(seen + len(tracks), doubted, outside)
-    return known.put(**columns).remember(heights=after)
+    return known.with_columns(**columns).with_memory(heights=after)
 
 
-def _at_height(
+def _restart_depth(
     known: Known, track: int, value: float, variance: float, models: ModelSet, config: DiverConfig
 ) -> Known:
-    """Return the tracks after one forgot what it knew of z, and begins at `value`."""
-    own = known.rows_of(track)
-    rows = known.rows.take(own)
-    x, P = models.common(rows.blocks)
+    """Restart the depth of one track at `value`."""
+    own = known.row_indices(track)
+    rows = known.rows.select(own)
+    x, P = models.to_common(rows.blocks)
     for row in range(len(rows)):
-        _set(x[row], P[row], models.height, value, variance, config)
-    return known.replace(rows=with_rows(known.rows, own, models.blocks(x, P), rows.mu, rows.logw))
+        reset_depth(x[row], P[row], models.height, value, variance, config)
+    return known.replace(
+        rows=replace_rows(known.rows, own, models.to_blocks(x, P), rows.mu, rows.logw)
+    )
 
 
-def with_rows(
+def replace_rows(
     rows: Rows, own: np.ndarray, blocks: tuple[Gaussians, ...], mu: FloatArray, logw: FloatArray
 ) -> Rows:
     """Return the table with other states, models and weights of the rows `own` (k,)."""
@@ -222,7 +229,7 @@ def with_rows(
     return rows.replace(blocks=tuple(merged), mu=all_mu, logw=all_logw)
 
 
-def _updated(
+def _update_track(
     known: Known,
     track: int,
     height: Height,
@@ -232,19 +239,18 @@ def _updated(
     layout: Layout,
     threshold: float,
 ) -> tuple[Known, float]:
-    """Return the tracks after one was updated by one number, z of a fix less its `gain` times the
-    x and y (2,) of that fix, and the NIS of its mixture, by which nothing changes where it is
-    above `threshold`.
+    """Update one track by a scalar: z of a fix less its `gain` times x and y (2,) of the fix.
 
-    share: probability that the number is the track's. Below 1 each model becomes the mixture of
-    what it is with it and without.
+    :param share: probability that the fix belongs to the track. Below 1, each model becomes a
+        mixture.
+    :returns: the new state and the NIS of the mixture. A NIS above `threshold` changes nothing.
     """
-    own = known.rows_of(track)
-    rows, value = known.rows.take(own), height.value - float(height.gain @ z)
-    weight = rows.weight_among_themselves()[:, None] * rows.mu
-    masks = layout.estimated(models)
+    own = known.row_indices(track)
+    rows, value = known.rows.select(own), height.value - float(height.gain @ z)
+    weight = rows.normalized_weight()[:, None] * rows.mu
+    masks = layout.estimated_masks(models)
     parts = [
-        _compared(block, part.seen, part.height, height, value)
+        _depth_innovations(block, part.fix_matrix, part.height, height, value)
         for part, block in zip(models.parts, rows.blocks)
     ]
     v, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
@@ -259,19 +265,20 @@ def _updated(
     blocks = []
     for part, block, mask, (PHt, nu, s) in zip(models.parts, rows.blocks, masks, parts):
         certain = share * density[:, part.models] / (weight * density).sum()
-        blocks.append(_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
-    sound, repairs = repaired(tuple(blocks))
-    rows, total = rows.replace(blocks=sound).with_models(factor)
+        blocks.append(_update_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
+    sound, repairs = repair_covariances(tuple(blocks))
+    rows, total = rows.replace(blocks=sound).multiply_models(factor)
     with np.errstate(divide='ignore'):
         logw = np.maximum(rows.logw + np.log(total), LEAST_LOG)
-    known = known.replace(rows=with_rows(known.rows, own, rows.blocks, rows.mu, logw))
-    return known.counted(repairs=repairs), nis
+    known = known.replace(rows=replace_rows(known.rows, own, rows.blocks, rows.mu, logw))
+    return known.add_counts(repairs=repairs), nis
 
 
-def _compared(
+def _depth_innovations(
     block: Gaussians, seen: FloatArray, place: int, height: Height, value: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return PHt (N, n, m), innovation (N, m) and its variance (N, m) of ``z - gain (x, y)``."""
+    """Return PHt (N, n, m), innovation (N, m) and innovation variance (N, m) of ``z - gain (x,
+    y)``."""
     h = np.zeros((block.x.shape[1], block.x.shape[2]))
     h[: len(seen[0])] = -height.gain[0] * seen[0] - height.gain[1] * seen[1]
     h[place] += 1.0
@@ -279,7 +286,7 @@ def _compared(
     return PHt, value - (h * block.x).sum(axis=1), (h * PHt).sum(axis=1) + height.rest
 
 
-def _scalar(
+def _update_scalar(
     block: Gaussians,
     PHt: FloatArray,
     v: FloatArray,
@@ -289,8 +296,7 @@ def _scalar(
     without: float,
     estimated: BoolArray | None,
 ) -> Gaussians:
-    """Return the block after one number: in each model the mixture of what it is with it, with the
-    weight `certain` (N, m), and `without`."""
+    """Update a block by a scalar, as a mixture with weights `certain` (N, m) and `without`."""
     K = PHt / np.where(S > 0.0, S, 1.0)[:, None]
     if estimated is not None:
         K[:, ~estimated] = 0.0
@@ -308,8 +314,8 @@ def _scalar(
 # -- rows ----------------------------------------------------------------------------------------
 
 
-def _of_rows(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weight, mean and variance of z of each row, (N,) each."""
+def _row_depths(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return weight, mean z and variance of z of each row, (N,) each."""
     z, variance = (
         np.concatenate(parts, axis=1)
         for parts in zip(
@@ -324,12 +330,12 @@ def _of_rows(rows: Rows, models: ModelSet) -> tuple[FloatArray, FloatArray, Floa
     return rows.weight, mean, np.maximum(square - mean * mean, 0.0)
 
 
-def ambiguous(known: Known, models: ModelSet) -> BoolArray:
-    """Return which divers (T,) may be at another depth as well."""
+def ambiguous_depths(known: Known, models: ModelSet) -> BoolArray:
+    """Return which tracks (T,) have a second possible depth."""
     two = np.zeros(len(known), bool)
-    weights, means, variances = _of_rows(known.rows, models)
+    weights, means, variances = _row_depths(known.rows, models)
     for track in range(len(known)):
-        own = known.rows_of(track)
+        own = known.row_indices(track)
         weight, mean, variance = weights[own], means[own], variances[own]
         counts = np.flatnonzero(weight > POSSIBLE / 10.0)
         order = counts[np.argsort(mean[counts], kind='stable')]
@@ -340,68 +346,71 @@ def ambiguous(known: Known, models: ModelSet) -> BoolArray:
     return two
 
 
-def spread(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
-    """Return the tracks as `seen` will find them: with the rows spread where they agree and the
-    paths bend within what they believe."""
+def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
+    """Spread the rows of tracks that agree, if the paths of the ping bend within their
+    uncertainty."""
     echo = seen.echo
-    if models.height < 0 or models.copies == 1 or not len(known) or not echo.any():
+    if models.height < 0 or models.rows_per_track == 1 or not len(known) or not echo.any():
         return known
-    weights, means, variances = _of_rows(known.rows, models)
+    weights, means, variances = _row_depths(known.rows, models)
     measured = seen.measured
     for track in range(len(known)):
-        own = known.rows_of(track)
+        own = known.row_indices(track)
         weight, mean, variance = weights[own], means[own], variances[own]
         middle = float(weight @ mean)
         between, within = float(weight @ (mean - middle) ** 2), float(weight @ variance)
         if not between < AGREE * within:
             continue
-        rows = known.rows.take(own)
+        rows = known.rows.select(own)
         x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
         place = np.append(np.einsum('r,rm,ram->a', weight, rows.mu, x), middle)
-        bend = _bend(place, measured.rx[echo])
+        bend = _path_curvature(place, measured.rx[echo])
         if not seen.passive:
-            bend = bend + _bend(place, measured.tx[echo])
+            bend = bend + _path_curvature(place, measured.tx[echo])
         deviation = 0.5 * bend * (within + between) / np.sqrt(measured.variance[echo])
         if deviation.max() > BENT:
-            new = _spread(rows, layout.mask, models)
-            known = known.replace(rows=with_rows(known.rows, own, *new))
-            known = spread_anew(known, track)
+            new = _spread_rows(rows, layout.mask, models)
+            known = known.replace(rows=replace_rows(known.rows, own, *new))
+            known = count_respread(known, track)
     return known
 
 
-def spread_anew(known: Known, track: int) -> Known:
-    """Return the tracks with one more spread of the rows of a track."""
-    spreads = known['spreads'].copy()
+def count_respread(known: Known, track: int) -> Known:
+    """Return the state with one more spread of a track."""
+    spreads = known['respreads'].copy()
     spreads[track] += 1
-    return known.put(spreads=spreads)
+    return known.with_columns(respreads=spreads)
 
 
-def _bend(place: FloatArray, instrument: FloatArray) -> FloatArray:
-    """Return the second derivative (C,) in z of the distance from `place` (3,) to instruments (C,
-    3), not nearer than a metre, 1/m."""
+def _path_curvature(place: FloatArray, instrument: FloatArray) -> FloatArray:
+    """Return d^2(distance)/dz^2 (C,), 1/m, from `place` (3,) to instruments (C, 3); distances from
+    1 m."""
     apart = instrument - place
     distance = np.maximum(np.sqrt((apart * apart).sum(axis=1)), 1.0)
     return np.asarray((1.0 - np.minimum(apart[:, 2] / distance, 1.0) ** 2) / distance)
 
 
-def _spread(
+def _spread_rows(
     rows: Rows, estimated: BoolArray, models: ModelSet
 ) -> tuple[tuple[Gaussians, ...], FloatArray, FloatArray]:
-    """Return states, models (K, M) and weights (K,) of the K rows of a track, with what all rows
-    believe spread over them; estimated (n,): see `estimation.consider`."""
+    """Return states, models (K, M) and log weights (K,) of K rows spread over the depth of a
+    track.
+
+    estimated: (n,) mask, see `estimation.consider`.
+    """
     place = models.height
-    each = rows.weight_among_themselves()[:, None] * rows.mu
+    each = rows.normalized_weight()[:, None] * rows.mu
     K, total = len(each), each.sum(axis=0)
     share = np.where(total > 0.0, each / np.where(total > 0.0, total, 1.0), 1.0 / K)
-    x, P = models.common(rows.blocks)
+    x, P = models.to_common(rows.blocks)
     mean = np.einsum('km,kma->ma', share, x)
     apart = x - mean
     whole = np.einsum('km,kmab->mab', share, P + apart[..., :, None] * apart[..., None, :])
     line = whole[:, place] / np.sqrt(whole[:, place, place])[:, None]
     moved = estimated[:, None] | estimated[None, :]
-    # Standard deviations: what lies between the rows does not lie within them.
+    # The variance between the rows is subtracted from the variance within them.
     steps = np.linspace(-1.0, 1.0, K)
     narrow = whole - (steps**2).mean() * line[:, :, None] * line[:, None, :] * moved
     at = mean + steps[:, None, None] * np.where(estimated, line, 0.0)
     covariance = np.tile(add_jitter(narrow)[0], (K, 1, 1, 1))
-    return models.blocks(at, covariance), np.tile(total, (K, 1)), np.full(K, -math.log(K))
+    return models.to_blocks(at, covariance), np.tile(total, (K, 1)), np.full(K, -math.log(K))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is published of the divers, and what a user has to know of the input."""
+"""Published estimates and warnings of the diver tracker."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
 from . import births, clutter, depth, offsets
 from .config import DiverConfig
-from .fixes import scale_of, stated_weight
-from .forgetting import PUBLISHES
-from .known import Known, of_rows
+from .fixes import estimated_scales, weight_without_small_scales
+from .known import Known, row_outputs
 from .models import FAMILIES, HOVER, ModelSet
+from .pruning import PUBLISH_EXISTENCE
 
 
 def estimate_of(
     known: Known, models: ModelSet, config: DiverConfig, frame_id: str, origin: Origin | None
 ) -> Estimate:
-    """Return what is published of a scan; origin: where the frame lies on Earth, None when that is
-    not known."""
-    # Of tracks whose hits are counted the existence is NaN.
-    known = known.only(~(known['existence'] <= PUBLISHES))
-    mean, covariance = published(known, models)
+    """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
+    # The existence is NaN for tracks confirmed by hits.
+    known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
+    mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
-        covariance = offsets.widened(known.memory['recent'], mean, covariance, config)
+        covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -49,10 +48,10 @@ def estimate_of(
         'track_state': known.life.status,
         **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
         'target_id': known['target_id'].astype(np.int32),
-        **of_families(known, models),
+        **family_extras(known, models),
     }
-    if models.height >= 0 and models.copies > 1:
-        extras['depth_ambiguous'] = depth.ambiguous(known, models).astype(np.uint8)
+    if models.height >= 0 and models.rows_per_track > 1:
+        extras['depth_ambiguous'] = depth.ambiguous_depths(known, models).astype(np.uint8)
     if origin is not None:
         place = origin.geodetic(xyz)
         extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
@@ -64,44 +63,45 @@ def estimate_of(
         state=mean,
         covariance=covariance,
         model_names=models.names,
-        probabilities=known.rows.models(),
+        probabilities=known.rows.model_probabilities(),
         extras=extras,
     )
 
 
-def published(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, q) and covariance (T, q, q): where all rows say, and how far off that may be
-    for those that say how well a place is known.
+def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, q) and covariance (T, q, q) of the published state.
 
-    Fixes that are better than stated look like fixes whose errors last. If they are as stated, the
-    row that says so is the optimal filter: its error is uncorrelated with all that is computed of
-    the data, so that of the mean of all rows has its covariance and the square of how far the two
-    are apart. If they are better, this is cautious.
+    All rows contribute to the mean. Only rows with scale >= 1 contribute to the covariance,
+    because fixes that are better than reported look like fixes with time-correlated errors. If the
+    reported covariances are correct, the row of scale 1 is the optimal filter, whose error is
+    uncorrelated with all other estimates. The covariance of the mean is then its covariance plus
+    the squared difference. If fixes are better, the result is conservative.
     """
     maps = tuple(part.outputs for part in models.parts)
-    rows, each = known.rows, of_rows(known.rows, maps)
+    rows, each = known.rows, row_outputs(known.rows, maps)
     mean, covariance = rows.combine(*each, rows.weight)
     if len(models.scales) > 1:
-        own, covariance = rows.combine(*each, stated_weight(rows))
+        own, covariance = rows.combine(*each, weight_without_small_scales(rows))
         off = mean - own
         covariance = covariance + off[:, :, None] * off[:, None, :]
     return mean, covariance
 
 
-def of_families(known: Known, models: ModelSet) -> dict[str, FloatArray]:
-    """Return what is published of families beside the probabilities of their models."""
+def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
+    """Return the extra columns of families."""
     if models.families is None:
         return {}
-    each = known.rows.models()
+    each = known.rows.model_probabilities()
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = scale_of(known.rows)
+    out['covariance_scale'] = estimated_scales(known.rows)
     return out
 
 
 def health(known: Known, waiting: int) -> dict[str, float]:
-    """Return numbers for diagnostics; waiting: fixes that wait for the vessel."""
+    """Return the numbers for diagnostics. waiting: number of fixes that wait for the vessel
+    pose."""
     hit = known['nis_dof'] > 0
     mean = float(np.mean(known['nis'][hit] / known['nis_dof'][hit])) if hit.any() else float('nan')
     return {
@@ -119,21 +119,21 @@ def health(known: Known, waiting: int) -> dict[str, float]:
 
 
 def warnings(known: Known, config: DiverConfig) -> list[str]:
-    """Return what of the input cannot be true or used, in sentences for the user."""
+    """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
-    unstated = [name for name in stds if not getattr(config, name)]
+    unset = [name for name in stds if not getattr(config, name)]
     if config.dimensions == 2:
-        unstated.insert(0, 'target_z (or dimensions: 3)')
-    if unstated:
-        advice += ', or state what is not exact: ' + ', '.join(unstated)
+        unset.insert(0, 'target_z (or dimensions: 3)')
+    if unset:
+        advice += ', or set instrument errors: ' + ', '.join(unset)
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
-    more = memory['excess'] >= ENOUGH
+    exceeds = memory['excess'] >= ENOUGH
     return [
         *memory['fixes'].warnings(config.fix_bias_std > 0.0),
         *memory['heights'].warnings(config),
-        *memory['arrivals'].warnings('arrivals', advice, more_than_stated=more),
+        *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),
-        *births.no_room(known, config),
+        *births.start_warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]

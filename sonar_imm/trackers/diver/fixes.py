@@ -12,23 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Fixes: which are whose, and what they do to the tracks.
+"""Association of fixes with tracks, and the update by fixes.
 
-Every fix is compared with every row it may belong to (`compare`): with the covariances that the
-row assumes, under all its models. So each fix has a density under each row, and one under each
-whole track. By these densities it is decided whose it is:
+`compare` computes the density of each fix under each row it may belong to: all models of the row,
+with the covariance scale of the row. The densities of a track select the association:
 
-- `by_name`: the fix says so. A name settles whose a fix is, never whether it is good.
-- `jointly` (jipda): every pairing of tracks and fixes is weighed, exactly (`estimation.jipda`). So
-  a track has a probability of existence, by which it is confirmed, published and ended.
-- `singly` (gnn): the likeliest pairing is taken for true; hits and misses are counted.
+- `associate_by_id`: the ID selects the track of a fix; the fix still has to pass the gate.
+- `associate_jipda`: exact probabilities of all joint events (`estimation.jipda`), with a
+  probability of existence for each track.
+- `associate_gnn`: the most likely assignment; hits and misses are counted.
 
-Which fix may be a track's is not asked of a chi-square where the models are families, but of the
-density of the whole mixture: it has to be more probable that the diver was seen there than that he
-was missed and the fix is false (`bound`).
+For families, gating uses the predictive density of the mixture instead of a chi-square test. A fix
+passes if a detection at this place is more probable than a missed target and a false fix
+(`gate_log_density`).
 
-Then the rows are updated by the fixes that may be theirs, in proportion to the probabilities
-(`update`). What each row says of the fixes weighs it, and rows without weight are not computed.
+`update_tracks` updates the rows with all associated fixes, in proportion to the association
+probabilities. The likelihood of the fixes weights the rows. Rows of negligible weight are not
+computed.
 
 Source: docs/diver.md, 'Association'.
 """
@@ -47,18 +47,18 @@ from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
 from ...estimation.bank import Innovations
 from ...estimation.rows import (
     Borrowed,
+    drop_weightless_rows,
     LEAST_LOG,
     log_sum,
-    of_targets,
-    revived,
+    reduce_targets,
+    restore_rows,
     ROW_AGAIN,
     ROW_LOST,
     Rows,
-    thinned,
 )
 from ...measurements import NOBODY
-from .innovations import FixConsistency, watch
-from .known import Feature, Known, of_rows, repaired
+from .innovations import FixConsistency, whiten_innovations
+from .known import Feature, Known, repair_covariances, row_outputs
 from .models import ModelSet
 from .offsets import RecentPairs
 from .scan import Group
@@ -71,56 +71,65 @@ FEATURES = {
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
 }
-"""nis, nis_dof: of this scan, NaN and 0 without a hit; score: how much better than clutter the
-track explained the last ten scans or so, a log-likelihood ratio; white: whitened innovation of the
-last fix; existence: probability that there is a diver, NaN where hits are counted instead;
-evidence: sum of the probabilities of its detections."""
+"""nis, nis_dof: of this scan, NaN and 0 without a hit.
+
+score: log-likelihood ratio of the track against clutter over about the last ten scans.
+
+white: whitened innovation of the last fix.
+
+existence: probability that the target exists; NaN for tracks confirmed by hits.
+
+evidence: sum of the detection probabilities of the track.
+"""
 
 FAR = 80.0
-"""Normalised distance squared along an axis, from what every model expects, beyond which a density
-is nothing but small: what counts is which one is nearer."""
+"""Squared normalised distance along one axis beyond which a density is replaced by a bound. The
+bound decreases with the distance, so it still ranks tracks."""
 
-OPENS_GATE = {'gnn': 1e-6, 'jipda': 0.01}
-"""A model less probable than this opens no gate. A choice needs the rare ones, or loses the track
-at a sharp turn; where all pairings are weighed they cost little."""
+MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
+"""Minimum probability of a model that opens the gate. A single assignment needs rare models, or
+it loses tracks in sharp turns; joint association does not."""
 
-LEAST_DETECTED = 1e-9
-"""Probability of detection of a track outside of all that the sensor covers: that of a fix is
+MIN_DETECTION_PROBABILITY = 1e-9
+"""Lower bound of the detection probability of a track outside the coverage, because ratios are
 divided by it."""
 
-CONFIRMS = 0.9
-"""Existence above which a track may be confirmed."""
+CONFIRM_EXISTENCE = 0.9
+"""Existence above which a track can be confirmed."""
 
-SHARE = 5e-4
-"""Share of the weight of the scales that is spread evenly over them with each scan, so that a
-sensor which becomes worse is noticed."""
+REDISTRIBUTED_FRACTION = 5e-4
+"""Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
+quality is detected."""
 
-STATED = 1.0
-"""Rows with a lower scale say where a diver is, but not how well that is known: fixes that are
-better than stated look like fixes whose errors last."""
+MIN_PUBLISHED_SCALE = 1.0
+"""Smallest scale whose rows contribute to the published covariance. Smaller scales also fit
+time-correlated errors, so they contribute to the mean only."""
 
 
 class Assumptions(NamedTuple):
-    """All that is assumed of T tracks, in their order: row (A,) whose states are used; scale (A,)
-    of the covariances; logw (A,), logarithms of the weights; target (A,), the track; own (A,):
-    whether the row is its own, or borrowed."""
+    """All A assumptions of T tracks, in order of the tracks."""
 
     row: IndexArray
+    """(A,) row whose states are used."""
     scale: FloatArray
+    """(A,) scale of the covariances."""
     logw: FloatArray
+    """(A,) logarithm of the weight."""
     target: IntArray
-    own: BoolArray
+    """(A,) track index."""
+    has_row: BoolArray
+    """(A,) True for assumptions with a row of their own, False for borrowed ones."""
 
     @classmethod
-    def of(cls, rows: Rows, borrowed: Borrowed) -> Assumptions:
-        """Return the assumptions of rows and of the list of those without one."""
+    def from_rows(cls, rows: Rows, borrowed: Borrowed) -> Assumptions:
+        """Return the assumptions of rows and of the borrowed list."""
         N, scale = len(rows), rows.key['scale']
         if not len(borrowed):
             return cls(np.arange(N), scale, rows.logw, rows.target, np.ones(N, np.bool_))
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
         return cls(
-            np.concatenate([np.arange(N), borrowed.lender(rows, 'scale')])[order],
+            np.concatenate([np.arange(N), borrowed.find_lenders(rows, 'scale')])[order],
             np.concatenate([scale, borrowed.key])[order],
             np.concatenate([rows.logw, borrowed.logw])[order],
             target[order],
@@ -129,75 +138,84 @@ class Assumptions(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Fixes beside assumptions: assumption, fix (p,), in rising order of the first; compared: what
-    each block of models says of each pair; log (p,): density of the fix under the assumption, and
-    whole (T, D) under the track, logarithms; nis (T, D): the least of any model, where a
-    chi-square is the gate, else None."""
+    """Comparison of D fixes with assumptions, as p pairs in order of the assumptions."""
 
     among: Assumptions
     assumption: IndexArray
+    """(p,) index of the assumption."""
     fix: IndexArray
-    compared: tuple[Innovations, ...]
+    """(p,) index of the fix."""
+    innovations: tuple[Innovations, ...]
+    """Innovations of the pairs for each block of models."""
     log: FloatArray
-    whole: FloatArray
+    """(p,) log density of the fix under the assumption."""
+    track_log: FloatArray
+    """(T, D) log density of each fix under each track."""
     nis: FloatArray | None
+    """(T, D) smallest NIS of any model; None for density gating."""
 
 
 class Association(NamedTuple):
-    """Whose D fixes are: beta (T, D), the probability of each pair; missed (T,): that a track has
-    none; fix (T,): the likeliest one of a track that was hit, -1 of others; free (D,): where a
-    track may begin; existence (D,): of that track, None where its hits will tell; score (T,);
-    weighed: whether existence follows from the probabilities."""
+    """Association of D fixes with T tracks."""
 
     beta: FloatArray
+    """(T, D) probability of each pair."""
     missed: FloatArray
+    """(T,) probability that the target exists and was not detected."""
     fix: IntArray
+    """(T,) most probable fix of a track with a hit; -1 for no hit."""
     free: BoolArray
+    """(D,) True for fixes that may start a track."""
     existence: FloatArray | None
+    """(D,) existence of a track started at the fix; None if hits are counted."""
     score: FloatArray
-    weighed: bool = False
+    """(T,) new score of each track."""
+    is_joint: bool = False
+    """True if existence follows from the probabilities."""
 
     @property
     def hit(self) -> BoolArray:
-        """(T,) whether a hit is likelier than a miss."""
+        """(T,) True if a hit is more probable than a miss."""
         return self.fix >= 0
 
     @property
     def claimed(self) -> FloatArray:
-        """(D,) the probability that each fix is a track's."""
+        """(D,) probability that the fix belongs to any track."""
         return np.asarray(self.beta.sum(axis=0))
 
     @property
     def exists(self) -> FloatArray:
-        """(T,) the probability that there is a diver, hit or missed."""
+        """(T,) probability that the target exists, detected or missed."""
         return self.missed + self.beta.sum(axis=1)
 
 
-# -- comparing -----------------------------------------------------------------------------------
+# -- comparison ----------------------------------------------------------------------------------
 
 
-def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs:
-    """Compare the fixes of a group with the rows that they may belong to: with those near them,
-    or, of fixes with names, with those of these names. opens: as in `OPENS_GATE`."""
+def compare(known: Known, group: Group, models: ModelSet, min_probability: float) -> Pairs:
+    """Compare the fixes of a group with rows near them, or with the tracks of the same ID.
+
+    :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
+    """
     rows, z, R = known.rows, group.z, group.R
-    among = Assumptions.of(rows, known.borrowed)
-    expected = [bank.expected(b, part.measured) for b, part in zip(rows.blocks, models.parts)]
-    off = _off(expected, among, z, R)
-    # All rows of a track see what one of them may: else one would stay where it is for ever.
-    near = of_targets(np.logical_or, off <= 1.0, among.target)
+    among = Assumptions.from_rows(rows, known.borrowed)
+    expected = [bank.predict_fix(b, part.measured) for b, part in zip(rows.blocks, models.parts)]
+    off = _box_distance(expected, among, z, R)
+    # A fix near one row is compared with all rows of the track, or a row could stay behind.
+    near = reduce_targets(np.logical_or, off <= 1.0, among.target)
     if group.target_id is not None:
         near = known['target_id'][:, None] == group.target_id
     near = near[among.target]
     assumption, fix = np.nonzero(near)
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
-    log = _of_mixture(rows.mu[row], compared)
+    log = _mixture_log_density(rows.mu[row], compared)
     table = -0.5 * FAR * np.square(np.maximum(off, 1.0))
     table[assumption, fix] = log
     whole = log_sum(among.logw[:, None] + table, among.target)
     nis = None
     if models.families is None:
-        probable = (rows.mu * np.exp(rows.logw)[:, None])[row] >= opens
+        probable = (rows.mu * np.exp(rows.logw)[:, None])[row] >= min_probability
         least = np.concatenate([each.nis for each in compared], axis=1)
         least = np.where(probable, least, np.inf).min(axis=1, initial=np.inf)
         nis = np.full(whole.shape, np.inf)
@@ -205,9 +223,8 @@ def compare(known: Known, group: Group, models: ModelSet, opens: float) -> Pairs
     return Pairs(among, assumption, fix, compared, log, whole, nis)
 
 
-def _of_mixture(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
-    """Return the logarithm (p,) of the density of each pair's fix under all models, of
-    probabilities mu (p, M)."""
+def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
+    """Return the log density (p,) of each pair over all models. mu: (p, M) model probabilities."""
     with np.errstate(divide='ignore'):
         of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
         best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
@@ -217,26 +234,28 @@ def _of_mixture(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
         )
 
 
-def density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
-    """Return the logarithm of the density of a fix z (2,), R (2, 2) under one track."""
+def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
+    """Return the log density of a fix z (2,), R (2, 2) under the rows of one track."""
     every, scale = np.arange(len(rows)), rows.key['scale']
     many = np.tile(z, (len(rows), 1)), R * scale[:, None, None]
     compared = [
         bank.weigh(block, every, *many, part.measured)
         for block, part in zip(rows.blocks, models.parts)
     ]
-    log = rows.logw + _of_mixture(rows.mu, compared)
+    log = rows.logw + _mixture_log_density(rows.mu, compared)
     return float(log_sum(log, np.zeros(len(rows), np.int64))[0])
 
 
-def _off(
+def _box_distance(
     expected: list[tuple[FloatArray, FloatArray]],
     among: Assumptions,
     z: FloatArray,
     R: FloatArray,
 ) -> FloatArray:
-    """Return how far each fix is from the box that the models of each assumption reach, (A, D), in
-    halves of its width."""
+    """Return the distance (A, D) of each fix from the box around the predictions of an assumption.
+
+    Unit: half the box width.
+    """
     if not len(z):
         return np.empty((len(among.row), 0))
     widest = np.array([R[:, 0, 0].max(), R[:, 1, 1].max()])
@@ -251,57 +270,59 @@ def _off(
     return np.asarray((np.abs(z - middle[:, None]) / half[:, None]).max(axis=2))
 
 
-def bound(group: Group) -> float:
-    """Return the logarithm of the density from which it is more probable that a diver was seen
-    than that he was missed and the fix is false."""
+def gate_log_density(group: Group) -> float:
+    """Return the gate threshold: the log density at which a detection and a miss with a false fix
+    are equally probable."""
     p = group.config.detection_probability
     return math.log(group.clutter) + math.log1p(-p) - math.log(p)
 
 
-def possible(group: Group, pairs: Pairs) -> BoolArray:
-    """Return which pairs (T, D) may belong together."""
+def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
+    """Return which pairs (T, D) pass the gate."""
     if pairs.nis is not None:
         threshold = gate_threshold(group.config.gate_probability, 2)
         return np.asarray(pairs.nis <= threshold)
-    ratio = 0.0 if group.seen is None else group.seen.log_ratio
-    return np.asarray(pairs.whole + ratio > bound(group))
+    ratio = 0.0 if group.detection is None else group.detection.log_ratio
+    return np.asarray(pairs.track_log + ratio > gate_log_density(group))
 
 
-# -- associating ---------------------------------------------------------------------------------
+# -- association ---------------------------------------------------------------------------------
 
 
-def associating(models: ModelSet, pairing: str) -> Callable[[Known, Group], Known]:
-    """Return the stage that compares and pairs: by names where fixes have them, else by
+def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group], Known]:
+    """Return the stage that compares and associates fixes: by ID if fixes have IDs, otherwise by
     `pairing`."""
-    pair, opens = {'jipda': jointly, 'gnn': singly}[pairing], OPENS_GATE[pairing]
+    by_density = {'jipda': associate_jipda, 'gnn': associate_gnn}[pairing]
+    min_probability = MIN_MODEL_PROBABILITY[pairing]
 
     def associate(known: Known, group: Group) -> Known:
-        group.pairs = compare(known, group, models, opens)
-        way = pair if group.target_id is None else by_name
-        group.found = way(known, group, group.pairs)
+        group.pairs = compare(known, group, models, min_probability)
+        associate_pairs = by_density if group.target_id is None else associate_by_id
+        group.association = associate_pairs(known, group, group.pairs)
         return known
 
     return associate
 
 
-def by_name(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Give each fix to the track of its name, unless it is improbable there."""
-    T, D = pairs.whole.shape
+def associate_by_id(known: Known, group: Group, pairs: Pairs) -> Association:
+    """Assign each fix to the track of its ID, if it passes the gate."""
+    T, D = pairs.track_log.shape
     own = known['target_id'][:, None] == group.target_id
-    good = own & np.isfinite(pairs.whole)
+    good = own & np.isfinite(pairs.track_log)
     if pairs.nis is None:
-        good &= pairs.whole > bound(group)
+        good &= pairs.track_log > gate_log_density(group)
     fix = np.where(good.any(axis=1), good.argmax(axis=1) if D else -1, -1)
     free = ~own.any(axis=0)
-    return Association(*_certain(fix, D), fix, free, None, known['score'])
+    return Association(*_hard_association(fix, D), fix, free, None, known['score'])
 
 
-def singly(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Take the likeliest joint event for true; confirmed tracks choose before tentative ones."""
-    T, D = pairs.whole.shape
-    seen, p = group.seen, group.config.detection_probability
+def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
+    """Select the most likely joint event; confirmed tracks are assigned before tentative
+    tracks."""
+    T, D = pairs.track_log.shape
+    seen, p = group.detection, group.config.detection_probability
     ratio = 0.0 if seen is None else seen.log_ratio
-    fit = np.where(possible(group, pairs), pairs.whole + ratio, -np.inf)
+    fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
     fix = assign_fits(fit, known.life.status == TENTATIVE, p, group.clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
@@ -309,33 +330,33 @@ def singly(known: Known, group: Group, pairs: Pairs) -> Association:
     score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(group.clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
-    return Association(*_certain(fix, D), fix, free, None, score)
+    return Association(*_hard_association(fix, D), fix, free, None, score)
 
 
-def _certain(fix: IntArray, D: int) -> tuple[FloatArray, FloatArray]:
-    """Return beta (T, D) and missed (T,) where each track takes `fix` (T,), or nothing (-1)."""
+def _hard_association(fix: IntArray, D: int) -> tuple[FloatArray, FloatArray]:
+    """Return beta (T, D) and missed (T,) of a single assignment. fix (T,): -1 for a miss."""
     beta = np.zeros((len(fix), D))
     hit = np.flatnonzero(fix >= 0)
     beta[hit, fix[hit]] = 1.0
     return beta, np.where(fix >= 0, 0.0, 1.0)
 
 
-def jointly(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Weigh all pairings of tracks and fixes."""
-    T, D = pairs.whole.shape
-    config, status, seen = group.config, known.life.status, group.seen
-    may = possible(group, pairs)
-    # Where as many divers are tracked as there may be, a fix is of none that is yet to come.
+def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
+    """Compute the probabilities of all joint events of tracks and fixes."""
+    T, D = pairs.track_log.shape
+    config, status, seen = group.config, known.life.status, group.detection
+    may = gate_pairs(group, pairs)
+    # With max_tracks confirmed tracks, no fix is attributed to a new target.
     full = int((status != TENTATIVE).sum()) >= config.max_tracks
-    ratio = np.exp(pairs.whole) / (group.clutter + (0.0 if full else group.birth_density))
+    ratio = np.exp(pairs.track_log) / (group.clutter + (0.0 if full else group.birth_density))
     detected = np.full(T, config.detection_probability)
     if seen is not None:
-        detected = np.maximum(seen.tracks, LEAST_DETECTED)
+        detected = np.maximum(seen.tracks, MIN_DETECTION_PROBABILITY)
         ratio = ratio * seen.fixes / detected[:, None]
-    looked = group.whole | may.any(axis=1)
+    looked = group.is_complete | may.any(axis=1)
     before = known['existence']
-    # Of a track that began otherwise existence is not known.
-    guess = np.where(status == TENTATIVE, 0.5, CONFIRMS)
+    # The existence of tracks from pings and starts is unknown.
+    guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
     before = np.where(np.isnan(before), guess, before)
     beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
     hit = beta.sum(axis=1) > 0.5 * after
@@ -346,131 +367,150 @@ def jointly(known: Known, group: Group, pairs: Pairs) -> Association:
     return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
 
 
-# -- updating ------------------------------------------------------------------------------------
+# -- update --------------------------------------------------------------------------------------
 
 
-def updating(
+def update_stage(
     models: ModelSet, estimated: Callable[[Known], tuple[BoolArray | None, ...]]
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that updates rows, models and existence; estimated: what an update may
-    move, for each block."""
+    """Return the stage that updates rows, models and existence. estimated: masks of the components
+    that an update may change, one per block."""
 
     def update(known: Known, group: Group) -> Known:
-        found, pairs = group.found, group.pairs
-        assert found is not None and pairs is not None
-        known = _watched(known, group, found, models)
-        columns = {'score': found.score}
-        if found.weighed:
-            # The life of a named track hangs on its own fixes.
+        association, pairs = group.association, group.pairs
+        assert association is not None and pairs is not None
+        known = _record_innovations(known, group, association, models)
+        columns = {'score': association.score}
+        if association.is_joint:
+            # Tracks with an ID live by the hits of their own fixes.
             named = known['target_id'] != NOBODY
-            columns['existence'] = np.where(named, known['existence'], found.exists)
-            columns['evidence'] = known['evidence'] + found.beta.sum(axis=1)
-        known = known.put(**columns)
-        if not (found.beta > 0.0).any():
+            columns['existence'] = np.where(named, known['existence'], association.exists)
+            columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
+        known = known.with_columns(**columns)
+        if not (association.beta > 0.0).any():
             return known
-        return updated(known, pairs, found, models, estimated(known))
+        return update_tracks(known, pairs, association, models, estimated(known))
 
     return update
 
 
-def updated(
+def update_tracks(
     known: Known,
     pairs: Pairs,
-    found: Association,
+    association: Association,
     models: ModelSet,
     estimated: tuple[BoolArray | None, ...],
 ) -> Known:
-    """Return the tracks after fixes that are theirs with the probabilities of `found`."""
+    """Update the tracks by the fixes, with the probabilities of the association."""
     among = pairs.among
-    exists = np.where(found.exists > 0.0, found.exists, 1.0)
-    missed = np.where(found.beta.any(axis=1), found.missed / exists, 1.0)
+    exists = np.where(association.exists > 0.0, association.exists, 1.0)
+    missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
     track = among.target[pairs.assumption]
-    weight = found.beta[track, pairs.fix] / exists[track]
+    weight = association.beta[track, pairs.fix] / exists[track]
     used = np.flatnonzero((weight > 0.0) & (pairs.log > -np.inf))
     assumption, weight = pairs.assumption[used], weight[used]
-    whole = pairs.whole[track[used], pairs.fix[used]]
+    whole = pairs.track_log[track[used], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    rows, borrowed = _reweighed(known, among, missed[among.target] + gain)
-    rows, borrowed, left = thinned(rows, borrowed, 'scale', _staying(rows))
-    # The pairs of rows that are left, in the order of these.
+    rows, borrowed = _update_weights(known, among, missed[among.target] + gain)
+    rows, borrowed, left = drop_weightless_rows(rows, borrowed, 'scale', _protected_rows(rows))
+    # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
-    row = np.where(among.own, place[among.row], -1)[assumption]
+    row = np.where(among.has_row, place[among.row], -1)[assumption]
     own = row >= 0
     row, used, weight, whole = row[own], used[own], weight[own, None], whole[own, None]
     blocks, factors = [], []
-    for block, part, each, mask in zip(rows.blocks, models.parts, pairs.compared, estimated):
-        chosen = each.only(used)
+    for block, part, each, mask in zip(rows.blocks, models.parts, pairs.innovations, estimated):
+        chosen = each.select(used)
         ratio, none = weight * np.exp(chosen.log - whole), missed[rows.target]
         block, factor = bank.update(block, chosen, row, ratio, none, part.measured, mask)
         blocks.append(block)
         factors.append(factor)
-    sound, repairs = repaired(tuple(blocks))
-    rows, _ = rows.replace(blocks=sound).with_models(np.concatenate(factors, axis=1))
-    rows, borrowed = revived(rows, borrowed, 'scale', _again(rows, borrowed))
-    return known.replace(rows=rows, borrowed=borrowed).counted(repairs=repairs)
+    sound, repairs = repair_covariances(tuple(blocks))
+    rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
+    rows, borrowed = restore_rows(rows, borrowed, 'scale', _can_restore(rows, borrowed))
+    return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
-def _reweighed(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
-    """Return the rows and the list of those without one after the weights of all assumptions were
-    multiplied by `factor` (A,)."""
+def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
+    """Multiply the weights of all assumptions by `factor` (A,).
+
+    Return the rows and the borrowed list.
+    """
     with np.errstate(divide='ignore'):
         logw = among.logw + np.log(factor)
     logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
     rows, borrowed = known.rows, known.borrowed
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
-    of_rows[among.row[among.own]] = logw[among.own]
-    of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.own]
+    of_rows[among.row[among.has_row]] = logw[among.has_row]
+    of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
     return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list)
 
 
-def _staying(rows: Rows) -> BoolArray:
-    """Return which rows (N,) stay whatever they weigh among all: those whose start is their state,
-    of each track the heaviest, and those that weigh among the rows that say how well its place is
-    known."""
+def _protected_rows(rows: Rows) -> BoolArray:
+    """Return which rows (N,) are kept at any total weight.
+
+    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
+    scales of at least `MIN_PUBLISHED_SCALE`.
+    """
     first, scale = rows.first, rows.key['scale']
-    # A start is a state and no scale: all rows of such a track stay, also the first.
-    stays = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
-    stays |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
-    return stays | (stated_weight(rows) >= ROW_LOST) & (scale >= STATED)
+    # A start depth is a state: all rows of such a track are kept, also the first.
+    protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
+    is_published = scale >= MIN_PUBLISHED_SCALE
+    return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
 
 
-def _again(rows: Rows, borrowed: Borrowed) -> BoolArray:
-    """Return which assumptions (B,) weigh enough for a row, among all or among those that say how
-    well a place is known."""
-    stated = np.where(rows.key['scale'] >= STATED, np.exp(rows.logw), 0.0)
-    total = np.add.reduceat(stated, rows.first)[borrowed.target]
-    least = np.where((borrowed.key >= STATED) & (total > 0.0), total, 1.0) * ROW_AGAIN
+def _can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
+    """Return which assumptions (B,) have sufficient weight for a row.
+
+    For scales of at least `MIN_PUBLISHED_SCALE`, the weight among these scales is sufficient.
+    """
+    is_published = rows.key['scale'] >= MIN_PUBLISHED_SCALE
+    total = np.add.reduceat(np.where(is_published, np.exp(rows.logw), 0.0), rows.first)
+    total = total[borrowed.target]
+    is_published = borrowed.key >= MIN_PUBLISHED_SCALE
+    least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
     return np.asarray(np.exp(borrowed.logw) > least)
 
 
-def stated_weight(rows: Rows) -> FloatArray:
-    """Return the weights (N,) of the rows that say how well a place is known."""
-    return rows.weights_of(rows.key['scale'] >= STATED)
+def weight_without_small_scales(rows: Rows) -> FloatArray:
+    """Return row weights (N,) normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
+    return rows.weights_among(rows.key['scale'] >= MIN_PUBLISHED_SCALE)
 
 
-def scale_of(rows: Rows) -> FloatArray:
-    """Return how many times what they state the covariances of measurements are, (T,), as the rows
-    that say it tell."""
+def estimated_scales(rows: Rows) -> FloatArray:
+    """Return the estimated covariance scale (T,) of each track, from scales of at least
+    `MIN_PUBLISHED_SCALE`."""
     if not len(rows):
         return np.empty(0)
-    return np.asarray(np.add.reduceat(stated_weight(rows) * rows.key['scale'], rows.first))
+    return np.asarray(
+        np.add.reduceat(weight_without_small_scales(rows) * rows.key['scale'], rows.first)
+    )
 
 
-def spread_over_scales(known: Known) -> Known:
-    """Return the tracks after a little of the weight of the scales was spread over them: over
-    those that are stated, over the others, and over these two, so that what the stated ones weigh
-    among themselves does not depend on the others."""
+def redistribute_weights(known: Known) -> Known:
+    """Redistribute a small fraction of the scale weights.
+
+    The fraction is spread over the scales from 1, over the smaller scales, and over these two
+    groups. So the relative weights of the scales from 1 do not depend on the smaller scales.
+    """
     rows, borrowed = known.rows, known.borrowed
     target = np.concatenate([rows.target, borrowed.target])
     scale = np.concatenate([rows.key['scale'], borrowed.key])
     weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
-    group = 2 * target + (scale >= STATED)
+    group = 2 * target + (scale >= MIN_PUBLISHED_SCALE)
     total = np.bincount(group, weight, minlength=2 * len(known))
     size = np.bincount(group, minlength=2 * len(known))
     groups = (size.reshape(-1, 2) > 0).sum(axis=1)[target]
-    after = (1.0 - SHARE) * total[group] + SHARE / groups
-    logw = np.log(after * ((1.0 - SHARE) * weight / total[group] + SHARE / size[group]))
+    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + REDISTRIBUTED_FRACTION / groups
+    logw = np.log(
+        after
+        * (
+            (1.0 - REDISTRIBUTED_FRACTION) * weight / total[group]
+            + REDISTRIBUTED_FRACTION / size[group]
+        )
+    )
     N = len(rows)
     return known.replace(
         rows=rows.replace(logw=logw[:N]),
@@ -478,20 +518,25 @@ def spread_over_scales(known: Known) -> Known:
     )
 
 
-def _watched(known: Known, group: Group, found: Association, models: ModelSet) -> Known:
-    """Return the tracks with the whitened innovations of the fixes that are theirs, and what these
-    say of the stated covariances."""
-    tracks = np.flatnonzero(found.hit)
+def _record_innovations(
+    known: Known, group: Group, association: Association, models: ModelSet
+) -> Known:
+    """Store the whitened innovations of associated fixes, and update the covariance checks."""
+    tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
-    fix = found.fix[tracks]
-    seen = tuple(part.seen for part in models.parts)
-    mean, covariance = known.rows.combine(*of_rows(known.rows, seen), stated_weight(known.rows))
-    scale = scale_of(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
+    fix = association.fix[tracks]
+    seen = tuple(part.fix_matrix for part in models.parts)
+    mean, covariance = known.rows.combine(
+        *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)
+    )
+    scale = (
+        estimated_scales(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
+    )
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
     before: FixConsistency = known.memory['fixes']
-    white, after = watch(
+    white, after = whiten_innovations(
         mean[tracks],
         covariance[tracks],
         group.z[fix],
@@ -505,5 +550,5 @@ def _watched(known: Known, group: Group, found: Association, models: ModelSet) -
     columns['white'][tracks] = white
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
-    # Where fixes say where divers are, nothing is assumed of the instruments.
-    return known.put(**columns).remember(fixes=after, recent=RecentPairs())
+    # With fixes, no instrument errors are assumed.
+    return known.with_columns(**columns).with_memory(fixes=after, recent=RecentPairs())

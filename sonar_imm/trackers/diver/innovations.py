@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What innovations say of the stated covariances of fixes."""
+"""Consistency of the fix covariances with the innovations."""
 
 from __future__ import annotations
 
@@ -25,54 +25,57 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.consistency import FARTHEST
 
 MEMORY = 50.0
-"""Fixes over which `FixConsistency` is gathered and forgotten."""
+"""Number of fixes over which `FixConsistency` averages."""
 
 OPTIMISTIC, PESSIMISTIC, CORRELATED = 1.7, 0.5, 0.3
-"""Mean NIS for each coordinate above and below which, and lag-1 correlation above which, a
-covariance is not what it says. Of `MEMORY` fixes with true covariances the mean has a standard
-deviation of 0.14, so that the first is five sigmas away: motion takes up a part of errors that are
-larger than stated, and leaves a mean of about 2 however much larger they are."""
+"""Limits of the NIS per coordinate, and of the lag-1 correlation.
+
+Over `MEMORY` fixes with correct covariances, the mean NIS has a standard deviation of 0.14, so the
+first limit is at five sigma. Motion absorbs part of larger errors: the NIS stays near 2 for any
+excess.
+"""
 
 TOO_SMALL, ENOUGH = 2.0, 12.0
-"""Scale of the covariances of fixes above which they are too small to be left as they are, and the
-sum of the logarithms of what was above it, over groups of fixes in turn, that is evidence enough:
-8 groups where the scale is 10, 17 where it is 4. Of true covariances the sum stayed below 4 in
-four hours of the scenes of `simulate`."""
+"""Scale above which covariances are too small, and the evidence that triggers a warning.
+
+The evidence is the accumulated log of the scale over `TOO_SMALL`: 8 groups of fixes at scale 10,
+17 at scale 4. With correct covariances it stayed below 4 in four hours of `simulate` scenarios.
+"""
 
 
 class FixConsistency(NamedTuple):
-    """When a stated covariance of fixes cannot be true, and what innovations cannot tell: sums
-    over the last fixes of confirmed tracks.
+    """Consistency sums over the last fixes of confirmed tracks.
 
-    number of fixes; nis, for each coordinate; pairs of successive fixes, their cross product and
-    mean square of whitened innovations; of `families` the scale of the covariances that the copies
-    of the filter tell, and the evidence (`ENOUGH`) that it is above `TOO_SMALL`.
-
-    Innovations of a filter with true covariances have a mean NIS of their number of coordinates
-    (2) and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as
-    that. Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated from
-    fix to fix: the source filters its output, so that its errors last, or its covariances are
-    pessimistic. These two look the same. And a source that states only the white part of errors
-    that last looks perfect: from one sensor, a bias slower than the motion is not in the
-    innovations. So a covariance is never scaled down on this evidence; `warnings` says what the
-    user has to state.
+    With correct covariances, the NIS per coordinate is 1 and innovations are white. Innovations
+    beyond 3 sigma per coordinate are sharp turns and are limited. A larger NIS: covariances are
+    too small. A smaller or correlated NIS: errors are time-correlated because the source filters
+    its output, or covariances are too large; the data cannot separate these cases. Time-correlated
+    errors slower than the motion do not show in innovations of one sensor. So covariances are
+    never scaled down from this evidence; `warnings` names the parameters to set.
     """
 
     number: float = 0.0
+    """Number of fixes."""
     nis: float = 0.0
+    """Sum of NIS per coordinate."""
     pairs: float = 0.0
+    """Number of pairs of successive fixes."""
     cross: float = 0.0
+    """Sum of products of successive whitened innovations."""
     square: float = 0.0
+    """Sum of their mean squares."""
     scale: float = 1.0
+    """Covariance scale estimated by the scaled filters."""
     evidence: float = 0.0
+    """Evidence that the scale exceeds `TOO_SMALL`."""
 
-    def after(self, white: FloatArray, before: FloatArray) -> FixConsistency:
-        """Return the sums with whitened innovations (k, 2), and those of the fix `before` (k, 2)
-        of the same tracks, NaN for none, of which about the last `MEMORY` count.
+    def with_fixes(self, white: FloatArray, before: FloatArray) -> FixConsistency:
+        """Add whitened innovations (k, 2), and those `before` (k, 2) of the same tracks, NaN for
+        none.
 
-        An innovation longer than `FARTHEST` allows is a sharp turn and says nothing of noise: it
-        is shortened to that."""
-        white, before = _shortened(white), _shortened(before)
+        Innovations longer than `FARTHEST` are shortened to it.
+        """
+        white, before = _shorten(white), _shorten(before)
         paired = np.isfinite(before).all(axis=1)
         own, earlier = white[paired], before[paired]
         total = self.number + len(white)
@@ -87,18 +90,17 @@ class FixConsistency(NamedTuple):
         )
 
     def with_scale(self, scale: FloatArray, tentative: BoolArray) -> FixConsistency:
-        """Return this after fixes whose covariances were taken `scale` (k,) times, by tracks of
-        which some are `tentative` (k,)."""
+        """Add the scale (k,) estimated by tracks, of which some are `tentative` (k,)."""
         if tentative.all():
             return self
-        # What one track takes for true is true; others may be on the wrong fixes.
+        # The smallest scale counts: other tracks may follow wrong fixes.
         least = float(scale[~tentative].min())
         evidence = max(self.evidence + math.log(least / TOO_SMALL), 0.0)
         return self._replace(scale=least, evidence=evidence)
 
     @property
     def mean_nis(self) -> float:
-        """For each coordinate, 1 where all is well; NaN without a fix."""
+        """NIS per coordinate, expected 1; NaN without a fix."""
         return self.nis / self.number if self.number else float('nan')
 
     @property
@@ -107,32 +109,34 @@ class FixConsistency(NamedTuple):
         return self.cross / self.square if self.square else float('nan')
 
     def warnings(self, bias_stated: bool) -> list[str]:
-        """Sentences on covariances that cannot be true: of `families` as soon as the evidence is
-        enough, else once `MEMORY` fixes were seen."""
+        """Return warnings about wrong covariances: for families when the evidence suffices,
+        otherwise after `MEMORY` fixes."""
         if self.evidence >= ENOUGH:
             times = self.scale * max(self.mean_nis, 1.0)
             return [
-                f'fixes scatter some {math.sqrt(times):.2g} times as far as they state: their '
-                f'covariances are {times:.2g} times too small; multiply covariance_scale by that'
+                f'fix covariances too small by a factor {times:.2g}: errors are '
+                f'{math.sqrt(times):.2g} times as large as reported. Multiply covariance_scale by '
+                f'{times:.2g}'
             ]
         if self.number < 0.99 * MEMORY:
             return []
         if self.mean_nis > OPTIMISTIC:
             return [
-                f'fixes miss by more than they state: mean NIS {self.mean_nis:.2g} for each '
-                'coordinate, 1 is due; raise covariance_scale (model_set families finds out by '
-                'how much) or the noise of the motion'
+                f'fix innovations are too large: NIS {self.mean_nis:.2g} per coordinate '
+                '(expected 1). Increase covariance_scale or the motion noise; model_set families '
+                'estimates the scale'
             ]
         if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
             return [
-                f'the errors of the fixes last, or their covariances are too large (mean NIS '
-                f'{self.mean_nis:.2g} for each coordinate, correlation {self.lag_1:.2g} from fix '
-                'to fix); the data cannot tell which: state fix_bias_std and fix_bias_time'
+                f'fix innovations are too small or correlated: NIS {self.mean_nis:.2g} per '
+                f'coordinate (expected 1), lag-1 correlation {self.lag_1:.2g} (expected 0). If '
+                'the source filters its output, set fix_bias_std and fix_bias_time; otherwise '
+                'its covariances are too large'
             ]
         return []
 
 
-def watch(
+def whiten_innovations(
     mean: FloatArray,
     covariance: FloatArray,
     z: FloatArray,
@@ -141,11 +145,12 @@ def watch(
     tentative: BoolArray,
     known: FixConsistency,
 ) -> tuple[FloatArray, FixConsistency]:
-    """Return the whitened innovations (k, 2) of fixes z (k, 2), R (k, 2, 2) of k tracks, and what
-    is `known` of them with those of confirmed tracks.
+    """Return the whitened innovations (k, 2) of fixes z (k, 2), R (k, 2, 2), and the updated sums.
 
-    mean (k, 2), covariance (k, 2, 2): the fix that a mixture expects; before (k, 2): the whitened
-    innovation of its last fix; tentative (k,).
+    :param mean: (k, 2) predicted fix.
+    :param covariance: (k, 2, 2) of the prediction.
+    :param before: (k, 2) previous whitened innovation of the tracks.
+    :param tentative: (k,) True for tracks that are not counted.
     """
     S = covariance + R
     # The inverse of the Cholesky factor of 2 x 2, written out.
@@ -156,11 +161,11 @@ def watch(
         second = (z[:, 1] - mean[:, 1] - b * first) / np.sqrt(S[:, 1, 1] - b * b)
     white = np.column_stack([first, second])
     firm = ~tentative & np.isfinite(white).all(axis=1)
-    return white, known.after(white[firm], before[firm])
+    return white, known.with_fixes(white[firm], before[firm])
 
 
-def _shortened(white: FloatArray) -> FloatArray:
-    """Return whitened innovations (k, 2) that are no longer than `FARTHEST` allows."""
+def _shorten(white: FloatArray) -> FloatArray:
+    """Limit whitened innovations (k, 2) to the length `FARTHEST`."""
     square = np.square(white).sum(axis=1, keepdims=True)
     with np.errstate(invalid='ignore', divide='ignore'):
         return np.where(square > 2.0 * FARTHEST, np.sqrt(2.0 * FARTHEST / square), 1.0) * white

@@ -12,18 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Errors of instruments that last: constants behind the states of motion.
+"""Instrument errors: constants behind the motion states.
 
-Each receiver may lie off its stated place and have a late clock; the sound speed may be wrong for
-all; a sensor of bearings may be turned by some degrees, because its mount or its heading is off.
-These constants stand behind the components of motion of every model and row, and the receivers
-that have been heard so far decide how many there are. New ones come in with their prior,
-uncorrelated with all that is known.
+A receiver can have a position error and a late clock. The sound speed can be wrong. A bearing
+sensor can be rotated by a mount or heading error. These constants follow the motion components of
+every model and row. The receivers received so far determine their number. New constants start with
+their prior, uncorrelated with the state.
 
-How a constant is treated is described in `estimation.consider`. What is considered is one constant
-for all models and tracks. What is estimated is a copy in each model and track, mixed like any
-state: one posterior shared by tracks would need their joint covariance, and the posterior of one
-track as the prior of another would count its data twice.
+`estimation.consider` describes how a constant is treated. A considered constant is common to all
+models and tracks. An estimated constant is a copy in each model and track, mixed like any state: a
+common posterior would need the joint covariance of all tracks.
 """
 
 from __future__ import annotations
@@ -40,30 +38,28 @@ from .config import DiverConfig
 from .models import ModelSet
 
 AT_TRANSMITTER = 0.01
-"""Horizontal distance in metres within which a receiver is at the transmitter: the frame hangs on
-that place, so that it has no error of position there."""
+"""Horizontal distance, m, within which a receiver is at the transmitter. The transmitter defines
+the frame, so such a receiver has no position error."""
 
 MOST_RECEIVERS = 64
-"""Receivers whose errors are part of the state, which grows with its square; those that are heard
-first. More are numbers that wander, not instruments."""
+"""Maximum number of receivers with errors in the state, which grows with its square. The first
+received ones are used."""
 
 TIMES, PLACE, BEARINGS = 'times', 'place', 'bearings'
-"""What may be off for good."""
+"""Kinds of errors."""
 
 
 @frozen
 class Instruments:
-    """Receivers heard so far, in the order in which their errors stand in the state.
-
-    known: each a receiver id or the name of a sensor, and what of it may be off: `TIMES` of
-    arrival, `PLACE` as well, or `BEARINGS`.
-    """
+    """Instruments received so far, in order of their errors in the state."""
 
     known: tuple[tuple[int | str, str], ...] = ()
+    """Receiver ID or sensor name, and the kind of error: `TIMES` of arrival, `PLACE` (position and
+    times), or `BEARINGS`."""
 
     def with_receivers(self, ping: Arrivals, config: DiverConfig) -> Instruments:
-        """Return these with the receivers of a ping, `MOST_RECEIVERS` in all; the same where
-        nothing is to be known of them."""
+        """Add the receivers of a ping, up to `MOST_RECEIVERS` in total, if receiver errors are
+        configured."""
         new: list[tuple[int | str, str]] = []
         if config.receiver_position_std or config.receiver_clock_std:
             ids = {each for each, what in self.known if what != BEARINGS}
@@ -78,8 +74,7 @@ class Instruments:
         return self._with(new)
 
     def with_sensor(self, name: str) -> Instruments:
-        """Return these with a sensor whose fixes may all be turned about it; the same where it is
-        known."""
+        """Add a sensor with a bearing error."""
         return self if (name, BEARINGS) in self.known else self._with([(name, BEARINGS)])
 
     def _with(self, new: list[tuple[int | str, str]]) -> Instruments:
@@ -87,7 +82,7 @@ class Instruments:
         return Instruments((*self.known, *new)) if new else self
 
     def layout(self, config: DiverConfig, models: ModelSet) -> Layout:
-        """Return where the errors stand behind the components of `models`."""
+        """Return the indices of the errors behind the components of `models`."""
         n = models.n
         variances: list[float] = []
         estimated: list[bool] = []
@@ -118,35 +113,41 @@ class Instruments:
 
 @frozen(eq=False)
 class Layout:
-    """n components of motion, then q constants with prior `variances` (q,).
-
-    mask (n + q,): True for what an update may move, False for what is only considered;
-    sound_speed, offsets, clocks, bearings: places among all n + q, -1 or absent for none.
-    """
+    """State layout: n motion components, then q constants."""
 
     n: int
+    """Number of motion components."""
     variances: FloatArray
+    """(q,) prior variances of the constants."""
     mask: BoolArray
+    """(n + q,) True for components that an update may change; False for considered constants."""
     sound_speed: int
+    """Index of the sound speed error; -1 for none."""
     offsets: dict[int | str, int]
+    """Index of the x offset of each receiver."""
     clocks: dict[int | str, int]
+    """Index of the clock error of each receiver."""
     bearings: dict[int | str, int]
+    """Index of the bearing error of each sensor or receiver."""
 
     @property
     def size(self) -> int:
         return self.n + len(self.variances)
 
-    def estimated(self, models: ModelSet) -> tuple[BoolArray | None, ...]:
-        """Return `mask` for the components of each block, None where an update may move all."""
+    def estimated_masks(self, models: ModelSet) -> tuple[BoolArray | None, ...]:
+        """Return `mask` for the components of each block; None if an update may change all."""
         if self.mask.all():
             return (None,) * len(models.parts)
-        return tuple(self.mask[part.places(self.n, self.size)] for part in models.parts)
+        return tuple(self.mask[part.indices(self.n, self.size)] for part in models.parts)
 
-    def columns(
+    def measurement_columns(
         self, models: ModelSet, receivers: np.ndarray, passive: bool, bearing: BoolArray
     ) -> IntArray:
-        """Return (C, 7) for `acoustics.arrivals_3d.observe`, of which some are a `bearing` (C,);
-        of a tag the emission stands last."""
+        """Return the component indices (C, 7) for `acoustics.arrivals_3d.observe`.
+
+        :param bearing: (C,) True for bearings.
+        :param passive: True for a tag, whose emission time is the last component.
+        """
         out = np.full((len(receivers), 7), -1)
         out[:, X], out[:, Y], out[:, Z] = 0, 1, models.height
         out[:, SOUND_SPEED_ERROR] = self.sound_speed
@@ -159,9 +160,8 @@ class Layout:
             out[:, EMISSION] = self.size
         return out
 
-    def widened(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return states (..., m) and covariances (..., m, m), m <= n + q, with the constants that
-        are new at their prior."""
+    def with_new_constants(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Append new constants at their prior to states (..., m) and covariances (..., m, m)."""
         m, size = x.shape[-1], self.size
         if m == size:
             return x, P
@@ -171,8 +171,8 @@ class Layout:
         covariance[..., new, new] = self.variances[m - self.n :]
         return wide, covariance
 
-    def of_rows(self, rows: Rows, models: ModelSet) -> Rows:
-        """Return the rows with the constants that are new at their prior."""
+    def rows_with_new_constants(self, rows: Rows, models: ModelSet) -> Rows:
+        """Append new constants at their prior to rows."""
         known = rows.blocks[0].x.shape[1] - len(models.parts[0].components)
         new = self.variances[known:]
         if not len(new):
@@ -188,20 +188,21 @@ class Layout:
             blocks.append(Gaussians(wide, covariance))
         return rows.replace(blocks=tuple(blocks))
 
-    def turned(
+    def rotate_about_sensor(
         self, rows: Rows, models: ModelSet, sensor: str, place: FloatArray, *, back: bool = False
     ) -> Rows:
-        """Return the rows with positions as a `sensor` at `place` (2,) shows them: turned about it
-        by the error of its bearings, or `back`.
+        """Rotate the positions of rows about a `sensor` at `place` (2,) by its bearing error.
 
-        So a fix measures the position itself, whoever it is of and wherever he is: what the error
-        does to it stands in the covariance of the state, wherever the state goes from there.
+        In rotated positions, a fix measures the position itself. The covariance of the state
+        contains the effect of the bearing error.
+
+        :param back: rotate back.
         """
-        if sensor not in self.bearings:  # there were too many before it
+        if sensor not in self.bearings:  # MOST_RECEIVERS reached
             return rows
         sign, blocks = -1.0 if back else 1.0, []
         for part, (x, P) in zip(models.parts, rows.blocks):
-            at = part.at(self.bearings[sensor], self.n)
+            at = part.index_of(self.bearings[sensor], self.n)
             angle, arm = sign * x[:, at], x[:, :2] - place[:, None]
             cos, sin = np.cos(angle), np.sin(angle)
             turned = np.stack(
@@ -213,16 +214,16 @@ class Layout:
             T = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
             # The rows of the position, then its columns.
             left = P.copy()
-            left[:, :2] = _product(T, P[:, :2]) + slope[:, :, None] * P[:, None, at]
+            left[:, :2] = _multiply(T, P[:, :2]) + slope[:, :, None] * P[:, None, at]
             covariance = left.copy()
             columns = np.swapaxes(left, 1, 2)
-            across = _product(T, columns[:, :2]) + slope[:, :, None] * columns[:, None, at]
+            across = _multiply(T, columns[:, :2]) + slope[:, :, None] * columns[:, None, at]
             covariance[:, :, :2] = np.swapaxes(across, 1, 2)
             covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
             blocks.append(Gaussians(moved, covariance))
         return rows.replace(blocks=tuple(blocks))
 
 
-def _product(T: FloatArray, P: FloatArray) -> FloatArray:
-    """Return T P, (N, 2, n, m), of matrices T (N, 2, 2, m) and P (N, 2, n, m)."""
+def _multiply(T: FloatArray, P: FloatArray) -> FloatArray:
+    """Return T P (N, 2, n, m) of matrices T (N, 2, 2, m) and P (N, 2, n, m)."""
     return np.asarray((T[:, :, :, None] * P[:, None]).sum(axis=2))

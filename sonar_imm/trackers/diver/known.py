@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is known of all divers after a scan, and how it crosses the time to the next.
+"""Tracker state after a scan, and its prediction to the next scan.
 
-`Known` is one immutable value. A track is a weighted set of rows (`estimation.rows`): a row is one
-interacting multiple model filter under one assumption, a scale of the covariances of measurements
-or a depth at which the track began. What a stage of the tracker notes of each track is a
-*feature*, what it remembers of no track stands in the *memory*; this module knows neither by name.
+`Known` is one immutable value. A track is a weighted set of rows (`estimation.rows`). A row is one
+interacting multiple model filter under one assumption: a scale of the measurement covariances, or
+a start depth. Data of a stage for each track is a *feature*; its data for all tracks is in the
+*memory*. This module knows no feature or memory entry by name.
 """
 
 from __future__ import annotations
@@ -39,46 +39,54 @@ from ...estimation.rows import Borrowed, Rows
 from .models import ModelSet
 
 MOST_STEPS = 300
-"""A gap is crossed in no more steps than this, however long it is."""
+"""Maximum number of prediction steps over a gap."""
 
 
 class Feature(NamedTuple):
-    """What is noted of each track: the value for one that begins, its shape and its type."""
+    """A column of the state with one value for each track."""
 
     birth: Any
+    """Value of a new track."""
     shape: tuple[int, ...] = ()
+    """Shape of one value."""
     kind: type = np.float64
+    """numpy type of the column."""
 
 
 @frozen(eq=False)
 class Known:
-    """T tracks, N rows of them, and what the stages remember.
+    """Tracker state: T tracks with N rows, and the memory of the stages.
 
-    life: identities, hits and misses; features: by name, a column (T, ...) each; memory: by the
-    name of what a stage remembers of no track; counts: of what happened so far. No array is ever
-    written again: values of earlier scans share them.
+    Arrays are never changed in place, because the states of earlier scans share them.
     """
 
     stamp_ns: int
+    """Time of the scan, ns; 0 before the first scan."""
     life: Tracks
+    """Track IDs, hits and misses."""
     rows: Rows
+    """N rows of all tracks, in order of the tracks."""
     borrowed: Borrowed
+    """Assumptions without a row of their own."""
     features: dict[str, np.ndarray]
+    """Columns (T, ...) by name."""
     memory: dict[str, Any]
+    """Data of the stages that belongs to no track, by name."""
     counts: dict[str, int]
+    """Event counters by name."""
 
     @classmethod
-    def nobody(
+    def empty(
         cls, life: Tracks, models: ModelSet, size: int, features: Mapping[str, Feature]
     ) -> Known:
-        """Return the value without a track; `life` has none, but the next identity."""
-        none = np.empty((0, models.copies, len(models.names), size))
+        """Return a state without tracks; `life` holds the next track ID."""
+        none = np.empty((0, models.rows_per_track, len(models.names), size))
         empty = np.empty((*none.shape, size))
-        rows = models.rows(none, empty, none[..., 0], none[..., 0, 0])
+        rows = models.make_rows(none, empty, none[..., 0], none[..., 0, 0])
         columns: dict[str, np.ndarray] = {
             name: np.empty((0, *feature.shape), feature.kind) for name, feature in features.items()
         }
-        return cls(0, life, rows, Borrowed.none(), columns, {}, {})
+        return cls(0, life, rows, Borrowed.empty(), columns, {}, {})
 
     def __len__(self) -> int:
         return len(self.life)
@@ -87,38 +95,43 @@ class Known:
         """Return a column (T, ...)."""
         return self.features[feature]
 
-    def put(self, **columns: np.ndarray) -> Known:
-        """Return this with other columns."""
+    def with_columns(self, **columns: np.ndarray) -> Known:
+        """Return the state with the given columns replaced."""
         return evolve(self, features={**self.features, **columns})
 
-    def remember(self, **values: Any) -> Known:
-        """Return this with other values in the memory."""
+    def with_memory(self, **values: Any) -> Known:
+        """Return the state with the given memory entries replaced."""
         return evolve(self, memory={**self.memory, **values})
 
-    def counted(self, **more: int) -> Known:
-        """Return this with counts that are higher by so many."""
+    def add_counts(self, **more: int) -> Known:
+        """Return the state with increased event counters."""
         changed = {name: self.counts.get(name, 0) + n for name, n in more.items() if n}
         return evolve(self, counts={**self.counts, **changed}) if changed else self
 
     def replace(self, **changes: Any) -> Known:
-        """Return this with other rows, life or stamp."""
+        """Return the state with other rows, life or stamp."""
         return evolve(self, **changes)
 
-    def only(self, kept: BoolArray, life: Tracks | None = None) -> Known:
-        """Return the tracks where `kept` (T,) is True; life: that of those."""
+    def select(self, kept: BoolArray, life: Tracks | None = None) -> Known:
+        """Return the tracks selected by `kept` (T,). life: lifecycle data of the selected
+        tracks."""
         if kept.all():
             return self if life is None else evolve(self, life=life)
         return evolve(
             self,
             life=self.life.only(kept) if life is None else life,
-            rows=self.rows.of_targets(kept),
-            borrowed=self.borrowed.of_targets(kept),
+            rows=self.rows.select_targets(kept),
+            borrowed=self.borrowed.select_targets(kept),
             features={name: column[kept] for name, column in self.features.items()},
         )
 
     def with_tracks(self, life: Tracks, new: Rows, columns: Mapping[str, Any]) -> Known:
-        """Return this with more tracks, `life` is that of all: `new` are their rows, numbered from
-        0, and `columns` has a value for each feature, or one for each track."""
+        """Return the state with additional tracks.
+
+        :param life: lifecycle data of all tracks.
+        :param new: rows of the new tracks, whose targets are numbered from 0.
+        :param columns: for each feature one value, or one value per new track.
+        """
         count = len(life) - len(self)
         rows = self.rows.append(evolve(new, target=new.target + len(self)))
         features = {
@@ -127,17 +140,20 @@ class Known:
         return evolve(self, life=life, rows=rows, features=features)
 
     def with_rows_of(self, track: int, new: Rows) -> Known:
-        """Return this with `new` as all rows of one track."""
-        rows, borrowed = self.rows.in_place_of(track, new), self.borrowed.without(track)
+        """Return the state with all rows of one track replaced by `new`."""
+        rows, borrowed = self.rows.replace_target(track, new), self.borrowed.without_target(track)
         return evolve(self, rows=rows, borrowed=borrowed)
 
-    def rows_of(self, track: int) -> IndexArray:
-        """Return which rows are those of a track."""
+    def row_indices(self, track: int) -> IndexArray:
+        """Return the row indices of a track."""
         return np.flatnonzero(self.rows.target == track)
 
     def require_like(self, other: Known, constants: int) -> None:
-        """Raise ValueError where this is no value of the models of `other`, which has no track,
-        with so many constants behind their components."""
+        """Check that the state fits the models of `other`, a state without tracks.
+
+        :param constants: expected number of constants behind the motion components.
+        :raises ValueError: the state belongs to other models.
+        """
         rows, T = self.rows, len(self)
         sizes = {
             block.x.shape[1] - there.x.shape[1]
@@ -157,7 +173,7 @@ class Known:
 
     @property
     def _form(self) -> tuple[object, ...]:
-        """Names, types and shapes, but for the numbers of tracks, rows and constants."""
+        """Names, types and shapes, except the numbers of tracks, rows and constants."""
         columns = sorted({**self.features, **self.rows.key}.items())
         return (
             [(name, column.shape[1:], column.dtype) for name, column in columns],
@@ -166,17 +182,19 @@ class Known:
             self.life.seen.shape[1],
         )
 
-    def finite(self) -> BoolArray:
-        """Return which tracks (T,) have finite numbers only."""
+    def is_finite(self) -> BoolArray:
+        """Return which tracks (T,) contain finite numbers only."""
         good = np.ones(len(self.rows), np.bool_)
         for x, P in self.rows.blocks:
             good &= np.isfinite(x).all(axis=(1, 2)) & np.isfinite(P).all(axis=(1, 2, 3))
         return np.bincount(self.rows.target[~good], minlength=len(self)) == 0
 
 
-def of_rows(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return mean (N, q) and covariance (N, q, q) of outputs of the motion under each row, `maps`
-    (q, n', m) of each block."""
+def row_outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (N, q) and covariance (N, q, q) of motion outputs of each row. maps:
+
+    (q, n', m) of each block.
+    """
     blocks = [
         Gaussians(block.x[:, : E.shape[1]], block.P[:, : E.shape[1], : E.shape[1]])
         for block, E in zip(rows.blocks, maps)
@@ -184,19 +202,21 @@ def of_rows(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, Float
     return bank.combine(blocks, rows.mu, maps)
 
 
-def outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, q) and covariance (T, q, q) of outputs of the motion, as in `of_rows`."""
-    return rows.combine(*of_rows(rows, maps), rows.weight)
+def track_outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, q) and covariance (T, q, q) of motion outputs; maps as in `row_outputs`."""
+    return rows.combine(*row_outputs(rows, maps), rows.weight)
 
 
-def places(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, 2) and covariance (T, 2, 2) of where the divers are."""
-    return outputs(known.rows, tuple(part.outputs[:2] for part in models.parts))
+def track_positions(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+    """Return mean (T, 2) and covariance (T, 2, 2) of the target positions."""
+    return track_outputs(known.rows, tuple(part.outputs[:2] for part in models.parts))
 
 
-def repaired(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]:
-    """Return the blocks with covariances that are such, and how many were none. One that is spoilt
-    changes no other (`estimation.covariance`)."""
+def repair_covariances(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]:
+    """Return blocks with valid covariances, and the number of repairs.
+
+    Other covariances stay bit-identical (`estimation.covariance`).
+    """
     found, count = [], 0
     for block in blocks:
         P = block.P.transpose(1, 2, 0, 3)
@@ -211,39 +231,43 @@ def repaired(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]
     return tuple(found), count
 
 
-class Step(NamedTuple):
-    """Rows after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
-    that step, and how many covariances it had to repair."""
+class Prediction(NamedTuple):
+    """Rows after one prediction step."""
 
     rows: Rows
     transition: FloatArray
+    """(T or 1, M, M) transition probabilities of the step."""
     dt: float
+    """Length of the step, s."""
     repairs: int
+    """Number of repaired covariances."""
 
 
-def crossed(
+def predict_over(
     models: ModelSet,
     chain: AdaptiveChain,
     rows: Rows,
     learnt: FloatArray,
     dt: float,
     longest: float,
-) -> list[Step]:
-    """Mix and predict over dt seconds, in equal steps of at most `longest`; learnt: what corrects
-    the transitions of each track.
+) -> list[Prediction]:
+    """Mix and predict over dt seconds, in equal steps of at most `longest` seconds.
 
-    A model holds for a whole step, so one step over a long gap says that the diver swam straight
-    all the while: the prediction is a ring, and the diver, who turned, is inside it.
+    A model holds for a whole step. One step over a long gap would assume a straight path, and its
+    prediction would be a ring around the position of a turning target.
+
+    :param learnt: corrections of the transition probabilities of each track.
+    :returns: the prediction after each step, at least one.
     """
     count = min(max(math.ceil(dt / longest), 1), MOST_STEPS)
     transition, moves = chain.transition(learnt, dt / count), models.moves(dt / count)
-    of_rows = transition if len(transition) == 1 else transition[rows.target]
+    per_row = transition if len(transition) == 1 else transition[rows.target]
     steps = []
     for _ in range(count):
-        blocks, mu = bank.mix(models.bank, rows.blocks, rows.mu, of_rows)
+        blocks, mu = bank.mix(models.bank, rows.blocks, rows.mu, per_row)
         moved = tuple(bank.predict(block, each) for block, each in zip(blocks, moves))
-        moved, repairs = repaired(moved)
+        moved, repairs = repair_covariances(moved)
         mu = mu / mu.sum(axis=1, keepdims=True) if len(mu) else mu
         rows = rows.replace(blocks=moved, mu=mu, parent=np.arange(len(rows)))
-        steps.append(Step(rows, transition, dt / count, repairs))
+        steps.append(Prediction(rows, transition, dt / count, repairs))
     return steps

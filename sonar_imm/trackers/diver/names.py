@@ -12,18 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tracks whose name is known, and what to do when a diver is also seen without one.
+"""Target IDs of tracks, and merging of duplicates of a target with an ID.
 
-A named track takes its part of the fixes that have no name, so that a diver with a transponder on
-a sonar is one track. A second track can stand beside it all the same:
-the sonar may have seen the diver before the transponder was heard. Two divers that swim together
-are seen together, now and then at least; a single diver never is. So a nameless track that stays
-beside a named one, for so many scans that two divers would have been seen together once but for a
-probability of `MISTAKEN`, is the same diver: the confirmed or older of the two goes on, with the
-name.
+A track with an ID also takes fixes without ID, so a diver with a transponder on a sonar is one
+track. A second track can exist beside it, for example if the sonar detected the diver before the
+first transponder message. Two targets that swim together are sometimes detected together; one
+target never is. So if a track without ID stays near a track with ID for `scans_to_merge` scans
+without such a detection, both are one target. The confirmed or older track continues with the ID.
 
-A name lasts as long as something says it: after `max_coast` without a fix of its own a track that
-still is seen goes on without its name.
+A track loses its ID after `max_coast` without a measurement of this ID.
 """
 
 from __future__ import annotations
@@ -37,37 +34,36 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import gate_threshold, TrackStatus
 from ...measurements import NOBODY
-from .known import Feature, Known, places
+from .known import Feature, Known, track_positions
 from .models import ModelSet
 from .scan import Group, Scan
 
 FEATURES = {'target_id': Feature(NOBODY, kind=np.int64)}
-"""Whose track it is, `NOBODY` where that is not known."""
+"""target_id: ID of the target, `NOBODY` if unknown."""
 
 BESIDE = 4.0
-"""Mahalanobis distance squared within which a nameless track is beside a named one."""
+"""Squared Mahalanobis distance at which a track without ID is near a track with ID."""
 
 MISTAKEN = 1e-3
-"""Probability that two divers side by side are taken for one."""
+"""Probability of merging two targets that swim together."""
 
 
 class LastNamed(NamedTuple):
-    """The stamp of the last measurement of each name."""
+    """Stamp, ns, of the last measurement of each ID."""
 
     stamps: dict[int, int] = {}
 
 
-def patience(detection_probability: float) -> int:
-    """Return after how many scans a track never seen together with the one beside it is the same
-    diver."""
+def scans_to_merge(detection_probability: float) -> int:
+    """Return the number of scans without a joint detection after which two tracks are merged."""
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
-def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
-    """Return the stage that takes in the names of a scan, and forgets those that nothing has said
-    for `max_coast` seconds."""
+def id_times_stage(max_coast: float) -> Callable[[Known, Scan], Known]:
+    """Return the stage that updates the ID times and removes IDs older than `max_coast`
+    seconds."""
 
-    def remember(known: Known, scan: Scan) -> Known:
+    def update_id_times(known: Known, scan: Scan) -> Known:
         named: LastNamed = known.memory['last_named']
         if not scan.names and not named.stamps:
             return known
@@ -81,34 +77,35 @@ def remembering(max_coast: float) -> Callable[[Known, Scan], Known]:
         }
         kept = np.isin(known['target_id'], np.array(list(last), np.int64))
         target_id = np.where(kept, known['target_id'], NOBODY)
-        return known.put(target_id=target_id).remember(last_named=LastNamed(last))
+        return known.with_columns(target_id=target_id).with_memory(last_named=LastNamed(last))
 
-    return remember
+    return update_id_times
 
 
-def merging(models: ModelSet) -> Callable[[Known, Scan], Known]:
-    """Return the stage that ends the tracks that are divers with a name once more, and puts that
-    name where it belongs."""
+def merge_stage(models: ModelSet) -> Callable[[Known, Scan], Known]:
+    """Return the stage that merges duplicates of targets with an ID."""
 
     def merge(known: Known, scan: Scan) -> Known:
-        return merged(known, scan, models) if known.memory['last_named'].stamps else known
+        return (
+            merge_duplicates(known, scan, models) if known.memory['last_named'].stamps else known
+        )
 
     return merge
 
 
-def merged(known: Known, scan: Scan, models: ModelSet) -> Known:
-    """Return the tracks without those that are divers with a name once more."""
-    seen = [group for group in scan.fixes if group.target_id is None and group.whole]
+def merge_duplicates(known: Known, scan: Scan, models: ModelSet) -> Known:
+    """Merge tracks without ID into the track of the same target with ID."""
+    seen = [group for group in scan.fixes if group.target_id is None and group.is_complete]
     target_id = known['target_id'].copy()
     nameless, named = (np.flatnonzero((target_id == NOBODY) == free) for free in (True, False))
     if not seen or not len(named) or not len(nameless):
         return known
-    mean, covariance = places(known, models)
+    mean, covariance = track_positions(known, models)
     apart = mean[nameless][:, None] - mean[named][None]
-    distance = squared(apart, covariance[nameless][:, None] + covariance[named][None])
-    ids, before = known.life.track_id.astype(np.int64), scan.before
+    distance = mahalanobis_squared(apart, covariance[nameless][:, None] + covariance[named][None])
+    ids, before = known.life.track_id.astype(np.int64), scan.previous
     ago = dict(zip(before.life.track_id.tolist(), zip(before['near_to'], before['near_for'])))
-    limit = max(patience(group.config.detection_probability) for group in seen)
+    limit = max(scans_to_merge(group.config.detection_probability) for group in seen)
     near_to, near_for = known['near_to'].copy(), known['near_for'].copy()
     existence, going_on = known['existence'].copy(), np.ones(len(ids), bool)
     for row, place in zip(nameless.tolist(), distance.argmin(axis=1).tolist()):
@@ -116,38 +113,37 @@ def merged(known: Known, scan: Scan, models: ModelSet) -> Known:
         if distance[nameless == row, place].min() > BESIDE or not going_on[other]:
             continue
         pair = [row, other]
-        if sum(int(near(group, mean[pair], covariance[pair]).sum()) for group in seen) > 1:
+        if sum(int(fixes_near(group, mean[pair], covariance[pair]).sum()) for group in seen) > 1:
             continue
         partner, count = ago.get(int(ids[row]), (0, 0))
         near_to[row], near_for[row] = ids[other], 1 + (count if partner == ids[other] else 0)
         if near_for[row] < limit:
             continue
-        stays, goes = (row, other) if _prefer(known, row, other) else (other, row)
+        stays, goes = (row, other) if _is_preferred(known, row, other) else (other, row)
         target_id[stays], existence[stays], going_on[goes] = target_id[other], math.nan, False
         near_to[stays] = near_for[stays] = 0
     columns = {'near_to': near_to, 'near_for': near_for, 'target_id': target_id}
-    return known.put(existence=existence, **columns).only(going_on)
+    return known.with_columns(existence=existence, **columns).select(going_on)
 
 
-def _prefer(known: Known, row: int, other: int) -> bool:
-    """Return whether of two tracks of one diver the first goes on: confirmed before tentative,
-    then older."""
+def _is_preferred(known: Known, row: int, other: int) -> bool:
+    """Return whether the first of two tracks continues: confirmed before tentative, then the older
+    one."""
     tentative = known.life.status == TrackStatus.TENTATIVE
     if tentative[row] != tentative[other]:
         return bool(tentative[other])
     return bool(known.life.track_id[row] < known.life.track_id[other])
 
 
-def near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return which fixes (D,) of a scan are near one of two tracks: mean (2, 2), covariance (2, 2,
-    2)."""
+def fixes_near(group: Group, mean: FloatArray, covariance: FloatArray) -> BoolArray:
+    """Return which fixes (D,) are near one of two tracks: mean (2, 2), covariance (2, 2, 2)."""
     apart = group.z[:, None] - mean[None]
-    distance = squared(apart, covariance[None] + group.R[:, None])
+    distance = mahalanobis_squared(apart, covariance[None] + group.R[:, None])
     threshold = gate_threshold(group.config.gate_probability, 2)
     return np.asarray(distance.min(axis=1) <= threshold)
 
 
-def squared(apart: FloatArray, S: FloatArray) -> FloatArray:
-    """Return Mahalanobis distances squared (...,) of vectors (..., 2) under covariances (..., 2,
+def mahalanobis_squared(apart: FloatArray, S: FloatArray) -> FloatArray:
+    """Return squared Mahalanobis distances (...,) of vectors (..., 2) under covariances (..., 2,
     2)."""
     return np.einsum('...a,...a->...', apart, np.linalg.solve(S, apart[..., None])[..., 0])

@@ -12,27 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether arrivals miss by the same, ping after ping: a receiver that is not where it is said to
-be, a late clock, a wrong sound speed, a diver who is not at the depth he is taken to be at.
+"""Test for instrument errors in arrivals: receiver positions, clocks, sound speed, assumed depth.
 
-A ping of more pairs than the place of the diver has coordinates has something left that no place
-explains. With the residuals r (C,) in units of their standard deviations, H (C, k) how they depend
-on the place, and N (C, C - k) what is orthogonal to H,
+A ping with more pairs than position coordinates has residuals that no position explains. With the
+normalised residuals r (C,), H (C, k) their derivative by the position, and N (C, C - k) orthogonal
+to H,
 
     t = N' r ~ N(N' D b, 1)
 
-whatever the motion of the diver, where b are errors that last and D how they show in r. Summed
-over pings, and forgotten, the score ``s = sum w D' N t`` has the covariance
-``V = sum w^2 D' N N' D`` if there are none, and ``s' V^-1 s`` is a chi-square (Rao 1948, *Large
-sample tests of statistical hypotheses*): the test against any error of each pair that is constant.
-What is stated of instruments adds its own covariance to V.
+for any motion, where b are constant errors and D their effect on r. The score ``s = sum w D' N
+t``, summed over pings with decaying weights, has the covariance ``V = sum w^2 D' N N' D`` without
+errors. Then ``s' V^-1 s`` is a chi-square (Rao 1948, *Large sample tests of statistical
+hypotheses*): the test against any constant error of each pair. Configured instrument errors add
+their covariance to V.
 
-Errors that another place explains as well leave no residual, and no test finds them. So as long as
-nothing is stated of the instruments they are taken to be as good as those in the field usually
-are (`ASSUMED`). What such errors do to the place that the pairs heard lately give by themselves
-is part of the published covariance: with G the gain of that place, ``G D B D' G'``, B their
-variances. They are the same in every ping, so that filtering does not lessen it, and no estimate
-is moved by it.
+Errors that another position explains leave no residual and cannot be tested. So without configured
+instrument errors, typical errors are assumed (`ASSUMED`). Their effect on a position from the
+recent pairs is added to the published covariance: ``G D B D' G'``, with G the gain of this
+position and B the error variances. These errors are equal in all pings, so filtering does not
+reduce them. Estimates do not change.
 """
 
 from __future__ import annotations
@@ -51,61 +49,65 @@ from .instruments import AT_TRANSMITTER
 from .scan import Ping
 
 MEMORY = 100.0
-"""Pings over which the evidence is forgotten."""
+"""Number of pings over which the evidence decays."""
 
 ENOUGH = 10.0
-"""Dimensions of what no place explains from which there is a verdict."""
+"""Minimum degrees of freedom for a result."""
 
 SIGMAS = 4.0
-"""A false alarm has the probability of so many standard deviations, 3e-5, at each look; looks
-within `MEMORY` pings are alike."""
+"""Significance of a warning in standard deviations: a false alarm probability of 3e-5 per test.
+Tests within `MEMORY` pings are correlated."""
 
 MOST_PAIRS = 24
-"""Pairs that are looked at: those that are heard first. The evidence grows with their square."""
+"""Maximum number of pairs in the test, the first received ones. The evidence grows with their
+square."""
 
 WILD, CAPPED = 20.0, 3.0
-"""Metres beyond which an echo is another's, and the most standard deviations of `t`, for each of
-its dimensions, that count: an outlier is no evidence of what lasts."""
+"""Residual, m, beyond which an echo belongs to another target; and the limit of `t` per dimension,
+in standard deviations, against outliers."""
 
 STEPS, FARTHEST = 2, 30.0
-"""Gauss-Newton steps to the place that a ping shows, and how far, m, they may lead."""
+"""Gauss-Newton steps to the position of a ping, and their maximum total length, m."""
 
 DEPTHS, SHARE = (0.25, 0.5, 0.75), 0.7
-"""Depths, as shares of the water column, whose paths are compared with those of the depth in use;
-the share of all evidence from which a single cause is named."""
+"""Depths, as fractions of the water column, that are tested; and the fraction of the evidence
+above which a single cause is named."""
 
 SOUND_SPEED = len(DEPTHS)
 CAUSES = SOUND_SPEED + 1
-"""Places in the score: depths, the sound speed, then the pairs."""
+"""Indices of the score: depths, sound speed, then pairs."""
 
 EVERY, DEPTH = 'every', 'target_z (or dimensions: 3)'
 STDS = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
 
 
 ASSUMED = dict(zip(STDS, (0.3, 1e-4, 2.0)))
-"""What is assumed of the instruments where nothing is stated: receivers placed by differential
-GNSS, clocks set before the dive, a sound speed from a table of temperatures."""
+"""Assumed instrument errors: receiver positions from differential GNSS, clocks set before the
+dive, sound speed from a temperature table."""
 
 RECENT = 20
-"""Pings for which a pair that was heard counts."""
+"""Number of pings for which a received pair counts."""
 
 WEAK = 0.05
-"""Directions that the pairs show this many times worse than the best one, or worse still, are left
-out: how far they are off is in the covariance of the filter."""
+"""Relative singular value below which a direction is ignored: the filter covariance contains its
+error."""
 
 
 class RecentPairs(NamedTuple):
-    """The pairs (R,), as (transmitter, receiver), whose echoes tracks took lately: tx (R, 3), NaN
-    of tags, rx (R, 3), variance (R,) of the path, m^2, and age (R,) in pings."""
+    """R recent pairs (transmitter, receiver) of associated echoes."""
 
     pairs: tuple[tuple[int, int], ...] = ()
     tx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    """(R, 3) transmitter positions, m; NaN for tags."""
     rx: Annotated[FloatArray, 'p3'] = np.zeros((0, 3))
+    """(R, 3) receiver positions, m."""
     variance: Annotated[FloatArray, 'p'] = np.zeros(0)
+    """(R,) variance of the path length, m^2."""
     age: Annotated[FloatArray, 'p'] = np.zeros(0)
+    """(R,) age in pings."""
 
-    def after(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
-        """With the echoes `taken` (C,) of a ping; ids (rows of the message, 2)."""
+    def with_ping(self, ping: Ping, taken: BoolArray, ids: IntArray) -> RecentPairs:
+        """Add the echoes `taken` (C,) of a ping. ids: (rows of the message, 2)."""
         rows = {
             pair: (self.tx[k], self.rx[k], self.variance[k], self.age[k] + 1.0)
             for k, pair in enumerate(self.pairs)
@@ -122,9 +124,9 @@ class RecentPairs(NamedTuple):
         columns = (np.array(column) for column in zip(*(rows[pair] for pair in pairs)))
         return RecentPairs(tuple(pairs), *columns)
 
-    def spread(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
-        """What `ASSUMED` errors do to a place (3,), of whose coordinates the first `known` are
-        states: (known, known), m^2."""
+    def assumed_covariance(self, place: FloatArray, known: int, sound_speed: float) -> FloatArray:
+        """Return the covariance (known, known), m^2, of a position (3,) due to `ASSUMED` errors;
+        its first `known` coordinates are states."""
         tag = bool(np.isnan(self.tx[0, 0]))
         paths = arrival_paths(place, None if tag else self.tx, self.rx)
         std = np.sqrt(self.variance)
@@ -142,23 +144,30 @@ class RecentPairs(NamedTuple):
         return np.asarray(moved @ moved.T)
 
 
-class Offsets(NamedTuple):
-    """The evidence: pairs (R,), as (transmitter, receiver); score (K,) and variance (K, K) with K
-    = `CAUSES` + R: the depths, the sound speed, then the pairs; length (R,): path of each pair, m;
-    square and freedom: of all t, and how many there were."""
+class BiasTest(NamedTuple):
+    """Evidence of constant instrument errors, with K = `CAUSES` + R components."""
 
     pairs: tuple[tuple[int, int], ...] = ()
+    """R pairs (transmitter, receiver)."""
     score: Annotated[FloatArray, 's'] = np.zeros(CAUSES)
+    """(K,) score."""
     variance: Annotated[FloatArray, 'ss'] = np.zeros((CAUSES, CAUSES))
+    """(K, K) covariance of the score."""
     length: Annotated[FloatArray, 'p'] = np.zeros(0)
+    """(R,) last path length of each pair, m."""
     square: float = 0.0
+    """Sum of squares of all t."""
     freedom: float = 0.0
+    """Number of all t."""
 
-    def after(
+    def with_ping(
         self, ping: Ping, echoes: BoolArray, ids: IntArray, x: FloatArray, config: DiverConfig
-    ) -> Offsets:
-        """With a ping of a diver at x (2,) or, where depth is a state, (3,): `echoes` (C,) of it
-        that may be his, `ids` (rows of the message, 2) of transmitters and receivers."""
+    ) -> BiasTest:
+        """Add a ping of a target at x (2,), or (3,) with depth as a state.
+
+        :param echoes: (C,) True for echoes that may belong to the target.
+        :param ids: (rows of the message, 2) transmitter and receiver IDs.
+        """
         chosen = np.flatnonzero(echoes)
         k = len(x) + int(ping.passive)
         if len(chosen) <= k:
@@ -166,7 +175,7 @@ class Offsets(NamedTuple):
         named = [(int(a), int(b)) for a, b in ids[ping.row[chosen]]]
         new = [pair for pair in dict.fromkeys(named) if pair not in self.pairs]
         now = self._with_pairs(new[: MOST_PAIRS - len(self.pairs)])
-        fitted = _fitted(ping, chosen, x, config)
+        fitted = _fit_position(ping, chosen, x, config)
         if fitted is None:
             return now
         place, residual, H, length = fitted
@@ -179,7 +188,7 @@ class Offsets(NamedTuple):
         span = config.depth_max - config.depth_min
         for at, share in enumerate(DEPTHS):
             deep = np.append(place[:2], -config.depth_min - share * span)
-            D[:, at] = _lengths(ping, chosen, deep) - length
+            D[:, at] = _path_lengths(ping, chosen, deep) - length
         D[:, SOUND_SPEED] = length
         std = np.sqrt(ping.measured.variance[chosen])
         N = np.linalg.qr(H / std[:, None], mode='complete')[0][:, k:]
@@ -188,7 +197,7 @@ class Offsets(NamedTuple):
         keep = 1.0 - 1.0 / MEMORY
         lengths = now.length.copy()
         lengths[column[column >= 0]] = length[column >= 0]
-        return Offsets(
+        return BiasTest(
             now.pairs,
             keep * now.score + shown.T @ t,
             keep**2 * now.variance + shown.T @ shown,
@@ -197,7 +206,7 @@ class Offsets(NamedTuple):
             keep**2 * now.freedom + len(t),
         )
 
-    def _with_pairs(self, new: list[tuple[int, int]]) -> Offsets:
+    def _with_pairs(self, new: list[tuple[int, int]]) -> BiasTest:
         if not new:
             return self
         size, K = len(new), len(self.score)
@@ -211,12 +220,12 @@ class Offsets(NamedTuple):
         )
 
     def evidence(self, config: DiverConfig) -> dict[str, tuple[float, int]]:
-        """The statistic, and how many degrees of freedom it has where nothing lasts: of any error
-        of each pair, and of causes that may explain all."""
+        """Return the test statistic and its degrees of freedom, for any error of each pair and for
+        single causes."""
         if self.freedom < ENOUGH:
             return {}
         V, s = self.variance, self.score
-        # What is stated of the pairs; of geometric weights, w sums to at most twice w^2.
+        # Configured errors of the pairs. For geometric weights, sum w <= 2 sum w^2.
         off = config.receiver_position_std**2
         off += (config.receiver_clock_std * config.sound_speed) ** 2
         stated = off * np.eye(len(self.pairs))
@@ -229,7 +238,7 @@ class Offsets(NamedTuple):
         sure = value > 1e-6 * value[-1]
         every = float(((vector[:, sure].T @ z[CAUSES:]) ** 2 / value[sure]).sum())
         rank = int(sure.sum())
-        # Noise that is larger than stated lasts no longer than the ping.
+        # Noise above the reported variances is uncorrelated between pings.
         scatter = max((self.square - every) / max(self.freedom - rank, 1.0), 1.0)
         found = {EVERY: (every / scatter, rank), 'sound_speed': (z[SOUND_SPEED] ** 2 / scatter, 1)}
         if config.dimensions == 2:
@@ -238,47 +247,48 @@ class Offsets(NamedTuple):
         return found
 
     def warnings(self, config: DiverConfig) -> list[str]:
-        """A sentence where there is evidence of errors that last and are larger than stated."""
+        """Return a warning if constant errors are larger than configured."""
         found = self.evidence(config)
-        beyond = [value / most(rank) for value, rank in found.values()]
+        beyond = [value / chi2_limit(rank) for value, rank in found.values()]
         if not found or max(beyond) <= 1.0:
             return []
         largest = found[EVERY][0]
         likely = [
             name for name, (value, _) in found.items() if name != EVERY and value > SHARE * largest
         ]
-        unstated = [f'{name} (now {getattr(config, name):g})' for name in STDS]
+        unset = [f'{name} (now {getattr(config, name):g})' for name in STDS]
         if config.dimensions == 2:
-            unstated.insert(0, DEPTH)
-        what = f'{" or ".join(likely)} would explain it; else ' if likely else ''
+            unset.insert(0, DEPTH)
+        cause = f'Likely cause: {" or ".join(likely)}. ' if likely else ''
         return [
-            'arrivals miss by the same ping after ping, wherever the diver is and by more than is '
-            f'stated of the instruments (chi-square {largest:.3g} of {found[EVERY][1]} degrees of '
-            f'freedom), so that covariances are too small: {what}state ' + ', '.join(unstated)
+            f'arrival residuals are constant over pings: chi-square {largest:.3g} (expected '
+            f'{found[EVERY][1]}), so covariances are too small. {cause}Set ' + ', '.join(unset)
         ]
 
 
-def most(rank: int) -> float:
-    """What a chi-square of `rank` degrees of freedom stays below but for `SIGMAS`, by the cube
-    root of Wilson and Hilferty."""
+def chi2_limit(rank: int) -> float:
+    """Return the `SIGMAS` limit of a chi-square of `rank` degrees of freedom (Wilson and
+    Hilferty)."""
     spread = 2.0 / (9.0 * rank)
     return rank * (1.0 - spread + SIGMAS * math.sqrt(spread)) ** 3
 
 
-def watched(
-    found: Offsets,
+def accumulate_residuals(
+    found: BiasTest,
     recent: RecentPairs,
     places: Mapping[int, FloatArray],
     took: Mapping[int, BoolArray],
     ping: Arrivals,
     seen: Ping,
     config: DiverConfig,
-) -> tuple[Offsets, RecentPairs]:
-    """Return the evidence `found` and that of a ping `seen`, of which tracks `took` (C,)
-    measurements each, only of those whose places (2 or 3,) are given; and the pairs heard lately.
+) -> tuple[BiasTest, RecentPairs]:
+    """Return the evidence and the recent pairs after a ping.
 
-    Of each pair it is the echo that a track took, else the nearest that is no other track's: where
-    an error is large, the echoes that have it are refused.
+    Each pair contributes the echo of the track, or the nearest echo of no other track, because
+    echoes with large errors fail the gate.
+
+    :param places: position (2,) or (3,) by track index.
+    :param took: (C,) measurements of each track.
     """
     taken = np.zeros(len(seen.row), bool)
     for good in took.values():
@@ -286,13 +296,13 @@ def watched(
     ids = np.column_stack([ping.tx_id, ping.rx_id]).astype(np.int64)
     if ping.passive:
         ids[:, 0] = 0
-    recent = recent.after(seen, taken, ids)
+    recent = recent.with_ping(seen, taken, ids)
     for track, place in places.items():
         good = took[track]
         echo = np.flatnonzero(seen.echo)
         mine = good[echo]
         whole = place if len(place) == 3 else np.append(place, config.target_z)
-        late = seen.measured.value[echo] - _lengths(seen, echo, whole)
+        late = seen.measured.value[echo] - _path_lengths(seen, echo, whole)
         if ping.passive and mine.any():
             late -= np.median(late[mine])
         off = np.where(mine, -1.0, np.abs(late))
@@ -301,33 +311,38 @@ def watched(
         for node in np.unique(seen.measured.node[echo[usable]]):
             members = np.flatnonzero(usable & (seen.measured.node[echo] == node))
             echoes[echo[members[off[members].argmin()]]] = True
-        found = found.after(seen, echoes, ids, place, config)
+        found = found.with_ping(seen, echoes, ids, place, config)
     return found, recent
 
 
-def widened(
+def with_assumed_errors(
     recent: RecentPairs, mean: FloatArray, covariance: FloatArray, config: DiverConfig
 ) -> FloatArray:
-    """Return the covariances (T, q, q) of outputs mean (T, q), position first, with what is
-    assumed of the instruments: nothing where something is stated, or fixes say where divers
-    are."""
+    """Add the assumed instrument errors to the covariances (T, q, q) of outputs `mean` (T, q).
+
+    No effect if instrument errors are configured or fixes are used.
+    """
     exact = config.systematic_errors == 'exact'
     if not recent.pairs or exact or any(getattr(config, name) for name in STDS):
         return covariance
-    # Depths that are states may be seen by elevations and sensors, which are not among these.
+    # Excludes z: elevations and depth sensors also determine a depth state.
     covariance, known = covariance.copy(), 2
     for t, row in enumerate(mean):
         place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
-        covariance[t, :known, :known] += recent.spread(place, known, config.sound_speed)
+        covariance[t, :known, :known] += recent.assumed_covariance(
+            place, known, config.sound_speed
+        )
     return covariance
 
 
-def _fitted(
+def _fit_position(
     ping: Ping, chosen: IndexArray, x: FloatArray, config: DiverConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
-    """Where the echoes `chosen` (C,) put a diver who is near x (2 or 3,): place (3,), residual
-    (C,), its derivative H (C, k) by the place, and by the emission of a tag, length (C,); None
-    where they put him nowhere near."""
+    """Fit a position near x (2,) or (3,) to the echoes `chosen` (C,).
+
+    :returns: position (3,), residual (C,), H (C, k) by position and tag emission, length (C,);
+        None if the position is too far from x.
+    """
     deep = len(x) == 3
     place = np.array([x[0], x[1], x[2] if deep else config.target_z])
     measured = ping.measured
@@ -352,7 +367,9 @@ def _fitted(
     return None
 
 
-def _lengths(ping: Ping, chosen: IndexArray, place: FloatArray) -> FloatArray:
+def _path_lengths(ping: Ping, chosen: IndexArray, place: FloatArray) -> FloatArray:
+    """Return the path lengths (C,), m, of the echoes `chosen` (C,) for a target at `place`
+    (3,)."""
     measured = ping.measured
     tx = None if ping.passive else measured.tx[chosen]
     return arrival_paths(place, tx, measured.rx[chosen]).length

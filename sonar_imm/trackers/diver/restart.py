@@ -12,11 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lost tracks: two refused fixes in a row that agree with each other begin a track anew, under its
-own identity.
+"""Restart of lost tracks after two consecutive rejected fixes that agree.
 
-A fix that may have been a track's own and was not believed is remembered. One that agrees with it,
-as the next fix of a track that began at the first would, begins the track anew.
+A rejected fix is stored with the nearest track, or with the track of its ID. If the next rejected
+fix fits a track started at the stored fix, the track restarts there and keeps its ID.
 """
 
 from __future__ import annotations
@@ -33,79 +32,86 @@ from ...estimation.rows import Rows
 from . import fixes
 from .births import with_velocities_at_fix
 from .instruments import Layout
-from .known import crossed, Feature, Known, outputs
+from .known import Feature, Known, predict_over, track_outputs
 from .models import ModelSet
 from .scan import Group
 
-FEATURES = {'refused': Feature(math.nan, (6,))}
-"""Stamp, position and covariance (xx, xy, yy) of the last fix that may have been the track's own
-and was not believed, NaN since it took another."""
+FEATURES = {'rejected': Feature(math.nan, (6,))}
+"""Stamp, position and covariance (xx, xy, yy) of the last rejected fix of the track; NaN after a
+hit."""
 
 LOST = 0.02
-"""A track whose misses in a row were less probable than this may be lost."""
+"""Probability of consecutive misses below which a track may be lost."""
 
 MISTAKEN = 0.02
-"""A false fix is expected beside another this often, at most, where two refused fixes that agree
-begin a track anew."""
+"""Maximum expected number of false fixes near a rejected fix for a restart."""
 
 REACH = 13.8
-"""Mahalanobis distance squared within which a fix is beside another."""
+"""Squared Mahalanobis distance within which two fixes are near each other."""
 
 
-def restarting(
+def restart_stage(
     models: ModelSet,
     chain: AdaptiveChain,
     layouts: Callable[[Known], Layout],
     associate: Callable[[Known, Group], Known],
 ) -> Callable[[Known, Group], Known]:
-    """Return the stage that begins lost tracks anew, and asks whose the fixes are once more where
-    it did."""
+    """Return the stage that restarts lost tracks and then repeats the association."""
 
     def restart(known: Known, group: Group) -> Known:
-        known, begun = reacquired(known, group, models, chain, layouts(known))
-        return associate(known, group) if begun else known
+        known, restarted = restart_lost_tracks(known, group, models, chain, layouts(known))
+        return associate(known, group) if restarted else known
 
     return restart
 
 
-def reacquired(
+def restart_lost_tracks(
     known: Known, group: Group, models: ModelSet, chain: AdaptiveChain, layout: Layout
 ) -> tuple[Known, bool]:
-    """Return what becomes of tracks that a group of fixes did not hit, and whether one began anew.
-    Whoever is where the sensor does not see may have done anything there."""
-    found, seen, refused = group.found, group.seen, known['refused']
-    assert found is not None and group.pairs is not None
+    """Restart tracks whose last two rejected fixes agree with each other.
+
+    A track outside the coverage restarts if the target can have reached the fix.
+
+    :returns: the new state, and whether any track restarted.
+    """
+    association, seen, rejected = group.association, group.detection, known['rejected']
+    assert association is not None and group.pairs is not None
     if not len(known):
         return known, False
-    hit, firm = found.hit, known.life.status != TENTATIVE
-    left = found.beta[firm].sum(axis=0) < 0.5
-    if found.weighed and seen is not None:
-        hit = hit | ~seen.unseen
+    hit, firm = association.hit, known.life.status != TENTATIVE
+    left = association.beta[firm].sum(axis=0) < 0.5
+    if association.is_joint and seen is not None:
+        hit = hit | ~seen.is_outside
     if hit.any():
-        refused = refused.copy()
-        refused[hit] = np.nan
-    begun: dict[int, Rows] = {}
-    for track, row in _refusals(known, group, hit, left, group.pairs.whole):
+        rejected = rejected.copy()
+        rejected[hit] = np.nan
+    restarted: dict[int, Rows] = {}
+    for track, row in _rejected_fixes(known, group, hit, left, group.pairs.track_log):
         z, R, new = group.z[row], group.R[row], None
-        hidden = seen is not None and seen.unseen[track]
-        lost = _reaches(known, track, z, group) if hidden else _may_be_lost(known, track, group)
-        if np.isfinite(refused[track, 0]) and lost:
-            new = _anew(known, track, refused[track], z, R, group, models, chain, layout)
-        refused = refused.copy()
+        hidden = seen is not None and seen.is_outside[track]
+        lost = _can_reach(known, track, z, group) if hidden else _may_be_lost(known, track, group)
+        if np.isfinite(rejected[track, 0]) and lost:
+            new = restarted_track(
+                known, track, rejected[track], z, R, group, models, chain, layout
+            )
+        rejected = rejected.copy()
         if new is None:
-            refused[track] = known.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
+            rejected[track] = known.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
         else:
-            begun[track], refused[track] = new, np.nan
-    for track, new in begun.items():
+            restarted[track], rejected[track] = new, np.nan
+    for track, new in restarted.items():
         known = known.with_rows_of(track, new)
-    return known.put(refused=refused), bool(begun)
+    return known.with_columns(rejected=rejected), bool(restarted)
 
 
-def _refusals(
+def _rejected_fixes(
     known: Known, group: Group, hit: BoolArray, left: BoolArray, whole: FloatArray
 ) -> Iterator[tuple[int, int]]:
-    """Yield tracks, each with the fix that may have been its own: by the name, or the nearest of
-    what confirmed tracks `left`, each to the track it is nearest to."""
+    """Yield each track without a hit, with its rejected fix.
+
+    Fixes with an ID belong to the track of the ID. Others belong to the nearest track, if
+    confirmed tracks `left` (D,) them.
+    """
     if group.target_id is not None:
         own = known['target_id'][:, None] == group.target_id[None]
         for track, row in zip(*np.nonzero(own)):
@@ -125,20 +131,19 @@ def _refusals(
 
 
 def _may_be_lost(known: Known, track: int, group: Group) -> bool:
-    """Return whether so many misses in a row are improbable of a track that is where it should
-    be."""
-    if group.target_id is not None or not group.whole:
+    """Return whether the number of consecutive misses is improbable for a correct track."""
+    if group.target_id is not None or not group.is_complete:
         return True
     missed = 1.0 - group.config.detection_probability
-    # Who lives by his existence has no count of misses, but refused a fix before.
+    # Tracks with existence count no misses; one miss is the stored rejected fix.
     before = max(int(known.life.misses[track]), 1)
     return bool(missed ** (before + 1) <= LOST)
 
 
-def _reaches(known: Known, track: int, z: FloatArray, group: Group) -> bool:
-    """Return whether the diver of a track may have come to z (2,) since he was seen."""
-    rows = known.rows.take(known.rows_of(track))
-    weight = rows.weight_among_themselves()
+def _can_reach(known: Known, track: int, z: FloatArray, group: Group) -> bool:
+    """Return whether the target can have moved to z (2,) since its last hit."""
+    rows = known.rows.select(known.row_indices(track))
+    weight = rows.normalized_weight()
     x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
     mean = np.einsum('r,rm,ram->a', weight, rows.mu, x)
     passed = (known.stamp_ns - int(known.life.last_hit_ns[track])) * 1e-9
@@ -146,10 +151,10 @@ def _reaches(known: Known, track: int, z: FloatArray, group: Group) -> bool:
     return bool(np.hypot(*(z - mean)) <= fastest * passed)
 
 
-def _anew(
+def restarted_track(
     known: Known,
     track: int,
-    refused: FloatArray,
+    rejected: FloatArray,
     z: FloatArray,
     R: FloatArray,
     group: Group,
@@ -157,21 +162,23 @@ def _anew(
     chain: AdaptiveChain,
     layout: Layout,
 ) -> Rows | None:
-    """Return the rows now of the track, had it begun at the fix that it `refused` (6,); None where
-    the fix z (2,), R (2, 2) does not agree, or two false fixes may well do."""
-    stamp, px, py, xx, xy, yy = refused.tolist()
-    x, P, mu = models.new_tracks(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
+    """Return the rows of a track started at its rejected fix (6,).
+
+    Return None if the fix z (2,), R (2, 2) does not agree, or if two false fixes are likely.
+    """
+    stamp, px, py, xx, xy, yy = rejected.tolist()
+    x, P, mu = models.initial_states(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
     with_velocities_at_fix(P, models, group.config)
-    x, P = layout.widened(x, P)
-    rows = models.rows(x, P, mu, np.full(x.shape[:2], -math.log(x.shape[1])))
+    x, P = layout.with_new_constants(x, P)
+    rows = models.make_rows(x, P, mu, np.full(x.shape[:2], -math.log(x.shape[1])))
     dt = max((known.stamp_ns - stamp) * 1e-9, 0.0)
     learnt = known['learnt'][track : track + 1]
-    rows = crossed(models, chain, rows, learnt, dt, group.config.longest_step)[-1].rows
-    whole = fixes.density(rows, z, R, models)
-    if whole <= fixes.bound(group):
+    rows = predict_over(models, chain, rows, learnt, dt, group.config.longest_step)[-1].rows
+    whole = fixes.track_log_density(rows, z, R, models)
+    if whole <= fixes.gate_log_density(group):
         return None
     if group.target_id is None and group.config.max_tracks > 1:
-        _, covariance = outputs(rows, tuple(part.seen for part in models.parts))
+        _, covariance = track_outputs(rows, tuple(part.fix_matrix for part in models.parts))
         area = math.pi * REACH * math.sqrt(np.linalg.det(covariance[0] + R))
         if group.clutter * area > MISTAKEN:
             return None

@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What was measured at one stamp, as arrays that a filter can use.
+"""Measurements of one stamp as arrays.
 
-A `Scan` holds the measurements of a stamp in the order in which they are used: groups of fixes, of
-which each diver causes at most one; pings; and places where somebody says that a diver is.
+A `Scan` holds the measurements of a stamp in processing order: groups of fixes with at most one
+per target, pings, and starts.
 
-A ping is a table of measurements (`Ping`). Its rows come in the order of their content
-(`Arrivals.in_order`): the order in which the arrivals of a ping were sent changes no bit.
+A ping is a table of measurements (`Ping`), in the order of their content (`Arrivals.in_order`).
+The message order of arrivals does not change the result.
 """
 
 from __future__ import annotations
@@ -41,46 +41,52 @@ from .models import ModelSet
 
 if TYPE_CHECKING:
     from .births import Birth
-    from .coverage import Seen
+    from .coverage import DetectionProbability
     from .fixes import Association, Pairs
-    from .known import Known, Step
+    from .known import Known, Prediction
 
 LEAST_VAR_TOA = 1e-13
-"""Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance
-with the unknown emission of a tag has no inverse."""
+"""Minimum variance of an arrival time, s^2: 0.5 mm of path. Below it, the joint covariance with a
+tag emission is singular."""
 
 MOST_MEASUREMENTS = 128
-"""Measurements of one ping that are used at once: time and memory grow with them, by the third
-power where their joint covariance is needed."""
+"""Maximum number of measurements of one ping. Computation grows up to their third power."""
 
 OUTLIER_DENSITY = 1.0 / 50.0
-"""Density of a wild path length, 1/m: late by anything up to 50 m."""
+"""Density of an outlier path length, 1/m: up to 50 m late."""
 
 
 class Height(NamedTuple):
-    """What a fix states of z: the value, how its error goes with those of x and y (2,), and the
-    variance of the rest."""
+    """The z of a fix."""
 
     value: float
+    """z, m."""
     gain: FloatArray
+    """(2,) regression of the z error on the errors of x and y."""
     rest: float
+    """Residual variance, m^2."""
 
     def variance(self, covariance: FloatArray) -> float:
-        """Of z itself, beside x and y with `covariance` (2, 2)."""
+        """Return the variance of z, for x and y with `covariance` (2, 2)."""
         return self.rest + float(self.gain @ covariance @ self.gain)
 
 
 class Heights(NamedTuple):
-    """`Height` of D fixes: value (D,), NaN for none; gain (D, 2); rest (D,)."""
+    """The z of D fixes, see `Height`."""
 
     value: FloatArray
+    """(D,) z, m; NaN for none."""
     gain: FloatArray
+    """(D, 2)."""
     rest: FloatArray
+    """(D,) m^2."""
 
     @classmethod
-    def of(cls, position: FloatArray, covariance: FloatArray, factor: float) -> Heights | None:
-        """Of fixes at `position` (D, 3) with `covariance` (D, 3, 3) times `factor`; None where no
-        one states z."""
+    def from_fixes(
+        cls, position: FloatArray, covariance: FloatArray, factor: float
+    ) -> Heights | None:
+        """Return the heights of fixes at `position` (D, 3), `covariance` (D, 3, 3) times `factor`;
+        None if no fix has a z."""
         variance = covariance[:, 2, 2]
         stated = np.isfinite(variance)
         if not stated.any():
@@ -95,127 +101,138 @@ class Heights(NamedTuple):
         return cls(np.where(stated, position[:, 2], np.nan), gain, rest * factor)
 
     def row(self, d: int) -> Height | None:
-        """Of one fix, None where it states no z."""
+        """Return the height of one fix; None if it has no z."""
         if not math.isfinite(self.value[d]):
             return None
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
 
 
 MOST_BIRTHS = 1.5
-"""New divers for each false fix, at most, where the density of false fixes is learnt."""
+"""Maximum ratio of birth density and estimated clutter density."""
 
 
 @define(eq=False)
 class Group:
-    """D fixes of one stamp and sensor, of which each diver causes at most one: z (D, 2), R
-    (D, 2, 2).
+    """D fixes of one stamp and sensor, with at most one per target.
 
-    config: the parameters, with those of the sensor; target_id: (D,) whose fixes they are, None
-    when that is not known of any; whole: whether they are all that there was to see, so that a
-    diver without a fix was missed; heights: what they state of z, None where nothing, or depth is
-    no state; sensor: its name, and seen_from (2,) where it stands, None where that is not known;
-    learnt: the density of false fixes where `clutter_density` is not stated.
-
-    What stages tell later ones, each slot written by one: seen, how probable detections are where
-    the sensor does not see everywhere (`coverage`); pairs and found, which fixes are whose
-    (`fixes`); births, where tracks may begin (`births`).
+    Later stages use the slots `detection` (`coverage`), `pairs` and `association` (`fixes`), and
+    `births`. One stage writes each slot.
     """
 
     z: FloatArray
+    """(D, 2) positions, m."""
     R: FloatArray
+    """(D, 2, 2) covariances, m^2."""
     config: DiverConfig
+    """Parameters of the sensor."""
     target_id: IntArray | None
-    whole: bool
+    """(D,) IDs of the targets; None if no fix has an ID."""
+    is_complete: bool
+    """True if the group is a whole scan, so that a target without a fix was missed."""
     heights: Heights | None = None
+    """The z of the fixes; None without z, or in 2D."""
     sensor: str = ''
+    """Name of the sensor."""
     seen_from: FloatArray | None = None
-    learnt: float = CLUTTER
-    seen: Seen | None = field(default=None, init=False)
+    """(2,) sensor position; None if unknown."""
+    learnt_clutter: float = CLUTTER
+    """Estimated clutter density, 1/m^2, if `clutter_density` is not set."""
+    detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
-    found: Association | None = field(default=None, init=False)
+    association: Association | None = field(default=None, init=False)
     births: list[Birth] = field(factory=list, init=False)
 
     @property
-    def turned_by(self) -> tuple[str, FloatArray] | None:
-        """The name and the place (2,) of a sensor whose bearings may be off, None where they are
-        not, or nobody knows where it stands."""
+    def rotation_sensor(self) -> tuple[str, FloatArray] | None:
+        """Name and position (2,) of a sensor with a bearing error; None without error or
+        position."""
         if not self.config.bearing_bias_std_deg or self.seen_from is None:
             return None
         return self.sensor, self.seen_from
 
     @property
     def clutter(self) -> float:
-        """The density of false fixes, 1/m^2."""
-        return self.config.clutter_density or self.learnt
+        """Clutter density, 1/m^2."""
+        return self.config.clutter_density or self.learnt_clutter
 
     @property
     def birth_density(self) -> float:
-        """The density of new divers, 1/m^2: where that of false fixes is learnt, not many more.
-        Else a sensor that gives none has its fixes doubted for divers that may yet come."""
+        """Density of new targets, 1/m^2.
+
+        If the clutter density is estimated, the ratio to it is limited. With almost no false
+        fixes, an unlimited birth density would attribute the fixes of known targets to new ones.
+        """
         stated = self.config.birth_density
-        return stated if self.config.clutter_density else min(stated, MOST_BIRTHS * self.learnt)
+        return (
+            stated
+            if self.config.clutter_density
+            else min(stated, MOST_BIRTHS * self.learnt_clutter)
+        )
 
 
 @define(eq=False)
 class Scan:
     """The measurements of one stamp.
 
-    fixes: groups of them; pings: each with its rows in order, of tags one for each tag; starts:
-    where somebody says that a diver is; names: whose fixes and pings are among them; complete:
-    whether a diver of whom nothing is known at this stamp was missed.
-
-    What stages tell later ones: before, what was known before the scan, and step, how the time to
-    it was crossed (the prediction); births, where a ping shows a new diver.
+    Later stages use the slots `previous`, `prediction` and `births`.
     """
 
     fixes: list[Group]
+    """Groups of fixes."""
     pings: list[Arrivals]
+    """Pings with rows in order, one per tag."""
     starts: list[Start]
+    """Start messages."""
     names: list[int]
+    """Target IDs of fixes and pings."""
     complete: bool
-    before: Known = field(init=False)
-    step: Step = field(init=False)
+    """True if a track without a measurement was missed."""
+    previous: Known = field(init=False)
+    """State before the scan."""
+    prediction: Prediction = field(init=False)
+    """Prediction to the scan."""
     births: list[Birth] = field(factory=list, init=False)
+    """Births from pings."""
 
     @classmethod
-    def of(
+    def from_items(
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
         clutter: Clutters,
     ) -> Scan:
-        """The scan of `items`; clutter: of each sensor, where it is learnt."""
+        """Build the scan of `items`. clutter: estimated clutter of each sensor."""
         fixes, names = position_groups(items, config), []
         for group in fixes if config.pairing != 'gnn' else ():
-            found = clutter.of(group.sensor)
+            found = clutter.get(group.sensor)
             if group.target_id is None and found is not None:
-                group.learnt = found.density
+                group.learnt_clutter = found.density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()
         pings: list[Arrivals] = []
         starts: list[Start] = []
-        complete = any(group.whole and group.target_id is None for group in fixes)
+        complete = any(group.is_complete and group.target_id is None for group in fixes)
         for item in items:
             if isinstance(item, Arrivals):
-                pings += _of_each_tag(item.in_order())
+                pings += _split_by_tag(item.in_order())
             elif isinstance(item, Start):
                 starts.append(item)
         for ping in pings:
-            name = name_of(ping)
+            name = tag_id(ping)
             complete |= config.fixes_are_scans and name == NOBODY
             if name != NOBODY:
                 names.append(name)
         return cls(fixes, pings, starts, names, complete)
 
 
-def name_of(ping: Arrivals) -> int:
-    """The number of the tag whose ping it is; `NOBODY` for echoes, and for a tag without one."""
+def tag_id(ping: Arrivals) -> int:
+    """Return the ID of the tag; `NOBODY` for echoes and for tags without an ID."""
     return int(ping.tx_id[0]) if ping.passive and int(ping.tx_id[0]) != 0 else NOBODY
 
 
-def _of_each_tag(ping: Arrivals) -> list[Arrivals]:
-    """A ping of several tags as one for each of them."""
+def _split_by_tag(ping: Arrivals) -> list[Arrivals]:
+    """Split a ping of several tags."""
     tags = np.unique(ping.tx_id) if ping.passive else ping.tx_id[:1]
     return [ping.only(ping.tx_id == tag) for tag in tags] if len(tags) > 1 else [ping]
 
@@ -224,8 +241,8 @@ def _of_each_tag(ping: Arrivals) -> list[Arrivals]:
 
 
 def position_groups(items: Sequence[Measurement], config: DiverConfig) -> list[Group]:
-    """The fixes of one stamp: all single ones of a sensor together, then scan by scan those that
-    say whose they are, of each diver the first, and those that do not."""
+    """Group the fixes of one stamp: single fixes by sensor, then each scan with and without
+    IDs."""
     groups: list[Group] = []
     single: dict[str, list[Fix]] = {}
     for item in items:
@@ -238,30 +255,31 @@ def position_groups(items: Sequence[Measurement], config: DiverConfig) -> list[G
             if fix.target_id == NOBODY:
                 nameless.append(fix)
             else:
-                group = _group(scan_of(fix), np.arange(1), own, named=True)
-                groups.append(_seen_from(fix, group))
+                group = _make_group(scan_of(fix), np.arange(1), own, named=True)
+                groups.append(_with_sensor_position(fix, group))
         if nameless:
-            groups.append(_together(nameless, own))
+            groups.append(_group_single_fixes(nameless, own))
     for item in items:
         if isinstance(item, Fixes):
-            groups += _named_and_nameless(item, config.of_sensor(item.sensor))
+            groups += _split_by_id(item, config.of_sensor(item.sensor))
     return groups
 
 
-def _named_and_nameless(scan: Fixes, config: DiverConfig) -> list[Group]:
+def _split_by_id(scan: Fixes, config: DiverConfig) -> list[Group]:
+    """Split a scan into fixes with IDs, the first of each ID, and fixes without."""
     if scan.target_id is None:
-        return [_group(scan, np.arange(len(scan)), config, named=False)]
+        return [_make_group(scan, np.arange(len(scan)), config, named=False)]
     known = np.flatnonzero(scan.target_id != NOBODY)
     _, first = np.unique(scan.target_id[known], return_index=True)
-    groups = [_group(scan, known[first], config, named=True)] if len(known) else []
+    groups = [_make_group(scan, known[first], config, named=True)] if len(known) else []
     if len(known) < len(scan) or not len(scan):
         nameless = np.flatnonzero(scan.target_id == NOBODY)
-        groups.append(_group(scan, nameless, config, named=False))
+        groups.append(_make_group(scan, nameless, config, named=False))
     return groups
 
 
-def _group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -> Group:
-    """The rows of a scan, with their names or as all that there was to see."""
+def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -> Group:
+    """Return a group of rows of a scan, with IDs or as a complete scan."""
     position, covariance = scan.position[rows], np.full((len(rows), 3, 3), np.nan)
     if scan.covariance is not None:
         covariance = scan.covariance[rows]
@@ -269,18 +287,18 @@ def _group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bool) -
     if not (stated := np.isfinite(R)).all():
         R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
     heights = (
-        Heights.of(position, covariance, config.covariance_scale)
+        Heights.from_fixes(position, covariance, config.covariance_scale)
         if config.dimensions == 3
         else None
     )
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
-    named_rows = target_id, not named, heights, scan.sensor, _place(config)
+    named_rows = target_id, not named, heights, scan.sensor, _sensor_position(config)
     return Group(z, R * config.covariance_scale, config, *named_rows)
 
 
-def _together(fixes: Sequence[Fix], config: DiverConfig) -> Group:
-    """Single fixes of one sensor as one group."""
+def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
+    """Return single fixes of one sensor as one group."""
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
     R = np.empty((len(fixes), 2, 2))
@@ -292,18 +310,22 @@ def _together(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
         whole = [nothing if fix.covariance is None else fix.covariance for fix in fixes]
-        heights = Heights.of(np.array([fix.position for fix in fixes]), np.array(whole), factor)
+        heights = Heights.from_fixes(
+            np.array([fix.position for fix in fixes]), np.array(whole), factor
+        )
     more = None, config.fixes_are_scans, heights, fixes[0].sensor
-    return _seen_from(fixes[0], Group(z, R * factor, config, *more, _place(config)))
+    return _with_sensor_position(
+        fixes[0], Group(z, R * factor, config, *more, _sensor_position(config))
+    )
 
 
-def _seen_from(fix: Fix, group: Group) -> Group:
-    """A group of fixes with the place of the sensor that `fix` states."""
+def _with_sensor_position(fix: Fix, group: Group) -> Group:
+    """Return the group with the sensor position of `fix`."""
     return group if fix.seen_from is None else evolve(group, seen_from=fix.seen_from)
 
 
-def _place(config: DiverConfig) -> FloatArray | None:
-    """Where a sensor with these parameters stands."""
+def _sensor_position(config: DiverConfig) -> FloatArray | None:
+    """Return the sensor position (2,) of the coverage sector; None without a sector."""
     return np.array(config.coverage_sector[:2]) if config.coverage_sector else None
 
 
@@ -311,17 +333,20 @@ def _place(config: DiverConfig) -> FloatArray | None:
 
 
 class Ping(NamedTuple):
-    """What a ping `measured`, in the order of its content; row (C,): the row of the ping that each
-    measurement stands in; passive: a tag's; pairs: transmitter-receiver pairs heard."""
+    """Measurements of a ping, in the order of their content."""
 
     measured: PingMeasurements
+    """Table of C measurements."""
     row: IntArray
+    """(C,) row of the ping of each measurement."""
     passive: bool
+    """True for a tag."""
     pairs: int
+    """Number of received transmitter-receiver pairs."""
 
-    def only(self, keep: BoolArray) -> Ping:
-        """The measurements `keep` (C,), without those whose parent is not kept."""
-        keep = self.kept(keep)
+    def select(self, keep: BoolArray) -> Ping:
+        """Return the measurements `keep` (C,), without orphans."""
+        keep = self.without_orphans(keep)
         place = np.cumsum(keep) - 1
         left = PingMeasurements._make(
             np.ascontiguousarray(column[keep]) for column in self.measured
@@ -330,26 +355,26 @@ class Ping(NamedTuple):
         pairs = len(np.unique(left.node[left.kind <= ONE_WAY]))
         return Ping(left, self.row[keep], self.passive, pairs)
 
-    def kept(self, keep: BoolArray) -> BoolArray:
-        """`keep` (C,) without those whose parent is not kept."""
+    def without_orphans(self, keep: BoolArray) -> BoolArray:
+        """Return `keep` (C,) without measurements whose parent is not kept."""
         parent = self.measured.parent
         orphaned = (parent >= 0) & ~keep[parent]
         return np.asarray(keep & ~orphaned)
 
-    def compared(self, keep: BoolArray) -> Ping:
-        """As `only`, but at most `MOST_MEASUREMENTS`, evenly chosen."""
+    def subsample(self, keep: BoolArray) -> Ping:
+        """Return the measurements `keep` (C,), at most `MOST_MEASUREMENTS`, evenly spaced."""
         if np.count_nonzero(keep) > MOST_MEASUREMENTS:
-            keep = np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep)))
-        return self.only(keep)
+            keep = np.isin(np.arange(len(keep)), subsample(np.flatnonzero(keep)))
+        return self.select(keep)
 
     @property
     def nodes(self) -> IntArray:
-        """The numbers of the pairs heard."""
+        """Numbers of the received pairs."""
         return np.unique(self.measured.node[self.echo])
 
     @property
     def echo(self) -> BoolArray:
-        """(C,) True for path lengths, which show that a diver is there."""
+        """(C,) True for path lengths, which indicate a target."""
         return np.asarray(self.measured.kind <= ONE_WAY)
 
 
@@ -360,12 +385,12 @@ def ping_measurements(
     models: ModelSet,
     layout: Layout,
 ) -> Ping:
-    """The usable `rows` of a ping as measurements."""
+    """Return the usable `rows` of a ping as measurements."""
     usable = rows[np.isfinite(ping.toa[rows])]
     if not ping.passive:
         usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
     if ping.passive:
-        usable = spread(usable[np.argsort(ping.rx_id[usable], kind='stable')])
+        usable = subsample(usable[np.argsort(ping.rx_id[usable], kind='stable')])
     speed = config.sound_speed
     first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
     variance = toa_variance(ping, config)[usable] * speed**2
@@ -408,14 +433,18 @@ def ping_measurements(
         density=columns[5].astype(np.float64),
         tx=np.ascontiguousarray(ping.tx[row_of]),
         rx=np.ascontiguousarray(ping.rx[row_of]),
-        columns=layout.columns(models, ping.rx_id[row_of], ping.passive, columns[2] == BEARING),
+        columns=layout.measurement_columns(
+            models, ping.rx_id[row_of], ping.passive, columns[2] == BEARING
+        ),
     )
     return Ping(measured, row_of, ping.passive, int(new.sum()))
 
 
 def _depth_reports(ping: Arrivals, rows: IndexArray) -> list[tuple[float, float, int]]:
-    """The different depth reports of a ping: depth, variance and the first row of each. The same
-    report stands beside every arrival; it is one measurement."""
+    """Return depth, variance and first row of each distinct depth report of a ping.
+
+    Each arrival repeats the report, which is one measurement.
+    """
     reports: dict[tuple[float, float], int] = {}
     for row in rows.tolist():
         depth, variance = float(ping.depth[row]), float(ping.var_depth[row])
@@ -424,16 +453,16 @@ def _depth_reports(ping: Arrivals, rows: IndexArray) -> list[tuple[float, float,
     return [(*report, reports[report]) for report in sorted(reports)]
 
 
-def spread(rows: IndexArray) -> IndexArray:
-    """At most `MOST_MEASUREMENTS` of the rows (n,), evenly chosen, in their order."""
+def subsample(rows: IndexArray) -> IndexArray:
+    """Return at most `MOST_MEASUREMENTS` of the rows (n,), evenly spaced, in order."""
     if len(rows) <= MOST_MEASUREMENTS:
         return rows
     return rows[np.linspace(0.0, len(rows) - 1.0, MOST_MEASUREMENTS).round().astype(np.intp)]
 
 
 def systematic_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
-    """Variance (n,) in s^2 that the errors of the instruments add to an arrival time: what a ping
-    by itself cannot tell from noise."""
+    """Return the variance (n,), s^2, of arrival times due to instrument errors, which one ping
+    cannot separate from noise."""
     relative = config.sound_speed_std / config.sound_speed
     late = np.where(np.isfinite(ping.toa), ping.toa - (ping.passive and np.nanmin(ping.toa)), 0.0)
     return np.asarray(
@@ -444,13 +473,14 @@ def systematic_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
 
 
 def toa_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
-    """Variance (n,) of the arrival times, s^2: the sender's, not below `LEAST_VAR_TOA`."""
+    """Return the variance (n,) of arrival times, s^2: the reported variance, at least
+    `LEAST_VAR_TOA`."""
     known = np.isfinite(ping.var_toa) & (ping.var_toa > 0.0)
     stated = np.where(known, np.maximum(ping.var_toa, LEAST_VAR_TOA), config.toa_std**2)
     return np.asarray(stated * config.covariance_scale)
 
 
 def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
-    """Variance (n,) of the bearings, rad^2: the sender's where given."""
+    """Return the variance (n,) of bearings, rad^2: the reported variance, if any."""
     known = np.isfinite(ping.var_bearing) & (ping.var_bearing > 0.0)
     return np.asarray(np.where(known, ping.var_bearing, np.deg2rad(config.bearing_std_deg) ** 2))

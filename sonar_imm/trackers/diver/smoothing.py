@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diver tracker offline: what each estimate would have been, had the future been known.
+"""Offline diver tracker: estimates from past and future measurements.
 
-Rows do not switch between each other, so that what a row weighs at the end it weighs all along. So
-each row that a track ends with is followed back by its parents, and smoothed by itself. Families,
-whose states are unequal, are smoothed each by itself, and then what they weigh.
+Rows do not interact, so the final weight of a row applies to all its scans. Each final row of a
+track is traced back by its parents and smoothed on its own. Families have unequal states: each
+family is smoothed on its own, then the family weights.
 """
 
 from __future__ import annotations
@@ -32,32 +32,35 @@ from ...estimation.arrays import FloatArray, IndexArray
 from ...estimation.rows import Borrowed, Rows
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from .known import crossed, Known, Step
+from .known import Known, predict_over, Prediction
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
-"""Steps without a measurement beyond which a pass of several models ends. What a mixture becomes
-in a long gap is too crude to carry the future back: on the tag of docs/real_recordings.md, heard
-every 29 s, it made estimates worse."""
+"""Maximum number of prediction steps without a measurement inside a pass of several models. Longer
+gaps made estimates worse (tag of docs/real_recordings.md, received every 29 s)."""
 
 
 class _Scan(NamedTuple):
-    """A scan in common components: known; x (N, M, n), P (N, M, n, n) of its rows; steps: those
-    that crossed the time to it, and the same of them."""
+    """A scan in common components, with N rows."""
 
     known: Known
+    """State after the scan."""
     x: FloatArray
+    """(N, M, n)."""
     P: FloatArray
-    steps: tuple[Step, ...]
+    """(N, M, n, n)."""
+    steps: tuple[Prediction, ...]
+    """Prediction steps to the scan."""
     between: tuple[tuple[FloatArray, FloatArray], ...]
+    """x and P after all steps except the last."""
 
 
 @frozen(eq=False)
 class _Path:
-    """The forward pass of one row, step by step: the number of the scan (None for a step inside a
-    gap), the state after it, and how it was reached."""
+    """Forward pass of one row, step by step."""
 
     scans: list[int | None] = field(factory=list)
+    """Number of the scan; None for a step inside a gap."""
     x: list[FloatArray] = field(factory=list)
     P: list[FloatArray] = field(factory=list)
     mu: list[FloatArray] = field(factory=list)
@@ -72,8 +75,8 @@ class _Path:
 
 
 class _Smoothed(NamedTuple):
-    """Rows of one track at one scan, given all data: x (M, n), P (M, n, n), mu (M,), the weight
-    and what the row assumes of each."""
+    """Smoothed rows of one track at one scan: x (M, n), P (M, n, n), mu (M,), log weight and key
+    of each row."""
 
     x: list[FloatArray]
     P: list[FloatArray]
@@ -83,9 +86,8 @@ class _Smoothed(NamedTuple):
 
 
 def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
-    """Return what each block of models weighs (K, blocks) given all data, of filtered mu (K, M)
-    and the transitions (K, M, M) into each step; of all models together what they weigh at the
-    end."""
+    """Return smoothed weights (K, blocks) of blocks of models, from filtered mu (K, M) and
+    transitions (K, M, M) into each step."""
     filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)
     if len(blocks) == 1:
         return np.broadcast_to(filtered[-1], filtered.shape)
@@ -103,9 +105,9 @@ def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[sli
 
 
 class SmoothingDiverTracker(DiverTracker):
-    """A `DiverTracker` that remembers everything, so that `smoothed` can look back at the end.
+    """A `DiverTracker` that stores all states for `smoothed`.
 
-    For recordings: memory grows with their length, 10 kB a diver and scan.
+    For bags: memory grows with their length, about 10 kB per track and scan.
     """
 
     def reset(self) -> None:
@@ -124,37 +126,50 @@ class SmoothingDiverTracker(DiverTracker):
         return revised
 
     def smoothed(self) -> list[Estimate]:
-        """The estimates of all scans, oldest first, each given all measurements.
+        """Return the smoothed estimates of all scans, oldest first.
 
-        Tracks, ids and states are those of the filter; ``nis`` stays the filter's too.
+        Track IDs, track states and ``nis`` are those of the filter.
         """
         if not self._passed:
             return []
-        scans = self._scans()
+        scans = self._build_scans()
         found: dict[tuple[int, int], _Smoothed] = {}
-        for track_id, first, last in self._passes(scans):
+        for track_id, first, last in self._find_passes(scans):
             self._smooth(scans, track_id, first, last, found)
-        return [self._estimate(self._told(scan, k, found)) for k, scan in enumerate(scans)]
+        return [
+            self._estimate(self._with_smoothed_rows(scan, k, found))
+            for k, scan in enumerate(scans)
+        ]
 
-    def _scans(self) -> list[_Scan]:
-        """All scans, with the constants of all instruments, and how each was reached."""
+    def _build_scans(self) -> list[_Scan]:
+        """Return all scans with the constants of all instruments, and the steps between them."""
         newest = self._passed[max(self._passed)]
         layout = self._layouts(newest)
         scans: list[_Scan] = []
         for stamp in sorted(self._passed):
             known = self._passed[stamp]
-            known = known.replace(rows=layout.of_rows(known.rows, self.models))
-            before = scans[-1].known if scans else known
-            dt = (known.stamp_ns - before.stamp_ns) * 1e-9
-            crossing = self.models, self._chain, before.rows, before['learnt']
-            steps = tuple(crossed(*crossing, dt, self.config.longest_step))
-            between = tuple(self.models.common(step.rows.blocks) for step in steps[:-1])
-            scans.append(_Scan(known, *self.models.common(known.rows.blocks), steps, between))
+            known = known.replace(rows=layout.rows_with_new_constants(known.rows, self.models))
+            previous = scans[-1].known if scans else known
+            dt = (known.stamp_ns - previous.stamp_ns) * 1e-9
+            steps = predict_over(
+                self.models,
+                self._chain,
+                previous.rows,
+                previous['learnt'],
+                dt,
+                self.config.longest_step,
+            )
+            between = tuple(self.models.to_common(step.rows.blocks) for step in steps[:-1])
+            scans.append(
+                _Scan(known, *self.models.to_common(known.rows.blocks), tuple(steps), between)
+            )
         return scans
 
-    def _passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:
-        """Identity, first and last scan of each track, cut where a gap is too long to look across,
-        and where its rows have no past of their own."""
+    def _find_passes(self, scans: Sequence[_Scan]) -> list[tuple[int, int, int]]:
+        """Return track ID, first and last scan of each pass.
+
+        Passes end at long gaps and where rows have no parent.
+        """
         passes: list[tuple[int, int, int]] = []
         open_: dict[int, int] = {}
         for k, scan in enumerate(scans):
@@ -169,7 +184,7 @@ class SmoothingDiverTracker(DiverTracker):
                 cut = not k or not len(came) or long
                 cut |= bool((rows.parent[rows.target == track] < 0).any())
                 if not cut:
-                    cut = before['spreads'][came[0]] != scan.known['spreads'][track]
+                    cut = before['respreads'][came[0]] != scan.known['respreads'][track]
                 if cut:
                     if track_id in open_:
                         passes.append((track_id, open_[track_id], k - 1))
@@ -184,13 +199,12 @@ class SmoothingDiverTracker(DiverTracker):
         last: int,
         found: dict[tuple[int, int], _Smoothed],
     ) -> None:
-        """Smooth the rows that a track ends a pass with, and put them into `found` by scan and
-        identity."""
+        """Smooth the final rows of a pass, and add them to `found` by scan and track ID."""
         end = scans[last].known.rows
-        rows: IndexArray = np.flatnonzero(end.target == _place(scans[last].known, track_id))
+        rows: IndexArray = np.flatnonzero(end.target == _track_index(scans[last].known, track_id))
         for row in rows.tolist():
-            path = self._path(scans, track_id, row, first, last)
-            x, P, mu = self._along(path)
+            path = self._trace_path(scans, track_id, row, first, last)
+            x, P, mu = self._smooth_path(path)
             key = {name: column[row] for name, column in end.key.items()}
             for k, number in enumerate(path.scans):
                 if number is None:
@@ -200,10 +214,10 @@ class SmoothingDiverTracker(DiverTracker):
                 for column, value in zip(columns, (x[k], P[k], mu[k], end.logw[row], key)):
                     column.append(value)
 
-    def _path(
+    def _trace_path(
         self, scans: Sequence[_Scan], track_id: int, row: int, first: int, last: int
     ) -> _Path:
-        """The forward pass that leads to a row of the `last` scan."""
+        """Return the forward pass that leads to a row of the `last` scan."""
         chain = [row]
         for scan in scans[last:first:-1]:
             chain.append(int(scan.known.rows.parent[chain[-1]]))
@@ -213,20 +227,23 @@ class SmoothingDiverTracker(DiverTracker):
             transition, dt = self.models.chain.matrix, 0.0
             if number > first:
                 came = chain[last - number + 1]
-                at = _place(scans[number - 1].known, track_id)
+                at = _track_index(scans[number - 1].known, track_id)
                 for step, (x, P) in zip(scan.steps, scan.between):
-                    mu, used = step.rows.mu[came], _of_track(step.transition, at)
+                    mu, used = step.rows.mu[came], _track_transition(step.transition, at)
                     path.add(None, x[came], P[came], mu, used, step.dt)
-                transition, dt = _of_track(scan.steps[-1].transition, at), scan.steps[-1].dt
+                transition, dt = (
+                    _track_transition(scan.steps[-1].transition, at),
+                    scan.steps[-1].dt,
+                )
             mu = scan.known.rows.mu[own]
             path.add(number, scan.x[own], scan.P[own], mu, transition, dt)
         return path
 
-    def _along(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x (K, M, n), P (K, M, n, n), mu (K, M) of a path, smoothed."""
+    def _smooth_path(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return smoothed x (K, M, n), P (K, M, n, n) and mu (K, M) of a path."""
         x, P, mu = np.stack(path.x), np.stack(path.P), np.stack(path.mu)
-        moves, transition = self._moves(path, x.shape[-1]), np.stack(path.transition)
-        blocks = self._families()
+        moves, transition = self._stack_motions(path, x.shape[-1]), np.stack(path.transition)
+        blocks = self._family_slices()
         weights = _family_weights(mu, transition, blocks)
         for block, weight in zip(blocks, weights.T):
             total = mu[:, block].sum(axis=1, keepdims=True)
@@ -247,17 +264,16 @@ class SmoothingDiverTracker(DiverTracker):
             mu[-1] = path.mu[-1]
         return x, P, mu
 
-    def _families(self) -> list[slice]:
-        """The places of models with states of the same components that switch between each
-        other."""
+    def _family_slices(self) -> list[slice]:
+        """Return the slices of models with equal components that switch between each other."""
         kinds = self.models.families
         if kinds is None:
             return [slice(0, len(self.models.names))]
         ends = np.cumsum(np.bincount(kinds.family)).tolist()
         return [slice(first, last) for first, last in zip([0, *ends], ends)]
 
-    def _moves(self, path: _Path, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F, Q (K, M, size, size) and B (K, M, size): the motion, and constants that stay."""
+    def _stack_motions(self, path: _Path, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return F, Q (K, M, size, size) and B (K, M, size) of the motion with constants."""
         moves = [self.models.motion(dt) for dt in path.dt]
         F, Q, B = (np.stack(parts) for parts in zip(*moves))
         n = B.shape[-1]
@@ -269,8 +285,10 @@ class SmoothingDiverTracker(DiverTracker):
         F_all[..., range(n, size), range(n, size)] = 1.0
         return F_all, Q_all, B_all
 
-    def _told(self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]) -> Known:
-        """What is known of a scan, given all data."""
+    def _with_smoothed_rows(
+        self, scan: _Scan, number: int, found: dict[tuple[int, int], _Smoothed]
+    ) -> Known:
+        """Return the state of a scan with smoothed rows."""
         known = scan.known
         parts = [found[number, track_id] for track_id in known.life.track_id.tolist()]
         if not parts:
@@ -281,15 +299,15 @@ class SmoothingDiverTracker(DiverTracker):
         )
         keys = [key for part in parts for key in part.key]
         key = {name: np.array([each[name] for each in keys]) for name in known.rows.key}
-        blocks, nobody = self.models.blocks(x, P), np.full(len(target), -1)
+        blocks, nobody = self.models.to_blocks(x, P), np.full(len(target), -1)
         rows = Rows(blocks, mu, logw, target, nobody, key)
-        return known.replace(rows=rows, borrowed=Borrowed.none())
+        return known.replace(rows=rows, borrowed=Borrowed.empty())
 
 
-def _place(known: Known, track_id: int) -> int:
+def _track_index(known: Known, track_id: int) -> int:
     return int(np.flatnonzero(known.life.track_id == track_id)[0])
 
 
-def _of_track(transition: FloatArray, track: int) -> FloatArray:
-    """The matrix (M, M) of a track among transitions (T or 1, M, M)."""
+def _track_transition(transition: FloatArray, track: int) -> FloatArray:
+    """Return the matrix (M, M) of a track from transitions (T or 1, M, M)."""
     return transition[0 if len(transition) == 1 else track]

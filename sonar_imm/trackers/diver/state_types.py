@@ -41,7 +41,7 @@ from .innovations import FixConsistency
 from .instruments import Instruments
 from .known import Known
 from .names import LastNamed
-from .offsets import Offsets, RecentPairs
+from .offsets import BiasTest, RecentPairs
 
 STATE_TYPES = (
     *STREAM_TYPES,
@@ -49,6 +49,6 @@ STATE_TYPES = (
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(NavigationBuffer, Origin),
     *(Known, Rows, Borrowed, Gaussians, Tracks),
-    *(NisMemory, FixConsistency, HeightCounts, Instruments, Offsets, RecentPairs),
+    *(NisMemory, FixConsistency, HeightCounts, Instruments, BiasTest, RecentPairs),
     *(Clutter, Clutters, LastNamed),
 )

@@ -12,24 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Divers from multistatic fixes or raw arrival times.
+"""Diver tracker for multistatic fixes and raw arrival times.
 
-A diver swims slowly and turns often. The tracker runs a motion model for each of sixteen headings
-and some for what else a diver does (`models`) in an interacting multiple model filter, and lets
-the data correct the probabilities of turning. It does so under several assumptions at once, each a
-row of one table (`estimation.rows`): what the stated covariances are worth, or how deep the diver
-is.
+A diver swims slowly and turns often. The tracker runs motion models for 16 headings, hovering and
+other motions (`models`) in an interacting multiple model filter. The data adapt the transition
+probabilities. Several assumptions run in parallel as rows of one table (`estimation.rows`): scales
+of the measurement covariances, or start depths.
 
-The measurements of a stamp, a `Scan`, go through stages, each a function of what is known:
+The measurements of one stamp form a `Scan`. It passes through stages, each a function of the
+state:
 
-    predict -> for each group of fixes: whose are they? -> update
-            -> for each ping: the same (`arrivals`)
-            -> learn -> forget -> begin
+    predict -> for each group of fixes: associate -> update
+            -> for each ping: associate and update (`arrivals`)
+            -> update transitions -> update IDs -> prune -> spawn
 
-The stages are put together once, from the parameters. What is known after a scan is one immutable
-value, `Known`, so that a late measurement is put in its place by computing the scans after it
-again (`intake.stream`). Positions that are not metres in the frame of the tracks are brought into
-it first (`georeferencing`).
+The stages are assembled once from the parameters. The state after a scan is one immutable value,
+`Known`. For a late measurement, the later scans are recomputed (`intake.stream`). Positions that
+are not in metres in the track frame are converted first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -59,31 +58,33 @@ from . import (
     depth,
     estimate,
     fixes,
-    forgetting,
     names,
     offsets,
+    pruning,
     restart,
 )
 from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .innovations import FixConsistency
 from .instruments import Instruments, Layout
-from .known import crossed, Feature, Known
+from .known import Feature, Known, predict_over
 from .models import build_models, ModelSet
 from .scan import Group, Scan
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
 
 SCORE_MEMORY = 0.9
-"""Share of its score a track keeps from scan to scan."""
+"""Factor on the score of a track at each scan."""
 
-OfGroup = Callable[[Known, Group], Known]
-OfScan = Callable[[Known, Scan], Known]
+GroupStage = Callable[[Known, Group], Known]
+ScanStage = Callable[[Known, Scan], Known]
 
 
 class DiverTracker:
-    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`,
-    `Start`, and what `georeferencing` makes fixes of."""
+    """Tracker of divers, boats and ships, with the interface `trackers.Tracker`.
+
+    `process` accepts `Fix`, `Fixes`, `Arrivals`, `Start`, and the inputs of `georeferencing`.
+    """
 
     STATE = ('_stream', '_georeferencer')
 
@@ -99,11 +100,11 @@ class DiverTracker:
             family=None if kinds is None else kinds.family,
             learns=config.adaptation == 'counts',
         )
-        self._settle(config)
+        self._apply_config(config)
         self.reset()
 
-    def _settle(self, config: DiverConfig) -> None:
-        """Put together what follows from the parameters, once and not in every scan."""
+    def _apply_config(self, config: DiverConfig) -> None:
+        """Build everything that depends on the parameters, once per change."""
         self.config, models = config, self.models
         self.rules = track_rules(config)
         layout = lru_cache(maxsize=16)(partial(Instruments.layout, config=config, models=models))
@@ -112,37 +113,38 @@ class DiverTracker:
         def layouts(known: Known) -> Layout:
             return layout(known.memory['instruments'])
 
-        covered = coverage.stated(config)
-        self._associate = fixes.associating(models, config.pairing)
+        covered = coverage.configured_coverage(config)
+        self._associate = fixes.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
             **names.FEATURES,
             **restart.FEATURES,
-            **forgetting.FEATURES,
+            **pruning.FEATURES,
             **coverage.FEATURES,
             **depth.FEATURES,
-            'learnt': Feature(None, self._chain.fresh(0).shape[1:]),
+            'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
         turn = config.bearing_bias_std_deg > 0.0
-        self._of_group: tuple[OfGroup, ...] = wanted(
-            turn and turning(models, layout),
-            covered and coverage.detecting(covered, models),
+        self._group_stages: tuple[GroupStage, ...] = select_stages(
+            turn and rotation_stage(models, layout),
+            covered and coverage.detection_stage(covered, models),
             self._associate,
-            models.families and restart.restarting(models, self._chain, layouts, self._associate),
-            fixes.updating(models, lambda known: layouts(known).estimated(models)),
-            config.dimensions == 3 and depth.updating(models, layouts, config),
-            clutter.count,
-            covered and coverage.missing(models, lambda known: bool(layouts(known).mask.all())),
-            turn and turning(models, layout, back=True),
-            births.at_fixes,
+            models.families
+            and restart.restart_stage(models, self._chain, layouts, self._associate),
+            fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
+            config.dimensions == 3 and depth.depth_stage(models, layouts, config),
+            clutter.count_clutter,
+            covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
+            turn and rotation_stage(models, layout, back=True),
+            births.spawn_at_fixes,
         )
-        self._of_scan: tuple[OfScan, ...] = wanted(
-            self._learn,
-            names.remembering(config.max_coast),
-            forgetting.forgetting(models, config, self.rules, bool(covered)),
-            names.merging(models),
-            clutter.without_first_fixes,
-            births.beginning(models, config, layouts, self._chain, self.features, self.rules),
+        self._scan_stages: tuple[ScanStage, ...] = select_stages(
+            self._update_transitions,
+            names.id_times_stage(config.max_coast),
+            pruning.pruning_stage(models, config, self.rules, bool(covered)),
+            names.merge_stage(models),
+            clutter.remove_first_fixes,
+            births.spawn_stage(models, config, layouts, self._chain, self.features, self.rules),
         )
         self._covered, self._layouts = covered, layouts
 
@@ -150,21 +152,21 @@ class DiverTracker:
         self._stream = ReplayStream(
             (Fix, Fixes, Arrivals, Start),
             StreamRules.of(self.config),
-            step=self._step,
-            initial=self._nobody(Tracks.none(self.rules)),
-            survivor=lambda known: self._nobody(known.life.none_left()),
+            step=self._process_scan,
+            initial=self._empty_state(Tracks.none(self.rules)),
+            survivor=lambda known: self._empty_state(known.life.none_left()),
         )
         self.counts = self._stream.counts
         self._georeferencer = Georeferencer(self.config, self.counts)
 
-    def _nobody(self, life: Tracks) -> Known:
-        nobody = Known.nobody(life, self.models, self.models.n, self.features)
-        return nobody.remember(
+    def _empty_state(self, life: Tracks) -> Known:
+        nobody = Known.empty(life, self.models, self.models.n, self.features)
+        return nobody.with_memory(
             fixes=FixConsistency(),
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
-            offsets=offsets.Offsets(),
+            offsets=offsets.BiasTest(),
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=clutter.Clutters(),
@@ -172,15 +174,17 @@ class DiverTracker:
         )
 
     def restored(self) -> None:
-        """Compute the states anew, from the oldest that was put in. Raises ValueError where that
-        is none of these models."""
-        base, nobody = self._stream.base, self._nobody(Tracks.none(self.rules))
+        """Recompute the states from the oldest saved one.
+
+        :raises ValueError: the saved state belongs to other models.
+        """
+        base, nobody = self._stream.base, self._empty_state(Tracks.none(self.rules))
         base.require_like(nobody, len(self._layouts(base).variances))
         self._stream.restored()
 
     @property
     def origin(self) -> Origin | None:
-        """Where the frame of the tracks lies on Earth, None when that is not known."""
+        """Geodetic origin of the track frame; None if unknown."""
         return self._georeferencer.origin
 
     @property
@@ -190,7 +194,7 @@ class DiverTracker:
     def reconfigure(self, config: DiverConfig) -> None:
         config = config.for_target()
         self.config.require_changeable(config)
-        self._settle(config)
+        self._apply_config(config)
         self._georeferencer.config = config
 
     def warm(self, inputs: Collection[type] | None = None) -> None:
@@ -200,15 +204,15 @@ class DiverTracker:
         return estimate.health(self._stream.state, len(self._georeferencer))
 
     def warnings(self) -> list[str]:
-        """What of the input cannot be true or used, in sentences for the user."""
-        own = estimate.warnings(self._stream.state, self.config)
-        return [*self._georeferencer.warnings(), *own]
+        """Return warnings about implausible or unused input."""
+        tracker_warnings = estimate.warnings(self._stream.state, self.config)
+        return [*self._georeferencer.warnings(), *tracker_warnings]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(known) for _, known in self._revise(measurement)]
 
     def _revise(self, measurement: Measurement) -> list[tuple[int, Known]]:
-        """The stamps and values that are new or changed, oldest first."""
+        """Return the new or changed states with their stamps, oldest first."""
         revised: dict[int, Known] = {}
         for ready in self._georeferencer.georeference(measurement):
             revised.update(self._stream.revise(ready))
@@ -220,94 +224,99 @@ class DiverTracker:
 
     # -- one scan ------------------------------------------------------------------------------
 
-    def _step(self, before: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
-        """What is known after all measurements of one stamp. Pure."""
-        scan = Scan.of(items, self.config, before.memory['clutter'])
-        known = self._predict(before, scan, stamp_ns)
+    def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
+        """Return the state after all measurements of one stamp. Pure function."""
+        scan = Scan.from_items(items, self.config, previous.memory['clutter'])
+        known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
-            for stage in self._of_group:
+            for stage in self._group_stages:
                 known = stage(known, group)
         for ping in scan.pings:
-            known = self._of_ping(known, scan, ping)
-        for last in self._of_scan:
+            known = self._process_ping(known, scan, ping)
+        for last in self._scan_stages:
             known = last(known, scan)
         return known
 
-    def _predict(self, before: Known, scan: Scan, stamp_ns: int) -> Known:
-        """The tracks as this scan should show them; the step that led there stands in `scan`."""
-        dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        several = len(before) and len(self.models.scales) > 1
-        start = fixes.spread_over_scales(before) if several else before
-        crossing = self.models, self._chain, start.rows, before['learnt']
-        steps = crossed(*crossing, dt, self.config.longest_step)
+    def _predict(self, previous: Known, scan: Scan, stamp_ns: int) -> Known:
+        """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
+        dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
+        has_scales = len(previous) and len(self.models.scales) > 1
+        start = fixes.redistribute_weights(previous) if has_scales else previous
+        steps = predict_over(
+            self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
+        )
         transition = np.linalg.matrix_power(steps[-1].transition, len(steps))
-        scan.before = before
-        scan.step = steps[-1]._replace(transition=transition, dt=dt)
-        # The error of the sound speed has its place in the state before any ping.
-        rows = self._layouts(before).of_rows(steps[-1].rows, self.models)
-        count = len(before)
+        scan.previous = previous
+        scan.prediction = steps[-1]._replace(transition=transition, dt=dt)
+        # The sound speed error is part of the state before the first ping.
+        rows = self._layouts(previous).rows_with_new_constants(steps[-1].rows, self.models)
+        count = len(previous)
         columns = {
             'nis': np.full(count, 0.0),
             'nis_dof': np.zeros(count, np.uint16),
-            'score': SCORE_MEMORY * before['score'],
-            'existence': before['existence'] * math.exp(-dt / self.config.survival_time),
+            'score': SCORE_MEMORY * previous['score'],
+            'existence': previous['existence'] * math.exp(-dt / self.config.survival_time),
         }
-        known = start.replace(stamp_ns=stamp_ns, rows=rows).put(**columns)
-        return known.counted(repairs=sum(step.repairs for step in steps))
+        known = start.replace(stamp_ns=stamp_ns, rows=rows).with_columns(**columns)
+        return known.add_counts(repairs=sum(step.repairs for step in steps))
 
-    def _of_ping(self, known: Known, scan: Scan, ping: Arrivals) -> Known:
-        """The tracks after a ping, and where it shows new ones."""
-        from . import arrivals  # and the search for positions, which fixes do not need
+    def _process_ping(self, known: Known, scan: Scan, ping: Arrivals) -> Known:
+        """Update the tracks by a ping, and store the births it shows."""
+        from . import arrivals  # imported late: not needed for fixes
 
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
         layout = self._layouts(known)
-        known = births.begun_anew(known, ping, free, self.models, layout, self.config)
+        known = births.restart_track(known, ping, free, self.models, layout, self.config)
         scan.births += births.births_from_ping(ping, free, self.config)
         return known
 
-    def _learn(self, known: Known, scan: Scan) -> Known:
-        """What the hits say of the transitions, and of the stated variances of arrivals where no
-        fix says the same."""
-        before, step, hit = scan.before, scan.step, known['nis_dof'] > 0
+    def _update_transitions(self, known: Known, scan: Scan) -> Known:
+        """Update the transition counts by the hits.
+
+        Also update the NIS of arrivals, except in scans with fixes.
+        """
+        previous, step, hit = scan.previous, scan.prediction, known['nis_dof'] > 0
         learnt = self._chain.learn(
-            before['learnt'],
+            previous['learnt'],
             step.transition,
-            before.rows.models(),
-            known.rows.models(),
+            previous.rows.model_probabilities(),
+            known.rows.model_probabilities(),
             step.dt,
             np.flatnonzero(hit),
         )
-        known = known.put(learnt=learnt, nis=np.where(hit, known['nis'], np.nan))
+        known = known.with_columns(learnt=learnt, nis=np.where(hit, known['nis'], np.nan))
         if not scan.pings or scan.fixes:
             return known
-        sure = hit & (known.life.status != TENTATIVE)
-        nis, dof = known['nis'][sure], known['nis_dof'][sure]
-        more = known.memory['excess']
-        if not len(self._layouts(known).variances):  # what lasts is no evidence twice
-            more = excess(more, nis, dof)
-        return known.remember(arrivals=known.memory['arrivals'].after(nis, dof), excess=more)
+        confirmed = hit & (known.life.status != TENTATIVE)
+        nis, dof = known['nis'][confirmed], known['nis_dof'][confirmed]
+        cusum = known.memory['excess']
+        if not len(self._layouts(known).variances):  # without estimated instrument errors
+            cusum = excess(cusum, nis, dof)
+        return known.with_memory(arrivals=known.memory['arrivals'].after(nis, dof), excess=cusum)
 
 
-def wanted(*stages: object) -> tuple:
-    """Return the stages that the parameters ask for: those that are not False or None."""
+def select_stages(*stages: object) -> tuple:
+    """Return the stages that are enabled, without False and None."""
     return tuple(stage for stage in stages if stage)
 
 
-def turning(
+def rotation_stage(
     models: ModelSet, layout: Callable[[Instruments], Layout], *, back: bool = False
-) -> OfGroup:
-    """Return the stage that turns the tracks as a sensor shows them whose bearings may all be off,
-    or back."""
+) -> GroupStage:
+    """Return the stage that rotates tracks by the bearing error of a sensor about its position.
+
+    back: rotate back.
+    """
 
     def turn(known: Known, group: Group) -> Known:
-        if group.turned_by is None:
+        if group.rotation_sensor is None:
             return known
-        instruments = known.memory['instruments'].with_sensor(group.turned_by[0])
+        instruments = known.memory['instruments'].with_sensor(group.rotation_sensor[0])
         place = layout(instruments)
-        rows = place.of_rows(known.rows, models)
-        turned = place.turned(rows, models, *group.turned_by, back=back)
-        return known.replace(rows=turned).remember(instruments=instruments)
+        rows = place.rows_with_new_constants(known.rows, models)
+        turned = place.rotate_about_sensor(rows, models, *group.rotation_sensor, back=back)
+        return known.replace(rows=turned).with_memory(instruments=instruments)
 
     return turn

@@ -91,15 +91,19 @@ class Scored(DiverTracker):
         self.area = area_of(measurements)
         super().__init__(config)
 
-    def _settle(self, config: DiverConfig) -> None:
-        super()._settle(config)
+    def _apply_config(self, config: DiverConfig) -> None:
+        super()._apply_config(config)
         # A track that begins anew at a fix is asked once more: that is no prediction of it.
-        after = self._of_group.index(self._associate) + 1
-        self._of_group = (*self._of_group[:after], self._scoring, *self._of_group[after:])
+        after = self._group_stages.index(self._associate) + 1
+        self._group_stages = (
+            *self._group_stages[:after],
+            self._scoring,
+            *self._group_stages[after:],
+        )
 
-    def _step(self, before: Known, stamp_ns: int, items: Any) -> Known:
+    def _process_scan(self, before: Known, stamp_ns: int, items: Any) -> Known:
         self.scores[stamp_ns] = (0.0, 0)
-        return super()._step(before, stamp_ns, items)
+        return super()._process_scan(before, stamp_ns, items)
 
     def _scoring(self, known: Known, group: Group) -> Known:
         """Add what was predicted of a group of fixes. A stage of the tracker."""
@@ -109,16 +113,16 @@ class Scored(DiverTracker):
         return known
 
     def _score(self, known: Known, group: Group) -> tuple[float, int]:
-        config, found, seen = group.config, group.found, group.seen
+        config, found, seen = group.config, group.association, group.detection
         assert found is not None and group.pairs is not None
         p, m = config.detection_probability, len(group.z)
         density = group.clutter + config.birth_density
         tracks = np.flatnonzero(found.hit)
         fix = found.fix[tracks]
         log_f = np.full(len(known), -np.inf)
-        log_f[tracks] = group.pairs.whole[tracks, fix]
+        log_f[tracks] = group.pairs.track_log[tracks, fix]
         score = m * math.log(density)
-        nameless = group.whole and group.target_id is None
+        nameless = group.is_complete and group.target_id is None
         if nameless:
             score -= density * self.area
         sure = config.max_tracks == 1

@@ -323,16 +323,16 @@ def test_positions_as_a_sensor_shows_them_are_turned_about_it_and_back():
         arm = state[:2] - place
         return np.append(place + [c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]], state[2:])
 
-    rows = models.rows(x[:, None], P[:, None], np.ones((2, 1, 3)) / 3.0, np.zeros((2, 1)))
-    rows = layout.turned(rows, models, '', place)
-    seen, covariance = models.common(rows.blocks)
+    rows = models.make_rows(x[:, None], P[:, None], np.ones((2, 1, 3)) / 3.0, np.zeros((2, 1)))
+    rows = layout.rotate_about_sensor(rows, models, '', place)
+    seen, covariance = models.to_common(rows.blocks)
     for row in np.ndindex(2, 3):
         np.testing.assert_allclose(seen[row], turned(x[row]), atol=1e-12)
         T = np.stack(
             [(turned(x[row] + h) - turned(x[row] - h)) / 2e-6 for h in 1e-6 * np.eye(5)], axis=1
         )
         np.testing.assert_allclose(covariance[row], T @ P[row] @ T.T, rtol=1e-6, atol=1e-6)
-    again = models.common(layout.turned(rows, models, '', place, back=True).blocks)
+    again = models.to_common(layout.rotate_about_sensor(rows, models, '', place, back=True).blocks)
     np.testing.assert_allclose(again[0], x, atol=1e-12)
     np.testing.assert_allclose(again[1], P, atol=1e-9)
 
@@ -443,8 +443,8 @@ def test_instruments_beyond_the_most_are_taken_as_they_are():
     models = build_models(config)
     layout = known.layout(config, models)
     x, P = np.zeros((1, 1, 1, layout.size)), np.eye(layout.size)[None, None, None]
-    rows = models.rows(x, P, np.ones((1, 1, 1)), np.zeros((1, 1)))
-    assert layout.turned(rows, models, 'sensor_65', np.ones(2)) is rows
+    rows = models.make_rows(x, P, np.ones((1, 1, 1)), np.zeros((1, 1)))
+    assert layout.rotate_about_sensor(rows, models, 'sensor_65', np.ones(2)) is rows
 
 
 @pytest.mark.statistics

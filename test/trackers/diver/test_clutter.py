@@ -113,7 +113,7 @@ def test_the_covariance_is_that_of_the_false_fixes():
     for _ in range(8):
         z = rng.uniform(-300.0, 300.0, (40, 2)) * (1.0, 0.3) @ [[0.8, 0.6], [-0.6, 0.8]]
         z += (5e5, 6e6)  # far from the origin of the frame
-        known, weight = known.after(z, np.full(40, 1.0)), np.exp(-1.0 / 100.0)
+        known, weight = known.with_scan(z, np.full(40, 1.0)), np.exp(-1.0 / 100.0)
         all_of_them = [(w * weight, p) for w, p in all_of_them] + [(1.0, p) for p in z]
     weights = np.array([w for w, _ in all_of_them])
     C = np.cov(np.array([p for _, p in all_of_them]).T, aweights=weights, ddof=0)
@@ -126,10 +126,10 @@ def test_densities_are_bounded():
     rng, known = np.random.default_rng(2), Clutter()
     assert known.density == pytest.approx(CLUTTER, rel=1e-4)
     for _ in range(300):
-        known = known.after(rng.normal(scale=0.01, size=(50, 2)), np.ones(50))
+        known = known.with_scan(rng.normal(scale=0.01, size=(50, 2)), np.ones(50))
     assert known.density == MOST
     for _ in range(3000):
-        known = known.after(np.empty((0, 2)), np.empty(0))
+        known = known.with_scan(np.empty((0, 2)), np.empty(0))
     assert known.density == LEAST
 
 

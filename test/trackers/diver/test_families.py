@@ -64,8 +64,8 @@ def test_chain_and_models_are_those_of_the_prototype(models):
 
 def mixed(models, x, P, mu, transition):
     law = evolve(models.bank, speed=0.75, speed_variance=0.16)
-    blocks, c = bank.mix(law, models.blocks(x[None], P[None]), mu[None], transition)
-    return (part[0] for part in (*models.common(tuple(blocks)), c))
+    blocks, c = bank.mix(law, models.to_blocks(x[None], P[None]), mu[None], transition)
+    return (part[0] for part in (*models.to_common(tuple(blocks)), c))
 
 
 def test_mixing_is_that_of_the_prototype(models):
@@ -119,7 +119,7 @@ def test_a_velocity_goes_to_the_headings_it_may_have(models):
 def test_a_run_is_that_of_the_prototype(monkeypatch):
     """Its transitions are taken at a step rounded to a microsecond, and are not learnt; who stands
     keeps his pace; every scale keeps its row."""
-    monkeypatch.setattr(sets, 'PACE_TIME', 1e12)
+    monkeypatch.setattr(sets, 'SPEED_MEMORY', 1e12)
     monkeypatch.setattr(rows, 'ROW_LOST', 1e-300)
     tracker = DiverTracker(
         config(
@@ -173,7 +173,7 @@ def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
         return out
 
     found = errors()
-    monkeypatch.setattr(sets, 'PACE_TIME', 1e12)
+    monkeypatch.setattr(sets, 'SPEED_MEMORY', 1e12)
     assert max(found[25:]) < 0.75 * max(errors()[25:])
 
 
@@ -226,9 +226,9 @@ def test_scale_of_the_stated_covariances(stated):
     scale = np.mean([e.extras['covariance_scale'][0] for e in estimates[100:]])
     warned = ' '.join(tracker.warnings())
     if stated < 1.0:
-        assert 3.0 < scale < 10.0 and 'times as far as they state' in warned
+        assert 3.0 < scale < 10.0 and 'fix covariances too small' in warned
     else:
-        assert 1.0 <= scale < 1.6 and 'times as far as they state' not in warned
+        assert 1.0 <= scale < 1.6 and 'fix covariances too small' not in warned
 
 
 def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known():
@@ -398,7 +398,7 @@ def test_smoothing_knows_when_behaviour_changed():
 
 def test_depth_is_a_state_beside_families():
     tracker = DiverTracker(config(dimensions=3, fix_bias_std=0.5))
-    assert tracker.models.scales == (1.0,) and tracker.models.copies == 3
+    assert tracker.models.scales == (1.0,) and tracker.models.rows_per_track == 3
     estimate = run(tracker, path(30))[-1]
     assert np.isfinite(estimate.state).all() and estimate.state_names[2] == 'pz'
     assert np.abs(estimate.state[0, :2] - [20.3, 0.0]).max() < 2.5

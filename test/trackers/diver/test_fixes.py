@@ -22,8 +22,13 @@ import numpy as np
 from sonar_imm.estimation import imm
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.clutter import Clutters
-from sonar_imm.trackers.diver.fixes import compare, singly
-from sonar_imm.trackers.diver.innovations import FARTHEST, FixConsistency, MEMORY, watch
+from sonar_imm.trackers.diver.fixes import associate_gnn, compare
+from sonar_imm.trackers.diver.innovations import (
+    FARTHEST,
+    FixConsistency,
+    MEMORY,
+    whiten_innovations,
+)
 from sonar_imm.trackers.diver.scan import Scan
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -46,7 +51,7 @@ def predicted(item):
     tracker = DiverTracker(CONFIG)
     for second in range(1, 6):
         tracker.process(scan(second, PLACES + 0.5 * second))
-    now = Scan.of([item], tracker.config, Clutters())
+    now = Scan.from_items([item], tracker.config, Clutters())
     known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
     return tracker, known, now.fixes[0]
 
@@ -54,16 +59,16 @@ def predicted(item):
 def test_taking_fixes_is_the_plain_update_of_those_tracks():
     item = scan(6, PLACES[[2, 0]] + 3.0)
     tracker, known, group = predicted(item)
-    x, P = tracker.models.common(known.rows.blocks)
+    x, P = tracker.models.to_common(known.rows.blocks)
     after = known
-    for stage in tracker._of_group:
+    for stage in tracker._group_stages:
         after = stage(after, group)
-    assert group.found.fix.tolist() == [1, -1, 0]
-    tracks, H = np.array([0, 2]), tracker.models.fix[None]
+    assert group.association.fix.tolist() == [1, -1, 0]
+    tracks, H = np.array([0, 2]), tracker.models.fix_matrix[None]
     z, R = group.z[[1, 0]], group.R[[1, 0]]
     v = z[:, None] - x[tracks, :, :2]
     want = imm.update(x[tracks], P[tracks], known.rows.mu[tracks], v, H, R)
-    x1, P1 = tracker.models.common(after.rows.blocks)
+    x1, P1 = tracker.models.to_common(after.rows.blocks)
     for got, plain, before in (
         (x1, want.x, x),
         (P1, want.P, P),
@@ -79,21 +84,21 @@ def test_the_score_says_how_much_better_than_clutter_a_track_explains_its_fixes(
     item = scan(6, PLACES[:1] + 3.0)
     tracker, known, group = predicted(item)
     pairs = compare(known, group, tracker.models, 1e-6)
-    found = singly(known, group, pairs)
+    found = associate_gnn(known, group, pairs)
     p, gained = CONFIG.detection_probability, found.score - known['score']
-    density = pairs.whole[0, 0] - math.log(group.clutter)
+    density = pairs.track_log[0, 0] - math.log(group.clutter)
     np.testing.assert_allclose(gained, [math.log(p) + density, *[math.log1p(-p)] * 2])
-    x, P = (part[:1] for part in tracker.models.common(known.rows.blocks))
-    v, H = group.z[None] - x[..., :2], tracker.models.fix[None]
+    x, P = (part[:1] for part in tracker.models.to_common(known.rows.blocks))
+    v, H = group.z[None] - x[..., :2], tracker.models.fix_matrix[None]
     want = imm.update(x, P, known.rows.mu[:1], v, H, group.R)
-    np.testing.assert_allclose(pairs.whole[0, 0], want.log_likelihood[0])
+    np.testing.assert_allclose(pairs.track_log[0, 0], want.log_likelihood[0])
 
 
 def test_tracks_whose_numbers_are_not_finite_are_found():
     tracker, known, _ = predicted(scan(6, PLACES))
     (block,) = known.rows.blocks
     block.x[0, 2, 5], block.P[2, 0, 0, 3] = np.nan, np.inf
-    assert known.finite().tolist() == [False, True, False]
+    assert known.is_finite().tolist() == [False, True, False]
 
 
 def test_the_account_of_innovations():
@@ -105,7 +110,7 @@ def test_the_account_of_innovations():
     before[2], before[3], z[3] = np.nan, [9.0, -12.0], z[3] + 40.0  # never seen; sharp turns
     tentative = np.array([False, True, False, False])
     old = FixConsistency(MEMORY - 1.0, 30.0, 40.0, 5.0, 35.0)
-    white, new = watch(mean, covariance, z, R, before, tentative, old)
+    white, new = whiten_innovations(mean, covariance, z, R, before, tentative, old)
     root = np.linalg.cholesky(covariance + R)
     now = np.linalg.solve(root, (z - mean)[..., None])[..., 0]
     np.testing.assert_allclose(white, now)

@@ -25,14 +25,14 @@ from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
-from sonar_imm.trackers.diver.births import begun_anew
+from sonar_imm.trackers.diver.births import restart_track
 from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.depth import ambiguous, spread
-from sonar_imm.trackers.diver.estimate import published
-from sonar_imm.trackers.diver.fixes import _staying
+from sonar_imm.trackers.diver.depth import ambiguous_depths, respread_depths
+from sonar_imm.trackers.diver.estimate import published_state
+from sonar_imm.trackers.diver.fixes import _protected_rows
 from sonar_imm.trackers.diver.instruments import Instruments
-from sonar_imm.trackers.diver.known import outputs
+from sonar_imm.trackers.diver.known import track_outputs
 from sonar_imm.trackers.diver.models import build_models, START_DEPTHS
 from sonar_imm.trackers.diver.scan import ping_measurements, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -93,13 +93,13 @@ def test_correlated_with_x_and_y_it_is_the_kalman_filter_of_all_three():
     tracker, models = DiverTracker(config), build_models(config)
     R, n = spatial(0.5, 0.6, -0.3), models.n
     H = np.zeros((3, n))
-    H[:2], H[2, models.height] = models.fix[0], 1.0
+    H[:2], H[2, models.height] = models.fix_matrix[0], 1.0
     mean, P = None, None
     for second in range(1, 30):
         z = rng.multivariate_normal([0.2 * second, 0.0, -10.0], R)
         estimate = last(tracker, [Fix(stamp_ns=second * 10**9, position=z, covariance=R)])
         if mean is None:
-            x0, P0, _ = models.new_tracks(z[None, :2], R[None, :2, :2])
+            x0, P0, _ = models.initial_states(z[None, :2], R[None, :2, :2])
             mean, P = x0[0, 0, 0], P0[0, 0, 0]
             h = models.height
             mean[h], P[h, h], P[h, :2], P[:2, h] = z[2], R[2, 2], R[2, :2], R[2, :2]
@@ -228,7 +228,7 @@ def test_heights_that_are_wild_all_the_time_are_said():
     tracker = DiverTracker(DiverConfig(dimensions=3, max_tracks=1, depth_max=100.0))
     fixes = [fix(k, -10.0 - 30.0 * (k % 3 == 0), spatial(0.09)) for k in range(1, 40)]
     assert last(tracker, fixes).state[0, Z] == pytest.approx(-10.0, abs=1.0)
-    assert [text for text in tracker.warnings() if 'were refused' in text]
+    assert [text for text in tracker.warnings() if 'were rejected' in text]
 
 
 def test_late_fixes_give_the_bits_of_sorted_ones():
@@ -322,20 +322,20 @@ def pings(path_std=0.3):
 def after_spread(state, models, tracker, path_std=0.3):
     layout = tracker._layouts(state)
     seen = ping_measurements(pings(path_std), np.arange(1), tracker.config, models, layout)
-    return spread(state, seen, layout, models)
+    return respread_depths(state, seen, layout, models)
 
 
 def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
     state, models, tracker = banked([-9.5, -9.6, -2.0], [4.0, 3.5, 0.1], [0.6, 0.4, 0.0])
     after = after_spread(state, models, tracker)
     maps = tuple(part.outputs for part in models.parts)
-    for before, now in zip(outputs(state.rows, maps), outputs(after.rows, maps)):
+    for before, now in zip(track_outputs(state.rows, maps), track_outputs(after.rows, maps)):
         assert now == pytest.approx(before, abs=1e-9)
-    x, P = models.common(after.rows.blocks)
+    x, P = models.to_common(after.rows.blocks)
     assert np.diff(x[:, 0, models.height]) == pytest.approx([2.0, 2.0], abs=0.1)
     assert after.rows.weight == pytest.approx(np.full(3, 1 / 3))
-    assert after.rows.models() == pytest.approx(state.rows.models())
-    assert (np.linalg.eigvalsh(P) > 0.0).all() and after['spreads'].tolist() == [1]
+    assert after.rows.model_probabilities() == pytest.approx(state.rows.model_probabilities())
+    assert (np.linalg.eigvalsh(P) > 0.0).all() and after['respreads'].tolist() == [1]
 
 
 @pytest.mark.parametrize(
@@ -349,7 +349,7 @@ def test_copies_that_agree_are_spread_with_the_same_mean_and_covariance():
 def test_other_copies_stay(means, variances, path_std):
     state, models, tracker = banked(means, variances, [0.4, 0.3, 0.3])
     after = after_spread(state, models, tracker, path_std)
-    assert after.rows is state.rows and not after['spreads'].any()
+    assert after.rows is state.rows and not after['respreads'].any()
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_other_copies_stay(means, variances, path_std):
 )
 def test_two_depths_are_said_where_there_is_a_gap_between_them(means, variances, weights, two):
     state, models, _ = banked(means, variances, weights)
-    assert ambiguous(state, models).tolist() == [two]
+    assert ambiguous_depths(state, models).tolist() == [two]
 
 
 def past_the_transmitter(seed):
@@ -399,8 +399,8 @@ def test_depth_hypotheses_neither_exchange_weight_nor_borrow():
         known = tracker._stream.state
         assert len(known.rows) == START_DEPTHS * len(known) and not len(known.borrowed)
     improbable = known.rows.replace(logw=np.log([1e-6, 0.5, 0.5 - 1e-6]))
-    assert _staying(improbable).all()
-    scan = Scan.of([], tracker.config, Clutters())
+    assert _protected_rows(improbable).all()
+    scan = Scan.from_items([], tracker.config, Clutters())
     after = tracker._predict(known, scan, known.stamp_ns + 10**9)
     np.testing.assert_array_equal(after.rows.logw, known.rows.logw)
 
@@ -430,10 +430,10 @@ def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
     known, ping = tracker._stream.state, pings[-1]
     free, layout = np.zeros(len(ping), bool), Instruments().layout(config, tracker.models)
     for nis, again in ((10.0, 0), (1e3, 1)):
-        known = known.put(nis=np.array([nis]), nis_dof=np.array([4], np.uint16))
-        after = begun_anew(known, ping, free, tracker.models, layout, config)
-        assert after['spreads'][0] - known['spreads'][0] == again
+        known = known.with_columns(nis=np.array([nis]), nis_dof=np.array([4], np.uint16))
+        after = restart_track(known, ping, free, tracker.models, layout, config)
+        assert after['respreads'][0] - known['respreads'][0] == again
     assert len(after.rows) == START_DEPTHS and (after.rows.parent == -1).all()
-    mean, covariance = published(after, tracker.models)
+    mean, covariance = published_state(after, tracker.models)
     error = mean[0, :3] - places[ping.stamp_ns][:3]
     assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0

@@ -27,8 +27,8 @@ from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver import fixes
-from sonar_imm.trackers.diver.estimate import published
-from sonar_imm.trackers.diver.known import repaired
+from sonar_imm.trackers.diver.estimate import published_state
+from sonar_imm.trackers.diver.known import repair_covariances
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SETS = [
@@ -87,7 +87,7 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
         np.testing.assert_allclose(total, 1.0, rtol=1e-9)
         np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
         for track in range(len(known)):
-            own = rows.key['scale'][known.rows_of(track)]
+            own = rows.key['scale'][known.row_indices(track)]
             own = np.append(own, borrowed.key[borrowed.target == track])
             assert np.array_equal(np.sort(own), scales)
         old = rows.parent >= 0
@@ -184,17 +184,21 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
     known = tracker._stream.state
     rows = known.rows
     first = rows.first[rows.target]
-    same = tuple(block.rows(first) for block in rows.blocks)
+    same = tuple(block.select(first) for block in rows.blocks)
     agreeing = known.replace(rows=rows.replace(blocks=same, mu=rows.mu[first]))
-    one = rows.take(rows.first)
+    one = rows.select(rows.first)
     stated = np.ones(len(one))
     single = known.replace(
         rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': stated})
     )
-    for ours, due in zip(published(agreeing, tracker.models), published(single, tracker.models)):
+    for ours, due in zip(
+        published_state(agreeing, tracker.models), published_state(single, tracker.models)
+    ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
-    spread = fixes.spread_over_scales(agreeing)
-    for ours, due in zip(published(spread, tracker.models), published(single, tracker.models)):
+    spread = fixes.redistribute_weights(agreeing)
+    for ours, due in zip(
+        published_state(spread, tracker.models), published_state(single, tracker.models)
+    ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
 
 
@@ -205,7 +209,7 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
     run(tracker, made[:20])
     known = tracker._stream.state
     P = [block.P.copy() for block in known.rows.blocks]
-    row = int(known.rows_of(1)[0])
+    row = int(known.row_indices(1)[0])
 
     def spoil(P, of=slice(None)):
         across = 1.5 * np.sqrt(P[row, 0, 0, of] * P[row, 1, 1, of])
@@ -213,8 +217,8 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
 
     spoil(P[0], 2)
     blocks = tuple(Gaussians(block.x, part) for block, part in zip(known.rows.blocks, P))
-    after, count = repaired(blocks)
-    assert count == 1 and repaired(after)[1] == 0
+    after, count = repair_covariances(blocks)
+    assert count == 1 and repair_covariances(after)[1] == 0
     for block, before in zip(after, blocks):
         different = np.argwhere((block.P != before.P).any(axis=(1, 2))).tolist()
         assert different == ([[row, 2]] if block is after[0] else [])
@@ -223,9 +227,11 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
     spoilt = known.replace(rows=known.rows.replace(blocks=blocks))
     read_only(spoilt)
     last = made[20].stamp_ns, [made[20]]
-    healthy, other = (tracker._step(each, *last) for each in (known, spoilt))
+    healthy, other = (tracker._process_scan(each, *last) for each in (known, spoilt))
     assert other.counts['repairs'] > healthy.counts.get('repairs', 0)
-    for ours, due in zip(published(other, tracker.models), published(healthy, tracker.models)):
+    for ours, due in zip(
+        published_state(other, tracker.models), published_state(healthy, tracker.models)
+    ):
         np.testing.assert_array_equal(ours[[0, 2]], due[[0, 2]])
         assert np.isfinite(ours).all()
 

@@ -43,10 +43,10 @@ def test_every_set_is_consistent(model_set):
         np.testing.assert_array_equal(Q, np.swapaxes(Q, -1, -2))
         assert np.linalg.eigvalsh(Q).min() > -1e-9 * max(Q.max(), 1e-9)
         np.testing.assert_allclose(models.chain.transition(dt).sum(axis=1), 1.0)
-    x, P, mu = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
+    x, P, mu = (item[0] for item in models.initial_states(CENTRE[None], SPREAD[None]))
     mean, covariance = imm.combine(x, P, mu, models.E)
-    assert len(mean) == models.copies
-    np.testing.assert_allclose(mean[:, :2], np.tile(CENTRE, (models.copies, 1)))
+    assert len(mean) == models.rows_per_track
+    np.testing.assert_allclose(mean[:, :2], np.tile(CENTRE, (models.rows_per_track, 1)))
     for row, scale in zip(covariance, models.scales):
         np.testing.assert_allclose(row[:2, :2], scale * SPREAD)
 
@@ -56,7 +56,7 @@ def test_ten_short_steps_are_one_long_step(model_set):
     models = build_models(
         DiverConfig(model_set=model_set, speed_noise=0.2, covariance_scales=(1.0,))
     )
-    x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
+    x, P, _ = (item[0] for item in models.initial_states(CENTRE[None], SPREAD[None]))
     long_x, long_P, _ = imm.predict(x, P, *models.motion(1.0))
     short_x, short_P = x, P
     for _ in range(10):

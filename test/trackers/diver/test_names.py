@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
-from sonar_imm.trackers.diver.names import patience
+from sonar_imm.trackers.diver.names import scans_to_merge
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SECOND = 10**9
@@ -58,7 +58,7 @@ def test_single_fixes_with_a_name_go_to_their_own_track():
 
 def test_scans_needed_before_two_tracks_are_one_follow_from_p_d():
     for p_detection in (0.5, 0.7, 0.9):
-        scans = patience(p_detection)
+        scans = scans_to_merge(p_detection)
         apart = (1.0 - p_detection**2) ** np.array([scans, scans - 1])
         assert apart[0] <= 1e-3 < apart[1]
 

@@ -27,14 +27,14 @@ from sonar_imm.acoustics.localisation import localise
 from sonar_imm.estimation.covariance import are_sound
 from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.trackers.diver.arrivals import (
-    _starts,
+    _start_positions,
+    apply_updates,
+    find_optima,
+    make_track_update,
     Mixture,
-    optima,
     PingUpdate,
-    Taking,
-    taking_of,
+    TrackUpdate,
     update_by_ping,
-    with_takings,
 )
 from sonar_imm.trackers.diver.explanations import PingMeasurements, subset_ping
 from sonar_imm.trackers.diver.heavy_tails import student_t_ping
@@ -186,10 +186,10 @@ def test_the_order_of_arrivals_changes_no_bit(passive, many):
 
 def begun(models, position, covariance, from_fix=True):
     """The hypotheses of a diver who is first seen."""
-    x, P, mu = models.new_tracks(position[None], covariance[None], from_fix)
+    x, P, mu = models.initial_states(position[None], covariance[None], from_fix)
     N, n = x[0, ..., 0].size, x.shape[-1]
-    scale = np.repeat(np.resize(models.scales, models.copies), N // models.copies)
-    return Mixture(x.reshape(N, n), P.reshape(N, n, n), mu.ravel() / models.copies, scale)
+    scale = np.repeat(np.resize(models.scales, models.rows_per_track), N // models.rows_per_track)
+    return Mixture(x.reshape(N, n), P.reshape(N, n, n), mu.ravel() / models.rows_per_track, scale)
 
 
 def test_many_good_arrivals_outvote_any_prior():
@@ -204,7 +204,7 @@ def test_many_good_arrivals_outvote_any_prior():
     before = begun(models, np.array([-30.0, 10.0]), 25.0 * np.eye(2))
     after = update_by_ping(before, numbers, config, layout).after
     assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
-    assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
+    assert np.hypot(*(find_optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
 
 
 @pytest.mark.parametrize('std', [1.0, 1e2, 1e6, 1e9])
@@ -221,9 +221,9 @@ def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
     numbers = ping_measurements(measurement, np.arange(len(twins)), config, models, layout)
     before = begun(models, (origin + at)[:2] + 1e-4, std**2 * np.eye(2))
     after = PingUpdate(before, np.log(before.mu), np.ones(len(numbers.row)), 0.0, 0)
-    taking = taking_of(before, after, numbers, config)
-    assert taking.dof == len(numbers.row)
-    assert 0.0 <= taking.nis <= taking.dof
+    update = make_track_update(before, after, numbers, config)
+    assert update.dof == len(numbers.row)
+    assert 0.0 <= update.nis <= update.dof
 
 
 def test_each_row_keeps_a_weight_whatever_the_arrivals_say():
@@ -234,8 +234,8 @@ def test_each_row_keeps_a_weight_whatever_the_arrivals_say():
     tracker.process(Fix(stamp_ns=10**9, position=np.zeros(3)))
     known, log = tracker._stream.state, np.array([-1.0, -2.0, -901.0, -900.0, -np.inf, -np.inf])
     before = Mixture(*(np.zeros((6, *shape)) for shape in ((6,), (6, 6), (), ())))
-    taking = Taking(PingUpdate(before, log, np.ones(4), 0.0, 0), np.ones(4, bool), 0.0, 0)
-    rows = with_takings(known, {0: taking}, tracker.models).rows
+    update = TrackUpdate(PingUpdate(before, log, np.ones(4), 0.0, 0), np.ones(4, bool), 0.0, 0)
+    rows = apply_updates(known, {0: update}, tracker.models).rows
     np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
     np.testing.assert_allclose(rows.mu[0, 0] / rows.mu[0, 1], np.exp(1.0))
     np.testing.assert_allclose(rows.mu[1, 0] / rows.mu[1, 1], np.exp(-1.0))
@@ -315,7 +315,7 @@ def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
     measurement = ping_of(at, RECEIVERS, tx)
     every = np.arange(len(RECEIVERS))
     measured = ping_measurements(measurement, every, config, models, layout).measured
-    starts = _starts(measured, passive=False)
+    starts = _start_positions(measured, passive=False)
     first = np.argmin(measured.value)
     ways = [
         np.linalg.norm(starts - place[first, :2], axis=1) for place in (measured.tx, measured.rx)
@@ -334,7 +334,9 @@ def test_the_state_does_not_grow_with_numbers_that_wander():
     layout = known.layout(config, models)
     assert len(known.known) == MOST_RECEIVERS
     assert len(layout.mask) <= models.n + 1 + 3 * MOST_RECEIVERS
-    first, last = layout.columns(models, np.array([101, 299]), False, np.zeros(2, bool))
+    first, last = layout.measurement_columns(
+        models, np.array([101, 299]), False, np.zeros(2, bool)
+    )
     assert (first != last).sum() == 2  # the errors of the last one have no place
 
 

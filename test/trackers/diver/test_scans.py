@@ -22,7 +22,7 @@ import pytest
 
 from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
-from sonar_imm.trackers.diver import fixes, forgetting
+from sonar_imm.trackers.diver import fixes, pruning
 from sonar_imm.trackers.diver import tracker as tracker_module
 from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.innovations import FixConsistency, MEMORY
@@ -122,13 +122,13 @@ def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
     config = DiverConfig(max_tracks=most, covariance_scales=(1.0, 3.0, 10.0), **densities)
     tracker = DiverTracker(config)
     run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
-    now = Scan.of([scan(11, (7.5, 1.9))], tracker.config, Clutters())
+    now = Scan.from_items([scan(11, (7.5, 1.9))], tracker.config, Clutters())
     known, (group,) = tracker._predict(tracker._stream.state, now, 11 * SECOND), now.fixes
-    fixes.associating(tracker.models, 'jipda')(known, group)
+    fixes.association_stage(tracker.models, 'jipda')(known, group)
     p, r = config.detection_probability, known['existence'][0]
-    seen = r * p * np.exp(group.pairs.whole[0, 0]) / (1e-5 + (most - 1) * 1e-4)
-    assert 0.01 < group.found.beta[0, 0] < 0.99
-    assert group.found.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
+    seen = r * p * np.exp(group.pairs.track_log[0, 0]) / (1e-5 + (most - 1) * 1e-4)
+    assert 0.01 < group.association.beta[0, 0] < 0.99
+    assert group.association.beta[0, 0] == pytest.approx(seen / (seen + 1.0 - r * p), rel=1e-9)
 
 
 def test_a_diver_is_confirmed_by_existence_and_evidence():
@@ -247,13 +247,16 @@ def test_the_column_of_fixes_may_be_mixed_with_single_fixes():
 def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     tracker = DiverTracker(DiverConfig())
     tracker.process(scan(1, (0.0, 0.0), (20.0, 0.0), (40.0, 0.0)))
-    known, (group,) = tracker._stream.state, Scan.of([scan(2)], tracker.config, Clutters()).fixes
+    known, (group,) = (
+        tracker._stream.state,
+        Scan.from_items([scan(2)], tracker.config, Clutters()).fixes,
+    )
     status = [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
     known = known.replace(life=evolve(known.life, status=np.array(status, np.uint8)))
-    known = known.put(existence=np.array([np.nan, np.nan, 0.3]))
-    fixes.associating(tracker.models, 'jipda')(known, group)
+    known = known.with_columns(existence=np.array([np.nan, np.nan, 0.3]))
+    fixes.association_stage(tracker.models, 'jipda')(known, group)
     r, missed = np.array([0.5, 0.9, 0.3]), 1.0 - tracker.config.detection_probability
-    np.testing.assert_allclose(group.found.exists, r * missed / (r * missed + 1.0 - r))
+    np.testing.assert_allclose(group.association.exists, r * missed / (r * missed + 1.0 - r))
 
 
 def test_what_is_stated_is_scaled_in_scans_as_in_single_fixes():
@@ -283,7 +286,7 @@ def test_tracks_whose_numbers_are_not_finite_end_and_are_counted(monkeypatch):
     for second in range(1, 6):
         tracker.process(scan(second, (0.1 * second, 0.0), (40.0, 0.0)))
     with monkeypatch.context() as patch:
-        patch.setattr(Known, 'finite', lambda known: np.arange(len(known)) != 1)
+        patch.setattr(Known, 'is_finite', lambda known: np.arange(len(known)) != 1)
         (estimate,) = tracker.process(scan(6, (0.6, 0.0), (40.0, 0.0)))
     assert ids_of(estimate) == [1] and tracker.health()['broken_tracks'] == 1
     (estimate,) = tracker.process(scan(7, (0.7, 0.0), (40.0, 0.0)))
@@ -361,7 +364,7 @@ def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
     tracker = DiverTracker(DiverConfig(history=0.0))
     for second in (1, 2):
         tracker.process(scan(second, (0.0, 0.0)))
-    real, steps = tracker_module.crossed, 0
+    real, steps = tracker_module.predict_over, 0
 
     def crossed(*arguments):
         nonlocal steps
@@ -369,7 +372,7 @@ def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
         steps = len(made)
         return [step._replace(repairs=k) for k, step in enumerate(made, start=1)]
 
-    monkeypatch.setattr(tracker_module, 'crossed', crossed)
+    monkeypatch.setattr(tracker_module, 'predict_over', crossed)
     tracker.process(scan(8, (0.0, 0.0)))
     assert steps > 2
     assert tracker.health()['covariance_repairs'] == steps * (steps + 1) // 2
@@ -380,13 +383,13 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
     nobody = DiverTracker(DiverConfig())._stream.state
     mean = np.array([[0.0, 0.0], [50.0, 0.0], [50.1, 0.0], [0.1, 0.0]])
     now = nobody.replace(life=evolve(nobody.life, track_id=np.array([1, 2, 3, 4], np.uint32)))
-    now = now.put(
+    now = now.with_columns(
         target_id=np.full(4, NOBODY),
         near_to=np.array([0, 1, 1, 1]),
         near_for=np.array([0, 5, 5, 5]),
     )
     tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
-    near_to, near_for = forgetting.coalescence(now, tentative, mean, wide, [])
+    near_to, near_for = pruning.count_near_scans(now, tentative, mean, wide, [])
     assert near_to.tolist() == [0, 0, 2, 1]
     assert near_for.tolist() == [0, 0, 1, 6]
 
@@ -395,12 +398,12 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
     lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
     for item in (pessimistic, lasting):
-        assert 'state fix_bias_std' in item.warnings(False)[0]
+        assert 'set fix_bias_std' in item.warnings(False)[0]
         assert item.warnings(True) == []
         assert item._replace(number=0.9 * MEMORY).warnings(False) == []
     optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
     for stated in (False, True):
-        assert 'raise covariance_scale' in optimistic.warnings(stated)[0]
+        assert 'Increase covariance_scale' in optimistic.warnings(stated)[0]
     assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []
 
 

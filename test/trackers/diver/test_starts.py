@@ -106,7 +106,7 @@ def test_too_many_are_counted_and_said():
     assert last.extras['track_id'].tolist() == [1, 2, 3]
     assert tracker.health()['not_started'] == 2
     assert tracker.warnings() == [
-        '2 starts began no track: there are max_tracks (3) confirmed ones'
+        '2 starts ignored: max_tracks (3) tracks are confirmed. Increase max_tracks'
     ]
 
 

@@ -23,7 +23,7 @@ from sonar_imm.estimation.consistency import average_bounds
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS
-from sonar_imm.trackers.diver.known import crossed, outputs
+from sonar_imm.trackers.diver.known import predict_over, track_outputs
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
@@ -215,11 +215,11 @@ def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns():
     for second in range(1, 8):
         tracker.process(fix(second, 0.75 * second, 0.2 * second))
     before = tracker._stream.state
-    learnt, mu = before['learnt'][0].copy(), before.rows.models()[0]
+    learnt, mu = before['learnt'][0].copy(), before.rows.model_probabilities()[0]
     tracker.process(fix(8, 500.0, 500.0))  # a false detection far away
     missed = tracker._stream.state
     assert missed.life.track_id[0] == 1 and missed['nis_dof'][0] == 0
-    assert not np.array_equal(missed.rows.models()[0], mu)
+    assert not np.array_equal(missed.rows.model_probabilities()[0], mu)
     assert np.array_equal(missed['learnt'][0], learnt)
     tracker.process(fix(9, 0.75 * 9, 0.2 * 9))
     assert not np.array_equal(tracker._stream.state['learnt'][0], learnt)
@@ -317,8 +317,8 @@ def test_a_long_gap_is_no_straight_line():
     def spread(longest):
         models = tracker.models
         rows = models, tracker._chain, before.rows, before['learnt']
-        *_, last = crossed(*rows, dt, longest)
-        _, covariance = outputs(last.rows, tuple(part.outputs for part in models.parts))
+        *_, last = predict_over(*rows, dt, longest)
+        _, covariance = track_outputs(last.rows, tuple(part.outputs for part in models.parts))
         return np.trace(covariance[0, :2, :2])
 
     assert spread(1.0) == pytest.approx(walked, rel=0.1)
