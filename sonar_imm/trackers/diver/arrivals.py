@@ -39,6 +39,7 @@ from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
 from . import coverage, offsets
 from .config import DiverConfig
+from .coverage_map import Coverage, DetectionProbability
 from .depth import replace_rows, respread_depths
 from .explanations import (
     expect_measurements,
@@ -80,7 +81,7 @@ NEAR = 28.0
 TAKEN = 0.5
 """Minimum inlier probability of a measurement that a track takes."""
 
-EVERYWHERE: Mapping[str, coverage.Coverage] = {}
+EVERYWHERE: Mapping[str, Coverage] = {}
 """No configured coverage."""
 
 EXCLUDED = -1
@@ -153,7 +154,7 @@ def associate_and_update(
     ping: Arrivals,
     config: DiverConfig,
     models: ModelSet,
-    covered: Mapping[str, coverage.Coverage] = EVERYWHERE,
+    covered: Mapping[str, Coverage] = EVERYWHERE,
 ) -> tuple[Known, BoolArray]:
     """Update the tracks by a ping, and return its free rows (n,). covered: coverage by sensor.
 
@@ -175,7 +176,7 @@ def _associate_ping(
     ping: Arrivals,
     config: DiverConfig,
     models: ModelSet,
-    detected: coverage.DetectionProbability | None,
+    detected: DetectionProbability | None,
 ) -> tuple[Known, BoolArray]:
     """Update the tracks by received arrivals. detected: None for a constant probability."""
     name, rows, free = tag_id(ping), np.arange(len(ping)), np.ones(len(ping), bool)

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby, islice, product
 import math
-from typing import NamedTuple
 
 from attrs import evolve
 import numpy as np
@@ -43,8 +42,8 @@ from .known import Feature, Known, track_positions
 from .models import ModelSet, start_depths, VELOCITY
 from .scan import (
     bearing_variance,
+    Birth,
     Group,
-    Height,
     Heights,
     ping_measurements,
     Scan,
@@ -65,29 +64,6 @@ LOST = 1e-9
 
 MOST_FOUND = 10
 """Maximum number of positions from combined echoes of one ping."""
-
-
-class Birth(NamedTuple):
-    """Position of a possible new track."""
-
-    position: FloatArray
-    """(2,) m."""
-    covariance: FloatArray
-    """(2, 2) m^2."""
-    ping: Arrivals | None = None
-    """The ping of the position; None for a fix."""
-    rows: IndexArray | None = None
-    """Rows of the ping that give the position."""
-    existence: float = math.nan
-    """Probability that the target exists; NaN if hits are counted."""
-    target_id: int = NOBODY
-    """ID of the target, or `NOBODY`."""
-    measured: bool = True
-    """False for a `Start` message."""
-    height: Height | None = None
-    """The z of the fix; None if the fix has no z."""
-    seen_by: tuple[str, FloatArray] | None = None
-    """Name and position (2,) of a sensor with a bearing error; None for others."""
 
 
 def spawn_at_fixes(known: Known, group: Group) -> Known:

@@ -26,7 +26,7 @@ tenth of `CLUTTER`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,10 +34,8 @@ from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...measurements import NOBODY
 from .config import CLUTTER, DiverConfig
-
-if TYPE_CHECKING:
-    from .known import Known
-    from .scan import Group, Scan
+from .known import Known
+from .scan import Group, Scan
 
 MOST = 1e-2
 """Upper limit of the density, 1/m^2: one false fix in every second scan inside a typical gate of a
@@ -130,6 +128,10 @@ class Clutters(NamedTuple):
     def get(self, sensor: str) -> Clutter | None:
         """Return the statistics of a sensor; None for none."""
         return dict(self.by_sensor).get(sensor)
+
+    def densities(self) -> dict[str, float]:
+        """Return the estimated clutter density of each sensor, 1/m^2."""
+        return {sensor: clutter.density for sensor, clutter in self.by_sensor}
 
     def with_sensor(self, sensor: str, clutter: Clutter) -> Clutters:
         """Replace the statistics of a sensor.

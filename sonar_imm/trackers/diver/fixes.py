@@ -37,12 +37,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from ...estimation import bank, jipda
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
 from ...estimation.bank import Innovations
 from ...estimation.rows import (
@@ -61,6 +60,7 @@ from .innovations import FixConsistency, whiten_innovations
 from .known import Feature, Known, repair_covariances, row_outputs
 from .models import ModelSet
 from .offsets import RecentPairs
+from .pairs import Association, Assumptions, Pairs
 from .scan import Group
 
 FEATURES = {
@@ -104,89 +104,6 @@ quality is detected."""
 MIN_PUBLISHED_SCALE = 1.0
 """Smallest scale whose rows contribute to the published covariance. Smaller scales also fit
 time-correlated errors, so they contribute to the mean only."""
-
-
-class Assumptions(NamedTuple):
-    """All A assumptions of T tracks, in order of the tracks."""
-
-    row: IndexArray
-    """(A,) row whose states are used."""
-    scale: FloatArray
-    """(A,) scale of the covariances."""
-    logw: FloatArray
-    """(A,) logarithm of the weight."""
-    target: IntArray
-    """(A,) track index."""
-    has_row: BoolArray
-    """(A,) True for assumptions with a row of their own, False for borrowed ones."""
-
-    @classmethod
-    def from_rows(cls, rows: Rows, borrowed: Borrowed) -> Assumptions:
-        """Return the assumptions of rows and of the borrowed list."""
-        N, scale = len(rows), rows.key['scale']
-        if not len(borrowed):
-            return cls(np.arange(N), scale, rows.logw, rows.target, np.ones(N, np.bool_))
-        target = np.concatenate([rows.target, borrowed.target])
-        order = np.argsort(target, kind='stable')
-        return cls(
-            np.concatenate([np.arange(N), borrowed.find_lenders(rows, 'scale')])[order],
-            np.concatenate([scale, borrowed.key])[order],
-            np.concatenate([rows.logw, borrowed.logw])[order],
-            target[order],
-            order < N,
-        )
-
-
-class Pairs(NamedTuple):
-    """Comparison of D fixes with assumptions, as p pairs in order of the assumptions."""
-
-    among: Assumptions
-    assumption: IndexArray
-    """(p,) index of the assumption."""
-    fix: IndexArray
-    """(p,) index of the fix."""
-    innovations: tuple[Innovations, ...]
-    """Innovations of the pairs for each block of models."""
-    log: FloatArray
-    """(p,) log density of the fix under the assumption."""
-    track_log: FloatArray
-    """(T, D) log density of each fix under each track."""
-    nis: FloatArray | None
-    """(T, D) smallest NIS of any model; None for density gating."""
-
-
-class Association(NamedTuple):
-    """Association of D fixes with T tracks."""
-
-    beta: FloatArray
-    """(T, D) probability of each pair."""
-    missed: FloatArray
-    """(T,) probability that the target exists and was not detected."""
-    fix: IntArray
-    """(T,) most probable fix of a track with a hit; -1 for no hit."""
-    free: BoolArray
-    """(D,) True for fixes that may start a track."""
-    existence: FloatArray | None
-    """(D,) existence of a track started at the fix; None if hits are counted."""
-    score: FloatArray
-    """(T,) new score of each track."""
-    is_joint: bool = False
-    """True if existence follows from the probabilities."""
-
-    @property
-    def hit(self) -> BoolArray:
-        """(T,) True if a hit is more probable than a miss."""
-        return self.fix >= 0
-
-    @property
-    def claimed(self) -> FloatArray:
-        """(D,) probability that the fix belongs to any track."""
-        return np.asarray(self.beta.sum(axis=0))
-
-    @property
-    def exists(self) -> FloatArray:
-        """(T,) probability that the target exists, detected or missed."""
-        return self.missed + self.beta.sum(axis=1)
 
 
 # -- comparison ----------------------------------------------------------------------------------

@@ -23,9 +23,9 @@ The message order of arrivals does not change the result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 from attrs import define, evolve, field
 import numpy as np
@@ -33,17 +33,13 @@ import numpy as np
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, Start
-from .clutter import Clutters
 from .config import CLUTTER, DiverConfig
+from .coverage_map import DetectionProbability
 from .explanations import PingMeasurements
 from .instruments import Layout
+from .known import Known, Prediction
 from .models import ModelSet
-
-if TYPE_CHECKING:
-    from .births import Birth
-    from .coverage import DetectionProbability
-    from .fixes import Association, Pairs
-    from .known import Known, Prediction
+from .pairs import Association, Pairs
 
 LEAST_VAR_TOA = 1e-13
 """Minimum variance of an arrival time, s^2: 0.5 mm of path. Below it, the joint covariance with a
@@ -105,6 +101,29 @@ class Heights(NamedTuple):
         if not math.isfinite(self.value[d]):
             return None
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
+
+
+class Birth(NamedTuple):
+    """Position of a possible new track."""
+
+    position: FloatArray
+    """(2,) m."""
+    covariance: FloatArray
+    """(2, 2) m^2."""
+    ping: Arrivals | None = None
+    """The ping of the position; None for a fix."""
+    rows: IndexArray | None = None
+    """Rows of the ping that give the position."""
+    existence: float = math.nan
+    """Probability that the target exists; NaN if hits are counted."""
+    target_id: int = NOBODY
+    """ID of the target, or `NOBODY`."""
+    measured: bool = True
+    """False for a `Start` message."""
+    height: Height | None = None
+    """The z of the fix; None if the fix has no z."""
+    seen_by: tuple[str, FloatArray] | None = None
+    """Name and position (2,) of a sensor with a bearing error; None for others."""
 
 
 MOST_BIRTHS = 1.5
@@ -199,14 +218,14 @@ class Scan:
         cls,
         items: Sequence[Measurement],
         config: DiverConfig,
-        clutter: Clutters,
+        clutter: Mapping[str, float],
     ) -> Scan:
-        """Build the scan of `items`. clutter: estimated clutter of each sensor."""
+        """Build the scan of `items`. clutter: estimated clutter density of each sensor."""
         fixes, names = position_groups(items, config), []
         for group in fixes if config.pairing != 'gnn' else ():
-            found = clutter.get(group.sensor)
-            if group.target_id is None and found is not None:
-                group.learnt_clutter = found.density
+            density = clutter.get(group.sensor)
+            if group.target_id is None and density is not None:
+                group.learnt_clutter = density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()

@@ -64,6 +64,7 @@ from . import (
     restart,
 )
 from .config import DiverConfig
+from .coverage_map import configured_coverage
 from .georeferencing import Georeferencer
 from .innovations import FixConsistency
 from .instruments import Instruments, Layout
@@ -113,7 +114,7 @@ class DiverTracker:
         def layouts(known: Known) -> Layout:
             return layout(known.memory['instruments'])
 
-        covered = coverage.configured_coverage(config)
+        covered = configured_coverage(config)
         self._associate = fixes.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
@@ -226,7 +227,7 @@ class DiverTracker:
 
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, previous.memory['clutter'])
+        scan = Scan.from_items(items, self.config, previous.memory['clutter'].densities())
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:

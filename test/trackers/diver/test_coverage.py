@@ -23,7 +23,7 @@ from scipy.stats import norm
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Arrivals, Fixes
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.diver import coverage
+from sonar_imm.trackers.diver import coverage, coverage_map
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.trackers.state_file import json_parameters
 
@@ -163,7 +163,7 @@ def test_what_is_left_of_a_track_by_a_half_plane_is_the_truncated_normal(edge):
     life = evolve(known.life, status=np.ones(1, np.uint8))
     known = known.replace(rows=known.rows.replace(blocks=(block,)), life=life)
     seen = coverage.detection_probability(
-        known, tracker.models, coverage.configured_coverage(config)[''], 0.9
+        known, tracker.models, coverage_map.configured_coverage(config)[''], 0.9
     )
     after = coverage.apply_misses(known, tracker.models, seen, np.ones(1), True)
     x, P = (part[0, ..., 0] for part in after.rows.blocks[0])
@@ -182,12 +182,12 @@ def test_what_is_left_of_a_track_by_a_half_plane_is_the_truncated_normal(edge):
 def test_tables_are_read_between_their_points(tmp_path):
     grid = [(x, y, 0.1 * x + 0.01 * y) for y in (0.0, 10.0, 30.0) for x in (0.0, 2.0, 5.0)]
     by_place = DiverConfig(coverage_file=written(tmp_path, 'a.csv', 'x,y,probability', grid))
-    at = coverage.configured_coverage(by_place)[''].probability
+    at = coverage_map.configured_coverage(by_place)[''].probability
     places = np.array([[0.0, 0.0], [3.5, 20.0], [5.0, 30.0], [5.1, 0.0], [1.0, -0.1]])
     assert at(places, 0.9) == pytest.approx([0.0, 0.55, 0.8, 0.0, 0.0])
     ranges = written(tmp_path, 'b.csv', 'range,probability', [(40, 0.5), (10, 0.9), (60, 0.0)])
     by_range = DiverConfig(coverage_file=ranges, coverage_sector=(100, 0, 180, 20, 0, 1e6))
-    at = coverage.configured_coverage(by_range)[''].probability
+    at = coverage_map.configured_coverage(by_range)[''].probability
     places = np.array([[98.0, 0.0], [75.0, 0.0], [50.0, 0.0], [30.0, 0.0], [125.0, 0.0]])
     assert at(places, 0.9) == pytest.approx([0.9, 0.7, 0.25, 0.0, 0.0])
 
@@ -200,7 +200,7 @@ def test_each_sensor_has_its_own():
             'right.coverage_sector': [0, 0, 180, 90, 0, 50],
         }
     )
-    found = coverage.configured_coverage(config)
+    found = coverage_map.configured_coverage(config)
     assert sorted(found) == ['left', 'right']
     place = np.array([-20.0, 1.0])
     assert [found[name].probability(place, 0.9) for name in ('left', 'right')] == [0.0, 0.9]

@@ -21,7 +21,6 @@ import numpy as np
 
 from sonar_imm.estimation import imm
 from sonar_imm.measurements import Fixes
-from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.fixes import associate_gnn, compare
 from sonar_imm.trackers.diver.innovations import (
     FARTHEST,
@@ -51,7 +50,7 @@ def predicted(item):
     tracker = DiverTracker(CONFIG)
     for second in range(1, 6):
         tracker.process(scan(second, PLACES + 0.5 * second))
-    now = Scan.from_items([item], tracker.config, Clutters())
+    now = Scan.from_items([item], tracker.config, {})
     known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
     return tracker, known, now.fixes[0]
 

@@ -26,7 +26,6 @@ from sonar_imm.estimation.gauss_markov import gauss_markov
 from sonar_imm.estimation.rows import LEAST_LOG
 from sonar_imm.measurements import Arrivals, Fix, Fixes, GeodeticFix, RelativeFix, Start
 from sonar_imm.trackers.diver.births import restart_track
-from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous_depths, respread_depths
 from sonar_imm.trackers.diver.estimate import published_state
@@ -400,7 +399,7 @@ def test_depth_hypotheses_neither_exchange_weight_nor_borrow():
         assert len(known.rows) == START_DEPTHS * len(known) and not len(known.borrowed)
     improbable = known.rows.replace(logw=np.log([1e-6, 0.5, 0.5 - 1e-6]))
     assert _protected_rows(improbable).all()
-    scan = Scan.from_items([], tracker.config, Clutters())
+    scan = Scan.from_items([], tracker.config, {})
     after = tracker._predict(known, scan, known.stamp_ns + 10**9)
     np.testing.assert_array_equal(after.rows.logw, known.rows.logw)
 

@@ -24,7 +24,6 @@ from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
 from sonar_imm.trackers.diver import fixes, pruning
 from sonar_imm.trackers.diver import tracker as tracker_module
-from sonar_imm.trackers.diver.clutter import Clutters
 from sonar_imm.trackers.diver.innovations import FixConsistency, MEMORY
 from sonar_imm.trackers.diver.known import Known
 from sonar_imm.trackers.diver.scan import position_groups, Scan
@@ -122,7 +121,7 @@ def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
     config = DiverConfig(max_tracks=most, covariance_scales=(1.0, 3.0, 10.0), **densities)
     tracker = DiverTracker(config)
     run(tracker, [scan(second, (0.5 * second, 0.0)) for second in range(1, 11)])
-    now = Scan.from_items([scan(11, (7.5, 1.9))], tracker.config, Clutters())
+    now = Scan.from_items([scan(11, (7.5, 1.9))], tracker.config, {})
     known, (group,) = tracker._predict(tracker._stream.state, now, 11 * SECOND), now.fixes
     fixes.association_stage(tracker.models, 'jipda')(known, group)
     p, r = config.detection_probability, known['existence'][0]
@@ -249,7 +248,7 @@ def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     tracker.process(scan(1, (0.0, 0.0), (20.0, 0.0), (40.0, 0.0)))
     known, (group,) = (
         tracker._stream.state,
-        Scan.from_items([scan(2)], tracker.config, Clutters()).fixes,
+        Scan.from_items([scan(2)], tracker.config, {}).fixes,
     )
     status = [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
     known = known.replace(life=evolve(known.life, status=np.array(status, np.uint8)))
