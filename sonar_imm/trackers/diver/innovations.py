@@ -130,8 +130,8 @@ class FixConsistency(NamedTuple):
             return [
                 f'fix innovations are too small or correlated: NIS {self.mean_nis:.2g} per '
                 f'coordinate (expected 1), lag-1 correlation {self.lag_1:.2g} (expected 0). If '
-                'the source filters its output, set fix_bias_std and fix_bias_time; otherwise '
-                'its covariances are too large'
+                'the source filters its output, set fix_bias_std; otherwise its covariances are '
+                'too large'
             ]
         return []
 
