@@ -182,7 +182,7 @@ def test_numbers(table):
     assert row.number('x') == 1.5 and row.optional('z') != row.optional('z')
     for name, words in (
         ('y', "y is 'abc', not a number"),
-        ('latitude', "lat is '59 25.8 N', not decimal degrees"),
+        ('latitude', "lat is '59 25.8 N', not a number"),
         ('z', 'z is empty'),
         ('vx', 'infinite'),
         ('depth', 'depth is empty'),

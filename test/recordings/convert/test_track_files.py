@@ -148,7 +148,10 @@ def test_truth_and_ignored_columns(tmp_path):
         ('{"type": "FeatureCollection", "features": [', 'damaged JSON'),
         ('{"type": "FeatureCollection", "features": [7, {"geometry": 3}]}', 'without a position'),
         ('<gpx><wpt lat="54" lon="10"></wpt></gpx>', 'nothing that could be converted'),
-        ('<gpx><wpt lat="154" lon="10"><time>2024-05-31T10:00:00Z</time></wpt></gpx>', 'swapped'),
+        (
+            '<gpx><wpt lat="154" lon="10"><time>2024-05-31T10:00:00Z</time></wpt></gpx>',
+            'look exchanged',
+        ),
         (
             '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">'
             '<!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;&b;&b;">]><gpx><wpt lat="1" lon="1">'
