@@ -40,7 +40,7 @@ USUAL_NAMES = {
         'fraction fractional_second fraction_of_second subsecond millisecond milliseconds '
         'millis msec microsecond microseconds usec nanosecond nanoseconds nsec millisekunde '
         'millisekunden mikrosekunden milliseconde millisecondes milisegundo milisegundos '
-        'millisekund millisekunder toa'
+        'millisekund millisekunder'
     ),
     'x': (
         'east easting px pos_x position_x utm_e utm_x utm_east utm_easting e ost rechtswert '
@@ -192,6 +192,11 @@ _UNITS = sorted({unit for units in UNITS.values() for unit in units}, key=len, r
 _UNIT = re.compile(f'_({"|".join(_UNITS)})(?=_|$)')
 _BRACKETS = re.compile(r'[\[(]([^\])]*)')
 
+FRACTIONS = {'mil': 10**6, 'msec': 10**6, 'mi': 10**3, 'usec': 10**3, 'nan': 1, 'nsec': 1}
+"""Nanoseconds of the unit of a column of parts of a second by the begin of its name, else s."""
+DAY_NAMES = {'datenum': 'datenum', 'matlab_time': 'datenum', 'excel_time': 'excel'}
+MONTH_FIRST = {'date', 'time', 'toa', 'tag_id'}
+"""Columns of an export of Lotek, which writes the month before the day."""
 NOTHING = ('', '-', '--', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', 'nil')
 """Cells without a value."""
 YES = (

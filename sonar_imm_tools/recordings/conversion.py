@@ -32,10 +32,11 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
-from .csv_table import BadRow, Row, Table
+from .csv_table import Row, Table
 from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
 from .sources import BagError
+from .times import BadRow
 from .writer import BagWriter
 
 T = TypeVar('T')

@@ -21,10 +21,9 @@ A row that cannot be read raises `BadRow`.
 from __future__ import annotations
 
 import codecs
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import csv
-from datetime import datetime, timedelta, timezone, tzinfo
 from decimal import Decimal
 import functools
 import itertools
@@ -32,15 +31,43 @@ import math
 from pathlib import Path
 import re
 from typing import Any, TextIO
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from attrs import frozen
 
 from sonar_imm.parameters import did_you_mean
 
-from .columns import ALIASES, factor_of, NO, NOTHING, plain, quantities_of, rank_of, YES
+from .columns import (
+    ALIASES,
+    DAY_NAMES,
+    factor_of,
+    FRACTIONS,
+    MONTH_FIRST,
+    name_of,
+    NO,
+    NOTHING,
+    plain,
+    quantities_of,
+    rank_of,
+    YES,
+)
 from .options import nanoseconds, option
 from .sources import BagError, start_of
+from .times import (
+    BadRow,
+    dated,
+    DAYS,
+    form_of,
+    HHMMSS,
+    hhmmss,
+    moment_ns,
+    ORDERS,
+    orders_of,
+    split_time,
+    text_of_days,
+    TIME_OF_DAY,
+    TIME_TEXT,
+    zone_of,
+)
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
@@ -55,26 +82,6 @@ _THOUSANDS = re.compile(r'[-+]?\d{1,3}(,\d{3})+$')
 _DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
 NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
 _ZERO = re.compile(r'[-+]?0*([.,]0*)?$')
-
-TIME_TEXT = re.compile(
-    r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$'
-)
-TIME_OF_DAY = re.compile(r'\d\d?:\d\d(:\d\d)?([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
-_DATES = (
-    (re.compile(r'(\d{4})[-/.](\d\d?)[-/.](\d\d?)$'), (1, 2, 3)),
-    (re.compile(r'(\d{4})(\d\d)(\d\d)$'), (1, 2, 3)),
-    (re.compile(r'(\d\d?)\.(\d\d?)\.(\d{4})$'), (3, 2, 1)),
-)
-"""Forms of a date that can be read in one way only, with the places of year, month and day."""
-
-
-class BadRow(ValueError):
-    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
-    reason."""
-
-    def __init__(self, why: str, reason: str = ''):
-        super().__init__(why)
-        self.reason = reason
 
 
 @frozen(kw_only=True)
@@ -93,7 +100,12 @@ class CsvOptions:
     time_zone: str = option('', 'ZONE',
         'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
     time_unit: str = option('', 'UNIT',
-        'Unit of numeric times in {what}: s, ms, us or ns.', choices=('', *TIME_UNITS))
+        'Unit of numeric times in {what}: s, ms, us or ns; HHMMSS for a time of day in one '
+        'number; datenum for days of MATLAB, excel for days of a spreadsheet.',
+        choices=('', *TIME_UNITS, HHMMSS, *DAYS))
+    date_order: str = option('', 'ORDER',
+        'Order of day, month and year in dates such as 05/06/24 in {what}.',
+        choices=('', *ORDERS))
     time_offset_ns: int = option(0, 'SECONDS',
         'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
     delimiter: str = option('', '',
@@ -103,9 +115,10 @@ class CsvOptions:
     # fmt: on
 
     def __attrs_post_init__(self) -> None:
-        if self.time_unit not in ('', *TIME_UNITS):
+        units = (*TIME_UNITS, HHMMSS, *DAYS)
+        if self.time_unit not in ('', *units):
             raise BagError(
-                f"the time unit must be one of {', '.join(TIME_UNITS)}, got '{self.time_unit}'"
+                f"the time unit must be one of {', '.join(units)}, got '{self.time_unit}'"
             )
         if self.time_zone:
             zone_of(self.time_zone)
@@ -212,6 +225,8 @@ class Row:
         stamp = moment_ns(self._moment(name), lambda: self._zone(name))
         if stamp is None:
             stamp = self.seconds_ns(name)
+        if name == 'stamp':
+            stamp = self._with_fraction(stamp)
         stamp += self.table.options.time_offset_ns
         if not stamp and self.table.counts_from_zero(name):
             stamp = 1  # a stamp of 0 means none in ROS
@@ -222,19 +237,47 @@ class Row:
             )
         return stamp
 
+    def _with_fraction(self, stamp_ns: int) -> int:
+        """A time with the part of a second that stands in a column of its own."""
+        unit = self.table.fraction_unit
+        if not unit:
+            return stamp_ns
+        own = round(self.number('fraction') * unit)
+        if stamp_ns % 10**9 == 0:
+            return stamp_ns + own
+        if abs(stamp_ns % 10**9 - own) > unit:
+            raise BadRow(
+                f'{self.table.header("stamp")} has another part of a second than '
+                f'{self.table.header("fraction")}'
+            )
+        return stamp_ns
+
     def _moment(self, name: str) -> str:
         """The text of a time, with the date of its own column where it has only a time of day."""
-        text = self.text(name)
-        if not TIME_OF_DAY.match(text):
-            date, _, clock = text.partition(' ')
-            written = not TIME_TEXT.match(text) and TIME_OF_DAY.match(clock.strip())
-            return dated(date, clock.strip(), self.table.header(name)) if written else text
+        text, form = self.text(name), self.table.time_form(name)
+        if TIME_TEXT.match(text):
+            return text
+        if parts := None if self.table.time_unit(name) else split_time(text):
+            return dated(*parts, self.table.header(name), self.table.date_order(name))
+        if form in DAYS:
+            try:
+                return text_of_days(Decimal(self._with_point(name)), form)
+            except (ArithmeticError, ValueError):
+                return text
+        clock = hhmmss(text) if form == HHMMSS else text
+        if form == HHMMSS and not clock:
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time as HHMMSS")
+        if not TIME_OF_DAY.match(clock):
+            return text
         if not self.table.has('date'):
             raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
-                'the date: add one, named date'
+                f"{self.table.header(name)} is '{text[:40]}', a time of day"
+                f'{" as HHMMSS" if form == HHMMSS else ""}, and no column holds the date: add '
+                'one, named date',
+                'no date',
             )
-        return dated(self.text('date'), text, self.table.header('date'))
+        order = self.table.date_order('date')
+        return dated(self.text('date'), clock, self.table.header('date'), order)
 
     def _zone(self, name: str) -> str:
         """The zone of a time that does not say it."""
@@ -265,6 +308,8 @@ class Table:
         self.cut_line = 0
         self._from_zero: dict[str, bool] = {}
         self._factors: dict[str, float] = {}
+        self._forms: dict[str, str] = {}
+        self._orders: dict[str, str] = {}
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """The number of its line, or of its record, and the cells of each row."""
@@ -358,10 +403,49 @@ class Table:
 
     def time_scale(self, name: str) -> int:
         """Nanoseconds in one unit of a time column."""
-        if self.options.time_unit:
-            return TIME_UNITS[self.options.time_unit]
+        return TIME_UNITS.get(self.time_unit(name), TIME_UNITS['s'])
+
+    def time_unit(self, name: str) -> str:
+        """The unit of a time column that the options or its header state, else empty."""
         suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
-        return TIME_UNITS[suffix.group(1) if suffix else 's']
+        return self.options.time_unit or (suffix.group(1) if suffix else '')
+
+    def time_form(self, name: str) -> str:
+        """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
+        name of `DAYS`. Raises `BagError` where that is not clear."""
+        unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
+        if unit or name not in self.index:
+            return unit if unit in (HHMMSS, *DAYS) else ''
+        if name not in self._forms:
+            cells = self.first_cells(self.index[name])
+            self._forms[name] = form_of(self.header(name), cells, self.has('date'))
+        return self._forms[name]
+
+    def date_order(self, name: str) -> str:
+        """The order of day, month and year in dates that are only numbers; empty where the rows
+        leave several."""
+        if self.options.date_order or name not in self.index:
+            return self.options.date_order
+        if name not in self._orders:
+            cells = self.first_cells(self.index[name])
+            orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
+            if MONTH_FIRST <= {name_of(header) for header in self.headers}:
+                orders = ['MDY']
+            self._orders[name] = orders[0] if len(orders) == 1 else ''
+        return self._orders[name]
+
+    @functools.cached_property
+    def fraction_unit(self) -> int:
+        """Nanoseconds in one unit of the column of the parts of seconds; 0 without such a column,
+        or where its values are no parts of a second."""
+        if not self.has('fraction'):
+            return 0
+        header = name_of(self.header('fraction'))
+        unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
+        cells = self.first_cells(self.index['fraction'])
+        values = [float(cell.replace(',', '.')) for cell in cells if NUMBER.match(cell)]
+        parts = len(values) == len(cells) and all(0.0 <= value * unit < 1e9 for value in values)
+        return unit if parts and cells else 0
 
     def _find_columns(self) -> dict[str, int]:
         """Match headers with quantities: mapped by hand first, then by their usual names."""
@@ -471,53 +555,3 @@ def _encoding(start: bytes) -> str:
     except UnicodeDecodeError:
         return 'cp1252'
     return 'utf-8-sig'
-
-
-def zone_of(name: str) -> tzinfo:
-    """A time zone by what stands behind a time (``Z``, ``+0200``) or by its name. Raises
-    `BagError`."""
-    if name.upper() in ('Z', 'UTC', 'GMT'):
-        return timezone.utc
-    if offset := re.match(r'([+-])(\d\d):?(\d\d)$', name):
-        hours, minutes = int(offset.group(2)), int(offset.group(3))
-        if hours < 24 and minutes < 60:
-            ahead = timedelta(hours=hours, minutes=minutes)
-            return timezone(ahead if offset.group(1) == '+' else -ahead)
-    try:
-        return ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise BagError(
-            f"there is no time zone '{name}'; write UTC, +02:00 or Europe/Berlin"
-        ) from None
-
-
-def moment_ns(text: str, zone: Callable[[], str]) -> int | None:
-    """Nanoseconds since 1970 of a date and a time of day, in the zone that `zone` gives where the
-    text names none; None for other texts. Raises `BadRow` and `BagError`."""
-    parts = TIME_TEXT.match(text)
-    if parts is None:
-        return None
-    date, clock, fraction, named = parts.groups()
-    return iso_ns(date, clock, fraction, zone_of(named or zone()))
-
-
-def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
-    """Nanoseconds since 1970 of an ISO 8601 time."""
-    try:
-        moment = datetime.fromisoformat(f'{date}T{clock}').replace(tzinfo=zone)
-    except ValueError:
-        raise BadRow(f"'{date} {clock}' is no date and time of the calendar") from None
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
-    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
-
-
-def dated(date: str, clock: str, header: str) -> str:
-    """A date and a time of day as one text; header: of the date. Raises `BadRow` for a date that
-    can be read in several ways."""
-    for form, places in _DATES:
-        if found := form.match(date):
-            year, month, day = (int(found.group(place)) for place in places)
-            padded = clock if clock[2] == ':' else f'0{clock}'
-            return f'{year:04d}-{month:02d}-{day:02d} {padded}'
-    raise BadRow(f"{header} is '{date[:40]}', which can be read in several ways; write 2024-05-31")

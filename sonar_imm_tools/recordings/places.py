@@ -27,8 +27,9 @@ from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
 from .columns import sign_of, unit_of
-from .csv_table import BadRow, NUMBER, Row, Table
+from .csv_table import NUMBER, Row, Table
 from .sources import BagError
+from .times import BadRow
 
 NEAR_ZERO = 1e-4
 """Degrees; both of a position below it are the place of receivers without a fix."""

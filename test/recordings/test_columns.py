@@ -16,10 +16,11 @@
 import pytest
 
 from sonar_imm_tools.recordings.convert import KINDS
-from sonar_imm_tools.recordings.csv_table import BadRow, CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
 from sonar_imm_tools.recordings.places import Degrees
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.times import BadRow
 
 
 @pytest.fixture

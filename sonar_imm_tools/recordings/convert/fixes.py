@@ -31,10 +31,11 @@ from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 from ..columns import name_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
-from ..csv_table import BadRow, Row, Table
+from ..csv_table import Row, Table
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError, quoted
+from ..times import BadRow
 from ..track_files import open_table
 from ..truth import number_names, truth_records
 

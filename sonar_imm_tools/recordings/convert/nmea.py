@@ -47,10 +47,10 @@ from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 from ... import SECOND
 from ..conversion import ConversionReport, converter, Leaps, Record
 from ..convert_options import FixesOptions, NmeaOptions
-from ..csv_table import BadRow, iso_ns, moment_ns
 from ..messages import ros_message
 from ..places import check_place
 from ..sources import BagError
+from ..times import BadRow, iso_ns, moment_ns
 from ..track_files import TrackFile
 from .fixes import write_fixes
 

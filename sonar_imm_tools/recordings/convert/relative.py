@@ -33,10 +33,11 @@ from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading,
 
 from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import CsvTable, Row
 from ..messages import ros_message
 from ..places import checked_origin, Degrees, origin_parameters, PolarRows
 from ..sources import BagError
+from ..times import BadRow
 from ..truth import truth_records
 from .fixes import by_name
 

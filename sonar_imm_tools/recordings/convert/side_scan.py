@@ -34,10 +34,11 @@ from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
 from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import CsvTable, Row
 from ..messages import ros_message
 from ..places import Degrees
 from ..sources import BagError
+from ..times import BadRow
 from ..xtf import pings_of
 from .bag_images import SYSTEM
 from .sonar_files import ground_message, Message, Record, speed_of, write_records
