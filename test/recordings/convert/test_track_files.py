@@ -179,3 +179,15 @@ def test_hostile_bytes_are_no_tracebacks(tmp_path_factory, name, place, written,
         assert '\n' not in str(error)
     else:
         assert all(np.isfinite(fix.position).all() for fix in fixes_of(report.path))
+
+
+def test_the_commonest_problem_is_named_and_its_advice_helps(tmp_path):
+    """A waypoint without a time does not hide a track whose times state no zone."""
+    point = '<trkpt lat="59.4" lon="10.{:03d}"><time>2021-01-01T00:00:{:02d}</time></trkpt>'
+    track = ''.join(point.format(k, k) for k in range(50))
+    path = tmp_path / 'a.gpx'
+    path.write_text(f'<gpx><wpt lat="59.4" lon="10.4"/><trk>{track}</trk></gpx>')
+    with pytest.raises(BagError, match='50 of 51 rows, .*--time-zone'):
+        convert_fixes(path, tmp_path / 'out')
+    report = convert_fixes(path, tmp_path / 'out', options=CsvOptions(time_zone='UTC'))
+    assert report.messages == {'/fix': 50}
