@@ -32,10 +32,11 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
-from .csv_table import BadRow, Row, Table
+from .csv_table import Row, Table
 from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
 from .sources import BagError
+from .times import BadRow
 from .writer import BagWriter
 
 T = TypeVar('T')
@@ -74,21 +75,28 @@ class ConversionReport:
     questions: list[str] = Factory(list)
     notes: dict[str, str] = Factory(dict)
     reasons: Counter[str] = Factory(Counter)
+    _kinds: Counter[str] = Factory(Counter)
+    _examples: dict[str, str] = Factory(dict)
 
     def bad_row(self, path: Path, where: str, why: object) -> None:
         """Count a bad row and name it while there are few."""
         self.bad_rows += 1
         if reason := getattr(why, 'reason', ''):
             self.reasons[reason.replace('_', ' ')] += 1
+        kind = reason or re.sub(r"'.*'|[-\d.]+", '', str(why))
+        self._kinds[kind] += 1
+        self._examples.setdefault(kind, f'{path.name}, {where}: {why}')
         if self.bad_rows <= MOST_NAMED:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
 
     def nothing(self, what: object) -> BagError:
-        """The error of a file without a usable record."""
-        first = f' (the first problem: {self.problems[0]})' if self.problems else ''
-        return BagError(f'{what} holds nothing that could be converted{first}')
+        """The error of a file without a usable record, with its commonest problem."""
+        words = f' ({self.problems[0]})' if self.problems else ''
+        for kind, count in self._kinds.most_common(1):
+            words = f' ({count} of {self.rows} rows, the first: {self._examples[kind]})'
+        return BagError(f'{what} holds nothing that could be converted{words}')
 
     def read_rows(self, table: Table, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
         """Yield the rows of `table` that `parse` accepts; count and name the others."""

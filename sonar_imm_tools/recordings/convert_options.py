@@ -84,8 +84,10 @@ class _Detecting(_OfSonar):
         kind='pairs')
 
 
-def _bearings(default: str) -> Any:
+def _bearings(default: str | None) -> Any:
     help = 'Where bearings count from: bow or north, clockwise, or east, counter-clockwise.'
+    if default is None:
+        help += ' By default north, where no column may be the position or heading of a vessel.'
     return option(default, '', help, choices=BEARINGS)
 
 
@@ -137,7 +139,7 @@ class FixesOptions(_Polar):
         'usbl.csv dive.bag --column x=easting --column y=northing',
         'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
-    bearings: str = _bearings('north')
+    bearings: str | None = _bearings(None)
 
 
 @frozen(kw_only=True)

@@ -14,31 +14,60 @@
 
 """CSV files of any origin: any delimiter, any names of columns, any unit of time.
 
-Each quantity has one name here (``x``, ``stamp``, ...) and a list of usual names (`ALIASES`).
-Columns with other names are mapped by hand. A row that cannot be read raises `BadRow`.
+Columns are found by their usual names (`columns`); columns with other names are mapped by hand.
+A row that cannot be read raises `BadRow`.
 """
 
 from __future__ import annotations
 
 import codecs
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import csv
-from datetime import datetime, timedelta, timezone, tzinfo
 from decimal import Decimal
+import functools
 import itertools
 import math
 from pathlib import Path
 import re
 from typing import Any, TextIO
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from attrs import frozen
 
 from sonar_imm.parameters import did_you_mean
 
+from .columns import (
+    ALIASES,
+    DAY_NAMES,
+    factor_of,
+    FRACTIONS,
+    MONTH_FIRST,
+    name_of,
+    NO,
+    NOTHING,
+    plain,
+    quantities_of,
+    rank_of,
+    YES,
+)
 from .options import nanoseconds, option
 from .sources import BagError, start_of
+from .times import (
+    BadRow,
+    dated,
+    DAYS,
+    form_of,
+    HHMMSS,
+    hhmmss,
+    moment_ns,
+    ORDERS,
+    orders_of,
+    split_time,
+    text_of_days,
+    TIME_OF_DAY,
+    TIME_TEXT,
+    zone_of,
+)
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
@@ -49,97 +78,10 @@ LONGEST_LINE = 1 << 20
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
-USUAL_NAMES = {
-    'stamp': (
-        'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
-        'epoch unix_time date_and_time device_time zeit zeitstempel uhrzeit'
-    ),
-    'date': 'utc_date gps_date date_utc day datum',
-    'x': 'east easting px pos_x position_x utm_e utm_x e ost rechtswert',
-    'y': 'north northing py pos_y position_y utm_n utm_y n nord hochwert',
-    'z': 'up pz pos_z position_z',
-    'depth': 'down tiefe',
-    'latitude': 'lat gps_latitude gps_lat decimal_latitude lat_dd breite',
-    'longitude': (
-        'lon lng long gps_longitude gps_lon gps_lng gps_long decimal_longitude lon_dd long_dd '
-        'laenge'
-    ),
-    'height': 'altitude alt ellipsoidal_height',
-    'var_x': 'var_east xx cov_xx cov_x_x',
-    'cov_xy': 'cov_east_north xy cov_x_y',
-    'var_y': 'var_north yy cov_yy cov_y_y',
-    'var_z': 'var_up var_height var_depth zz cov_zz cov_z_z',
-    'cov_xz': 'cov_east_up xz cov_x_z',
-    'cov_yz': 'cov_north_up yz cov_y_z',
-    'std_x': 'std_east sigma_x sigma_east sd_x sx',
-    'std_y': 'std_north sigma_y sigma_north sd_y sy',
-    'std_z': 'std_up std_height std_depth sigma_z sigma_up sigma_depth sd_z sz',
-    'std': 'sigma accuracy std_xy sigma_xy position_std',
-    'range': 'distance dist entfernung',
-    'std_range': 'sigma_range range_std',
-    'forward': 'ahead fwd rel_forward',
-    'starboard': 'stbd rel_starboard',
-    'vessel_x': 'vessel_east vessel_easting ship_x ship_east ship_easting boat_x boat_east own_x',
-    'vessel_y': (
-        'vessel_north vessel_northing ship_y ship_north ship_northing boat_y boat_north own_y'
-    ),
-    'vessel_latitude': 'vessel_lat ship_latitude ship_lat boat_latitude boat_lat own_lat',
-    'vessel_longitude': (
-        'vessel_lon vessel_long ship_longitude ship_lon boat_longitude boat_lon own_lon'
-    ),
-    'heading': 'hdg vessel_heading ship_heading boat_heading gyro',
-    'vx': 'v_east ve vel_x velocity_x',
-    'vy': 'v_north vn vel_y velocity_y',
-    'id': 'track_id target target_id tag beacon beacon_id transponder diver name taucher',
-    'valid': 'position_valid is_valid fix_valid validity',
-    'tag': 'tag_id transmitter transmitter_id tx tx_id full_id',
-    'ping': 'ping_id ping_number',
-    'receiver': 'rx rx_id receiver_id hydro hydrophone serial_number station name id',
-    'transmitter': 'tx tx_id transmitter_id source name id',
-    'arrival': 'arrival_time time_of_arrival detection_time',
-    'toa': 'travel_time delay tof time_of_flight',
-    'var_toa': 'toa_variance var_arrival',
-    'std_toa': 'sigma_toa std_arrival sigma_arrival',
-    'bearing': 'azimuth doa brg peilung',
-    'amplitude': 'amp response value',
-    'var_bearing': '',
-    'std_bearing': 'sigma_bearing bearing_std',
-    'elevation': 'elevation_angle',
-    'var_elevation': '',
-    'std_elevation': 'sigma_elevation',
-    'var_depth': '',
-    'std_depth': 'sigma_depth',
-    'file': 'filename file_name image picture frame',
-    'near_range': 'range_min min_range',
-    'far_range': 'range_max max_range',
-    'fov': 'field_of_view sector horizontal_fov',
-}
-ALIASES = {name: (name, *others.split()) for name, others in USUAL_NAMES.items()}
-"""The names of the columns of all kinds of table: those by which each quantity is found."""
-_UMLAUTS = str.maketrans({'ä': 'ae', 'ö': 'oe', 'ü': 'ue', 'ß': 'ss'})
-_UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
-
-TIME_TEXT = re.compile(
-    r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$'
-)
-TIME_OF_DAY = re.compile(r'\d\d?:\d\d(:\d\d)?([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
-_DATES = (
-    (re.compile(r'(\d{4})[-/.](\d\d?)[-/.](\d\d?)$'), (1, 2, 3)),
-    (re.compile(r'(\d{4})(\d\d)(\d\d)$'), (1, 2, 3)),
-    (re.compile(r'(\d\d?)\.(\d\d?)\.(\d{4})$'), (3, 2, 1)),
-)
-"""Forms of a date that can be read in one way only, with the places of year, month and day."""
-_YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
-_NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
-
-
-class BadRow(ValueError):
-    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
-    reason."""
-
-    def __init__(self, why: str, reason: str = ''):
-        super().__init__(why)
-        self.reason = reason
+_THOUSANDS = re.compile(r'[-+]?\d{1,3}(,\d{3})+$')
+_DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
+NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
+_ZERO = re.compile(r'[-+]?0*([.,]0*)?$')
 
 
 @frozen(kw_only=True)
@@ -158,7 +100,12 @@ class CsvOptions:
     time_zone: str = option('', 'ZONE',
         'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
     time_unit: str = option('', 'UNIT',
-        'Unit of numeric times in {what}: s, ms, us or ns.', choices=('', *TIME_UNITS))
+        'Unit of numeric times in {what}: s, ms, us or ns; HHMMSS for a time of day in one '
+        'number; datenum for days of MATLAB, excel for days of a spreadsheet.',
+        choices=('', *TIME_UNITS, HHMMSS, *DAYS))
+    date_order: str = option('', 'ORDER',
+        'Order of day, month and year in dates such as 05/06/24 in {what}.',
+        choices=('', *ORDERS))
     time_offset_ns: int = option(0, 'SECONDS',
         'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
     delimiter: str = option('', '',
@@ -168,9 +115,10 @@ class CsvOptions:
     # fmt: on
 
     def __attrs_post_init__(self) -> None:
-        if self.time_unit not in ('', *TIME_UNITS):
+        units = (*TIME_UNITS, HHMMSS, *DAYS)
+        if self.time_unit not in ('', *units):
             raise BagError(
-                f"the time unit must be one of {', '.join(TIME_UNITS)}, got '{self.time_unit}'"
+                f"the time unit must be one of {', '.join(units)}, got '{self.time_unit}'"
             )
         if self.time_zone:
             zone_of(self.time_zone)
@@ -205,21 +153,38 @@ class Row:
 
     def empty(self, *names: str) -> bool:
         """Whether all of these cells are empty, or not a number, as some write that."""
-        return all(self.text(name).lower() in ('', 'nan') for name in names)
+        return all(self.text(name).lower() in NOTHING for name in names)
 
     def optional(self, name: str) -> float:
-        """A number; NaN when the cell is empty, missing or NaN."""
+        """A number in the unit of its quantity (`columns.UNITS`); NaN when the cell is empty,
+        missing or NaN."""
         text = self.text(name)
-        if not text:
+        if text.lower() in NOTHING:
             return math.nan
+        number = self._with_point(name)
         try:
-            value = float(text if self.table.delimiter == ',' else text.replace(',', '.'))
+            value = float(number)
         except ValueError:
-            wanted = 'decimal degrees' if name in ('latitude', 'longitude') else 'a number'
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not {wanted}") from None
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
-        return value
+        return value * self.table.factor(name)
+
+    def _with_point(self, name: str) -> str:
+        """The text of a number with a decimal point. Raises `BadRow`."""
+        text = self.text(name)
+        comma, point = text.rfind(','), text.rfind('.')
+        if comma < 0:
+            return text
+        if point >= 0:
+            mark = ',' if comma > point else '.'
+            return text.replace('.' if mark == ',' else ',', '').replace(mark, '.')
+        if _THOUSANDS.match(text) and not self.table.decimal_comma:
+            raise BadRow(
+                f"{self.table.header(name)} is '{text[:40]}': the comma may be that of thousands "
+                'or a decimal one; write a decimal point'
+            )
+        return text.replace(',', '.')
 
     def height(self) -> float:
         """z, or minus the depth, in metres; 0 without either."""
@@ -227,19 +192,21 @@ class Row:
         return 0.0 if math.isnan(z) else z
 
     def require_valid(self) -> None:
-        """Raise `BadRow` for a row whose column ``valid`` says that it is not."""
-        flag = self.text('valid').lower()
-        if flag in ('', *_YES):
+        """Raise `BadRow` for a row that the column ``valid``, or ``status`` where it holds words
+        such as OK and error, marks as invalid."""
+        name = 'valid' if self.table.has('valid') or not self.table.has_status else 'status'
+        flag = self.text(name).lower()
+        if not flag or {flag, plain(flag)} & set(YES):
             return
-        if flag in _NO:
+        if {flag, plain(flag)} & set(NO):
             raise BadRow('the row is flagged as invalid', 'flagged invalid')
-        raise BadRow(f"{self.table.header('valid')} is '{flag[:40]}', neither true nor false")
+        raise BadRow(f"{self.table.header(name)} is '{flag[:40]}', neither true nor false")
 
     def seconds_ns(self, name: str) -> int:
         """A duration or a time as integer nanoseconds, exactly as written."""
         text = self.text(name)
         try:
-            value = Decimal(text if self.table.delimiter == ',' else text.replace(',', '.'))
+            value = Decimal(self._with_point(name))
             nanoseconds = value * self.table.time_scale(name)
             if not abs(nanoseconds) < 2**63:
                 raise BadRow(
@@ -258,6 +225,8 @@ class Row:
         stamp = moment_ns(self._moment(name), lambda: self._zone(name))
         if stamp is None:
             stamp = self.seconds_ns(name)
+        if name == 'stamp':
+            stamp = self._with_fraction(stamp)
         stamp += self.table.options.time_offset_ns
         if not stamp and self.table.counts_from_zero(name):
             stamp = 1  # a stamp of 0 means none in ROS
@@ -268,19 +237,47 @@ class Row:
             )
         return stamp
 
+    def _with_fraction(self, stamp_ns: int) -> int:
+        """A time with the part of a second that stands in a column of its own."""
+        unit = self.table.fraction_unit
+        if not unit:
+            return stamp_ns
+        own = round(self.number('fraction') * unit)
+        if stamp_ns % 10**9 == 0:
+            return stamp_ns + own
+        if abs(stamp_ns % 10**9 - own) > unit:
+            raise BadRow(
+                f'{self.table.header("stamp")} has another part of a second than '
+                f'{self.table.header("fraction")}'
+            )
+        return stamp_ns
+
     def _moment(self, name: str) -> str:
         """The text of a time, with the date of its own column where it has only a time of day."""
-        text = self.text(name)
-        if not TIME_OF_DAY.match(text):
-            date, _, clock = text.partition(' ')
-            written = not TIME_TEXT.match(text) and TIME_OF_DAY.match(clock.strip())
-            return dated(date, clock.strip(), self.table.header(name)) if written else text
+        text, form = self.text(name), self.table.time_form(name)
+        if TIME_TEXT.match(text):
+            return text
+        if parts := None if self.table.time_unit(name) else split_time(text):
+            return dated(*parts, self.table.header(name), self.table.date_order(name))
+        if form in DAYS:
+            try:
+                return text_of_days(Decimal(self._with_point(name)), form)
+            except (ArithmeticError, ValueError):
+                return text
+        clock = hhmmss(text) if form == HHMMSS else text
+        if form == HHMMSS and not clock:
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time as HHMMSS")
+        if not TIME_OF_DAY.match(clock):
+            return text
         if not self.table.has('date'):
             raise BadRow(
-                f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
-                'the date: add one, named date'
+                f"{self.table.header(name)} is '{text[:40]}', a time of day"
+                f'{" as HHMMSS" if form == HHMMSS else ""}, and no column holds the date: add '
+                'one, named date',
+                'no date',
             )
-        return dated(self.text('date'), text, self.table.header('date'))
+        order = self.table.date_order('date')
+        return dated(self.text('date'), clock, self.table.header('date'), order)
 
     def _zone(self, name: str) -> str:
         """The zone of a time that does not say it."""
@@ -310,6 +307,9 @@ class Table:
         self.problems: list[str] = []
         self.cut_line = 0
         self._from_zero: dict[str, bool] = {}
+        self._factors: dict[str, float] = {}
+        self._forms: dict[str, str] = {}
+        self._orders: dict[str, str] = {}
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """The number of its line, or of its record, and the cells of each row."""
@@ -332,12 +332,56 @@ class Table:
                 f'{"it" if len(missing) == 1 else "them"}, as in --column {missing[0]}=HEADER'
             )
 
+    @functools.cached_property
+    def first_rows(self) -> list[Row]:
+        """The rows by which the file is judged."""
+        return list(itertools.islice(self, LOOKED_AT))
+
+    def first_cells(self, column: int) -> list[str]:
+        """The cells of a column that are not empty, of the rows by which the file is judged."""
+        cells = (row.cells[column].strip() for row in self.first_rows if column < len(row.cells))
+        return [cell for cell in cells if cell.lower() not in NOTHING]
+
+    def is_blank(self, *names: str) -> bool:
+        """Say whether these quantities are empty or zero in every row that is looked at."""
+        cells = (cell for name in names for cell in self.first_cells(self.index[name]))
+        return all(_ZERO.match(cell) for cell in cells)
+
+    def varies(self, column: int) -> bool:
+        """Say whether a column holds numbers that change, and does not count the rows."""
+        cells = self.first_cells(column)
+        if not cells or not all(NUMBER.match(cell) for cell in cells):
+            return False
+        values = [float(cell.replace(',', '.')) for cell in cells]
+        steps = {after - before for before, after in itertools.pairwise(values)}
+        return bool(steps - {0.0, 1.0})
+
+    @functools.cached_property
+    def decimal_comma(self) -> bool:
+        """Whether commas within cells are decimal ones."""
+        cells = (cell for row in self.first_rows for cell in row.cells)
+        return self.delimiter != ',' or any(_DECIMAL_COMMA.match(cell.strip()) for cell in cells)
+
+    @functools.cached_property
+    def has_status(self) -> bool:
+        """Whether the column ``status`` holds words for good or bad."""
+        words = {
+            plain(cell) for cell in self.first_cells(self.index.get('status', len(self.headers)))
+        }
+        return any(word in (*YES, *NO) and len(word) > 1 and word.isalpha() for word in words)
+
+    def factor(self, name: str) -> float:
+        """Factor from the unit of a column to that of its quantity. Raises `BagError`."""
+        if name not in self._factors:
+            self._factors[name] = factor_of(name, self.header(name))
+        return self._factors[name]
+
     def counts_from_zero(self, name: str) -> bool:
         """Whether the first times of the file are seconds from its own start rather than a date,
         so that a time of 0 is one, and not one that is missing."""
         if name not in self._from_zero:
             times = []
-            for row in itertools.islice(self, LOOKED_AT):
+            for row in self.first_rows:
                 with contextlib.suppress(BadRow):
                     times.append(row.seconds_ns(name))
             self._from_zero[name] = max(times, default=0) < LONGEST_NS
@@ -359,10 +403,49 @@ class Table:
 
     def time_scale(self, name: str) -> int:
         """Nanoseconds in one unit of a time column."""
-        if self.options.time_unit:
-            return TIME_UNITS[self.options.time_unit]
+        return TIME_UNITS.get(self.time_unit(name), TIME_UNITS['s'])
+
+    def time_unit(self, name: str) -> str:
+        """The unit of a time column that the options or its header state, else empty."""
         suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
-        return TIME_UNITS[suffix.group(1) if suffix else 's']
+        return self.options.time_unit or (suffix.group(1) if suffix else '')
+
+    def time_form(self, name: str) -> str:
+        """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
+        name of `DAYS`. Raises `BagError` where that is not clear."""
+        unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
+        if unit or name not in self.index:
+            return unit if unit in (HHMMSS, *DAYS) else ''
+        if name not in self._forms:
+            cells = self.first_cells(self.index[name])
+            self._forms[name] = form_of(self.header(name), cells, self.has('date'))
+        return self._forms[name]
+
+    def date_order(self, name: str) -> str:
+        """The order of day, month and year in dates that are only numbers; empty where the rows
+        leave several."""
+        if self.options.date_order or name not in self.index:
+            return self.options.date_order
+        if name not in self._orders:
+            cells = self.first_cells(self.index[name])
+            orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
+            if MONTH_FIRST <= {name_of(header) for header in self.headers}:
+                orders = ['MDY']
+            self._orders[name] = orders[0] if len(orders) == 1 else ''
+        return self._orders[name]
+
+    @functools.cached_property
+    def fraction_unit(self) -> int:
+        """Nanoseconds in one unit of the column of the parts of seconds; 0 without such a column,
+        or where its values are no parts of a second."""
+        if not self.has('fraction'):
+            return 0
+        header = name_of(self.header('fraction'))
+        unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
+        cells = self.first_cells(self.index['fraction'])
+        values = [float(cell.replace(',', '.')) for cell in cells if NUMBER.match(cell)]
+        parts = len(values) == len(cells) and all(0.0 <= value * unit < 1e9 for value in values)
+        return unit if parts and cells else 0
 
     def _find_columns(self) -> dict[str, int]:
         """Match headers with quantities: mapped by hand first, then by their usual names."""
@@ -374,12 +457,15 @@ class Table:
                 )
             by_hand[name] = self.headers.index(header)
         found = dict(by_hand)
-        plain = [_plain(header) for header in self.headers]
-        for name, aliases in ALIASES.items():
-            matches = [plain.index(alias) for alias in aliases if alias in plain]
-            matches = [index for index in matches if index not in by_hand.values()]
-            if name not in found and matches and name not in self.options.ignore:
-                found[name] = matches[0]
+        usual = [quantities_of(header) for header in self.headers]
+        for name in ALIASES:
+            free = [
+                index
+                for index, names in enumerate(usual)
+                if name in names and index not in by_hand.values()
+            ]
+            if name not in found and free and name not in self.options.ignore:
+                found[name] = min(free, key=lambda index: rank_of(name, self.headers[index]))
         return found
 
 
@@ -469,59 +555,3 @@ def _encoding(start: bytes) -> str:
     except UnicodeDecodeError:
         return 'cp1252'
     return 'utf-8-sig'
-
-
-def _plain(header: str) -> str:
-    """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
-    name = re.sub(r'[\[(].*', '', header.lower().translate(_UMLAUTS)).strip()
-    return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
-
-
-def zone_of(name: str) -> tzinfo:
-    """A time zone by what stands behind a time (``Z``, ``+0200``) or by its name. Raises
-    `BagError`."""
-    if name.upper() in ('Z', 'UTC', 'GMT'):
-        return timezone.utc
-    if offset := re.match(r'([+-])(\d\d):?(\d\d)$', name):
-        hours, minutes = int(offset.group(2)), int(offset.group(3))
-        if hours < 24 and minutes < 60:
-            ahead = timedelta(hours=hours, minutes=minutes)
-            return timezone(ahead if offset.group(1) == '+' else -ahead)
-    try:
-        return ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise BagError(
-            f"there is no time zone '{name}'; write UTC, +02:00 or Europe/Berlin"
-        ) from None
-
-
-def moment_ns(text: str, zone: Callable[[], str]) -> int | None:
-    """Nanoseconds since 1970 of a date and a time of day, in the zone that `zone` gives where the
-    text names none; None for other texts. Raises `BadRow` and `BagError`."""
-    parts = TIME_TEXT.match(text)
-    if parts is None:
-        return None
-    date, clock, fraction, named = parts.groups()
-    return iso_ns(date, clock, fraction, zone_of(named or zone()))
-
-
-def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
-    """Nanoseconds since 1970 of an ISO 8601 time."""
-    try:
-        moment = datetime.fromisoformat(f'{date}T{clock}').replace(tzinfo=zone)
-    except ValueError:
-        raise BadRow(f"'{date} {clock}' is no date and time of the calendar") from None
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
-    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
-
-
-def dated(date: str, clock: str, header: str) -> str:
-    """A date and a time of day as one text; header: of the date. Raises `BadRow` for a date that
-    can be read in several ways."""
-    for form, places in _DATES:
-        if found := form.match(date):
-            year, month, day = (int(found.group(place)) for place in places)
-            padded = clock if clock[2] == ':' else f'0{clock}'
-            return f'{year:04d}-{month:02d}-{day:02d} {padded}'
-    raise BadRow(f"{header} is '{date[:40]}', which can be read in several ways; write 2024-05-31")

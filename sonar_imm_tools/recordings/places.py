@@ -26,21 +26,145 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .csv_table import BadRow, Row, Table
+from .columns import sign_of, unit_of
+from .csv_table import NUMBER, Row, Table
 from .sources import BagError
+from .times import BadRow
+
+NEAR_ZERO = 1e-4
+"""Degrees; both of a position below it are the place of receivers without a fix."""
 
 
 def check_place(latitude: float, longitude: float) -> None:
     """Raise `BadRow` for degrees that are no position on Earth."""
-    if latitude == longitude == 0.0:
+    if max(abs(latitude), abs(longitude)) < NEAR_ZERO:
         raise BadRow(
             'latitude 0, longitude 0 is what receivers without a fix write', 'no position'
         )
+    if (latitude, longitude) == (91.0, 181.0):
+        raise BadRow('latitude 91, longitude 181 is no position in AIS', 'no position')
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
         swapped = '; are the two swapped?' if abs(longitude) <= 90.0 else ''
         raise BadRow(
             f'latitude {latitude:g}, longitude {longitude:g} is not a position on Earth{swapped}'
         )
+
+
+_DEGREES = re.compile(
+    r'([A-Za-z]*)\s*([-+]?)(\d+(?:[.,]\d+)?)\s*(?:[°º:d\s]\s*(\d+(?:[.,]\d+)?))?'
+    r"\s*(?:['′’:m\s]\s*(\d+(?:[.,]\d+)?))?\s*(?:[°º'′’\"″”]|'')?\s*([A-Za-z]*)$"
+)
+"""Degrees, minutes and seconds with a hemisphere before or behind them."""
+_AXES = ('latitude', 'longitude')
+
+
+class Degrees:
+    """Latitude and longitude of the rows of a table, in degrees.
+
+    Cells hold decimal degrees, degrees and minutes (``59 25.8 N``), also seconds
+    (``59°25'48"N``), or degrees and minutes in one number, as in NMEA (``5925.8``). The hemisphere
+    is in the cell or in a column beside it. prefix: ``vessel_`` for the positions of a vessel.
+    Raises `BagError` for a table with latitude and longitude exchanged.
+    """
+
+    def __init__(self, table: Table, prefix: str = ''):
+        self._names = {axis: f'{prefix}{axis}' for axis in _AXES}
+        self._signs = {axis: self._sign_column(table, axis) for axis in _AXES}
+        values = {axis: self._first_values(table, axis) for axis in _AXES}
+        latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
+        limits = (latitude, 90.0), (longitude, 360.0)
+        beyond = [len(each) and 2.0 * np.mean(each > limit) > 1.0 for each, limit in limits]
+        if beyond[0] and latitude.max() <= 180.0 and (longitude <= 90.0).all():
+            north, east = (table.header(name) for name in self._names.values())
+            raise BagError(
+                f'{table.path}: {north} is beyond 90 degrees and {east} is not, so that latitude '
+                f"and longitude look exchanged; say --column '{self._names['latitude']}={east}' "
+                f"--column '{self._names['longitude']}={north}'"
+            )
+        self.packed = any(beyond) and all(
+            (each % 100.0 < 60.0).all() and (each < 100.0 * limit).all() for each, limit in limits
+        )
+
+    def place(self, row: Row) -> tuple[float, float]:
+        """Latitude and longitude of a row. Raises `BadRow`."""
+        latitude, longitude = self.unchecked(row)
+        check_place(latitude, longitude)
+        return latitude, longitude
+
+    def unchecked(self, row: Row) -> tuple[float, float]:
+        """Latitude and longitude, also those of no position. Raises `BadRow`."""
+        return self._value(row, 'latitude'), self._value(row, 'longitude')
+
+    def _value(self, row: Row, axis: str) -> float:
+        name = self._names[axis]
+        found = None if NUMBER.match(row.text(name)) else _DEGREES.match(row.text(name))
+        if found is None:
+            value, words = row.number(name), []
+        else:
+            before, minus, *numbers, behind = found.groups()
+            parts = [float((part or '0').replace(',', '.')) for part in numbers]
+            value = parts[0] + parts[1] / 60.0 + parts[2] / 3600.0
+            if max(parts[1:]) >= 60.0:
+                raise BadRow(f"{row.table.header(name)} is '{row.text(name)[:40]}'")
+            value = -value if minus == '-' else value
+            words = [word for word in (before, behind) if word]
+        if self.packed and (found is None or numbers[1] is None):
+            whole = math.floor(abs(value) / 100.0)
+            value = math.copysign(whole + (abs(value) - 100.0 * whole) / 60.0, value)
+        own: dict[str, float] = {}
+        if (beside := self._signs[axis]) is not None:
+            column, own = beside
+            words.append(row.text(column) or 'nothing')
+        for word in words[-1:]:
+            sign = own.get(word.lower()) or sign_of(axis, word)
+            if sign is None or value < 0.0 < sign:
+                raise BadRow(
+                    f"{row.table.header(name)} is '{row.text(name)[:40]}' with the hemisphere "
+                    f"'{word[:20]}'"
+                )
+            value = sign * abs(value)
+        return value
+
+    def _sign_column(self, table: Table, axis: str) -> tuple[str, dict[str, float]] | None:
+        """The column of the hemisphere: one by its name, one of words for hemispheres beside the
+        degrees, or the only one of such words; None without one."""
+        at, name = table.index[self._names[axis]], f'{self._names[axis]}_hemisphere'
+        taken = {table.index[each] for each in self._names.values()}
+        words = {
+            k: {cell.lower() for cell in table.first_cells(k)}
+            for k in range(len(table.headers))
+            if k not in taken
+        }
+        letters = {'o'} if axis == 'longitude' else set()
+        fitting = [
+            k
+            for k, found in words.items()
+            if found and all(word in letters or sign_of(axis, word) for word in found)
+        ]
+        beside = [k for k in (at + 1, at - 1) if k in fitting]
+        if name not in table.index:
+            if not beside and len(fitting) != 1:
+                return None
+            table.index[name] = (beside or fitting)[0]
+        found = words.get(table.index[name], set())
+        if 'o' not in found:
+            return name, {}
+        signs = {sign_of(axis, word) for word in found - {'o'}}
+        if len(signs) != 1:
+            raise BagError(
+                f"{table.path}: 'O' in {table.header(name)} may be east (Ost) or west (Ouest, "
+                'Oeste); write E or W'
+            )
+        return name, {'o': -(signs.pop() or 1.0)}
+
+    def _first_values(self, table: Table, axis: str) -> FloatArray:
+        cells = table.first_cells(table.index[self._names[axis]])
+        values = [float(cell.replace(',', '.')) for cell in cells if NUMBER.match(cell)]
+        factor = table.factor(self._names[axis])
+        return factor * np.array([value for value in values if abs(value) not in _UNKNOWN])
+
+
+_UNKNOWN = (91.0, 181.0, 999.0, 9999.0)
 
 
 class LocalFrame:
@@ -52,7 +176,10 @@ class LocalFrame:
     """
 
     def __init__(self, table: Table, origin: tuple[float, ...] | None = None):
-        self.geodetic = not table.has('x', 'y') and table.has('latitude', 'longitude')
+        metres = table.has('x', 'y')
+        self.geodetic = table.has('latitude', 'longitude') and (
+            not metres or table.is_blank('x', 'y')
+        )
         if not self.geodetic:
             if not any(table.has(name) for name in ('x', 'y')):
                 for found, other in (('latitude', 'longitude'), ('longitude', 'latitude')):
@@ -65,11 +192,12 @@ class LocalFrame:
                 )
             table.require('x', 'y')
         self.origin = checked_origin(origin) if self.geodetic else None
+        self._degrees = Degrees(table) if self.geodetic else None
 
     def position(self, row: Row) -> tuple[float, float, float]:
         """Give x, y, z of a row in metres. Raises `BadRow`."""
-        if self.geodetic:
-            return self._from_geodetic(row)
+        if self._degrees is not None:
+            return self._from_geodetic(*self._degrees.place(row), row)
         x, y, z = row.number('x'), row.number('y'), row.height()
         if max(abs(x), abs(y), abs(z)) > FARTHEST:
             raise BadRow(f'the position {x:g}, {y:g}, {z:g} is more than 100,000 km away')
@@ -81,9 +209,9 @@ class LocalFrame:
             return {}
         return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
 
-    def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
-        latitude, longitude = row.number('latitude'), row.number('longitude')
-        check_place(latitude, longitude)
+    def _from_geodetic(
+        self, latitude: float, longitude: float, row: Row
+    ) -> tuple[float, float, float]:
         height = row.optional('height') if row.table.has('height') else row.height()
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:
@@ -132,8 +260,11 @@ class PolarRows:
             if table.has(name) and (range_std, bearing_std_deg) == (None, None):
                 table.require(other)
         self._table, self._counted_from = table, counted_from
-        self._unit = _radians(table.header('bearing')) or math.radians(1.0)
-        self._std_unit = _radians(table.header('std_bearing')) or self._unit
+        stated = bool(unit_of(table.header('bearing')))
+        self._unit = 1.0 if stated else math.radians(1.0)
+        self._std_unit = table.factor('bearing') if stated else self._unit
+        if unit_of(table.header('std_bearing')):
+            self._std_unit = 1.0
         self._range_std = math.nan if range_std is None else range_std
         self._bearing_std = math.nan if bearing_std_deg is None else math.radians(bearing_std_deg)
         self._largest = 0.0
@@ -160,14 +291,8 @@ class PolarRows:
     def check_unit(self) -> None:
         """Raise `BagError` where neither the header nor the bearings say degrees or radians."""
         header = self._table.header('bearing')
-        if _radians(header) is None and 0.0 < self._largest <= _TURN:
+        if not unit_of(header) and 0.0 < self._largest <= _TURN:
             raise BagError(
                 f'{self._table.path}: {header} may be degrees or radians, none is beyond '
                 f'{self._largest:.3g}; write bearing_deg or bearing_rad in the header'
             )
-
-
-def _radians(header: str) -> float | None:
-    """The unit of an angle that its header names, in radians."""
-    unit = re.search(r'[_ \[(](deg|rad|°)', header.lower())
-    return None if unit is None else 1.0 if unit.group(1) == 'rad' else math.radians(1.0)

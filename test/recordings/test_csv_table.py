@@ -18,8 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from sonar_imm_tools.recordings.csv_table import BadRow, CsvOptions, CsvTable
+from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
 from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.times import BadRow
 
 
 @pytest.fixture
@@ -137,7 +138,7 @@ def test_date_and_time_of_day_may_be_two_columns(table, header, cells, stamp):
     assert row.stamp_ns() == stamp
 
 
-@pytest.mark.parametrize('date', ['05/06/2019', '9 Sep 2019', '', '190909'])
+@pytest.mark.parametrize('date', ['05/06/2019', '', '190909'])
 def test_a_date_that_can_be_read_in_several_ways_is_a_bad_row(table, date):
     (row,) = table(f'date,utc,x\n{date},18:01:08,1\n')
     with pytest.raises(BadRow, match='several ways'):
@@ -182,7 +183,7 @@ def test_numbers(table):
     assert row.number('x') == 1.5 and row.optional('z') != row.optional('z')
     for name, words in (
         ('y', "y is 'abc', not a number"),
-        ('latitude', "lat is '59 25.8 N', not decimal degrees"),
+        ('latitude', "lat is '59 25.8 N', not a number"),
         ('z', 'z is empty'),
         ('vx', 'infinite'),
         ('depth', 'depth is empty'),

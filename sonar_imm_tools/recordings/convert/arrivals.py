@@ -44,10 +44,11 @@ from sonar_imm.measurements import Arrivals, Rejection
 
 from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
-from ..csv_table import BadRow, CsvOptions, CsvTable, Row, Table
+from ..csv_table import CsvOptions, CsvTable, Row, Table
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters
 from ..sources import BagError
+from ..times import BadRow
 from ..truth import number_names, truth_records
 
 _NOWHERE = (math.nan, math.nan, math.nan)

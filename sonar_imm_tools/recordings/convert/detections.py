@@ -41,7 +41,8 @@ from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
 from ... import SECOND
 from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import CsvTable, Row
+from ..times import BadRow
 from .arrivals import Arrival, Places, read_places, Stations, write_pings
 
 HOUR = 3600.0

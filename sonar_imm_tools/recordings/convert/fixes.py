@@ -28,12 +28,14 @@ from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
+from ..columns import name_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
-from ..csv_table import BadRow, Row, Table
+from ..csv_table import Row, Table
 from ..messages import ros_message
 from ..places import LocalFrame, origin_parameters, PolarRows
-from ..sources import BagError
+from ..sources import BagError, quoted
+from ..times import BadRow
 from ..track_files import open_table
 from ..truth import number_names, truth_records
 
@@ -69,7 +71,10 @@ def write_fixes(
                 f'{table.path}: bearings from the bow need the pose of the vessel; see '
                 'sonar-imm convert relative'
             )
-        polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
+        if not how.bearings:
+            _ask_for_vessel(table)
+        bearings = how.bearings or 'north'
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
     frame = None if polar else LocalFrame(table, how.origin)
     origin = frame.origin if frame else None
     place = ('range', 'bearing') if polar else ('x', 'y')
@@ -150,6 +155,31 @@ def write_fixes(
         parameters={'diver': origin_parameters(origin)},
         streams=by_name((name if named else '', stamp) for _, stamp, _, name in read),
     )
+
+
+def _ask_for_vessel(table: Table) -> None:
+    """Raise `BagError` where columns of numbers are left over beside range and bearing that may be
+    the position or the heading of a vessel."""
+    used = {table.index[name] for name in _OF_RANGES if name in table.index}
+    left = [
+        header
+        for k, header in enumerate(table.headers)
+        if k not in used and name_of(header) not in UNRELATED and table.varies(k)
+    ]
+    if left:
+        raise BagError(
+            f'{table.path}: {len(left)} columns may be the position or the heading of a vessel '
+            f'({", ".join(left)}) and are not used. If ranges and bearings are measured from a '
+            f'vessel: sonar-imm convert relative {quoted(table.path)} OUT_BAG, with --column '
+            'heading=HEADER and so on. If from a sensor that does not move: --bearings north'
+        )
+
+
+_OF_RANGES = (
+    'stamp', 'date', 'fraction', 'range', 'bearing', 'std_range', 'std_bearing', 'z', 'depth',
+    'height', 'var_z', 'std_z', 'std_depth', 'var_depth', 'std', 'id', 'valid', 'status',
+)  # fmt: skip
+"""Quantities of a table of ranges and bearings from one place."""
 
 
 def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:

@@ -32,9 +32,9 @@ from sonar_imm.measurements import Pressure, Rejection
 from ... import SECOND
 from ..conversion import ConversionReport, converter, provenance
 from ..convert_options import HydrophonesOptions
-from ..csv_table import BadRow, moment_ns
 from ..messages import ros_message
 from ..sources import BagError
+from ..times import BadRow, moment_ns
 from ..writer import BagWriter
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@
 Positions of targets are those that AIS reports (``!AIVDM``: messages 1, 2, 3, 18, 19 and 27, by
 MMSI), targets with latitude and longitude (``TLL``) and tracked targets with distance and bearing
 (``TTM``), which are placed from the vessel's last position. The vessel's own position is in
-``GGA``, ``RMC``, ``GLL`` or ``GNS``, its heading in ``HDT`` or ``THS``.
+``GGA``, ``RMC``, ``GLL`` or ``GNS``, its heading in ``HDT`` or ``THS``. Targets of the USBL of a
+vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as well.
 
 Few sentences have a whole time. In this order a time is that before the sentence (seconds since
 1970 or ISO 8601), that of its tag block (``\\c:...*hh\\``), or the vessel's clock as of the last
@@ -27,7 +28,7 @@ it was true; its time is moved there.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import date as Date
 from datetime import datetime, timedelta, timezone
 from datetime import time as Time
@@ -42,15 +43,16 @@ import numpy as np
 from msg_adapters.fixes import write_geodetic
 from msg_adapters.navigation import write_heading
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 
 from ... import SECOND
 from ..conversion import ConversionReport, converter, Leaps, Record
 from ..convert_options import FixesOptions, NmeaOptions
-from ..csv_table import BadRow, iso_ns, moment_ns
 from ..messages import ros_message
 from ..places import check_place
 from ..sources import BagError
+from ..times import BadRow, iso_ns, moment_ns
 from ..track_files import TrackFile
 from .fixes import write_fixes
 
@@ -63,8 +65,10 @@ LENGTHS = {'K': 1000.0, 'N': 1852.0, 'S': 1609.344}
 ACCURATE, INACCURATE = 5.0, 15.0
 """Standard deviation on each axis of an AIS position, m: the report says better or worse than
 10 m."""
-SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,6},.*?\*[0-9A-Fa-f]{2})\s*$')
+SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,8},.*?\*[0-9A-Fa-f]{2})\s*$')
 """A sentence, behind a time or a tag block where there is one."""
+USBL = ('USRTH', 'PSIMSSB')
+_CLOCK = re.compile(r'\d{6}(\.\d*)?$')
 _TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
 
 
@@ -83,6 +87,8 @@ class _Log:
     headings: list[VesselHeading] = Factory(list)
     targets: list[dict[str, str]] = Factory(list)
     unread: Counter[str] = Factory(Counter)
+    hears: bool = False
+    """Whether the vessel has a USBL."""
 
 
 @converter(NmeaOptions)
@@ -91,7 +97,7 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
     of the vessel; where it holds no targets, the vessel's positions are the fixes.
     """
     log = _read(path, report, how.date)
-    as_fixes = how.own == 'fixes' or (how.own == 'auto' and not log.targets)
+    as_fixes = how.own == 'fixes' or (how.own == 'auto' and not (log.targets or log.hears))
     rows, beside = log.targets, list[Record]()
     if as_fixes:
         rows = rows + [
@@ -120,7 +126,9 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         origin=how.origin,
         storage=how.storage,
     )
+    lines = report.rows
     write_fixes(table, report, fixes, beside)
+    report.rows = lines
 
 
 def _read(path: Path, report: ConversionReport, day: str) -> _Log:
@@ -143,10 +151,15 @@ def _read(path: Path, report: ConversionReport, day: str) -> _Log:
         try:
             stamp = _stamp(found['before'])
             sentence = found['sentence']
-            if sentence[3:6] in ('VDM', 'VDO'):
+            head = sentence[1:].partition(',')[0]
+            if head in USBL:
+                _take_usbl(log, pynmea2.NMEASentence.checksum, sentence, stamp)
+            elif sentence[3:6] in ('VDM', 'VDO'):
                 _take_ais(log, pyais.decode(sentence.encode()), stamp, sentence[3:6] == 'VDO')
             else:
                 _take(log, pynmea2.parse(sentence, check=True), stamp)
+        except pynmea2.SentenceTypeError:
+            log.unread[head] += 1
         except wrong as error:
             report.bad_row(path, f'line {number}', error)
         except (ValueError, TypeError, IndexError, AttributeError, KeyError) as error:
@@ -189,14 +202,19 @@ def _stamp(before: str) -> int | None:
 
 def _take(log: _Log, sentence: Any, stamp: int | None) -> None:
     """What a sentence of NMEA 0183 says. Raises `BadRow` or `Rejection`."""
-    kind = sentence.sentence_type
+    kind = getattr(sentence, 'sentence_type', '')
+    if not kind:  # of a maker
+        log.unread[sentence.identifier()] += 1
+        return
     day = _dated(sentence)
     if day is not None and day != log.day:
         log.day, log.of_day = day, None
     clock = getattr(sentence, 'timestamp', None)
     if stamp is not None:
         log.clock = stamp
-    elif isinstance(clock, Time) and kind != 'GST':
+    elif clock and kind != 'GST':
+        if not _CLOCK.match(str(sentence.data[sentence.name_to_idx['timestamp']])):
+            raise BadRow('has a time that cannot be read as HHMMSS', 'unreadable time')
         _tell_time(log, clock)
     if kind in ('GGA', 'RMC', 'GLL', 'GNS'):
         _take_own(log, sentence)
@@ -225,6 +243,7 @@ def _tell_time(log: _Log, clock: Time) -> None:
     """Set the clock of the log by a time of day."""
     clock = clock.replace(tzinfo=None)
     if log.day is None:
+        log.of_day = clock
         return
     if log.of_day is not None:
         back = datetime.combine(log.day, log.of_day) - datetime.combine(log.day, clock)
@@ -236,10 +255,15 @@ def _tell_time(log: _Log, clock: Time) -> None:
 
 
 def _now(log: _Log) -> int:
+    if log.clock is None and log.of_day is not None:
+        raise BadRow(
+            'has a time of day and no date: say that of the first line with --date 2024-05-31',
+            'no date',
+        )
     if log.clock is None:
         raise BadRow(
-            'has no time, and none came before it: say the date of the first line with --date '
-            '2024-05-31',
+            'has no time, and none came before it; log a time before each line, or sentences with '
+            'a time',
             'no time',
         )
     return log.clock
@@ -290,8 +314,6 @@ def _take_heading(log: _Log, degrees: float) -> None:
 
 def _take_tracked(log: _Log, sentence: Any) -> None:
     """A target by distance and bearing from the vessel, placed from its last position."""
-    if log.place is None:
-        raise BadRow('needs a position of the vessel before it', 'no position')
     bearing = float(sentence.bearing)
     if sentence.brg_ref == 'R':
         if math.isnan(log.heading):
@@ -299,11 +321,59 @@ def _take_tracked(log: _Log, sentence: Any) -> None:
         bearing += log.heading
     distance = float(sentence.distance) * LENGTHS.get(sentence.dist_unit or 'N', math.nan)
     angle = math.radians(bearing)
-    place = Origin(*log.place, 0.0).geodetic(
-        np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
-    )
-    row = _row(_now(log), float(place[0]), float(place[1]))
-    log.targets.append(row | {'id': str(sentence.name or sentence.target_number)})
+    away = np.array([distance * math.sin(angle), distance * math.cos(angle), 0.0])
+    _take_target(log, away, str(sentence.name or sentence.target_number))
+
+
+def _take_target(log: _Log, away: FloatArray, name: str) -> None:
+    """A target at `away` (3,), m east, north and up, from the last position of the vessel."""
+    if log.place is None:
+        raise BadRow('needs a position of the vessel before it', 'no position')
+    place = Origin(*log.place, 0.0).geodetic(away)
+    row = _row(_now(log), float(place[0]), float(place[1]), float(away[2]))
+    log.targets.append(row | {'id': name})
+
+
+def _take_usbl(
+    log: _Log, checksum: Callable[[str], int], sentence: str, stamp: int | None
+) -> None:
+    """A target of a USBL: ``USRTH`` has its true bearing, elevation and slant range, ``PSIMSSB``
+    its place ahead and to starboard, and its depth. Raises `BadRow`."""
+    log.hears = True
+    body, _, stated = sentence[1:].strip().rpartition('*')
+    if checksum(body) != int(stated, 16):
+        raise BadRow('has another checksum than it states')
+    head, *fields = body.split(',')
+    if head == 'USRTH':
+        log.clock = stamp or log.clock
+        distance = float(fields[3])
+        bearing, elevation = math.radians(float(fields[5])), math.radians(float(fields[6]))
+        flat = distance * math.cos(elevation)
+        up = -abs(distance * math.sin(elevation))
+        away = np.array([flat * math.sin(bearing), flat * math.cos(bearing), up])
+        _take_target(log, away, '')
+        return
+    clock, name, status, _, system, orientation, _, *numbers = fields
+    if stamp is not None:
+        log.clock = stamp
+    elif not _CLOCK.match(clock):
+        raise BadRow('has a time that cannot be read as HHMMSS', 'unreadable time')
+    else:
+        _tell_time(log, Time.fromisoformat(f'{clock[:2]}:{clock[2:4]}:{clock[4:6]}'))
+    if status != 'A':
+        raise BadRow('is flagged as invalid', 'flagged invalid')
+    if (system, orientation) != ('C', 'H'):
+        raise BadRow(
+            f'has the coordinates {system}, {orientation}; C, H (metres ahead and to starboard) '
+            'are read',
+            'other coordinates',
+        )
+    if math.isnan(log.heading):
+        raise BadRow('counts from the bow and no heading came before it', 'no heading')
+    starboard, ahead, depth = (float(number) for number in numbers[:3])
+    sine, cosine = math.sin(math.radians(log.heading)), math.cos(math.radians(log.heading))
+    away = np.array([ahead * sine + starboard * cosine, ahead * cosine - starboard * sine, -depth])
+    _take_target(log, away, name)
 
 
 def _take_ais(log: _Log, message: Any, stamp: int | None, own: bool) -> None:

@@ -33,9 +33,11 @@ from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading,
 
 from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import CsvTable, Row
 from ..messages import ros_message
-from ..places import check_place, checked_origin, origin_parameters, PolarRows
+from ..places import checked_origin, Degrees, origin_parameters, PolarRows
+from ..sources import BagError
+from ..times import BadRow
 from ..truth import truth_records
 from .fixes import by_name
 
@@ -67,18 +69,29 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     geodetic = table.has('vessel_latitude', 'vessel_longitude')
     if not geodetic:
         table.require('vessel_x', 'vessel_y')
+    degrees = Degrees(table, 'vessel_') if geodetic else None
     polar = None
     if not table.has('forward', 'starboard'):
         polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
     levelled = polar is not None and how.bearings != 'bow'
-    if not levelled:
-        table.require('heading')
+    if not levelled and not table.has('heading'):
+        left = [
+            header
+            for k, header in enumerate(table.headers)
+            if k not in table.index.values() and table.varies(k)
+        ]
+        raise BagError(
+            f'{table.path} has no column for heading, and bearings count from the bow; not used '
+            f'are {", ".join(left) or "no columns of numbers"}. If one of them is the heading: '
+            f"--column 'heading={left[0] if left else 'HEADER'}'. If bearings count from north: "
+            '--bearings north'
+        )
     place = ('range', 'bearing') if polar else ('forward', 'starboard')
 
     def parse(row: Row) -> _Parsed:
         row.require_valid()
         stamp_ns, name = row.stamp_ns(), row.text('id')
-        pose = _pose(row, stamp_ns, geodetic, levelled, how.frame_id)
+        pose = _pose(row, stamp_ns, degrees, levelled, how.frame_id)
         if row.empty(*place):
             if name:
                 raise BadRow(f'{name} has no position')
@@ -136,7 +149,7 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
 
 
 def _pose(
-    row: Row, stamp_ns: int, geodetic: bool, levelled: bool, frame_id: str
+    row: Row, stamp_ns: int, degrees: Degrees | None, levelled: bool, frame_id: str
 ) -> list[tuple[str, Callable[..., Any], Any]]:
     """Topic, writer and measurement of each part of the vessel's pose. Raises `BadRow`."""
     heading = row.optional('heading') if levelled else row.number('heading')
@@ -144,7 +157,7 @@ def _pose(
         raise BadRow(f'{row.table.header("heading")} is {heading:g} degrees')
     yaw = 0.5 * math.pi - math.radians(0.0 if math.isnan(heading) else heading)
     orientation = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
-    if not geodetic:
+    if degrees is None:
         position = np.array([row.number('vessel_x'), row.number('vessel_y'), 0.0])
         if np.abs(position).max() > FARTHEST:
             raise BadRow(f'the vessel at {position[0]:g}, {position[1]:g} is not on Earth')
@@ -152,8 +165,7 @@ def _pose(
             stamp_ns=stamp_ns, position=position, orientation=orientation, frame_id=frame_id
         )
         return [('/nav', write_navigation, pose)]
-    latitude, longitude = row.number('vessel_latitude'), row.number('vessel_longitude')
-    check_place(latitude, longitude)
+    latitude, longitude = degrees.place(row)
     where = VesselFix(stamp_ns=stamp_ns, latitude=latitude, longitude=longitude, frame_id='gps')
     lies = VesselHeading(stamp_ns=stamp_ns, orientation=orientation, frame_id='vessel')
     return [('/nav_fix', write_geodetic, where), ('/heading', write_heading, lies)]

@@ -34,9 +34,11 @@ from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
 
 from ..conversion import ConversionReport, converter
 from ..convert_options import PicturesOptions, XtfOptions
-from ..csv_table import BadRow, CsvTable, Row
+from ..csv_table import CsvTable, Row
 from ..messages import ros_message
+from ..places import Degrees
 from ..sources import BagError
+from ..times import BadRow
 from ..xtf import pings_of
 from .bag_images import SYSTEM
 from .sonar_files import ground_message, Message, Record, speed_of, write_records
@@ -93,9 +95,10 @@ def convert_pictures(path: Path, how: PicturesOptions, report: ConversionReport)
     config = DetectorConfig.from_mapping(how.parameters)
     table = CsvTable(_table_of(path, how.table), how.options)
     table.require('stamp', 'file')
+    degrees = Degrees(table) if table.has('latitude', 'longitude') else None
 
     def rows() -> Iterator[Record]:
-        for row, record in report.read_rows(table, lambda row: _picture_row(row, how)):
+        for row, record in report.read_rows(table, lambda row: _picture_row(row, degrees, how)):
             yield {**record, 'where': f'line {row.line}'}
 
     def messages(record: Record) -> Iterator[Message]:
@@ -203,7 +206,7 @@ def _table_of(folder: Path, named: Path | str | None) -> Path:
     return found[0]
 
 
-def _picture_row(row: Row, how: PicturesOptions) -> Record:
+def _picture_row(row: Row, degrees: Degrees | None, how: PicturesOptions) -> Record:
     """What the table says of a picture. Raises `BadRow`."""
     usual = {'near_range': how.near_range, 'far_range': how.far_range, 'fov': how.fov}
     given = {name: row.optional(name) for name in usual}
@@ -213,14 +216,17 @@ def _picture_row(row: Row, how: PicturesOptions) -> Record:
     )
     if not (0.0 <= near < far and 0.0 < fov <= 360.0):
         raise BadRow('does not say its ranges and directions: --far-range and --fov', 'geometry')
-    geodetic = row.table.has('latitude', 'longitude')
-    names = ('longitude', 'latitude') if geodetic else ('x', 'y')
+    place = row.optional('x'), row.optional('y')
+    if degrees is not None:
+        place = (math.nan, math.nan)
+        if not row.empty('latitude', 'longitude'):
+            place = degrees.unchecked(row)[::-1]
     return {
         'stamp_ns': row.stamp_ns(),
         'file': row.text('file'),
         'grid': (near, far, math.radians(fov)),
-        'units': 'degrees' if geodetic else 'metres',
-        'place': tuple(row.optional(name) for name in names),
+        'units': 'metres' if degrees is None else 'degrees',
+        'place': place,
         'heading': row.optional('heading'),
         'pitch': math.nan,
         'roll': math.nan,

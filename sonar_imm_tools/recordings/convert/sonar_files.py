@@ -38,9 +38,9 @@ from sonar_imm.measurements import Altitude, Ground, Navigation, Rejection
 
 from ... import SECOND
 from ..conversion import ConversionReport, JUMP, Leaps, provenance
-from ..csv_table import BadRow
 from ..messages import ros_message
 from ..places import origin_parameters
+from ..times import BadRow
 from ..writer import BagWriter
 
 LATEST = 2**31 * SECOND

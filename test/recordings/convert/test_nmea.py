@@ -198,3 +198,83 @@ def test_damaged_sentences_are_no_tracebacks(tmp_path_factory, changes):
         assert '\n' not in str(error)
     else:
         assert np.isfinite(report.rows)
+
+
+def summed(body):
+    return f'${body}*{pynmea2.NMEASentence.checksum(body):02X}'
+
+
+def usrth(distance, bearing, elevation=0.0):
+    return summed(f'USRTH,0,0,0,{distance},0,{bearing},{elevation},0,0,0,90.0,16')
+
+
+def psimssb(moment, ahead, starboard, status='A', system='C', turned='H', name='B01'):
+    place = f'{starboard},{ahead},12.0,0.1'
+    return summed(f'PSIMSSB,{moment:%H%M%S}.00,{name},{status},,{system},{turned},M,{place},N,,')
+
+
+@pytest.mark.parametrize(
+    'sentence, east, north, up',
+    [
+        (usrth(100.0, 90.0), 100.0, 0.0, 0.0),
+        (usrth(100.0, 180.0, -30.0), 0.0, -86.6, -50.0),
+        (psimssb(BEGIN, 25.0, 20.0), 25.0, -20.0, -12.0),
+    ],
+)
+def test_targets_of_a_usbl_are_placed_from_the_vessel(tmp_path, sentence, east, north, up):
+    lines = [position('RMC', BEGIN), heading(90.0), sentence]
+    report = converted(tmp_path, lines, origin=(*PLACE,))
+    assert (report.messages['/nav_fix'], report.messages['/heading'], report.rows) == (1, 1, 3)
+    topic, kind = ('/fixes', 'fixes') if 'B01' in sentence else ('/fix', 'fix')
+    with BagReader(report.path) as bag:
+        (found,) = (item.measurement for item in measurements_of(bag, 'diver', {topic: kind}))
+    assert np.ravel(found.position) == pytest.approx([east, north, up], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    'sentence, words',
+    [
+        (psimssb(BEGIN, 1.0, 1.0, status='V'), 'flagged as invalid'),
+        (psimssb(BEGIN, 1.0, 1.0, system='P'), 'coordinates P, H'),
+        (psimssb(BEGIN, 1.0, 1.0, turned='N'), 'coordinates C, N'),
+        (usrth(100.0, 90.0)[:-2] + '00', 'another checksum'),
+    ],
+)
+def test_a_vessel_with_a_usbl_is_never_the_target(tmp_path, sentence, words):
+    with pytest.raises(BagError, match=words):
+        converted(tmp_path, [position('RMC', BEGIN), heading(90.0), sentence])
+
+
+def test_sentences_that_are_not_known_are_counted_by_their_names(tmp_path):
+    lines = [position('RMC', BEGIN), summed('PSIMSNS,1,2'), summed('GPXYZ,1'), summed('PFOO,1,2')]
+    report = converted(tmp_path, lines)
+    assert report.bad_rows == 0 and '1 GPXYZ' in report.notes['not used']
+    assert '(' not in report.notes['not used']
+
+
+@pytest.mark.parametrize('clock', ['95958.00', '0959 8.00', '09598.00', '9:59:58', '0959'])
+def test_a_time_that_cannot_be_read_takes_no_other_stamp(tmp_path, clock):
+    good = position('GGA', BEGIN)
+    body = good[1:].rpartition('*')[0].split(',')
+    bad = summed(','.join([body[0], clock, *body[2:]]))
+    report = converted(tmp_path, [good, bad, good], date='2024-05-31')
+    assert (report.bad_rows, report.rows) == (1, 3)
+    assert report.reasons == {'unreadable time': 1}
+    with pytest.raises(BagError, match='cannot be read as HHMMSS') as caught:
+        convert_nmea_alone(tmp_path, bad)
+    assert '--date' not in caught.value.sentence
+
+
+def convert_nmea_alone(tmp_path, line):
+    (tmp_path / 'bad.nmea').write_text(f'{line}\r\n' * 3)
+    return convert_nmea(tmp_path / 'bad.nmea', tmp_path / 'none', date='2024-05-31')
+
+
+def test_the_date_is_advised_only_where_it_helps(tmp_path):
+    times = [position('GGA', BEGIN)]
+    with pytest.raises(BagError, match='--date'):
+        converted(tmp_path, times)
+    assert converted(tmp_path, times, date='2024-05-31').messages == {'/fix': 1}
+    with pytest.raises(BagError, match='60 of 60 rows.*no time') as caught:
+        converted(tmp_path, [ais(211_000_000, PLACE, 60)] * 60)
+    assert '--date' not in caught.value.sentence

@@ -148,7 +148,10 @@ def test_truth_and_ignored_columns(tmp_path):
         ('{"type": "FeatureCollection", "features": [', 'damaged JSON'),
         ('{"type": "FeatureCollection", "features": [7, {"geometry": 3}]}', 'without a position'),
         ('<gpx><wpt lat="54" lon="10"></wpt></gpx>', 'nothing that could be converted'),
-        ('<gpx><wpt lat="154" lon="10"><time>2024-05-31T10:00:00Z</time></wpt></gpx>', 'swapped'),
+        (
+            '<gpx><wpt lat="154" lon="10"><time>2024-05-31T10:00:00Z</time></wpt></gpx>',
+            'look exchanged',
+        ),
         (
             '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">'
             '<!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;&b;&b;">]><gpx><wpt lat="1" lon="1">'
@@ -176,3 +179,15 @@ def test_hostile_bytes_are_no_tracebacks(tmp_path_factory, name, place, written,
         assert '\n' not in str(error)
     else:
         assert all(np.isfinite(fix.position).all() for fix in fixes_of(report.path))
+
+
+def test_the_commonest_problem_is_named_and_its_advice_helps(tmp_path):
+    """A waypoint without a time does not hide a track whose times state no zone."""
+    point = '<trkpt lat="59.4" lon="10.{:03d}"><time>2021-01-01T00:00:{:02d}</time></trkpt>'
+    track = ''.join(point.format(k, k) for k in range(50))
+    path = tmp_path / 'a.gpx'
+    path.write_text(f'<gpx><wpt lat="59.4" lon="10.4"/><trk>{track}</trk></gpx>')
+    with pytest.raises(BagError, match='50 of 51 rows, .*--time-zone'):
+        convert_fixes(path, tmp_path / 'out')
+    report = convert_fixes(path, tmp_path / 'out', options=CsvOptions(time_zone='UTC'))
+    assert report.messages == {'/fix': 50}

@@ -1,0 +1,273 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What columns of tables mean: input, and the expected value or sentence."""
+
+import pytest
+
+from sonar_imm_tools.recordings.convert import KINDS
+from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.places import Degrees
+from sonar_imm_tools.recordings.sniffing import sniff
+from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.times import BadRow
+
+
+@pytest.fixture
+def table(tmp_path):
+    def make(text, **options):
+        path = tmp_path / 'a.csv'
+        path.write_text(text, encoding='utf-8')
+        return CsvTable(path, CsvOptions(**options))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    'headers, found',
+    [
+        ('Zeitpunkt;Geogr. Breite;Geogr. Länge;Tiefe', 'stamp latitude longitude depth'),
+        ('Zeitstempel;Breitengrad;Längengrad;Genauigkeit', 'stamp latitude longitude std'),
+        ('Uhrzeit;Rechtswert;Hochwert;Gültig', 'stamp x y valid'),
+        ('Horodatage;Est;Nord;Écart-type;Valide', 'stamp x y std valid'),
+        ('Date;Heure;Latitude;Longitude;Profondeur', 'date stamp latitude longitude depth'),
+        ('Fecha;Hora;Latitud;Longitud;Profundidad', 'date stamp latitude longitude depth'),
+        ('Dato;Klokkeslett;Breddegrad;Lengdegrad;Dybde', 'date stamp latitude longitude depth'),
+        ('Tidspunkt;Øst;Nord;Navn', 'stamp x y id'),
+        ('Data;Hora;Leste;Norte;Alvo', 'date stamp x y id'),
+        ('BaseDateTime;MMSI;LAT;LON', 'stamp id latitude longitude'),
+        ('Zeit;Schiff Breite;Schiff Länge', 'stamp vessel_latitude vessel_longitude'),
+        ('Heure;Latitude navire;Longitude navire', 'stamp vessel_latitude vessel_longitude'),
+        ('time;Boat Easting;Boat Northing;Gyro', 'stamp vessel_x vessel_y heading'),
+        ('time;Distance;Relèvement;Cap', 'stamp range bearing heading'),
+        ('Zeit;Entfernung;Peilung;Zielnummer', 'stamp range bearing id'),
+        ('time;Target Lat;Target Lon', 'stamp latitude longitude'),
+    ],
+)
+def test_headers_in_six_languages(table, headers, found):
+    made = table(f'{headers}\n')
+    assert [made.index.get(name) for name in found.split()] == list(range(len(found.split())))
+
+
+def test_the_position_of_the_target_comes_before_one_of_nobody(table):
+    made = table('time,lat,lon,target_lat,target_lon\n')
+    assert (made.index['latitude'], made.index['longitude']) == (3, 4)
+
+
+def test_the_sign_of_a_hemisphere_is_no_northing(table):
+    assert 'y' not in table('time,lat,N/S,lon,E/W\n').index
+
+
+@pytest.mark.parametrize(
+    'name, header, cell, value',
+    [
+        ('x', 'East (km)', 1.5, 1500.0),
+        ('x', 'x_cm', 150, 1.5),
+        ('depth', 'Depth (ft)', 10, 3.048),
+        ('depth', 'depth_ft', 10, 3.048),
+        ('depth', 'Depth (below surface)', 10, 10),
+        ('depth', 'Tiefe [m]', 10, 10),
+        ('range', 'Range [km]', 0.2, 200),
+        ('range', 'Distance (NM)', 1, 1852),
+        ('var_x', 'var_x_cm2', 1e4, 1),
+        ('var_x', 'var_x [m^2]', 4, 4),
+        ('vx', 'vx (kn)', 1, 0.514444),
+        ('heading', 'Heading [rad]', 1.5707963, 90),
+        ('heading', 'Heading (°T)', 90, 90),
+        ('latitude', 'lat_rad', 1.0372492, 59.43),
+        ('bearing', 'bearing_deg', 180, 3.14159265),
+        ('bearing', 'Peilung [°]', 180, 3.14159265),
+        ('bearing', 'bearing', 0.5, 0.5),
+        ('std_toa', 'std_toa_ms', 2, 0.002),
+    ],
+)
+def test_units_of_headers_are_heeded(table, name, header, cell, value):
+    (row,) = table(f'{header};time\n{cell};1\n')
+    assert row.number(name) == pytest.approx(value, rel=1e-5)
+
+
+@pytest.mark.parametrize('header', ['x [px]', 'East (deg)', 'Depth (dbar)', 'Länge [m],lat'])
+def test_a_unit_of_another_kind_is_refused(table, header):
+    made = table(f'{header},time\n1,1,1\n')
+    (row,) = made
+    with pytest.raises(BagError, match='name another column with --column'):
+        row.number(next(iter(set(made.index) - {'latitude', 'stamp'})))
+
+
+PLACES = [
+    ('LATITUDE,N/S,LONGITUDE,E/W', '33.5,S,70.25,W', (-33.5, -70.25)),
+    ('lat,lat_dir,lon,lon_dir', '33.5,N,70.25,W', (33.5, -70.25)),
+    ('lat,foo,lon,bar', '33.5,S,70.25,E', (-33.5, 70.25)),
+    ('foo,lat,bar,lon', 'south,33.5,west,70.25', (-33.5, -70.25)),
+    ('lat,lon,North or South,East or West', '33.5,70.25,Sud,Ouest', (-33.5, -70.25)),
+    ('lat,N/S,lon,E/W', '-33.5,S,70.25,E', (-33.5, 70.25)),
+    ('lat,N/S,lon,E/W', '3330.00,S,07015.0,W', (-33.5, -70.25)),
+    ('lat,lon', '5925.8,01028.2', (59.43, 10.47)),
+    ('lat,lon', '-5925.8,00028.2', (-59.43, 0.47)),
+    ('lat,lon', '59 25.8 N,10 28.2 E', (59.43, 10.47)),
+    ('lat,lon', 'S59 25.8,W10 28.2', (-59.43, -10.47)),
+    ('lat,lon', "59°25.8'S,10°28.2'W", (-59.43, -10.47)),
+    ('lat,lon', '"59°25\'48.0""N","10°28\'12""W"', (59.43, -10.47)),
+    ('lat,lon', '59:25:48,10:28:12', (59.43, 10.47)),
+    ('lat,lon', '59.43 S,10.47 W', (-59.43, -10.47)),
+    ('lat,lon', '59.43S,10.47W', (-59.43, -10.47)),
+    ('lat,lon', '-59 25.8,-10 28.2', (-59.43, -10.47)),
+]
+
+
+@pytest.mark.parametrize('header, cells, place', PLACES)
+def test_degrees_in_every_spelling(table, header, cells, place):
+    made = table(f'time,{header}\n1,{cells}\n')
+    (row,) = made
+    assert Degrees(made).place(row) == pytest.approx(place, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    'header, cells, words',
+    [
+        ('lat,N/S,lon,E/W', '33.5,X,70.25,W', "hemisphere 'X'"),
+        ('lat,N/S,lon,E/W', '33.5,,70.25,W', "hemisphere 'nothing'"),
+        ('lat,N/S,lon,E/W', '-33.5,N,70.25,W', "hemisphere 'N'"),
+        ('lat,lon', '33.5 E,70.25 N', "hemisphere 'E'"),
+        ('lat,lon', '59 75.8,10 28.2', "lat is '59 75.8'"),
+        ('lat,lon', '0,0', 'receivers without a fix'),
+        ('lat,lon', '0.0000001,0.0000001', 'receivers without a fix'),
+        ('lat,lon', '91,181', 'no position in AIS'),
+        ('lat,lon', '-999,-999', 'not a position on Earth'),
+        ('lat,lon', '59.43,null', 'lon is empty'),
+    ],
+)
+def test_what_is_no_position_is_a_bad_row(table, header, cells, words):
+    made = table(f'time,{header}\n1,{cells}\n')
+    (row,) = made
+    with pytest.raises(BadRow, match=words):
+        Degrees(made).place(row)
+
+
+@pytest.mark.parametrize(
+    'cells, place',
+    [('33,S,70,O\n33,S,70,W', (-33.0, 70.0)), ('33,S,70,O\n33,S,70,E', (-33.0, -70.0))],
+)
+def test_o_is_east_beside_west_and_west_beside_east(table, cells, place):
+    made = table(f'lat,ns,lon,ew\n{cells}\n')
+    assert Degrees(made).place(next(iter(made))) == place
+
+
+def test_o_alone_is_a_question(table):
+    with pytest.raises(BagError, match='may be east .Ost. or west'):
+        Degrees(table('lat,ns,lon,ew\n33,S,70,O\n'))
+
+
+def test_a_column_of_s_elsewhere_is_no_hemisphere(table):
+    made = table('lat,lon,foo,mode,bar\n33,70,1,S,2\n33,70,1,N,3\n33,70,1,A,3\n')
+    assert Degrees(made).place(next(iter(made))) == (33.0, 70.0)
+
+
+def test_latitude_and_longitude_exchanged_are_a_question_with_an_answer(table):
+    text = 'time,Lat,Lon\n1,115.1,-33.5\n'
+    with pytest.raises(BagError) as caught:
+        Degrees(table(text))
+    assert "--column 'latitude=Lon' --column 'longitude=Lat'" in caught.value.sentence
+    made = table(text, columns={'latitude': 'Lon', 'longitude': 'Lat'})
+    assert Degrees(made).place(next(iter(made))) == (-33.5, 115.1)
+
+
+@pytest.mark.parametrize(
+    'text, value',
+    [
+        ('time,x\n1,"1,5"\n', 1.5),
+        ('time,x\n1,"1,500"\n2,"1,5"\n', 1.5),
+        ('time,x\n1,"1,234.5"\n', 1234.5),
+        ('time;x\n1;1.234,5\n', 1234.5),
+        ('time;x\n1;1,234\n', 1.234),
+        ('time,x\n1,"1,500"\n', 'thousands or a decimal one'),
+    ],
+)
+def test_commas_in_numbers(table, text, value):
+    row = next(iter(table(text)))
+    if isinstance(value, float):
+        assert row.number('x') == value
+    else:
+        with pytest.raises(BadRow, match=value):
+            row.number('x')
+
+
+@pytest.mark.parametrize(
+    'header, words, kept',
+    [
+        ('Status', 'OK Fehler OK', 2),
+        ('Status', 'ok ok nein', 2),
+        ('Statut', 'valide invalide valide', 2),
+        ('Estado', 'bueno malo bueno', 2),
+        ('Gültig', 'ja nein ja', 2),
+        ('Status', 'OK Fehler4 OK', 2),
+        ('status', '4 5 0', 3),
+        ('status', 'A B C', 3),
+        ('valid', '1 0 true', 2),
+    ],
+)
+def test_words_for_bad_rows(table, header, words, kept):
+    made = table(f'time,{header}\n' + ''.join(f'1,{word}\n' for word in words.split()))
+
+    def is_kept(row):
+        try:
+            row.require_valid()
+        except BadRow:
+            return False
+        return True
+
+    assert sum(map(is_kept, made)) == kept
+
+
+@pytest.mark.parametrize(
+    'header, cells, named',
+    [
+        ('time;range;bearing_deg;Kurs [°]', '{k};50;{k}0;{c}', 'Kurs'),
+        ('time;range;bearing_deg;heading', '{k};50;{k}0;{c}', 'heading'),
+        ('time;range;bearing_deg;pos1;pos2', '{k};50;{k}0;59.4{c};10.4{c}', 'pos1, pos2'),
+        ('time;range;bearing_deg;SNR [dB];no', '{k};50;{k}0;{c};{k}', ''),
+        ('time;range;bearing_deg;note;port', '{k};50;{k}0;a{k};7', ''),
+    ],
+)
+def test_columns_that_may_be_the_vessel_are_a_question(tmp_path, header, cells, named):
+    source = tmp_path / 'in.csv'
+    rows = [cells.format(k=k, c=k * k + 3) for k in range(1, 9)]
+    source.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
+    if named:
+        with pytest.raises(BagError) as caught:
+            KINDS['fixes'](source, tmp_path / 'out')
+        assert named in caught.value.sentence and '--bearings north' in caught.value.sentence
+        KINDS['fixes'](source, tmp_path / 'out', bearings='north')
+    else:
+        assert KINDS['fixes'](source, tmp_path / 'out').messages == {'/fix': 8}
+
+
+def test_the_heading_of_a_vessel_is_asked_for_by_the_columns_that_are_left(tmp_path):
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k};59,4{k};10,4{k};{80 + k * k};50;{k}0\n' for k in range(1, 9))
+    head = 'Zeit;Schiff Breite;Schiff Länge;Kurs [°];Entfernung [m];Peilung [°]\n'
+    source.write_text(head + rows, encoding='utf-8')
+    assert sniff(source).kind == 'relative'
+    with pytest.raises(BagError) as caught:
+        KINDS['relative'](source, tmp_path / 'out')
+    assert "--column 'heading=Kurs [°]'" in caught.value.sentence
+    named = CsvOptions(columns={'heading': 'Kurs [°]'})
+    report = KINDS['relative'](source, tmp_path / 'out', options=named)
+    assert report.messages['/heading'] == 8
+
+
+def test_columns_that_are_zero_throughout_give_way_to_filled_ones(tmp_path):
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k},0,0.0,59.43,{10.47 + 1e-4 * k}\n' for k in range(9))
+    source.write_text('Time,East,North,Lat,Lon\n' + rows)
+    assert 'latitude = Lat' in KINDS['fixes'](source, tmp_path / 'out').notes['columns of in.csv']
