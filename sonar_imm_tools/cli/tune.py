@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from attrs import asdict
 import click
@@ -38,6 +38,9 @@ from .common import (
 )
 from .track import Plan, say_parameters
 
+if TYPE_CHECKING:
+    from ..evaluation.tuning import Fitting
+
 
 @click.command(
     epilog=example(
@@ -52,7 +55,7 @@ from .track import Plan, say_parameters
 @click.option(
     '--parameters',
     metavar='NAME,...',
-    help='What to fit; by default what recordings of the system can tell.',
+    help='Parameters to fit; default: those that bags of the system can determine.',
 )
 @click.option(
     '--out',
@@ -78,15 +81,16 @@ def command(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Fit parameters to your own recordings, by how well the tracker predicts each measurement
-    from those before it. No truth is needed.
+    """Fit parameters to your own bags, by how well the tracker predicts each measurement from the
+    earlier ones. No truth is needed.
 
-    Says of each parameter what it is, between which bounds, or that the recording cannot tell it
-    (flat): then it stays as it is. What the fit is worth is measured on the half of each recording
-    that it has not seen, both ways round. Where nothing is gained, nothing is written.
+    Prints each parameter with its interval, and whether the bags determine it. A parameter is
+    determined if its fitted value also predicts the half of each bag that was not fitted better.
+    All others keep their values.
 
-    The file of --out has what was told, and the parameters that the fit began with (of --params,
-    --set or the recording's own parameters.yaml), so that `track --params` needs no other.
+    The file of --out holds the determined parameters and those that the fit began with (of
+    --params, --set or parameters.yaml of the bag): `track --params` needs no other file. If no
+    parameter is determined, it holds them unchanged, and the exit code is 0 as well.
     """
     from ..evaluation.tuning import most_evaluations, prepared, tune
     from ..recordings.own_files import PARAMETERS, write_ros_parameters
@@ -104,7 +108,7 @@ def command(
     fitting, measurements = prepared(runs, names)
     begin = time.perf_counter()
     fitting.scores(None)
-    most = most_evaluations(len(fitting.tunables))
+    most = most_evaluations(fitting)
     say(
         f'{measurements} measurements; at most {most} runs of some '
         f'{time.perf_counter() - begin:.2g} s each, shared by {jobs}',
@@ -112,10 +116,11 @@ def command(
     )
     with progress('tuning', most, quiet=as_json) as advance:
         found = tune(fitting, measurements, processes_used=jobs, advance=advance)
-    if out is not None and found.values:
+    if out is not None:
         stated = _begun_with(plan, bags[0], runs[0].system)
-        head = f'# Fitted by sonar-imm tune: {", ".join(found.values)}.\n'
-        write_ros_parameters(out, {'/**': {**stated, **found.values}}, head)
+        head = f'# Fitted by sonar-imm tune: {", ".join(found.values) or "no parameter"}.\n'
+        values = found.values or _configured(fitting)
+        write_ros_parameters(out, {'/**': {**stated, **values}}, head)
     if as_json:
         content = asdict(found)
         del content['values'], content['measurements']
@@ -133,18 +138,24 @@ def command(
         f'measurement; {found.evaluations} evaluations'
     )
     for row in found.parameters:
-        if row.verdict == 'flat':
-            say(f'{row.name}: flat, {row.reason}')
-    if not any(row.verdict == 'told' for row in found.parameters):
-        say('nothing is told: the parameters stay as they are, and nothing is written')
-    elif not found.values:
-        say('held out, the fit predicts no better: keep the parameters; nothing is written')
+        if not row.determined:
+            say(f'{row.name}: {row.verdict}, {row.reason}')
+    if not found.values:
+        data = 'this bag does' if len(bags) == 1 else 'these bags do'
+        rest = 'they stay as they are' if out is None else f'{out} holds them unchanged'
+        say(f'{data} not determine any of the parameters; {rest}')
     elif out is not None:
         say(f'written to {out}')
 
 
+def _configured(fitting: Fitting) -> dict[str, Any]:
+    """Return the parameters that were fitted as they are configured, without empty lists."""
+    values = {t.name: getattr(fitting.jobs[0].config, t.name) for t in fitting.tunables}
+    return {name: value for name, value in values.items() if value != ()}
+
+
 def _begun_with(plan: Plan, bag: Path, system: str) -> dict[str, Any]:
-    """What --params, --set and the recording's own file state."""
+    """Return the parameters of --params, --set and the bag's own file."""
     from sonar_imm.trackers import SYSTEMS
 
     from .common import parameters_taken, typed_overrides

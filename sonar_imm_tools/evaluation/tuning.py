@@ -12,8 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Parameters by the likelihood of a user's own recordings: what they say of each, or that they say
-nothing.
+"""Parameters by the likelihood of a user's own bags: which ones the data determine, and where.
 
     maximise   sum_k log p(measurement k | those before it; parameters) + log prior
 
@@ -24,11 +23,16 @@ Each system has a module `evaluation.<system>.predictive` with
 - ``for_tuning(config)``: the config without what costs time and changes no prediction.
 
 The coordinates are logarithms of positive numbers and logits of probabilities. The prior is normal
-around what is configured, so that the data have to say something before a parameter moves.
-Nelder-Mead finds the maximum from two starts, central differences its curvature. A parameter is
-``told`` when its standard error is small and it is not at a bound, else ``flat``: then it stays as
-it was, and those that are told are fitted once more. What the fit is worth is asked on the half of
-each recording that it has not seen, both ways round.
+around the configured value. Nelder-Mead finds the maximum from two starts, central differences its
+curvature. With covariances that are wrong by a large factor the tracker rejects most measurements,
+and the likelihood has several maxima. So standard deviations and scales are first tried on a grid
+over their whole range.
+
+A parameter is ``determined`` if three conditions hold: its standard error is small, it is not at a
+bound, and fitting it improves the prediction of data that were not fitted. For the last one each
+half of the bags is predicted with what was fitted to the other half, with and without the
+parameter; the least supported parameter is dropped until all have support. All others are ``not
+determined``: they keep their values, and the determined ones are fitted once more.
 
 The sums are exact (`math.fsum`), so that neither the order of recordings nor the number of
 processes changes a byte.
@@ -46,7 +50,7 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray, IndexArray
 from sonar_imm.intake import Intake
 from sonar_imm.measurements import Rejection
 from sonar_imm.parameters import Config, ConfigError, did_you_mean
@@ -60,14 +64,21 @@ from ..recordings.reader import BagReader
 FEWEST = 20
 """Measurements below which nothing is fitted."""
 DETERMINED = 0.35
-"""Standard error, of a logarithm or logit, up to which a parameter is told."""
+"""Standard error, of a logarithm or logit, up to which a parameter is determined."""
+SUPPORT = 2.0
+"""Held-out gain of log likelihood, over both halves, from which a parameter is determined. A fit
+of a parameter that is right already reaches it by chance in 2 % of cases."""
 STEP = 0.15
 """Of central differences."""
 EVALUATIONS = 40
 """Most evaluations of a fit, for each parameter."""
 PRECISION = 0.02
 """Of coordinates and of the log likelihood, at which Nelder-Mead stops."""
+SPACING = 1.2
+"""Largest spacing of the grid of scales, in their logarithm."""
 WHOLE, FIRST, SECOND = 'whole', 'first', 'second'
+DETERMINES, LEAVES = 'determined', 'not determined'
+"""Verdicts."""
 
 Scores = dict[int, tuple[float, int]]
 """Log predictive density, and the number of measurements, by stamp."""
@@ -78,7 +89,8 @@ class Tunable:
     """A parameter that can be fitted: `start` is the value that it has, or that stands for an
     automatic one. place: of an element, where the parameter is the list `whole`. kind: ``log`` or
     ``logit``. std: of the prior, in that coordinate. least: a bound beside those of the
-    parameter. usual: whether it is fitted without being asked for. step: of the differences."""
+    parameter. usual: whether it is fitted without being asked for. scanned: whether a grid between
+    the bounds is tried first. step: of the differences."""
 
     name: str
     start: float
@@ -88,6 +100,7 @@ class Tunable:
     place: int | None = None
     whole: tuple[float, ...] = ()
     usual: bool = True
+    scanned: bool = False
     step: float = STEP
 
     @property
@@ -114,6 +127,13 @@ class Tunable:
             min(u + 4.0 * self.std, self.coordinate(high)),
         )
 
+    def grid(self, config: Config) -> list[float]:
+        """Return the coordinates that are tried first, none for most parameters."""
+        if not self.scanned:
+            return []
+        low, high = self.bounds(config)
+        return np.linspace(low, high, math.ceil((high - low) / SPACING) + 1).tolist()
+
 
 @frozen(eq=False)
 class Recording:
@@ -137,7 +157,8 @@ class Recording:
 
     def scores(self, values: Mapping[str, Any], until: float = math.inf) -> Scores:
         """What a tracker with these parameters predicts, stamp by stamp, up to `until`."""
-        tracker = _predictive(self.system).Scored(evolve(self.config, **values), self.measurements)
+        config = evolve(self.config, **_in_range(self.config, values))
+        tracker = _predictive(self.system).Scored(config, self.measurements)
         intake = Intake(tracker, self.frame_id)
         for measurement in self.measurements:
             if measurement.stamp_ns > until:
@@ -150,6 +171,19 @@ class Recording:
                 tracker.process(admitted)
         found: Scores = tracker.scores
         return found
+
+
+def _in_range(config: Config, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values within the ranges of their parameters, which rounding and the steps of
+    differences may leave."""
+    specs = {spec.name: spec for spec in config.specs()}
+    inside = {}
+    for name, value in values.items():
+        low, high = specs[name].low, specs[name].high
+        limits = -math.inf if low is None else low, math.inf if high is None else high
+        clipped = np.clip(value, *limits).tolist()
+        inside[name] = tuple(clipped) if isinstance(value, tuple) else clipped
+    return inside
 
 
 def _predictive(system: str) -> Any:
@@ -218,16 +252,12 @@ class Fitting:
 def maximise(
     fitting: Fitting, start: FloatArray, part: str, advance: Callable[[int], None] | None = None
 ) -> tuple[FloatArray, float, int]:
-    """Where the posterior is largest, how large it is, and after how many evaluations."""
+    """Return where the posterior is largest, how large it is, and how many evaluations it took."""
     from scipy.optimize import minimize
 
     config = _recording(fitting.jobs[0]).config
     bounds = np.array([t.bounds(config) for t in fitting.tunables])
     start = np.clip(start, *bounds.T)
-    simplex = np.tile(start, (len(start) + 1, 1))
-    for k, tunable in enumerate(fitting.tunables):
-        step = 0.5 * tunable.std
-        simplex[k + 1, k] += step if start[k] + step <= bounds[k, 1] else -step
 
     def cost(u: FloatArray) -> float:
         if advance is not None:
@@ -235,6 +265,17 @@ def maximise(
         value = fitting.posterior(u, part)
         return -value if math.isfinite(value) else 1e12
 
+    tried = 0
+    for k, tunable in enumerate(fitting.tunables):
+        points = np.repeat(start[None], len(grid := tunable.grid(config)), axis=0)
+        points[:, k] = grid
+        if len(points):
+            costs = [cost(point) for point in points]
+            start, tried = points[int(np.argmin(costs))], tried + len(points)
+    simplex = np.tile(start, (len(start) + 1, 1))
+    for k, tunable in enumerate(fitting.tunables):
+        step = 0.5 * (SPACING if tunable.scanned else tunable.std)
+        simplex[k + 1, k] += step if start[k] + step <= bounds[k, 1] else -step
     found = minimize(
         cost,
         start,
@@ -247,7 +288,7 @@ def maximise(
             'maxfev': EVALUATIONS * len(start),
         },
     )
-    return np.asarray(found.x), -float(found.fun), int(found.nfev)
+    return np.asarray(found.x), -float(found.fun), tried + int(found.nfev)
 
 
 def errors(
@@ -283,21 +324,28 @@ def errors(
 
 @frozen(kw_only=True)
 class Row:
-    """What was found of a parameter. low, high: two standard errors to either side; None where the
-    likelihood has no curvature, or is largest at a bound."""
+    """Result for one parameter. low, high: two standard errors to either side; None where the
+    likelihood has no curvature, or is largest at a bound. held_out_gain: what fitting it gains per
+    measurement that was not fitted; None where it was not tested."""
 
     name: str
     before: float
     after: float
     low: float | None
     high: float | None
+    held_out_gain: float | None
     verdict: str
     reason: str
+
+    @property
+    def determined(self) -> bool:
+        return self.verdict == DETERMINES
 
 
 @frozen(kw_only=True)
 class Tuned:
-    """The result. values: of the parameters that are told; empty when nothing is gained."""
+    """The result. held_out_gain: of all determined parameters together, per measurement; of those
+    that were dropped last where none is left. values: of the determined parameters."""
 
     system: str
     measurements: int
@@ -354,9 +402,12 @@ def prepared(jobs: Sequence[Job], names: Sequence[str]) -> tuple[Fitting, int]:
     return Fitting(jobs, tunables, tuple(split)), count
 
 
-def most_evaluations(parameters: int) -> int:
-    """How many evaluations `tune` takes at most."""
-    return EVALUATIONS * parameters * 5 + 1 + 2 * parameters**2
+def most_evaluations(fitting: Fitting) -> int:
+    """Return how many evaluations `tune` takes at most."""
+    config, p = _recording(fitting.jobs[0]).config, len(fitting.tunables)
+    grid = sum(len(t.grid(config)) for t in fitting.tunables)
+    of_whole, of_halves = 3 * (EVALUATIONS * p + grid), p * (EVALUATIONS * (p + 1) + 2 * grid)
+    return of_whole + of_halves + 2 + 2 * p**2 + p * (p + 5)
 
 
 def tune(
@@ -379,7 +430,9 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
     config = _recording(fitting.jobs[0]).config
     start = np.array([t.coordinate(t.start) for t in tunables])
     std = np.array([t.std for t in tunables])
-    starts = [(fitting, start, WHOLE), (fitting, start + std, WHOLE)]
+    starts = [(fitting, start, WHOLE)]
+    if not all(t.scanned for t in tunables):
+        starts.append((fitting, start + std, WHOLE))
     fits = together(maximise, starts)
     best, _, _ = max(fits, key=lambda found: found[1])
     used = sum(found[2] for found in fits)
@@ -401,43 +454,22 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         part = evolve(fitting, tunables=tuple(tunables[k] for k in free))
         se[free] = errors(part, best[free], evaluate)
         used += 1 + 2 * len(free) ** 2
-    determined = (se <= DETERMINED) & ~at_bound
+    sharp = (se <= DETERMINED) & ~at_bound
 
     before, _ = fitting.scores(None)
-    after, gain, values = before, 0.0, {}
-    final = best
-    if determined.any():
-        again = evolve(fitting, tunables=tuple(t for t, yes in zip(tunables, determined) if yes))
-        begin = [(again, start[determined], FIRST), (again, start[determined], SECOND)]
-        if not determined.all():
-            begin.append((again, best[determined], WHOLE))
-        fits = together(maximise, begin)
-        used += sum(found[2] for found in fits)
-        final = best.copy()
-        if not determined.all():
-            final[determined] = fits[2][0]
-        chosen = np.array(
-            [
-                t.coordinate(rounded(t.value(u)))
-                for t, u, yes in zip(tunables, final, determined)
-                if yes
-            ]
-        )
-        halves = together(
-            _score,
-            [
-                (again, fits[0][0], SECOND),
-                (again, None, SECOND),
-                (again, fits[1][0], FIRST),
-                (again, None, FIRST),
-                (again, chosen, WHOLE),
-            ],
-        )
-        used += 5
-        gain = math.fsum([halves[0], -halves[1], halves[2], -halves[3]]) / measurements
-        after = halves[4]
-        if gain > 0.0:
-            values = _as_written(values_of(again.tunables, chosen))
+    after, values, final = before, {}, best.copy()
+    gain, gains, kept, evaluations = _supported(fitting, start, sharp, together)
+    used += evaluations
+    if len(kept):
+        again = evolve(fitting, tunables=tuple(tunables[k] for k in kept))
+        if len(kept) < len(tunables):
+            ((final[kept], _, evaluations),) = together(maximise, [(again, best[kept], WHOLE)])
+            used += evaluations
+        written = [t.coordinate(rounded(t.value(u))) for t, u in zip(again.tunables, final[kept])]
+        chosen = np.array(written)
+        (after,) = together(_score, [(again, chosen, WHOLE)])
+        used += 1
+        values = _as_written(values_of(again.tunables, chosen))
     rows = []
     for k, tunable in enumerate(tunables):
         place = final[k]
@@ -448,9 +480,14 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         reason = ''
         if at_bound[k]:
             reason = f'the likelihood goes on rising beyond {tunable.value(best[k]):.4g}'
-        elif not determined[k]:
-            reason = 'cannot be told from this recording'
-        value = rounded(tunable.value(place)) if determined[k] else tunable.start
+        elif not sharp[k]:
+            reason = 'the likelihood hardly depends on it'
+        elif k not in kept:
+            reason = (
+                f'with {tunable.value(place):.4g} the data that were not fitted are predicted no '
+                'better than with the configured value'
+            )
+        value = rounded(tunable.value(place)) if k in kept else tunable.start
         rows.append(
             Row(
                 name=tunable.label,
@@ -458,7 +495,8 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
                 after=value,
                 low=low,
                 high=high,
-                verdict='told' if determined[k] else 'flat',
+                held_out_gain=gains[k] / measurements if k in gains else None,
+                verdict=DETERMINES if k in kept else LEAVES,
                 reason=reason,
             )
         )
@@ -467,11 +505,42 @@ def _tune(fitting: Fitting, measurements: int, together: Together) -> Tuned:
         measurements=measurements,
         log_likelihood_before=before,
         log_likelihood_after=after,
-        held_out_gain=gain,
+        held_out_gain=gain / measurements,
         evaluations=used,
         parameters=tuple(rows),
         values=values,
     )
+
+
+def _supported(
+    fitting: Fitting, start: FloatArray, sharp: BoolArray, together: Together
+) -> tuple[float, dict[int, float], IndexArray, int]:
+    """Drop parameters without held-out support, the weakest first.
+
+    sharp (p,): which ones are tested. Returns the gain of log likelihood of those that are left,
+    or of those that were dropped last; the gain of each that was tested; the places of those that
+    are left; and the number of evaluations.
+    """
+    gain, used = 0.0, 0
+    gains: dict[int, float] = {}
+    kept: IndexArray = np.flatnonzero(sharp)
+    while len(kept):
+        part = evolve(fitting, tunables=tuple(fitting.tunables[k] for k in kept))
+        halves = [(part, start[kept], FIRST), (part, start[kept], SECOND)]
+        fits = together(maximise, halves)
+        calls = []
+        for (u, _, _), other in zip(fits, (SECOND, FIRST)):
+            without = np.where(np.eye(len(kept), dtype=bool), start[kept], u)
+            calls += [(part, each, other) for each in (u, None, *without)]
+        used += sum(found[2] for found in fits) + len(calls)
+        scores = np.reshape(together(_score, calls), (2, -1))
+        gain, *each = (math.fsum([*scores[:, 0], *-column]) for column in scores[:, 1:].T)
+        gains.update(zip(kept.tolist(), each))
+        weakest = int(np.argmin(each))
+        if min(gain, each[weakest]) >= SUPPORT:
+            break
+        kept = np.delete(kept, weakest)
+    return gain, gains, kept, used
 
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -57,9 +57,10 @@ def tunables(config: DiverConfig, measurements: Sequence[Any]) -> list[Tunable]:
             'tracker does not keep'
         )
     scale, least = config.covariance_scale, min(1.0, config.covariance_scale)
-    found = [Tunable(name='covariance_scale', start=scale, least=least)]
+    found = [Tunable(name='covariance_scale', start=scale, std=3.0, least=least, scanned=True)]
     if config.model_set not in MODEL_SETS:
-        # A set of another package may read these where they are stated; if not, they are flat.
+        # A set of another package may read these where they are configured; if not, the
+        # likelihood does not depend on them.
         noise = config.acceleration_noise
         for place, value in enumerate(noise):
             found.append(

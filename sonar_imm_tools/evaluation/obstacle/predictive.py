@@ -47,9 +47,10 @@ def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunabl
     pings = [item for item in measurements if isinstance(item, Detections)]
     found = []
     if any(np.isnan(ping.var_range).any() for ping in pings):
-        found.append(Tunable(name='range_std', start=config.range_std))
+        found.append(Tunable(name='range_std', start=config.range_std, scanned=True))
     if any(np.isnan(ping.var_bearing).any() for ping in pings):
-        found.append(Tunable(name='bearing_std_deg', start=config.bearing_std_deg))
+        bearing = config.bearing_std_deg
+        found.append(Tunable(name='bearing_std_deg', start=bearing, scanned=True))
     p = config.detection_probability
     found.append(Tunable(name='detection_probability', start=p, kind='logit'))
     found.append(Tunable(name='clutter_density', start=config.clutter_density))
