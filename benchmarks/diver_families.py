@@ -384,7 +384,7 @@ def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: A
         'nees': float(np.mean(squared[there])),
         'followed': float(np.mean(there)),
         'tracks': float(tracker._stream.state.life.next_id - 1),
-        'warns': float('times as far as they state' in warnings),
+        'warns': float('times as large as reported' in warnings),
         'advice': float((re.findall(r'are ([\d.e+]+) times too small', warnings) or ['nan'])[0]),
     }
 

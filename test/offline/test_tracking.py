@@ -202,7 +202,7 @@ def tracked(folder, **options):
 def test_wild_fixes_are_not_believed_with_and_without_names(tmp_path, name):
     rmse, inside, warnings, _ = tracked(tmp_path, name=name)
     assert rmse <= 1.35 and inside > 0.9
-    assert not any('as far as they state' in text for text in warnings)
+    assert not any('as large as reported' in text for text in warnings)
 
 
 @pytest.mark.statistics
@@ -211,4 +211,4 @@ def test_fixes_that_scatter_five_times_too_far_are_named_before_the_fiftieth(tmp
     _, inside, _, early = tracked(tmp_path, name=name, std=STD / 5.0, wild=0.0)
     # Over 20 runs .80 (docs/results/families.md).
     assert inside > 0.7
-    assert any('as far as they state' in text for text in early)
+    assert any('as large as reported' in text for text in early)
