@@ -215,7 +215,8 @@ def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
     top = np.maximum.reduceat(log, first)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide='ignore'):
-        return np.asarray(top + np.log(np.add.reduceat(np.exp(log - top[target]), first)))
+        relative = log - top[target]
+        return np.asarray(top + np.log(np.add.reduceat(np.exp(relative, out=relative), first)))
 
 
 @frozen(eq=False)

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import math
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,9 @@ FAR = 80.0
 """Squared normalised distance along one axis beyond which a density is replaced by a bound. The
 bound decreases with the distance, so it still ranks tracks."""
 
+MAX_TABLE = 1 << 19
+"""Largest number of assumptions times fixes that are compared at once."""
+
 MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
 """Minimum probability of a model that opens the gate. A single assignment needs rare models, or
 it loses tracks in sharp turns; joint association does not."""
@@ -114,30 +118,75 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
 
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
+    among = Assumptions.from_rows(known.rows, known.borrowed)
+    blocks, parts = known.rows.blocks, models.parts
+    expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
+    by_nis = models.families is None
+    each = [
+        _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
+        for part in _parts(among.target, len(group.z))
+    ]
+    if len(each) == 1:
+        return Pairs(among, *each[0])
+    assumption, fix, log, whole, nis = zip(*each)
+    return Pairs(
+        among,
+        np.concatenate(assumption),
+        np.concatenate(fix),
+        np.concatenate(log),
+        np.concatenate(whole),
+        np.concatenate(nis) if by_nis else None,
+    )
+
+
+def _parts(target: IntArray, fixes: int) -> list[slice]:
+    """Return slices of the assumptions, each with all assumptions of its tracks: a table of all
+    tracks and thousands of fixes would take hundreds of megabytes."""
+    count = max(1, MAX_TABLE // max(fixes, 1))
+    first = np.append(np.flatnonzero(np.diff(target, prepend=-1)), len(target))
+    cuts = [0]
+    for start, stop in zip(first, first[1:]):
+        if stop - cuts[-1] > count and start > cuts[-1]:
+            cuts.append(int(start))
+    return [slice(*pair) for pair in zip(cuts, [*cuts[1:], len(target)])]
+
+
+def _compare_part(
+    known: Known,
+    group: Group,
+    among: Assumptions,
+    part: slice,
+    expected: list[tuple[FloatArray, FloatArray]],
+    min_probability: float | None,
+) -> tuple[Any, ...]:
+    """Return the fields of `Pairs` after the first for a part of the assumptions.
+
+    :param min_probability: of a model whose NIS counts; None if no NIS is needed.
+    """
     rows, z, R = known.rows, group.z, group.R
-    among = Assumptions.from_rows(rows, known.borrowed)
-    expected = [bank.predict_fix(b, part.measured) for b, part in zip(rows.blocks, models.parts)]
+    among = Assumptions._make(column[part] for column in among)
+    track = among.target - (among.target[0] if len(among.target) else 0)
     off = _box_distance(expected, among, z, R)
     # A fix near one row is compared with all rows of the track, or a row could stay behind.
-    near = reduce_targets(np.logical_or, off <= 1.0, among.target)
+    near = reduce_targets(np.logical_or, off <= 1.0, track)
     if group.target_id is not None:
-        near = known['target_id'][:, None] == group.target_id
-    near = near[among.target]
-    assumption, fix = np.nonzero(near)
+        near = known['target_id'][np.unique(among.target), None] == group.target_id
+    assumption, fix = np.nonzero(near[track])
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
     log = _mixture_log_density(rows.mu[row], compared)
-    table = -0.5 * FAR * np.square(np.maximum(off, 1.0))
+    table = np.square(np.maximum(off, 1.0, out=off), out=off)
+    table *= -0.5 * FAR
     table[assumption, fix] = log
-    whole = log_sum(among.logw[:, None] + table, among.target)
+    whole = log_sum(among.logw[:, None] + table, track)
     nis = None
-    if models.families is None:
+    if min_probability is not None:
         probable = (rows.mu * np.exp(rows.logw)[:, None])[row] >= min_probability
         least = np.concatenate([each.nis for each in compared], axis=1)
         least = np.where(probable, least, np.inf).min(axis=1, initial=np.inf)
         nis = np.full(whole.shape, np.inf)
-        np.minimum.at(nis, (among.target[assumption], fix), least)
-    return Pairs(among, assumption, fix, compared, log, whole, nis)
+        np.minimum.at(nis, (track[assumption], fix), least)
+    return assumption + part.start, fix, log, whole, nis
 
 
 def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
@@ -184,7 +233,14 @@ def _box_distance(
         low = np.minimum(low, (place - reach).min(axis=2))
         high = np.maximum(high, (place + reach).max(axis=2))
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-300)
-    return np.asarray((np.abs(z - middle[:, None]) / half[:, None]).max(axis=2))
+    # Axis by axis and in place: a scan of 10,000 fixes takes much memory.
+    off = np.zeros((len(among.row), len(z)))
+    for axis in (0, 1):
+        apart = z[:, axis] - middle[:, axis, None]
+        np.abs(apart, out=apart)
+        apart /= half[:, axis, None]
+        np.maximum(off, apart, out=off)
+    return off
 
 
 def gate_log_density(group: Group) -> float:
@@ -306,13 +362,14 @@ def update_stage(
         known = known.with_columns(**columns)
         if not (association.beta > 0.0).any():
             return known
-        return update_tracks(known, pairs, association, models, estimated(known))
+        return update_tracks(known, group, pairs, association, models, estimated(known))
 
     return update
 
 
 def update_tracks(
     known: Known,
+    group: Group,
     pairs: Pairs,
     association: Association,
     models: ModelSet,
@@ -335,12 +392,14 @@ def update_tracks(
     place[left] = np.arange(len(left))
     row = np.where(among.has_row, place[among.row], -1)[assumption]
     own = row >= 0
-    row, used, weight, whole = row[own], used[own], weight[own, None], whole[own, None]
+    row, weight, whole = row[own], weight[own, None], whole[own, None]
+    assumption, fix = assumption[own], pairs.fix[used[own]]
+    z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
     blocks, factors = [], []
-    for block, part, each, mask in zip(rows.blocks, models.parts, pairs.innovations, estimated):
-        chosen = each.select(used)
-        ratio, none = weight * np.exp(chosen.log - whole), missed[rows.target]
-        block, factor = bank.update(block, chosen, row, ratio, none, part.measured, mask)
+    for block, part, mask in zip(rows.blocks, models.parts, estimated):
+        innovations = bank.weigh(block, row, z, R, part.measured)
+        ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
+        block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
         blocks.append(block)
         factors.append(factor)
     sound, repairs = repair_covariances(tuple(blocks))

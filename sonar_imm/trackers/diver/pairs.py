@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.bank import Innovations
 from ...estimation.rows import Borrowed, Rows
 
 
@@ -64,8 +63,6 @@ class Pairs(NamedTuple):
     """(p,) index of the assumption."""
     fix: IndexArray
     """(p,) index of the fix."""
-    innovations: tuple[Innovations, ...]
-    """Innovations of the pairs for each block of models."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray
