@@ -75,8 +75,8 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         f'diver who moves as the model says, covariances {factor} times too small': (
             'diver',
             'as modelled',
-            {'fixes': '150', 'factor': str(factor)},
-            {},
+            {'fixes': '100', 'factor': str(factor)},
+            {'model_set': 'heading_speed'},
             'covariance_scale',
             factor,
         )

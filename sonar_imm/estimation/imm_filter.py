@@ -278,7 +278,8 @@ class IMM:
         motions = [state.motion for state in states if state.motion is not None]
         transitions = [state.transition for state in states if state.transition is not None]
         x, P, mu = (np.concatenate(part) for part in zip(*(state[1:4] for state in states)))
-        found = imm_smooth(x, P, mu, np.stack(transitions), *map(np.stack, zip(*motions)))
+        F, Q, B = map(np.stack, zip(*motions))
+        found = imm_smooth(x, P, mu, np.stack(transitions), F, Q, B)
         stamps = np.array([state.stamp_ns for state in states]) / 1e9
         return Smoothed(stamps, *found.combine(self._joint.E), found.mu)
 

@@ -23,7 +23,7 @@ from oracles.smoothing import rts_smooth
 import pytest
 
 from sonar_imm.estimation import imm, kalman
-from sonar_imm.estimation.smoothing import imm_smooth, smooth_modes
+from sonar_imm.estimation.smoothing import imm_smooth, IMMPredicted, smooth_modes
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 
@@ -54,12 +54,13 @@ def kalman_pass(F, Q, B, H, R, x, P, Z):
     return np.array(xs), np.array(Ps)
 
 
-def imm_pass(transition, F, Q, B, H, R, x, P, mu, Z):
-    """Forward pass of one target; transition, F, Q and B (K, ...) are those into each step."""
+def imm_pass(transition, F, Q, B, H, R, x, P, mu, Z, moves_first=False):
+    """Forward pass of one target; transition, F, Q and B (K, ...) are those into each step;
+    moves_first: whether there is a move into the first step."""
     x, P, mu, steps = x[None], P[None], mu[None], []
     H = np.broadcast_to(H, (x.shape[1], *H.shape))
     for k, z in enumerate(Z):
-        if k:
+        if k or moves_first:
             mixed = imm.mix(x, P, mu, transition[k][None])
             (x, P, _), mu = imm.predict(mixed.x, mixed.P, F[k], Q[k], B[k]), mixed.c
         updated = imm.update(x, P, mu, z - np.einsum('jmn,tjn->tjm', H, x), H[None], R[None])
@@ -314,18 +315,18 @@ def test_the_enumeration_itself_agrees_with_an_independent_one(case):
 @pytest.mark.parametrize(
     'models, M, K, mu_error, x_error, spread_error',
     [
-        (random_models, 2, 6, 0.04, 0.20, 0.20),
-        (random_models, 3, 5, 0.04, 0.20, 0.20),
-        (headings, 3, 5, 0.02, 0.20, 0.15),
-        (headings, 4, 4, 0.02, 0.20, 0.15),
-        (quiet_and_agile, 2, 6, 0.08, 0.25, 0.30),
-        (quiet_and_agile, 3, 5, 0.05, 0.20, 0.20),
+        (random_models, 2, 9, 0.008, 0.015, 0.02),
+        (random_models, 3, 5, 0.008, 0.03, 0.03),
+        (headings, 3, 5, 0.008, 0.04, 0.04),
+        (headings, 4, 4, 0.005, 0.04, 0.03),
+        (quiet_and_agile, 2, 9, 0.02, 0.05, 0.10),
+        (quiet_and_agile, 3, 5, 0.008, 0.02, 0.04),
     ],
 )
 def test_close_to_the_enumeration_of_all_sequences(models, M, K, mu_error, x_error, spread_error):
     """Mean errors over twelve scenes: of the probabilities, of the state in its own sigmas, of its
-    variance. The filter, in the same scenes, is further away by a factor of at least two in
-    each."""
+    variance. With one Gaussian per model in the forward pass they are two to ten times larger. The
+    filter, in the same scenes, is further away by a factor of at least eight in each."""
     errors = {'smoothed': [], 'filtered': []}
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -356,7 +357,45 @@ def test_close_to_the_enumeration_of_all_sequences(models, M, K, mu_error, x_err
         np.mean(errors[name], axis=0) for name in ('smoothed', 'filtered')
     )
     assert (smoothed_error < [mu_error, x_error, spread_error]).all()
-    assert (filtered_error > 2.0 * smoothed_error).all()
+    assert (filtered_error > 8.0 * smoothed_error).all()
+
+
+def test_the_prediction_is_that_of_an_imm_filter_unless_it_is_given():
+    rng, K, M = np.random.default_rng(6), 6, 3
+    F, Q, B, H, R = random_models(rng, M)
+    mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
+    x0, P0 = np.zeros((M, 2)), repeat(np.eye(2), M)
+    moves = [repeat(part, K) for part in (transition, F, Q, B)]
+    filtered = imm_pass(*moves, H, R, x0, P0, mu, rng.normal(size=(K, 1)))
+    parts = [[np.zeros((M, 2))], [np.zeros((M, 2, 2))], [np.zeros(M)]]
+    for x, P, mu in zip(*(part[:-1] for part in filtered)):
+        mixed = imm.mix(x[None], P[None], mu[None], transition[None])
+        x, P, _ = imm.predict(mixed.x, mixed.P, F, Q, B)
+        for part, value in zip(parts, (x, P, mixed.c)):
+            part.append(value[0])
+    given = imm_smooth(*filtered, *moves, IMMPredicted(*map(np.array, parts)))
+    for one, other in zip(given, imm_smooth(*filtered, *moves)):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_after_a_step_that_no_measurement_explains_the_filtered_states_count():
+    """An update that widens, as one by two measurements either of which may be the right one. It
+    and what follows are smoothed as if the pass began there."""
+    rng, K, M = np.random.default_rng(7), 5, 3
+    F, Q, B, H, R = quiet_and_agile(rng, M)
+    mu, transition = rng.dirichlet(3 * np.ones(M)), chain(rng, M)
+    x0, P0 = np.zeros((M, 2)), repeat(np.eye(2), M)
+    moves = [repeat(part, K) for part in (transition, F, Q, B)]
+    Z = rng.normal(size=(K, 1))
+    before = imm_pass(*moves, H, R, x0, P0, mu, Z[:3])
+    before[1][2] *= 30.0
+    begin = [part[2] for part in before]
+    after = imm_pass(*moves, H, R, *begin, Z[3:], moves_first=True)
+    wide = [np.concatenate(parts) for parts in zip(before, after)]
+    whole = imm_smooth(*wide, *moves)
+    end = imm_smooth(*(part[2:] for part in wide), *(part[2:] for part in moves))
+    for one, other in zip(whole, end):
+        np.testing.assert_allclose(one[2:], other, atol=1e-9)
 
 
 def draw(rng, F, Q, B, H, R, x0, P0, mu, transition, K):

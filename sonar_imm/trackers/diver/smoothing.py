@@ -30,7 +30,7 @@ import numpy as np
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray, IndexArray
 from ...estimation.rows import Borrowed, Rows
-from ...estimation.smoothing import imm_smooth
+from ...estimation.smoothing import imm_smooth, IMMPredicted
 from ...measurements import Measurement
 from .known import Known, predict_over, Prediction
 from .tracker import DiverTracker
@@ -51,8 +51,8 @@ class _Scan(NamedTuple):
     """(N, M, n, n)."""
     steps: tuple[Prediction, ...]
     """Prediction steps to the scan."""
-    between: tuple[tuple[FloatArray, FloatArray], ...]
-    """x and P after all steps except the last."""
+    predicted: tuple[tuple[FloatArray, FloatArray], ...]
+    """x and P after each step; the last ones are those before the update."""
 
 
 @frozen(eq=False)
@@ -66,10 +66,12 @@ class _Path:
     mu: list[FloatArray] = field(factory=list)
     transition: list[FloatArray] = field(factory=list)
     dt: list[float] = field(factory=list)
+    predicted: list[IMMPredicted] = field(factory=list)
 
     def add(self, scan: int | None, *step: Any) -> None:
-        """Append a step: x (M, n), P (M, n, n), mu (M,), transition (M, M), dt."""
+        """Append a step: x (M, n), P (M, n, n), mu (M,), transition (M, M), dt, prediction."""
         columns: tuple[list[Any], ...] = self.x, self.P, self.mu, self.transition, self.dt
+        columns += (self.predicted,)
         for column, value in zip((self.scans, *columns), (scan, *step)):
             column.append(value)
 
@@ -159,9 +161,9 @@ class SmoothingDiverTracker(DiverTracker):
                 dt,
                 self.config.longest_step,
             )
-            between = tuple(self.models.to_common(step.rows.blocks) for step in steps[:-1])
+            predicted = tuple(self.models.to_common(step.rows.blocks) for step in steps)
             scans.append(
-                _Scan(known, *self.models.to_common(known.rows.blocks), tuple(steps), between)
+                _Scan(known, *self.models.to_common(known.rows.blocks), tuple(steps), predicted)
             )
         return scans
 
@@ -174,7 +176,7 @@ class SmoothingDiverTracker(DiverTracker):
         open_: dict[int, int] = {}
         for k, scan in enumerate(scans):
             before = scans[k - 1].known if k else scan.known
-            long = len(scan.between) >= LONGEST_GAP and len(self.models.names) > 1
+            long = len(scan.steps) > LONGEST_GAP and len(self.models.names) > 1
             ids = scan.known.life.track_id.tolist()
             for track_id in [each for each in open_ if each not in ids]:
                 passes.append((track_id, open_.pop(track_id), k - 1))
@@ -224,24 +226,23 @@ class SmoothingDiverTracker(DiverTracker):
         path = _Path()
         for number, own in zip(range(first, last + 1), reversed(chain)):
             scan = scans[number]
-            transition, dt = self.models.chain.matrix, 0.0
+            state = IMMPredicted(scan.x[own], scan.P[own], scan.known.rows.mu[own])
+            transition, dt, predicted = self.models.chain.matrix, 0.0, state
             if number > first:
                 came = chain[last - number + 1]
                 at = _track_index(scans[number - 1].known, track_id)
-                for step, (x, P) in zip(scan.steps, scan.between):
-                    mu, used = step.rows.mu[came], _track_transition(step.transition, at)
-                    path.add(None, x[came], P[came], mu, used, step.dt)
-                transition, dt = (
-                    _track_transition(scan.steps[-1].transition, at),
-                    scan.steps[-1].dt,
-                )
-            mu = scan.known.rows.mu[own]
-            path.add(number, scan.x[own], scan.P[own], mu, transition, dt)
+                for step, (x, P) in zip(scan.steps, scan.predicted):
+                    predicted = IMMPredicted(x[came], P[came], step.rows.mu[came])
+                    transition, dt = _track_transition(step.transition, at), step.dt
+                    if step is not scan.steps[-1]:
+                        path.add(None, *predicted, transition, dt, predicted)
+            path.add(number, *state, transition, dt, predicted)
         return path
 
     def _smooth_path(self, path: _Path) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return smoothed x (K, M, n), P (K, M, n, n) and mu (K, M) of a path."""
         x, P, mu = np.stack(path.x), np.stack(path.P), np.stack(path.mu)
+        predicted = IMMPredicted(*(np.stack(part) for part in zip(*path.predicted)))
         moves, transition = self._stack_motions(path, x.shape[-1]), np.stack(path.transition)
         blocks = self._family_slices()
         weights = _family_weights(mu, transition, blocks)
@@ -254,8 +255,11 @@ class SmoothingDiverTracker(DiverTracker):
             if len(blocks) > 1:
                 steps = steps / steps.sum(axis=2, keepdims=True)
             inside = mu[:, block] / total if len(blocks) > 1 else mu
-            own = (part[:, block] for part in moves)
-            result = imm_smooth(x[:, block], P[:, block], inside, steps, *own)
+            F, Q, B = (part[:, block] for part in moves)
+            prior = IMMPredicted(*(part[:, block] for part in predicted))
+            if len(blocks) > 1:
+                prior = prior._replace(mu=prior.mu / prior.mu.sum(axis=1, keepdims=True))
+            result = imm_smooth(x[:, block], P[:, block], inside, steps, F, Q, B, prior)
             self._smoothed_repairs += int(result.repaired.sum())
             x[:, block], P[:, block] = result.x, result.P
             mu[:, block] = result.mu * weight[:, None] if len(blocks) > 1 else result.mu
