@@ -195,8 +195,10 @@ _BRACKETS = re.compile(r'[\[(]([^\])]*)')
 FRACTIONS = {'mil': 10**6, 'msec': 10**6, 'mi': 10**3, 'usec': 10**3, 'nan': 1, 'nsec': 1}
 """Nanoseconds of the unit of a column of parts of a second by the begin of its name, else s."""
 DAY_NAMES = {'datenum': 'datenum', 'matlab_time': 'datenum', 'excel_time': 'excel'}
-MONTH_FIRST = {'date', 'time', 'toa', 'tag_id'}
+LOTEK = {'date', 'time', 'toa', 'tag_id'}
 """Columns of an export of Lotek, which writes the month before the day."""
+THELMA = {'id', 'protocol', 'receiver'}
+"""Columns of an export of Thelma."""
 NOTHING = ('', '-', '--', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', 'nil')
 """Cells without a value."""
 YES = (

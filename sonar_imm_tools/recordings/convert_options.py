@@ -206,9 +206,9 @@ class DetectionsOptions(_Receivers):
     )
     sync: Path | str | None = option(None, '',
         'CSV of the positions of fixed tags, with the column tag.', kind='file')
-    window: float = option(1.0, 'SECONDS',
-        'Longest time between the first and the last detection of a ping.', kind='float',
-        range=(1e-3, 600.0))
+    window: float | None = option(None, 'SECONDS',
+        'Longest time between the first and the last detection of a ping; by default 1, or half '
+        'of the time between the pings of a tag.', kind='float', range=(1e-3, 600.0))
     clock_interval: float = option(12.0, 'HOURS',
         'Time over which the clock of a receiver drifts evenly.', kind='float',
         range=(0.1, 1e4))

@@ -41,7 +41,7 @@ from .columns import (
     DAY_NAMES,
     factor_of,
     FRACTIONS,
-    MONTH_FIRST,
+    LOTEK,
     name_of,
     NO,
     NOTHING,
@@ -78,6 +78,9 @@ LONGEST_LINE = 1 << 20
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
+RECORDS = 'VEMCO DATA LOG'
+"""Begin of a file of records of several kinds, each with its own header, of which detections
+(``DET``) are read."""
 _THOUSANDS = re.compile(r'[-+]?\d{1,3}(,\d{3})+$')
 _DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
 NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
@@ -429,7 +432,7 @@ class Table:
         if name not in self._orders:
             cells = self.first_cells(self.index[name])
             orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
-            if MONTH_FIRST <= {name_of(header) for header in self.headers}:
+            if LOTEK <= {name_of(header) for header in self.headers}:
                 orders = ['MDY']
             self._orders[name] = orders[0] if len(orders) == 1 else ''
         return self._orders[name]
@@ -475,6 +478,7 @@ class CsvTable(Table):
     def __init__(self, path: str | Path, options: CsvOptions | None = None):
         self.path = Path(path)
         self.options = options or CsvOptions()
+        self._kind = ''
         start = start_of(self.path)
         if start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start[:64]:
             raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
@@ -484,6 +488,9 @@ class CsvTable(Table):
         with self._open() as file:
             lines = (line for line in _lines(file) if line.strip() and not line.startswith('#'))
             first = next(lines, '')
+            if first.startswith(RECORDS):
+                first = next((line for line in lines if line.startswith('DET_DESC')), first)
+                self._kind = 'DET'
         if not first:
             raise BagError(f'{self.path} is empty, not a CSV file')
         likely = max(',;\t|', key=first.count)
@@ -520,12 +527,14 @@ class CsvTable(Table):
                     raise self._no_table(reader.line_num) from None
                 if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
                     continue
+                if self._kind:
+                    header_seen = cells[0] == self._kind
                 if header_seen:
                     if len(cells) < width and not ended:
                         self.cut_line = reader.line_num
                     width = len(cells)
                     yield reader.line_num, cells
-                header_seen = True
+                header_seen = not self._kind
 
     @property
     def _dialect(self) -> dict[str, Any]:

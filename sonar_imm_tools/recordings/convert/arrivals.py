@@ -42,6 +42,7 @@ import numpy as np
 from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
+from ..columns import LOTEK, name_of, THELMA
 from ..conversion import ConversionReport, converter, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
 from ..csv_table import CsvOptions, CsvTable, Row, Table
@@ -170,6 +171,7 @@ def _is_passive(table: CsvTable) -> bool:
 
 def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> Arrival:
     """Read one line of the arrivals."""
+    row.require_valid()
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
     if receiver not in places:
         raise BadRow(f"the position of receiver '{receiver}' is not known")
@@ -187,6 +189,16 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     optional['var_toa'] = default if math.isnan(var_toa) else var_toa
     tag = row.text('tag') if passive and names_tags(row.table) else ''
     return Arrival(ping, time_ns, toa, transmitter, receiver, tuple(optional.values()), tag)
+
+
+def name_columns(table: Table) -> None:
+    """Find the columns of makers of receivers whose names mean other things elsewhere: ``TOA`` of
+    Lotek, the part of a second, and ``ID`` of Thelma beside a receiver, a tag."""
+    names = {name_of(header) for header in table.headers}
+    if LOTEK <= names and table.has('toa'):
+        table.index['fraction'] = table.index.pop('toa')
+    if THELMA <= names and table.has('id'):
+        table.index['tag'] = table.index['id']
 
 
 def names_tags(table: Table) -> bool:
