@@ -75,6 +75,11 @@ LONGEST_NS = 10**8 * 10**9
 """A recording is shorter, a date since 1970 longer."""
 LONGEST_LINE = 1 << 20
 """Characters."""
+ASKED = (
+    'x', 'y', 'z', 'depth', 'latitude', 'longitude', 'range', 'bearing', 'heading',
+    'vessel_x', 'vessel_y', 'vessel_latitude', 'vessel_longitude',
+)  # fmt: skip
+"""Quantities of which two columns with other values are a question."""
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
@@ -352,10 +357,7 @@ class Table:
 
     def varies(self, column: int) -> bool:
         """Say whether a column holds numbers that change, and does not count the rows."""
-        cells = self.first_cells(column)
-        if not cells or not all(NUMBER.match(cell) for cell in cells):
-            return False
-        values = [float(cell.replace(',', '.')) for cell in cells]
+        values = self._first_numbers(column, 1.0)
         steps = {after - before for before, after in itertools.pairwise(values)}
         return bool(steps - {0.0, 1.0})
 
@@ -377,7 +379,37 @@ class Table:
         """Factor from the unit of a column to that of its quantity. Raises `BagError`."""
         if name not in self._factors:
             self._factors[name] = factor_of(name, self.header(name))
+            self._ask_for_one(name)
         return self._factors[name]
+
+    def _ask_for_one(self, name: str) -> None:
+        """Raise `BagError` where several columns may be this quantity and hold other values."""
+        own = self.index.get(name, -1)
+        if name in self.options.columns or name not in ASKED or own < 0:
+            return
+        if rank_of(name, self.headers[own]) < 0:  # that of a target is the one
+            return
+        limit = 1e-6 if name.endswith('itude') else 0.02
+        for other, header in enumerate(self.headers):
+            if other in self.index.values() or name not in quantities_of(header):
+                continue
+            pairs = zip(
+                self._first_numbers(own, self._factors[name]),
+                self._first_numbers(other, factor_of(name, header)),
+            )
+            if any(abs(a - b) > limit for a, b in pairs):
+                raise BagError(
+                    f'{self.path}: {self.headers[own]} and {header} may both be {name}, and '
+                    f"differ; say --column '{name}={self.headers[own]}' or --column "
+                    f"'{name}={header}'"
+                )
+
+    def _first_numbers(self, column: int, factor: float) -> list[float]:
+        """The numbers of a column of the rows by which the file is judged; none where a cell is
+        no number."""
+        cells = self.first_cells(column)
+        whole = all(NUMBER.match(cell) for cell in cells)
+        return [factor * float(cell.replace(',', '.')) for cell in cells] if whole else []
 
     def counts_from_zero(self, name: str) -> bool:
         """Whether the first times of the file are seconds from its own start rather than a date,
@@ -416,12 +448,13 @@ class Table:
     def time_form(self, name: str) -> str:
         """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
         name of `DAYS`. Raises `BagError` where that is not clear."""
-        unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
-        if unit or name not in self.index:
-            return unit if unit in (HHMMSS, *DAYS) else ''
         if name not in self._forms:
-            cells = self.first_cells(self.index[name])
-            self._forms[name] = form_of(self.header(name), cells, self.has('date'))
+            unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
+            form = unit if unit in (HHMMSS, *DAYS) else ''
+            if not unit and name in self.index:
+                cells = self.first_cells(self.index[name])
+                form = form_of(self.header(name), cells, self.has('date'))
+            self._forms[name] = form
         return self._forms[name]
 
     def date_order(self, name: str) -> str:
@@ -445,10 +478,8 @@ class Table:
             return 0
         header = name_of(self.header('fraction'))
         unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
-        cells = self.first_cells(self.index['fraction'])
-        values = [float(cell.replace(',', '.')) for cell in cells if NUMBER.match(cell)]
-        parts = len(values) == len(cells) and all(0.0 <= value * unit < 1e9 for value in values)
-        return unit if parts and cells else 0
+        values = self._first_numbers(self.index['fraction'], unit)
+        return unit if values and all(0.0 <= value < 1e9 for value in values) else 0
 
     def _find_columns(self) -> dict[str, int]:
         """Match headers with quantities: mapped by hand first, then by their usual names."""

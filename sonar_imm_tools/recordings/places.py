@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 import math
 import re
 
@@ -55,6 +56,8 @@ _DEGREES = re.compile(
     r"\s*(?:['′’:m\s]\s*(\d+(?:[.,]\d+)?))?\s*(?:[°º'′’\"″”]|'')?\s*([A-Za-z]*)$"
 )
 """Degrees, minutes and seconds with a hemisphere before or behind them."""
+FARTHEST_APART = 5.0
+"""Metres that metres and degrees of the same rows may differ by, beside a tenth of the way."""
 _AXES = ('latitude', 'longitude')
 
 
@@ -191,6 +194,8 @@ class LocalFrame:
                     '--column x=HEADER'
                 )
             table.require('x', 'y')
+        if metres and table.has('latitude', 'longitude') and not self.geodetic:
+            _ask_for_places(table)
         self.origin = checked_origin(origin) if self.geodetic else None
         self._degrees = Degrees(table) if self.geodetic else None
 
@@ -218,6 +223,28 @@ class LocalFrame:
             self.origin = (latitude, longitude, 0.0)
         east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
         return east, north, up
+
+
+def _ask_for_places(table: Table) -> None:
+    """Raise `BagError` where x and y move by another distance than latitude and longitude do."""
+    if table.is_blank('latitude', 'longitude') or {'x', 'y'} & set(table.options.columns):
+        return
+    degrees, metres, places, origin = Degrees(table), [], [], None
+    for row in table.first_rows:
+        with suppress(BadRow):
+            place = degrees.place(row)
+            origin = origin or Origin(*place)
+            metres.append([row.number('x'), row.number('y')])
+            places.append(origin.local(*place)[:2])
+    if len(metres) != len(places) or not metres:
+        return
+    ways = [np.linalg.norm(np.array(each) - each[0], axis=1).max() for each in (metres, places)]
+    if abs(ways[0] - ways[1]) > FARTHEST_APART + 0.1 * max(ways):
+        x, y, north, east = map(table.header, ('x', 'y', 'latitude', 'longitude'))
+        raise BagError(
+            f'{table.path}: {x} and {y} move by {ways[0]:.3g} m, {north} and {east} by '
+            f'{ways[1]:.3g} m; say which are not the positions: --ignore x or --ignore latitude'
+        )
 
 
 def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, list[float]]:

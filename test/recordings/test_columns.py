@@ -271,3 +271,47 @@ def test_columns_that_are_zero_throughout_give_way_to_filled_ones(tmp_path):
     rows = ''.join(f'{k},0,0.0,59.43,{10.47 + 1e-4 * k}\n' for k in range(9))
     source.write_text('Time,East,North,Lat,Lon\n' + rows)
     assert 'latitude = Lat' in KINDS['fixes'](source, tmp_path / 'out').notes['columns of in.csv']
+
+
+@pytest.mark.parametrize(
+    'header, cells, words',
+    [
+        ('lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
+        ('lat,Latitude,lon', '59.1,59.1,10', ''),
+        ('lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
+        ('Depth (m),Depth (ft)', '10,32.8', ''),
+        ('Depth (m),Tiefe', '10,32.8', 'may both be depth'),
+        ('heading,gyro', '90,95', 'may both be heading'),
+        ('east,easting', '1,2', 'may both be x'),
+    ],
+)
+def test_two_columns_of_one_quantity_are_a_question(table, header, cells, words):
+    text = f'time,{header}\n1,{cells}\n'
+    (row,) = made = table(text)
+    quantity = next(name for name in ('latitude', 'depth', 'heading', 'x') if name in made.index)
+    if not words:
+        assert row.number(quantity) > 0.0
+        return
+    with pytest.raises(BagError, match=words):
+        row.number(quantity)
+    for name in header.split(',')[:2]:
+        (row,) = table(text, columns={quantity: name})
+        assert row.number(quantity) > 0.0
+
+
+def test_metres_and_degrees_that_disagree_are_a_question(tmp_path):
+    source = tmp_path / 'in.csv'
+    for scale in (1.0, 3.0):
+        rows = ''.join(
+            f'{k},{1.93 * scale * 57 * k:.2f},0,59.0,{10 + 1e-3 * 2 * k:.4f}\n' for k in range(20)
+        )
+        source.write_text('time,x,y,lat,lon\n' + rows)
+        if scale == 1.0:
+            assert KINDS['fixes'](source, tmp_path / 'agree').messages == {'/fix': 20}
+            continue
+        with pytest.raises(BagError, match='--ignore x or --ignore latitude'):
+            KINDS['fixes'](source, tmp_path / 'out')
+        for name, column in (('x', 'latitude = lat'), ('latitude', 'x')):
+            how = CsvOptions(ignore=[name])
+            notes = KINDS['fixes'](source, tmp_path / f'without_{name}', options=how).notes
+            assert column in notes['columns of in.csv']
