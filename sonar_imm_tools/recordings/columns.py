@@ -65,7 +65,7 @@ USUAL_NAMES = {
         'latitude_hemisphere hemisphere_lat lat_ref latitude_ref lat_ns latitude_ns'
     ),
     'longitude_hemisphere': (
-        'e_w ew e_or_w o_w east_west lon_dir long_dir longitude_dir longitude_direction '
+        'e_w ew e_or_w o_w e_o east_west lon_dir long_dir longitude_dir longitude_direction '
         'lon_hemisphere longitude_hemisphere hemisphere_lon lon_ref longitude_ref lon_ew '
         'longitude_ew'
     ),
@@ -141,6 +141,8 @@ VESSELS = (
     'navio', 'skip', 'fartoy', 'baat',
 )  # fmt: skip
 """Words that make a position or a heading that of the vessel."""
+ZONES = ('utc', 'gmt', 'local', 'lokal')
+"""Words beside the name of a time."""
 TARGETS = ('target', 'beacon', 'diver', 'rov', 'ziel', 'taucher', 'cible', 'objetivo', 'alvo')
 """Words that make a position that of the target."""
 OF_TARGETS = ('x', 'y', 'z', 'depth', 'latitude', 'longitude')
@@ -277,6 +279,8 @@ def rank_of(quantity: str, header: str) -> int:
     aliases = ALIASES[quantity]
     if name in aliases:
         return aliases.index(name)
+    if quantity in ('stamp', 'date') and (inner := _without(ZONES, name)) in aliases:
+        return len(aliases)
     if quantity in OF_TARGETS and (inner := _without(TARGETS, name)) and inner in aliases:
         return -1
     of_vessel = quantity.removeprefix('vessel_')

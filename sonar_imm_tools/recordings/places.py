@@ -27,7 +27,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .columns import sign_of, unit_of
+from .columns import plain, sign_of, unit_of
 from .csv_table import NUMBER, Row, Table
 from .sources import BagError
 from .times import BadRow
@@ -152,7 +152,8 @@ class Degrees:
         found = words.get(table.index[name], set())
         if 'o' not in found:
             return name, {}
-        signs = {sign_of(axis, word) for word in found - {'o'}}
+        found |= set(plain(table.header(name)).split('_'))
+        signs = {sign_of(axis, word) for word in found - {'o'}} - {None}
         if len(signs) != 1:
             raise BagError(
                 f"{table.path}: 'O' in {table.header(name)} may be east (Ost) or west (Ouest, "

@@ -13,6 +13,8 @@
 # limitations under the License.
 """What columns of tables mean: input, and the expected value or sentence."""
 
+import re
+
 import pytest
 
 from sonar_imm_tools.recordings.convert import KINDS
@@ -155,11 +157,16 @@ def test_what_is_no_position_is_a_bad_row(table, header, cells, words):
 
 
 @pytest.mark.parametrize(
-    'cells, place',
-    [('33,S,70,O\n33,S,70,W', (-33.0, 70.0)), ('33,S,70,O\n33,S,70,E', (-33.0, -70.0))],
+    'head, cells, place',
+    [
+        ('ew', '33,S,70,O\n33,S,70,W', (-33.0, 70.0)),
+        ('ew', '33,S,70,O\n33,S,70,E', (-33.0, -70.0)),
+        ('O/W', '33,S,70,O', (-33.0, 70.0)),
+        ('E/O', '33,S,70,O', (-33.0, -70.0)),
+    ],
 )
-def test_o_is_east_beside_west_and_west_beside_east(table, cells, place):
-    made = table(f'lat,ns,lon,ew\n{cells}\n')
+def test_o_is_east_beside_west_and_west_beside_east(table, head, cells, place):
+    made = table(f'lat,ns,lon,{head}\n{cells}\n')
     assert Degrees(made).place(next(iter(made))) == place
 
 
@@ -315,3 +322,20 @@ def test_metres_and_degrees_that_disagree_are_a_question(tmp_path):
             how = CsvOptions(ignore=[name])
             notes = KINDS['fixes'](source, tmp_path / f'without_{name}', options=how).notes
             assert column in notes['columns of in.csv']
+
+
+@pytest.mark.parametrize('places', ['lat;lon', 'Breite;Länge', 'x;y'])
+def test_positions_beside_range_and_bearing_are_a_question(tmp_path, places):
+    """Those of the target or those of a vessel: each reading has its option."""
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k};59.4;10.{k};{80 + k * k};50;{k}0\n' for k in range(1, 9))
+    source.write_text(f'time;{places};heading;range;bearing_deg\n{rows}', encoding='utf-8')
+    with pytest.raises(BagError) as caught:
+        KINDS['fixes'](source, tmp_path / 'out')
+    sentence = caught.value.sentence
+    assert '--ignore range' in sentence and 'convert relative' in sentence
+    report = KINDS['fixes'](source, tmp_path / 'target', options=CsvOptions(ignore=['range']))
+    assert report.messages == {'/fix': 8}
+    pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
+    how = CsvOptions(columns=dict(pairs))
+    assert KINDS['relative'](source, tmp_path / 'vessel', options=how).messages['/relative'] == 8

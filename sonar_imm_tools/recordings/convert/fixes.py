@@ -28,7 +28,7 @@ from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
-from ..columns import name_of, UNRELATED
+from ..columns import name_of, rank_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
 from ..csv_table import Row, Table
@@ -75,6 +75,16 @@ def write_fixes(
             _ask_for_vessel(table)
         bearings = how.bearings or 'north'
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+    elif table.has('range', 'bearing') and _may_be_of_vessel(table):
+        names = ('x', 'y') if table.has('x', 'y') else ('latitude', 'longitude')
+        headers = [table.header(name) for name in names]
+        columns = ' '.join(f"--column 'vessel_{n}={h}'" for n, h in zip(names, headers))
+        raise BagError(
+            f'{table.path}: {" and ".join(headers)} may be the position of the target, or that of '
+            f'a vessel from which {table.header("range")} and {table.header("bearing")} are '
+            f'measured. Of the target: --ignore range. Of a vessel: sonar-imm convert relative '
+            f'{quoted(table.path)} OUT_BAG {columns}'
+        )
     frame = None if polar else LocalFrame(table, how.origin)
     origin = frame.origin if frame else None
     place = ('range', 'bearing') if polar else ('x', 'y')
@@ -188,6 +198,15 @@ def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
     for name, stamp_ns in stamps:
         found.setdefault(name, []).append(stamp_ns)
     return found
+
+
+def _may_be_of_vessel(table: Table) -> bool:
+    """Say whether positions beside range and bearing have neither a word for the target nor one of
+    a vessel beside them, nor were named by hand."""
+    names = [name for name in ('x', 'y', 'latitude', 'longitude') if table.has(name)]
+    vessel = any(table.has(name) for name in ('vessel_x', 'vessel_latitude'))
+    ranks = [rank_of(name, table.header(name)) for name in names]
+    return not vessel and min(ranks) >= 0 and not set(names) & set(table.options.columns)
 
 
 def _has_places(table: Table) -> bool:
