@@ -118,7 +118,8 @@ USUAL_NAMES = {
     'var_toa': 'toa_variance var_arrival',
     'std_toa': 'sigma_toa std_arrival sigma_arrival',
     'bearing': (
-        'azimuth doa brg peilung azimut gisement relevement demora marcacion marcacao peiling'
+        'azimuth doa brg peilung azimut gisement relevement demora marcacion marcacao '
+        'peiling seitenpeilung true_bearing bearing_true relative_bearing bearing_relative'
     ),
     'amplitude': 'amp response value',
     'var_bearing': '',
@@ -153,6 +154,10 @@ UNRELATED = (
     'gain sats satellites hdop pdop'
 ).split()
 """Names of columns of numbers that are neither positions nor headings."""
+
+FROM_NORTH = {'azimuth', 'azimut', 'relevement', 'demora', 'true', 'north'}
+FROM_BOW = {'gisement', 'marcacao', 'relative', 'rel', 'bow', 'seitenpeilung'}
+"""Words of headers of bearings that usually count from north and from the bow."""
 
 METRES = {
     'm': 1.0, 'meter': 1.0, 'meters': 1.0, 'metre': 1.0, 'metres': 1.0, 'metros': 1.0,

@@ -84,11 +84,12 @@ class _Detecting(_OfSonar):
         kind='pairs')
 
 
-def _bearings(default: str | None) -> Any:
-    help = 'Where bearings count from: bow or north, clockwise, or east, counter-clockwise.'
-    if default is None:
-        help += ' By default north, where no column may be the position or heading of a vessel.'
-    return option(default, '', help, choices=BEARINGS)
+def _bearings(usual: str) -> Any:
+    help = (
+        'Where bearings count from: bow or north, clockwise, or east, counter-clockwise. By '
+        f'default {usual}, where no column says otherwise.'
+    )
+    return option(None, '', help, choices=BEARINGS)
 
 
 def _element_spacing() -> Any:
@@ -139,7 +140,7 @@ class FixesOptions(_Polar):
         'usbl.csv dive.bag --column x=easting --column y=northing',
         'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
-    bearings: str | None = _bearings(None)
+    bearings: str | None = _bearings('north')
 
 
 @frozen(kw_only=True)
@@ -157,7 +158,7 @@ class RelativeOptions(_Polar):
         'usbl.csv dive.bag',
         'usbl.csv dive.bag --bearings north --column vessel_x=ship_e --column vessel_y=ship_n',
     )
-    bearings: str = _bearings('bow')
+    bearings: str | None = _bearings('bow')
 
 
 @frozen(kw_only=True)

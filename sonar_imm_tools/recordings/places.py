@@ -27,7 +27,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .columns import plain, sign_of, unit_of
+from .columns import FROM_BOW, FROM_NORTH, plain, sign_of, unit_of
 from .csv_table import NUMBER, Row, Table
 from .sources import BagError
 from .times import BadRow
@@ -266,6 +266,20 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
 BEARINGS = ('bow', 'north', 'east')
 """Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
 _TURN = 6.3
+
+
+def bearings_from(table: Table, stated: str | None, usual: str) -> str:
+    """Where bearings of a table count from: as stated, else as usual. Raises `BagError` where the
+    header has a word for the other one of north and bow."""
+    words = set(plain(table.header('bearing')).split('_'))
+    others = {'north': FROM_BOW, 'bow': FROM_NORTH}[usual]
+    if stated is None and words & others:
+        other = {'north': 'bow', 'bow': 'north'}[usual]
+        raise BagError(
+            f'{table.path}: {table.header("bearing")} may count from {other} or from {usual}; say '
+            f'--bearings {other} or --bearings {usual}'
+        )
+    return stated or usual
 
 
 class PolarRows:

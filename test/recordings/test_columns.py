@@ -339,3 +339,29 @@ def test_positions_beside_range_and_bearing_are_a_question(tmp_path, places):
     pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
     how = CsvOptions(columns=dict(pairs))
     assert KINDS['relative'](source, tmp_path / 'vessel', options=how).messages['/relative'] == 8
+
+
+@pytest.mark.parametrize(
+    'kind, header, asked',
+    [
+        ('relative', 'Azimut [°]', True),
+        ('relative', 'Demora (°)', True),
+        ('relative', 'Bearing true (deg)', True),
+        ('relative', 'Gisement [deg]', False),
+        ('relative', 'bearing_deg', False),
+        ('fixes', 'Gisement [deg]', True),
+        ('fixes', 'relative_bearing_deg', True),
+        ('fixes', 'Relèvement [deg]', False),
+    ],
+)
+def test_bearings_whose_word_is_of_another_direction_are_a_question(tmp_path, kind, header, asked):
+    source = tmp_path / 'in.csv'
+    head = {'relative': 'time;boat_x;boat_y;heading;range', 'fixes': 'time;range'}[kind]
+    cells = {'relative': '0;{k};90;50', 'fixes': '50'}[kind]
+    rows = ''.join(f'{k};{cells.format(k=k)};{k}0\n' for k in range(1, 9))
+    source.write_text(f'{head};{header}\n{rows}', encoding='utf-8')
+    if asked:
+        with pytest.raises(BagError, match='--bearings (bow or --bearings north|north or --bear)'):
+            KINDS[kind](source, tmp_path / 'out')
+    for bearings in ('north', 'bow') if kind == 'relative' and asked else (None,) * (not asked):
+        assert KINDS[kind](source, tmp_path / f'out_{bearings}', bearings=bearings).messages

@@ -33,7 +33,7 @@ from ..conversion import ask_for_units, ConversionReport, converter, Record, wri
 from ..convert_options import FixesOptions
 from ..csv_table import Row, Table
 from ..messages import ros_message
-from ..places import LocalFrame, origin_parameters, PolarRows
+from ..places import bearings_from, LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError, quoted
 from ..times import BadRow
 from ..track_files import open_table
@@ -73,7 +73,7 @@ def write_fixes(
             )
         if not how.bearings:
             _ask_for_vessel(table)
-        bearings = how.bearings or 'north'
+        bearings = bearings_from(table, how.bearings, 'north')
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
     elif table.has('range', 'bearing') and _may_be_of_vessel(table):
         names = ('x', 'y') if table.has('x', 'y') else ('latitude', 'longitude')

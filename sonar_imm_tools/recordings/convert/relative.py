@@ -35,7 +35,7 @@ from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import CsvTable, Row
 from ..messages import ros_message
-from ..places import checked_origin, Degrees, origin_parameters, PolarRows
+from ..places import bearings_from, checked_origin, Degrees, origin_parameters, PolarRows
 from ..sources import BagError
 from ..times import BadRow
 from ..truth import truth_records
@@ -72,8 +72,10 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     degrees = Degrees(table, 'vessel_') if geodetic else None
     polar = None
     if not table.has('forward', 'starboard'):
-        polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
-    levelled = polar is not None and how.bearings != 'bow'
+        table.require('range', 'bearing')
+        bearings = bearings_from(table, how.bearings, 'bow')
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+    levelled = polar is not None and bearings != 'bow'
     if not levelled and not table.has('heading'):
         left = [
             header
