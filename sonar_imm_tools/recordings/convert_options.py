@@ -141,6 +141,8 @@ class FixesOptions(_Polar):
         'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
     bearings: str | None = _bearings('north')
+    depth_std: float | None = option(None, 'METRES',
+        'Standard deviation of z or depth, for rows that state none.', kind='float', above=0.0)
 
 
 @frozen(kw_only=True)

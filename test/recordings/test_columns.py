@@ -19,7 +19,9 @@ import pytest
 
 from sonar_imm_tools.recordings.convert import KINDS
 from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.places import Degrees
+from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.times import BadRow
@@ -365,3 +367,15 @@ def test_bearings_whose_word_is_of_another_direction_are_a_question(tmp_path, ki
             KINDS[kind](source, tmp_path / 'out')
     for bearings in ('north', 'bow') if kind == 'relative' and asked else (None,) * (not asked):
         assert KINDS[kind](source, tmp_path / f'out_{bearings}', bearings=bearings).messages
+
+
+def test_a_depth_that_is_not_tracked_is_said_and_the_advice_helps(tmp_path):
+    source = tmp_path / 'in.csv'
+    source.write_text('time;x;y;Tiefe [m]\n' + ''.join(f'{k};1;{k};6,0\n' for k in range(1, 9)))
+    note = KINDS['fixes'](source, tmp_path / 'out').notes['depth']
+    assert 'Tiefe [m] is not tracked' in note and '--depth-std' in note
+    report = KINDS['fixes'](source, tmp_path / 'with', depth_std=0.5)
+    assert report.notes['depth'] == 'is tracked with --set dimensions=3'
+    with BagReader(report.path) as bag:
+        first = next(iter(measurements_of(bag, 'diver'))).measurement
+    assert first.position[2] == -6.0 and first.covariance[2, 2] == 0.25

@@ -110,7 +110,7 @@ def write_fixes(
         fix = Fix(
             stamp_ns=stamp_ns,
             position=position,
-            covariance=_with_height(row, covariance),
+            covariance=_with_height(row, covariance, how.depth_std),
             frame_id=how.frame_id,
         )
         check_size(fix)
@@ -133,6 +133,15 @@ def write_fixes(
         for line, _ in empty:
             report.bad_row(table.path, f'line {line}', f'{" and ".join(place)} are empty')
         empty = []
+    if depth := next((name for name in ('z', 'depth') if table.has(name)), ''):
+        known = how.depth_std is not None or table.has('var_z') or table.has('std_z')
+        if not table.is_blank(depth):
+            report.notes['depth'] = (
+                'is tracked with --set dimensions=3'
+                if known
+                else f'{table.header(depth)} is not tracked, since no column is its standard '
+                'deviation; say --depth-std METRES'
+            )
     named = _names_divers(table, rows, report)
     records: Iterable[Record]
     if named or empty:
@@ -288,10 +297,15 @@ def _covariance(row: Row) -> np.ndarray | None:
     return np.array([[var_x, cov_xy], [cov_xy, var_y]])
 
 
-def _with_height(row: Row, covariance: np.ndarray | None) -> np.ndarray | None:
-    """`covariance` (2, 2) with what the row states of z, (3, 3); as it is where nothing."""
+def _with_height(
+    row: Row, covariance: np.ndarray | None, depth_std: float | None
+) -> np.ndarray | None:
+    """`covariance` (2, 2) with what the row states of z, or `depth_std`, m, as (3, 3); as it is
+    where nothing is known."""
     variance = row.optional('var_z') if row.table.has('var_z') else row.optional('std_z')
     variance = variance if row.table.has('var_z') else variance * abs(variance)
+    if not variance > 0.0 and depth_std is not None:
+        variance = depth_std**2
     if not variance > 0.0 or row.empty('z') and row.empty('depth') and row.empty('height'):
         return covariance
     whole = np.full((3, 3), np.nan)
