@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import functools
 import math
 from pathlib import Path
@@ -53,6 +54,7 @@ MOST_OFF = 0.1
 FASTEST, NEAR = 100.0, 1000.0
 """No ship is faster, m/s, or jumps further, m."""
 NEIGHBOURS = 5
+_OF_TABLES = re.compile('--(?=(column|time-zone|time-unit|time-offset|date-order|ignore)( |$))')
 MOST_NAMED = 20
 """At most this many bad rows are listed; all are counted."""
 
@@ -63,7 +65,8 @@ class ConversionReport:
 
     messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
     each of the first bad rows and for the file as a whole; questions: what is kept and looks
-    wrong; reasons: bad rows by a word, of those that have one; notes: facts worth telling, such as
+    wrong; reasons: bad rows by a word, of those that have one; kinds: all bad rows by kind, with
+    one of each in `examples`; notes: facts worth telling, such as
     the origin of local coordinates, also kept in the bag.
     """
 
@@ -75,8 +78,8 @@ class ConversionReport:
     questions: list[str] = Factory(list)
     notes: dict[str, str] = Factory(dict)
     reasons: Counter[str] = Factory(Counter)
-    _kinds: Counter[str] = Factory(Counter)
-    _examples: dict[str, str] = Factory(dict)
+    kinds: Counter[str] = Factory(Counter)
+    examples: dict[str, str] = Factory(dict)
 
     def bad_row(self, path: Path, where: str, why: object) -> None:
         """Count a bad row and name it while there are few."""
@@ -84,8 +87,8 @@ class ConversionReport:
         if reason := getattr(why, 'reason', ''):
             self.reasons[reason.replace('_', ' ')] += 1
         kind = reason or re.sub(r"'.*'|[-\d.]+", '', str(why))
-        self._kinds[kind] += 1
-        self._examples.setdefault(kind, f'{path.name}, {where}: {why}')
+        self.kinds[kind] += 1
+        self.examples.setdefault(kind, f'{path.name}, {where}: {why}')
         if self.bad_rows <= MOST_NAMED:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:
@@ -94,8 +97,8 @@ class ConversionReport:
     def nothing(self, what: object) -> BagError:
         """The error of a file without a usable record, with its commonest problem."""
         words = f' ({self.problems[0]})' if self.problems else ''
-        for kind, count in self._kinds.most_common(1):
-            words = f' ({count} of {self.rows} rows, the first: {self._examples[kind]})'
+        for kind, count in self.kinds.most_common(1):
+            words = f' ({count} of {self.rows} rows, the first: {self.examples[kind]})'
         return BagError(f'{what} holds nothing that could be converted{words}')
 
     def read_rows(self, table: Table, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
@@ -123,6 +126,27 @@ class ConversionReport:
             )
         if left:
             self.notes[f'ignored columns of {table.path.name}'] = left
+
+
+@contextmanager
+def flags_of(prefix: str, report: ConversionReport) -> Iterator[None]:
+    """Name the options of a table beside the input, as in ``--truth-column``, in every sentence
+    about that table."""
+    flag = f'--{prefix}-'
+    problems, examples = len(report.problems), set(report.examples)
+    try:
+        yield
+    except BagError as error:
+        sentence = _OF_TABLES.sub(flag, error.sentence)
+        if sentence == error.sentence:
+            raise
+        raise BagError(sentence) from None
+    finally:
+        report.problems[problems:] = [
+            _OF_TABLES.sub(flag, problem) for problem in report.problems[problems:]
+        ]
+        for kind in report.examples.keys() - examples:
+            report.examples[kind] = _OF_TABLES.sub(flag, report.examples[kind])
 
 
 def converter(options: type[Any]) -> Callable[[Converter], Callable[..., ConversionReport]]:

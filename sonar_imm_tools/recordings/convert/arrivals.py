@@ -43,7 +43,7 @@ from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
 from ..columns import LOTEK, name_of, THELMA
-from ..conversion import ConversionReport, converter, Record, write_bag
+from ..conversion import ConversionReport, converter, flags_of, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
 from ..csv_table import CsvOptions, CsvTable, Row, Table
 from ..messages import ros_message
@@ -252,6 +252,17 @@ def read_places(
     name: str,
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
     """Read the positions of receivers or transmitters by name, and the origin of local metres."""
+    with flags_of('receiver', report):
+        return _places(path, report, options, origin, name)
+
+
+def _places(
+    path: str | Path,
+    report: ConversionReport,
+    options: CsvOptions | None,
+    origin: tuple[float, ...] | None,
+    name: str,
+) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
     table = CsvTable(path, options)
     table.require(name)
     frame = LocalFrame(table, origin)
