@@ -56,6 +56,8 @@ _DEGREES = re.compile(
     r"\s*(?:['′’:m\s]\s*(\d+(?:[.,]\d+)?))?\s*(?:[°º'′’\"″”]|'')?\s*([A-Za-z]*)$"
 )
 """Degrees, minutes and seconds with a hemisphere before or behind them."""
+_LETTERS = re.compile(r'(\d)\s*d\s*(\d+)\s*m\s*([\d.]+)\s*s', re.IGNORECASE)
+"""Degrees, minutes and seconds marked by letters, of which the last is no south."""
 FARTHEST_APART = 5.0
 """Metres that metres and degrees of the same rows may differ by, beside a tenth of the way."""
 _AXES = ('latitude', 'longitude')
@@ -100,7 +102,8 @@ class Degrees:
 
     def _value(self, row: Row, axis: str) -> float:
         name = self._names[axis]
-        found = None if NUMBER.match(row.text(name)) else _DEGREES.match(row.text(name))
+        text = _LETTERS.sub(r"\1°\2'\3″", row.text(name))
+        found = None if NUMBER.match(text) else _DEGREES.match(text)
         if found is None:
             value, words = row.number(name), []
         else:
@@ -118,12 +121,12 @@ class Degrees:
         if (beside := self._signs[axis]) is not None:
             column, own = beside
             words.append(row.text(column) or 'nothing')
-        for word in words[-1:]:
-            sign = own.get(word.lower()) or sign_of(axis, word)
-            if sign is None or value < 0.0 < sign:
+        signs = {own.get(word.lower()) or sign_of(axis, word) for word in words}
+        for sign in signs:
+            if sign is None or len(signs) > 1 or value < 0.0 < sign:
                 raise BadRow(
                     f"{row.table.header(name)} is '{row.text(name)[:40]}' with the hemisphere "
-                    f"'{word[:20]}'"
+                    f"'{words[-1][:20]}'"
                 )
             value = sign * abs(value)
         return value
@@ -145,6 +148,10 @@ class Degrees:
             if found and all(word in letters or sign_of(axis, word) for word in found)
         ]
         beside = [k for k in (at + 1, at - 1) if k in fitting]
+        if words.get(table.index.get(name, -1)) and all(
+            NUMBER.match(word) for word in words[table.index[name]]
+        ):
+            del table.index[name]  # an offset to the north or east
         if name not in table.index:
             if not beside and len(fitting) != 1:
                 return None
