@@ -118,12 +118,16 @@ class ConversionReport:
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken
         self.problems += table.problems
-        header = table.header('z')
-        if table.has('z') and re.search('depth|tiefe|down', header.lower()):
-            self.questions.append(
-                f'{table.path.name}: z counts up and {header} sounds like a depth; is --column '
-                f"'depth={header}' meant?"
-            )
+        for name, sign, way in (('z', 1.0, 'up'), ('depth', -1.0, 'down')):
+            header, other = table.header(name), {'z': 'depth', 'depth': 'z'}[name]
+            values = table.first_numbers(table.index[name], sign) if table.has(name) else []
+            sounds = name == 'depth' or re.search('depth|tiefe|down', header.lower())
+            if sounds and values and max(values) > 0.0 and (name == 'z' or min(values) >= 0.0):
+                self.questions.append(
+                    f'{table.path.name}: {name} counts {way} and {header} is '
+                    f'{"a depth" if name == "z" else "negative"}; is --column '
+                    f"'{other}={header}' meant?"
+                )
         if left:
             self.notes[f'ignored columns of {table.path.name}'] = left
 

@@ -357,7 +357,7 @@ class Table:
 
     def varies(self, column: int) -> bool:
         """Say whether a column holds numbers that change, and does not count the rows."""
-        values = self._first_numbers(column, 1.0)
+        values = self.first_numbers(column, 1.0)
         steps = {after - before for before, after in itertools.pairwise(values)}
         return bool(steps - {0.0, 1.0})
 
@@ -394,8 +394,8 @@ class Table:
             if other in self.index.values() or name not in quantities_of(header):
                 continue
             pairs = zip(
-                self._first_numbers(own, self._factors[name]),
-                self._first_numbers(other, factor_of(name, header)),
+                self.first_numbers(own, self._factors[name]),
+                self.first_numbers(other, factor_of(name, header)),
             )
             if any(abs(a - b) > limit for a, b in pairs):
                 raise BagError(
@@ -404,7 +404,7 @@ class Table:
                     f"'{name}={header}'"
                 )
 
-    def _first_numbers(self, column: int, factor: float) -> list[float]:
+    def first_numbers(self, column: int, factor: float) -> list[float]:
         """The numbers of a column of the rows by which the file is judged; none where a cell is
         no number."""
         cells = self.first_cells(column)
@@ -478,7 +478,7 @@ class Table:
             return 0
         header = name_of(self.header('fraction'))
         unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
-        values = self._first_numbers(self.index['fraction'], unit)
+        values = self.first_numbers(self.index['fraction'], unit)
         return unit if values and all(0.0 <= value < 1e9 for value in values) else 0
 
     def _find_columns(self) -> dict[str, int]:

@@ -60,6 +60,8 @@ _LETTERS = re.compile(r'(\d)\s*d\s*(\d+)\s*m\s*([\d.]+)\s*s', re.IGNORECASE)
 """Degrees, minutes and seconds marked by letters, of which the last is no south."""
 FARTHEST_APART = 5.0
 """Metres that metres and degrees of the same rows may differ by, beside a tenth of the way."""
+NEAR_ORIGIN = 1e5
+"""Metres from a stated origin that positions are within."""
 _AXES = ('latitude', 'longitude')
 
 
@@ -80,15 +82,32 @@ class Degrees:
         limits = (latitude, 90.0), (longitude, 360.0)
         beyond = [len(each) and 2.0 * np.mean(each > limit) > 1.0 for each, limit in limits]
         if beyond[0] and latitude.max() <= 180.0 and (longitude <= 90.0).all():
-            north, east = (table.header(name) for name in self._names.values())
-            raise BagError(
-                f'{table.path}: {north} is beyond 90 degrees and {east} is not, so that latitude '
-                f"and longitude look exchanged; say --column '{self._names['latitude']}={east}' "
-                f"--column '{self._names['longitude']}={north}'"
-            )
+            raise self._exchanged(table, 'one is beyond 90 degrees and the other is not')
         self.packed = any(beyond) and all(
             (each % 100.0 < 60.0).all() and (each < 100.0 * limit).all() for each, limit in limits
         )
+
+    def _exchanged(self, table: Table, why: str) -> BagError:
+        north, east = (table.header(name) for name in self._names.values())
+        return BagError(
+            f'{table.path}: {north} and {east} look exchanged, since {why}; say --column '
+            f"'{self._names['latitude']}={east}' --column '{self._names['longitude']}={north}'"
+        )
+
+    def check_origin(self, table: Table, origin: tuple[float, float, float]) -> None:
+        """Raise `BagError` where the first position is near a stated origin only with latitude and
+        longitude exchanged."""
+        for row in table.first_rows:
+            with suppress(BadRow):
+                place = self.place(row)
+                ways = [
+                    float(np.linalg.norm(Origin(*origin).local(*each)[:2]))
+                    for each in (place, place[::-1])
+                    if abs(each[0]) <= 90.0
+                ]
+                if len(ways) == 2 and ways[1] < NEAR_ORIGIN < 0.1 * ways[0]:
+                    raise self._exchanged(table, f'the origin is {ways[0] / 1e3:.0f} km away')
+                return
 
     def place(self, row: Row) -> tuple[float, float]:
         """Latitude and longitude of a row. Raises `BadRow`."""
@@ -206,6 +225,8 @@ class LocalFrame:
             _ask_for_places(table)
         self.origin = checked_origin(origin) if self.geodetic else None
         self._degrees = Degrees(table) if self.geodetic else None
+        if self._degrees is not None and self.origin is not None:
+            self._degrees.check_origin(table, self.origin)
 
     def position(self, row: Row) -> tuple[float, float, float]:
         """Give x, y, z of a row in metres. Raises `BadRow`."""

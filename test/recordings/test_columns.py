@@ -386,3 +386,30 @@ def test_a_depth_that_is_not_tracked_is_said_and_the_advice_helps(tmp_path):
     with BagReader(report.path) as bag:
         first = next(iter(measurements_of(bag, 'diver'))).measurement
     assert first.position[2] == -6.0 and first.covariance[2, 2] == 0.25
+
+
+@pytest.mark.parametrize(
+    'place, asked', [('10.47,59.43', True), ('59.43,10.47', False), ('-20,150', False)]
+)
+def test_positions_near_a_stated_origin_only_when_exchanged_are_a_question(tmp_path, place, asked):
+    source = tmp_path / 'in.csv'
+    source.write_text(f'time,lat,lon\n1,{place}\n')
+    if not asked:
+        KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4))
+        return
+    with pytest.raises(BagError, match="--column 'latitude=lon' --column 'longitude=lat'"):
+        KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4))
+    how = CsvOptions(columns={'latitude': 'lon', 'longitude': 'lat'})
+    assert KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4), options=how).messages
+
+
+@pytest.mark.parametrize('depths, asked', [('-5 -6', True), ('-0.1 6', False), ('0 0', False)])
+def test_a_depth_that_is_negative_throughout_is_asked_about(tmp_path, depths, asked):
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k},1,{k},{depth}\n' for k, depth in enumerate(depths.split(), start=1))
+    source.write_text(f'time,x,y,Depth\n{rows}')
+    questions = KINDS['fixes'](source, tmp_path / 'out').questions
+    assert any("'z=Depth' meant" in question for question in questions) == asked
+    how = CsvOptions(columns={'z': 'Depth'})
+    if asked:
+        assert not KINDS['fixes'](source, tmp_path / 'up', options=how).questions
