@@ -91,6 +91,8 @@ USUAL_NAMES = {
     'vessel_y': '',
     'vessel_latitude': '',
     'vessel_longitude': '',
+    'vessel_latitude_hemisphere': '',
+    'vessel_longitude_hemisphere': '',
     'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',

@@ -76,7 +76,16 @@ class Degrees:
 
     def __init__(self, table: Table, prefix: str = ''):
         self._names = {axis: f'{prefix}{axis}' for axis in _AXES}
+        named = [axis for axis in _AXES if f'{prefix}{axis}_hemisphere' in table.index]
         self._signs = {axis: self._sign_column(table, axis) for axis in _AXES}
+        found = [axis for axis in _AXES if self._signs[axis] is not None]
+        if len(found) == 1 and not named:
+            name = f'{prefix}{found[0]}_hemisphere'
+            raise BagError(
+                f'{table.path}: {table.header(name)} may be the hemisphere of '
+                f'{table.header(self._names[found[0]])}; say --column '
+                f"'{name}={table.header(name)}' or --ignore {name}"
+            )
         values = {axis: self._first_values(table, axis) for axis in _AXES}
         latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
         limits = (latitude, 90.0), (longitude, 360.0)
@@ -154,7 +163,9 @@ class Degrees:
         """The column of the hemisphere: one by its name, one of words for hemispheres beside the
         degrees, or the only one of such words; None without one."""
         at, name = table.index[self._names[axis]], f'{self._names[axis]}_hemisphere'
-        taken = {table.index[each] for each in self._names.values()}
+        if name in table.options.ignore:
+            return None
+        taken = {k for quantity, k in table.index.items() if quantity != name}
         words = {
             k: {cell.lower() for cell in table.first_cells(k)}
             for k in range(len(table.headers))

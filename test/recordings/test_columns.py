@@ -413,3 +413,22 @@ def test_a_depth_that_is_negative_throughout_is_asked_about(tmp_path, depths, as
     how = CsvOptions(columns={'z': 'Depth'})
     if asked:
         assert not KINDS['fixes'](source, tmp_path / 'up', options=how).questions
+
+
+@pytest.mark.parametrize('header', ['lat,mode,lon', 'mode,lat,lon'])
+def test_one_column_of_hemispheres_alone_is_a_question(table, header):
+    cells = dict(zip(('lat', 'mode', 'lon'), ('33.5', 'S', '70.25')))
+    text = f'{header}\n' + ','.join(cells[name] for name in header.split(',')) + '\n'
+    with pytest.raises(BagError, match="'latitude_hemisphere=mode' or --ignore latitude_h"):
+        Degrees(table(text))
+    for how, latitude in (
+        ({'columns': {'latitude_hemisphere': 'mode'}}, -33.5),
+        ({'ignore': ['latitude_hemisphere']}, 33.5),
+    ):
+        made = table(text, **how)
+        assert Degrees(made).place(next(iter(made))) == (latitude, 70.25)
+
+
+def test_a_diver_named_s_is_no_hemisphere(table):
+    made = table('name,lat,lon,id\nS,33.5,70.25,E\n')
+    assert Degrees(made).place(next(iter(made)))[0] == 33.5
