@@ -167,8 +167,9 @@ class RelativeOptions(_Polar):
 class NmeaOptions(_WithTruth):
     """Log of NMEA 0183 and AIS to /fixes, /nav_fix and /heading. Needs pyais and pynmea2.
 
-    Fixes are the targets of AIS (by MMSI), TLL and TTM; the vessel's own GGA, RMC, GLL, GNS, HDT
-    and THS are its navigation, or the fixes where there are no targets. Times stand before a
+    Fixes are the targets of AIS (by MMSI), TLL and TTM, and of a USBL (USRTH, PSIMSSB); the
+    vessel's own GGA, RMC, GLL, GNS, HDT and THS are its navigation, or the fixes where there are
+    no targets. Times stand before a
     sentence, in its tag block, or are the vessel's clock with the date of ZDA or RMC.
     """
 

@@ -117,7 +117,8 @@ def dated(date: str, clock: str, header: str, order: str = '') -> str:
     if not order or order not in orders:
         order = orders[0] if len(orders) == 1 else ''
     if not order:
-        several = f'can be read in several ways: say --date-order {", ".join(orders)}, or'
+        flags = ' or '.join(f'--date-order {each}' for each in orders)
+        several = f'can be read in several ways: say {flags}, or'
         raise BadRow(
             f"{header} is '{date[:40]}', which {several if orders else 'is no date;'} "
             'write 2024-05-31',
