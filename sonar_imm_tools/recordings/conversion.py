@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import functools
+import json
 import math
 from pathlib import Path
 import re
@@ -36,7 +37,7 @@ from .. import SECOND
 from .csv_table import Row, Table
 from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
-from .sources import BagError
+from .sources import BagError, TARGET_NAMES
 from .times import BadRow
 from .writer import BagWriter
 
@@ -66,8 +67,8 @@ class ConversionReport:
     messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
     each of the first bad rows and for the file as a whole; questions: what is kept and looks
     wrong; reasons: bad rows by a word, of those that have one; kinds: all bad rows by kind, with
-    one of each in `examples`; notes: facts worth telling, such as
-    the origin of local coordinates, also kept in the bag.
+    one of each in `examples`; target_names: target IDs by name;
+    notes: facts worth telling, such as the origin of local coordinates, also kept in the bag.
     """
 
     path: Path
@@ -79,6 +80,7 @@ class ConversionReport:
     notes: dict[str, str] = Factory(dict)
     reasons: Counter[str] = Factory(Counter)
     kinds: Counter[str] = Factory(Counter)
+    target_names: dict[str, int] = Factory(dict)
     examples: dict[str, str] = Factory(dict)
 
     def bad_row(self, path: Path, where: str, why: object) -> None:
@@ -275,6 +277,8 @@ def write_bag(
     if not ordered:
         raise report.nothing(source)
     notes = provenance(source, report.notes)
+    if named := {str(number): name for name, number in report.target_names.items()}:
+        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
     with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
         for stamp_ns, topic, kind, raw in ordered:
             bag.write_raw(topic, kind, raw, stamp_ns)

@@ -17,6 +17,7 @@ import re
 
 import pytest
 
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import KINDS
 from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
 from sonar_imm_tools.recordings.measurements import measurements_of
@@ -432,3 +433,26 @@ def test_one_column_of_hemispheres_alone_is_a_question(table, header):
 def test_a_diver_named_s_is_no_hemisphere(table):
     made = table('name,lat,lon,id\nS,33.5,70.25,E\n')
     assert Degrees(made).place(next(iter(made)))[0] == 33.5
+
+
+@pytest.mark.parametrize(
+    'kind, head, cells',
+    [
+        ('fixes', 'time;lat;lon;Name', '{k};59.4;{x};Schmidt'),
+        ('relative', 'time;boat_lat;boat_lon;heading;range;bearing_deg;Zielname',
+         '{k};59.4;{x};90;50;10;Schmidt'),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize('end', ['gpx', 'kml', 'geojson', 'csv'])
+def test_names_of_targets_travel_to_the_export(tmp_path, kind, head, cells, end):
+    """From the table by bag and run.json to the name of the track."""
+    source = tmp_path / 'in.csv'
+    rows = [cells.format(k=k, x=10.0 + 1e-5 * k) for k in range(1, 31)]
+    source.write_text('\n'.join([head, *rows]) + '\n', encoding='utf-8')
+    bag = KINDS[kind](source, tmp_path / 'bag').path
+    assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
+    out = tmp_path / f'out.{end}'
+    assert main(['export', str(tmp_path / 'run'), str(out)]) == 0
+    assert 'Schmidt' in out.read_text(encoding='utf-8')
+    if end == 'gpx':
+        assert '<name>Schmidt</name>' in out.read_text(encoding='utf-8')

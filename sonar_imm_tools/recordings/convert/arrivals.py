@@ -154,6 +154,7 @@ def write_pings(
 def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:
     """The number of each tag, as ``tx_id`` has it: its own, or its order from 1."""
     numbers = number_names([name for name in names if name])
+    report.target_names = numbers
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
     return numbers

@@ -247,6 +247,7 @@ def _scans(
     """Scans of the rows with the same stamp, each with the number of its diver where the rows are
     named, and those at the stamps `empty`, in which nobody was seen."""
     numbers = number_names([name for _, _, name in rows if name]) if named else {}
+    report.target_names = numbers
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
     by_stamp: dict[int, list[tuple[Fix, int]]] = {stamp_ns: [] for stamp_ns in empty}

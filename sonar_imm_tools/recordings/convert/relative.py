@@ -27,6 +27,7 @@ import numpy as np
 
 from msg_adapters.arrivals import FARTHEST
 from msg_adapters.fixes import write_geodetic, write_relative
+from msg_adapters.inputs.topic import tag_numbers
 from msg_adapters.navigation import write_heading, write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading, VesselPose
@@ -139,6 +140,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     known |= {'relative_axes': 'enu' if levelled else 'flu', 'frame_id': how.frame_id}
     if tags:
         known['tags'] = list(dict.fromkeys(tags.values()))
+        numbers = tag_numbers(known['tags'])
+        report.target_names = {name: numbers[tag] for name, tag in tags.items()}
     write_bag(
         report.path,
         records,
