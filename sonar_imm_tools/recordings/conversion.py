@@ -120,6 +120,9 @@ class ConversionReport:
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken
         self.problems += table.problems
+        for name, form in (table.forms | table.orders).items():
+            if form not in ('', 'YMD'):
+                self.notes[f'{name} of {table.path.name}'] = f'{table.header(name)} is {form}'
         for name, sign, way in (('z', 1.0, 'up'), ('depth', -1.0, 'down')):
             header, other = table.header(name), {'z': 'depth', 'depth': 'z'}[name]
             values = table.first_numbers(table.index[name], sign) if table.has(name) else []

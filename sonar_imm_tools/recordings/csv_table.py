@@ -316,8 +316,8 @@ class Table:
         self.cut_line = 0
         self._from_zero: dict[str, bool] = {}
         self._factors: dict[str, float] = {}
-        self._forms: dict[str, str] = {}
-        self._orders: dict[str, str] = {}
+        self.forms: dict[str, str] = {}
+        self.orders: dict[str, str] = {}
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """The number of its line, or of its record, and the cells of each row."""
@@ -448,27 +448,27 @@ class Table:
     def time_form(self, name: str) -> str:
         """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
         name of `DAYS`. Raises `BagError` where that is not clear."""
-        if name not in self._forms:
+        if name not in self.forms:
             unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
             form = unit if unit in (HHMMSS, *DAYS) else ''
             if not unit and name in self.index:
                 cells = self.first_cells(self.index[name])
                 form = form_of(self.header(name), cells, self.has('date'))
-            self._forms[name] = form
-        return self._forms[name]
+            self.forms[name] = form
+        return self.forms[name]
 
     def date_order(self, name: str) -> str:
         """The order of day, month and year in dates that are only numbers; empty where the rows
         leave several."""
         if self.options.date_order or name not in self.index:
             return self.options.date_order
-        if name not in self._orders:
+        if name not in self.orders:
             cells = self.first_cells(self.index[name])
             orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
             if LOTEK <= {name_of(header) for header in self.headers}:
                 orders = ['MDY']
-            self._orders[name] = orders[0] if len(orders) == 1 else ''
-        return self._orders[name]
+            self.orders[name] = orders[0] if len(orders) == 1 else ''
+        return self.orders[name]
 
     @functools.cached_property
     def fraction_unit(self) -> int:

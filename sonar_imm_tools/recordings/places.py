@@ -252,7 +252,10 @@ class LocalFrame:
         """The origin, which is needed to convert back to latitude and longitude."""
         if self.origin is None:
             return {}
-        return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
+        notes = {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
+        if self._degrees is not None and self._degrees.packed:
+            notes['degrees'] = 'degrees and minutes in one number (DDMM.MM)'
+        return notes
 
     def _from_geodetic(
         self, latitude: float, longitude: float, row: Row

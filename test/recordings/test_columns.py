@@ -456,3 +456,15 @@ def test_names_of_targets_travel_to_the_export(tmp_path, kind, head, cells, end)
     assert 'Schmidt' in out.read_text(encoding='utf-8')
     if end == 'gpx':
         assert '<name>Schmidt</name>' in out.read_text(encoding='utf-8')
+
+
+def test_forms_that_were_found_out_are_said(tmp_path):
+    source = tmp_path / 'in.csv'
+    source.write_text(
+        'Date;Time;Lat;Lon\n'
+        + ''.join(f'25/12/2019;0959{k};5925.8;01028.{k}\n' for k in range(10, 20))
+    )
+    notes = KINDS['fixes'](source, tmp_path / 'out', options=CsvOptions(time_zone='UTC')).notes
+    assert notes['stamp of in.csv'] == 'Time is HHMMSS'
+    assert notes['date of in.csv'] == 'Date is DMY'
+    assert 'DDMM.MM' in notes['degrees']
