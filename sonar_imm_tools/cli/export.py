@@ -201,7 +201,7 @@ def _to_degrees(asked: _Asked) -> Callable[[Any], Any] | None:
 def _export_tracks(asked: _Asked) -> Told:
     """Tracks of a run of divers or obstacles."""
     from ..recordings.export.tracks import tracks_of, write_tracks
-    from ..recordings.sources import BagError
+    from ..recordings.sources import BagError, names_of_targets, TARGET_NAMES
 
     degrees = _to_degrees(asked)
     if degrees is None and (stated := asked.record.get('origin')):
@@ -211,7 +211,8 @@ def _export_tracks(asked: _Asked) -> Told:
         except (AttributeError, TypeError, ValueError, OverflowError):
             sentence = f"'origin' in the run.json of {asked.run} cannot be understood"
             raise BagError(sentence) from None
-    tracks = tracks_of(asked.folder.read_estimates(), degrees)
+    names = names_of_targets(asked.record.get(TARGET_NAMES))
+    tracks = tracks_of(asked.folder.read_estimates(), degrees, names)
     with whole(asked.out) as unfinished:
         left_out = write_tracks(unfinished, tracks, asked.kind, asked.run.name)
     count = sum(1 for _ in tracks.each())

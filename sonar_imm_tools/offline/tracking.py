@@ -33,6 +33,7 @@ from attrs import asdict, define, field, frozen
 import numpy as np
 
 from msg_adapters.inputs import inputs_of
+from msg_adapters.inputs.topic import tag_numbers
 from sonar_imm import __version__
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
@@ -44,6 +45,7 @@ from sonar_imm.trackers import System
 from .. import SECOND
 from ..recordings.measurements import measurements_of, Received
 from ..recordings.reader import BagError, BagReader
+from ..recordings.sources import TARGET_NAMES
 from ..recordings.topics import fitting_topics
 from .jobs import processes
 from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
@@ -286,6 +288,14 @@ class OfflineRun:
         origin = getattr(self.tracker, 'origin', None) or self.options.origin
         return {} if origin is None else {'origin': asdict(origin)}
 
+    def target_names(self) -> dict[str, Any]:
+        """The names of targets by target ID, as the parameter `tags` lists and the recording notes
+        them; nothing where there are none."""
+        tags = tag_numbers(getattr(self.tracker.config, 'tags', ()))
+        names = {str(number): tag for tag, number in tags.items() if tag != str(number)}
+        names |= self.bag.target_names
+        return {TARGET_NAMES: names} if names else {}
+
     def landmarks(self) -> dict[str, Any]:
         """The obstacles that are known at the end; nothing of a tracker that keeps none."""
         known = getattr(self.tracker, 'known', None)
@@ -367,6 +377,7 @@ def write_run(
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         **offline.origin(),
+        **offline.target_names(),
         **offline.mounting(),
         **offline.landmarks(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},

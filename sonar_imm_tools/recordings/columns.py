@@ -65,7 +65,7 @@ USUAL_NAMES = {
         'latitude_hemisphere hemisphere_lat lat_ref latitude_ref lat_ns latitude_ns'
     ),
     'longitude_hemisphere': (
-        'e_w ew e_or_w o_w east_west lon_dir long_dir longitude_dir longitude_direction '
+        'e_w ew e_or_w o_w e_o east_west lon_dir long_dir longitude_dir longitude_direction '
         'lon_hemisphere longitude_hemisphere hemisphere_lon lon_ref longitude_ref lon_ew '
         'longitude_ew'
     ),
@@ -91,6 +91,8 @@ USUAL_NAMES = {
     'vessel_y': '',
     'vessel_latitude': '',
     'vessel_longitude': '',
+    'vessel_latitude_hemisphere': '',
+    'vessel_longitude_hemisphere': '',
     'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
@@ -118,7 +120,8 @@ USUAL_NAMES = {
     'var_toa': 'toa_variance var_arrival',
     'std_toa': 'sigma_toa std_arrival sigma_arrival',
     'bearing': (
-        'azimuth doa brg peilung azimut gisement relevement demora marcacion marcacao peiling'
+        'azimuth doa brg peilung azimut gisement relevement demora marcacion marcacao '
+        'peiling seitenpeilung true_bearing bearing_true relative_bearing bearing_relative'
     ),
     'amplitude': 'amp response value',
     'var_bearing': '',
@@ -141,6 +144,8 @@ VESSELS = (
     'navio', 'skip', 'fartoy', 'baat',
 )  # fmt: skip
 """Words that make a position or a heading that of the vessel."""
+ZONES = ('utc', 'gmt', 'local', 'lokal')
+"""Words beside the name of a time."""
 TARGETS = ('target', 'beacon', 'diver', 'rov', 'ziel', 'taucher', 'cible', 'objetivo', 'alvo')
 """Words that make a position that of the target."""
 OF_TARGETS = ('x', 'y', 'z', 'depth', 'latitude', 'longitude')
@@ -151,6 +156,10 @@ UNRELATED = (
     'gain sats satellites hdop pdop'
 ).split()
 """Names of columns of numbers that are neither positions nor headings."""
+
+FROM_NORTH = {'azimuth', 'azimut', 'relevement', 'demora', 'true', 'north'}
+FROM_BOW = {'gisement', 'marcacao', 'relative', 'rel', 'bow', 'seitenpeilung'}
+"""Words of headers of bearings that usually count from north and from the bow."""
 
 METRES = {
     'm': 1.0, 'meter': 1.0, 'meters': 1.0, 'metre': 1.0, 'metres': 1.0, 'metros': 1.0,
@@ -195,8 +204,10 @@ _BRACKETS = re.compile(r'[\[(]([^\])]*)')
 FRACTIONS = {'mil': 10**6, 'msec': 10**6, 'mi': 10**3, 'usec': 10**3, 'nan': 1, 'nsec': 1}
 """Nanoseconds of the unit of a column of parts of a second by the begin of its name, else s."""
 DAY_NAMES = {'datenum': 'datenum', 'matlab_time': 'datenum', 'excel_time': 'excel'}
-MONTH_FIRST = {'date', 'time', 'toa', 'tag_id'}
+LOTEK = {'date', 'time', 'toa', 'tag_id'}
 """Columns of an export of Lotek, which writes the month before the day."""
+THELMA = {'id', 'protocol', 'receiver'}
+"""Columns of an export of Thelma."""
 NOTHING = ('', '-', '--', 'nan', 'na', 'n/a', '#n/a', 'null', 'none', 'nil')
 """Cells without a value."""
 YES = (
@@ -275,6 +286,8 @@ def rank_of(quantity: str, header: str) -> int:
     aliases = ALIASES[quantity]
     if name in aliases:
         return aliases.index(name)
+    if quantity in ('stamp', 'date') and (inner := _without(ZONES, name)) in aliases:
+        return len(aliases)
     if quantity in OF_TARGETS and (inner := _without(TARGETS, name)) and inner in aliases:
         return -1
     of_vessel = quantity.removeprefix('vessel_')

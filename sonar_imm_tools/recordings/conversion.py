@@ -18,7 +18,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import functools
+import json
 import math
 from pathlib import Path
 import re
@@ -35,7 +37,7 @@ from .. import SECOND
 from .csv_table import Row, Table
 from .messages import cdr_of, ros_message
 from .reader import BagMessage, BagReader
-from .sources import BagError
+from .sources import BagError, TARGET_NAMES
 from .times import BadRow
 from .writer import BagWriter
 
@@ -53,6 +55,7 @@ MOST_OFF = 0.1
 FASTEST, NEAR = 100.0, 1000.0
 """No ship is faster, m/s, or jumps further, m."""
 NEIGHBOURS = 5
+_OF_TABLES = re.compile('--(?=(column|time-zone|time-unit|time-offset|date-order|ignore)( |$))')
 MOST_NAMED = 20
 """At most this many bad rows are listed; all are counted."""
 
@@ -63,8 +66,9 @@ class ConversionReport:
 
     messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
     each of the first bad rows and for the file as a whole; questions: what is kept and looks
-    wrong; reasons: bad rows by a word, of those that have one; notes: facts worth telling, such as
-    the origin of local coordinates, also kept in the bag.
+    wrong; reasons: bad rows by a word, of those that have one; kinds: all bad rows by kind, with
+    one of each in `examples`; target_names: target IDs by name;
+    notes: facts worth telling, such as the origin of local coordinates, also kept in the bag.
     """
 
     path: Path
@@ -75,8 +79,9 @@ class ConversionReport:
     questions: list[str] = Factory(list)
     notes: dict[str, str] = Factory(dict)
     reasons: Counter[str] = Factory(Counter)
-    _kinds: Counter[str] = Factory(Counter)
-    _examples: dict[str, str] = Factory(dict)
+    kinds: Counter[str] = Factory(Counter)
+    target_names: dict[str, int] = Factory(dict)
+    examples: dict[str, str] = Factory(dict)
 
     def bad_row(self, path: Path, where: str, why: object) -> None:
         """Count a bad row and name it while there are few."""
@@ -84,8 +89,8 @@ class ConversionReport:
         if reason := getattr(why, 'reason', ''):
             self.reasons[reason.replace('_', ' ')] += 1
         kind = reason or re.sub(r"'.*'|[-\d.]+", '', str(why))
-        self._kinds[kind] += 1
-        self._examples.setdefault(kind, f'{path.name}, {where}: {why}')
+        self.kinds[kind] += 1
+        self.examples.setdefault(kind, f'{path.name}, {where}: {why}')
         if self.bad_rows <= MOST_NAMED:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:
@@ -94,8 +99,8 @@ class ConversionReport:
     def nothing(self, what: object) -> BagError:
         """The error of a file without a usable record, with its commonest problem."""
         words = f' ({self.problems[0]})' if self.problems else ''
-        for kind, count in self._kinds.most_common(1):
-            words = f' ({count} of {self.rows} rows, the first: {self._examples[kind]})'
+        for kind, count in self.kinds.most_common(1):
+            words = f' ({count} of {self.rows} rows, the first: {self.examples[kind]})'
         return BagError(f'{what} holds nothing that could be converted{words}')
 
     def read_rows(self, table: Table, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
@@ -115,14 +120,42 @@ class ConversionReport:
         taken, left = table.columns_used()
         self.notes[f'columns of {table.path.name}'] = taken
         self.problems += table.problems
-        header = table.header('z')
-        if table.has('z') and re.search('depth|tiefe|down', header.lower()):
-            self.questions.append(
-                f'{table.path.name}: z counts up and {header} sounds like a depth; is --column '
-                f"'depth={header}' meant?"
-            )
+        for name, form in (table.forms | table.orders).items():
+            if form not in ('', 'YMD'):
+                self.notes[f'{name} of {table.path.name}'] = f'{table.header(name)} is {form}'
+        for name, sign, way in (('z', 1.0, 'up'), ('depth', -1.0, 'down')):
+            header, other = table.header(name), {'z': 'depth', 'depth': 'z'}[name]
+            values = table.first_numbers(table.index[name], sign) if table.has(name) else []
+            sounds = name == 'depth' or re.search('depth|tiefe|down', header.lower())
+            if sounds and values and max(values) > 0.0 and (name == 'z' or min(values) >= 0.0):
+                self.questions.append(
+                    f'{table.path.name}: {name} counts {way} and {header} is '
+                    f'{"a depth" if name == "z" else "negative"}; is --column '
+                    f"'{other}={header}' meant?"
+                )
         if left:
             self.notes[f'ignored columns of {table.path.name}'] = left
+
+
+@contextmanager
+def flags_of(prefix: str, report: ConversionReport) -> Iterator[None]:
+    """Name the options of a table beside the input, as in ``--truth-column``, in every sentence
+    about that table."""
+    flag = f'--{prefix}-'
+    problems, examples = len(report.problems), set(report.examples)
+    try:
+        yield
+    except BagError as error:
+        sentence = _OF_TABLES.sub(flag, error.sentence)
+        if sentence == error.sentence:
+            raise
+        raise BagError(sentence) from None
+    finally:
+        report.problems[problems:] = [
+            _OF_TABLES.sub(flag, problem) for problem in report.problems[problems:]
+        ]
+        for kind in report.examples.keys() - examples:
+            report.examples[kind] = _OF_TABLES.sub(flag, report.examples[kind])
 
 
 def converter(options: type[Any]) -> Callable[[Converter], Callable[..., ConversionReport]]:
@@ -247,6 +280,8 @@ def write_bag(
     if not ordered:
         raise report.nothing(source)
     notes = provenance(source, report.notes)
+    if named := {str(number): name for name, number in report.target_names.items()}:
+        notes[TARGET_NAMES] = json.dumps(named, ensure_ascii=False)
     with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
         for stamp_ns, topic, kind, raw in ordered:
             bag.write_raw(topic, kind, raw, stamp_ns)

@@ -84,11 +84,12 @@ class _Detecting(_OfSonar):
         kind='pairs')
 
 
-def _bearings(default: str | None) -> Any:
-    help = 'Where bearings count from: bow or north, clockwise, or east, counter-clockwise.'
-    if default is None:
-        help += ' By default north, where no column may be the position or heading of a vessel.'
-    return option(default, '', help, choices=BEARINGS)
+def _bearings(usual: str) -> Any:
+    help = (
+        'Where bearings count from: bow or north, clockwise, or east, counter-clockwise. By '
+        f'default {usual}, where no column says otherwise.'
+    )
+    return option(None, '', help, choices=BEARINGS)
 
 
 def _element_spacing() -> Any:
@@ -139,7 +140,9 @@ class FixesOptions(_Polar):
         'usbl.csv dive.bag --column x=easting --column y=northing',
         'radar.csv dive.bag --bearings north --range-std 2 --bearing-std 0.5',
     )
-    bearings: str | None = _bearings(None)
+    bearings: str | None = _bearings('north')
+    depth_std: float | None = option(None, 'METRES',
+        'Standard deviation of z or depth, for rows that state none.', kind='float', above=0.0)
 
 
 @frozen(kw_only=True)
@@ -157,15 +160,16 @@ class RelativeOptions(_Polar):
         'usbl.csv dive.bag',
         'usbl.csv dive.bag --bearings north --column vessel_x=ship_e --column vessel_y=ship_n',
     )
-    bearings: str = _bearings('bow')
+    bearings: str | None = _bearings('bow')
 
 
 @frozen(kw_only=True)
 class NmeaOptions(_WithTruth):
     """Log of NMEA 0183 and AIS to /fixes, /nav_fix and /heading. Needs pyais and pynmea2.
 
-    Fixes are the targets of AIS (by MMSI), TLL and TTM; the vessel's own GGA, RMC, GLL, GNS, HDT
-    and THS are its navigation, or the fixes where there are no targets. Times stand before a
+    Fixes are the targets of AIS (by MMSI), TLL and TTM, and of a USBL (USRTH, PSIMSSB); the
+    vessel's own GGA, RMC, GLL, GNS, HDT and THS are its navigation, or the fixes where there are
+    no targets. Times stand before a
     sentence, in its tag block, or are the vessel's clock with the date of ZDA or RMC.
     """
 
@@ -206,9 +210,9 @@ class DetectionsOptions(_Receivers):
     )
     sync: Path | str | None = option(None, '',
         'CSV of the positions of fixed tags, with the column tag.', kind='file')
-    window: float = option(1.0, 'SECONDS',
-        'Longest time between the first and the last detection of a ping.', kind='float',
-        range=(1e-3, 600.0))
+    window: float | None = option(None, 'SECONDS',
+        'Longest time between the first and the last detection of a ping; by default 1, or half '
+        'of the time between the pings of a tag.', kind='float', range=(1e-3, 600.0))
     clock_interval: float = option(12.0, 'HOURS',
         'Time over which the clock of a receiver drifts evenly.', kind='float',
         range=(0.1, 1e4))

@@ -41,7 +41,7 @@ from .columns import (
     DAY_NAMES,
     factor_of,
     FRACTIONS,
-    MONTH_FIRST,
+    LOTEK,
     name_of,
     NO,
     NOTHING,
@@ -75,9 +75,17 @@ LONGEST_NS = 10**8 * 10**9
 """A recording is shorter, a date since 1970 longer."""
 LONGEST_LINE = 1 << 20
 """Characters."""
+ASKED = (
+    'x', 'y', 'z', 'depth', 'latitude', 'longitude', 'range', 'bearing', 'heading',
+    'vessel_x', 'vessel_y', 'vessel_latitude', 'vessel_longitude',
+)  # fmt: skip
+"""Quantities of which two columns with other values are a question."""
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
+RECORDS = 'VEMCO DATA LOG'
+"""Begin of a file of records of several kinds, each with its own header, of which detections
+(``DET``) are read."""
 _THOUSANDS = re.compile(r'[-+]?\d{1,3}(,\d{3})+$')
 _DECIMAL_COMMA = re.compile(r'[-+]?\d*,(\d{1,2}|\d{4,})$')
 NUMBER = re.compile(r'[-+]?(\d+([.,]\d*)?|[.,]\d+)$')
@@ -308,8 +316,8 @@ class Table:
         self.cut_line = 0
         self._from_zero: dict[str, bool] = {}
         self._factors: dict[str, float] = {}
-        self._forms: dict[str, str] = {}
-        self._orders: dict[str, str] = {}
+        self.forms: dict[str, str] = {}
+        self.orders: dict[str, str] = {}
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """The number of its line, or of its record, and the cells of each row."""
@@ -349,10 +357,7 @@ class Table:
 
     def varies(self, column: int) -> bool:
         """Say whether a column holds numbers that change, and does not count the rows."""
-        cells = self.first_cells(column)
-        if not cells or not all(NUMBER.match(cell) for cell in cells):
-            return False
-        values = [float(cell.replace(',', '.')) for cell in cells]
+        values = self.first_numbers(column, 1.0)
         steps = {after - before for before, after in itertools.pairwise(values)}
         return bool(steps - {0.0, 1.0})
 
@@ -374,7 +379,37 @@ class Table:
         """Factor from the unit of a column to that of its quantity. Raises `BagError`."""
         if name not in self._factors:
             self._factors[name] = factor_of(name, self.header(name))
+            self._ask_for_one(name)
         return self._factors[name]
+
+    def _ask_for_one(self, name: str) -> None:
+        """Raise `BagError` where several columns may be this quantity and hold other values."""
+        own = self.index.get(name, -1)
+        if name in self.options.columns or name not in ASKED or own < 0:
+            return
+        if rank_of(name, self.headers[own]) < 0:  # that of a target is the one
+            return
+        limit = 1e-6 if name.endswith('itude') else 0.02
+        for other, header in enumerate(self.headers):
+            if other in self.index.values() or name not in quantities_of(header):
+                continue
+            pairs = zip(
+                self.first_numbers(own, self._factors[name]),
+                self.first_numbers(other, factor_of(name, header)),
+            )
+            if any(abs(a - b) > limit for a, b in pairs):
+                raise BagError(
+                    f'{self.path}: {self.headers[own]} and {header} may both be {name}, and '
+                    f"differ; say --column '{name}={self.headers[own]}' or --column "
+                    f"'{name}={header}'"
+                )
+
+    def first_numbers(self, column: int, factor: float) -> list[float]:
+        """The numbers of a column of the rows by which the file is judged; none where a cell is
+        no number."""
+        cells = self.first_cells(column)
+        whole = all(NUMBER.match(cell) for cell in cells)
+        return [factor * float(cell.replace(',', '.')) for cell in cells] if whole else []
 
     def counts_from_zero(self, name: str) -> bool:
         """Whether the first times of the file are seconds from its own start rather than a date,
@@ -413,26 +448,27 @@ class Table:
     def time_form(self, name: str) -> str:
         """How numbers of a time column are meant where they are no count of seconds: `HHMMSS` or a
         name of `DAYS`. Raises `BagError` where that is not clear."""
-        unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
-        if unit or name not in self.index:
-            return unit if unit in (HHMMSS, *DAYS) else ''
-        if name not in self._forms:
-            cells = self.first_cells(self.index[name])
-            self._forms[name] = form_of(self.header(name), cells, self.has('date'))
-        return self._forms[name]
+        if name not in self.forms:
+            unit = self.time_unit(name) or DAY_NAMES.get(name_of(self.header(name)), '')
+            form = unit if unit in (HHMMSS, *DAYS) else ''
+            if not unit and name in self.index:
+                cells = self.first_cells(self.index[name])
+                form = form_of(self.header(name), cells, self.has('date'))
+            self.forms[name] = form
+        return self.forms[name]
 
     def date_order(self, name: str) -> str:
         """The order of day, month and year in dates that are only numbers; empty where the rows
         leave several."""
         if self.options.date_order or name not in self.index:
             return self.options.date_order
-        if name not in self._orders:
+        if name not in self.orders:
             cells = self.first_cells(self.index[name])
             orders = orders_of([(split_time(cell) or (cell,))[0] for cell in cells])
-            if MONTH_FIRST <= {name_of(header) for header in self.headers}:
+            if LOTEK <= {name_of(header) for header in self.headers}:
                 orders = ['MDY']
-            self._orders[name] = orders[0] if len(orders) == 1 else ''
-        return self._orders[name]
+            self.orders[name] = orders[0] if len(orders) == 1 else ''
+        return self.orders[name]
 
     @functools.cached_property
     def fraction_unit(self) -> int:
@@ -442,10 +478,8 @@ class Table:
             return 0
         header = name_of(self.header('fraction'))
         unit = next((ns for begin, ns in FRACTIONS.items() if header.startswith(begin)), 10**9)
-        cells = self.first_cells(self.index['fraction'])
-        values = [float(cell.replace(',', '.')) for cell in cells if NUMBER.match(cell)]
-        parts = len(values) == len(cells) and all(0.0 <= value * unit < 1e9 for value in values)
-        return unit if parts and cells else 0
+        values = self.first_numbers(self.index['fraction'], unit)
+        return unit if values and all(0.0 <= value < 1e9 for value in values) else 0
 
     def _find_columns(self) -> dict[str, int]:
         """Match headers with quantities: mapped by hand first, then by their usual names."""
@@ -475,6 +509,7 @@ class CsvTable(Table):
     def __init__(self, path: str | Path, options: CsvOptions | None = None):
         self.path = Path(path)
         self.options = options or CsvOptions()
+        self._kind = ''
         start = start_of(self.path)
         if start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start[:64]:
             raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
@@ -484,6 +519,9 @@ class CsvTable(Table):
         with self._open() as file:
             lines = (line for line in _lines(file) if line.strip() and not line.startswith('#'))
             first = next(lines, '')
+            if first.startswith(RECORDS):
+                first = next((line for line in lines if line.startswith('DET_DESC')), first)
+                self._kind = 'DET'
         if not first:
             raise BagError(f'{self.path} is empty, not a CSV file')
         likely = max(',;\t|', key=first.count)
@@ -520,12 +558,14 @@ class CsvTable(Table):
                     raise self._no_table(reader.line_num) from None
                 if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
                     continue
+                if self._kind:
+                    header_seen = cells[0] == self._kind
                 if header_seen:
                     if len(cells) < width and not ended:
                         self.cut_line = reader.line_num
                     width = len(cells)
                     yield reader.line_num, cells
-                header_seen = True
+                header_seen = not self._kind
 
     @property
     def _dialect(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 import math
 import re
 
@@ -26,7 +27,7 @@ from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
-from .columns import sign_of, unit_of
+from .columns import FROM_BOW, FROM_NORTH, plain, sign_of, unit_of
 from .csv_table import NUMBER, Row, Table
 from .sources import BagError
 from .times import BadRow
@@ -55,6 +56,12 @@ _DEGREES = re.compile(
     r"\s*(?:['′’:m\s]\s*(\d+(?:[.,]\d+)?))?\s*(?:[°º'′’\"″”]|'')?\s*([A-Za-z]*)$"
 )
 """Degrees, minutes and seconds with a hemisphere before or behind them."""
+_LETTERS = re.compile(r'(\d)\s*d\s*(\d+)\s*m\s*([\d.]+)\s*s', re.IGNORECASE)
+"""Degrees, minutes and seconds marked by letters, of which the last is no south."""
+FARTHEST_APART = 5.0
+"""Metres that metres and degrees of the same rows may differ by, beside a tenth of the way."""
+NEAR_ORIGIN = 1e5
+"""Metres from a stated origin that positions are within."""
 _AXES = ('latitude', 'longitude')
 
 
@@ -69,21 +76,47 @@ class Degrees:
 
     def __init__(self, table: Table, prefix: str = ''):
         self._names = {axis: f'{prefix}{axis}' for axis in _AXES}
+        named = [axis for axis in _AXES if f'{prefix}{axis}_hemisphere' in table.index]
         self._signs = {axis: self._sign_column(table, axis) for axis in _AXES}
+        found = [axis for axis in _AXES if self._signs[axis] is not None]
+        if len(found) == 1 and not named:
+            name = f'{prefix}{found[0]}_hemisphere'
+            raise BagError(
+                f'{table.path}: {table.header(name)} may be the hemisphere of '
+                f'{table.header(self._names[found[0]])}; say --column '
+                f"'{name}={table.header(name)}' or --ignore {name}"
+            )
         values = {axis: self._first_values(table, axis) for axis in _AXES}
         latitude, longitude = (np.abs(values[axis]) for axis in _AXES)
         limits = (latitude, 90.0), (longitude, 360.0)
         beyond = [len(each) and 2.0 * np.mean(each > limit) > 1.0 for each, limit in limits]
         if beyond[0] and latitude.max() <= 180.0 and (longitude <= 90.0).all():
-            north, east = (table.header(name) for name in self._names.values())
-            raise BagError(
-                f'{table.path}: {north} is beyond 90 degrees and {east} is not, so that latitude '
-                f"and longitude look exchanged; say --column '{self._names['latitude']}={east}' "
-                f"--column '{self._names['longitude']}={north}'"
-            )
+            raise self._exchanged(table, 'one is beyond 90 degrees and the other is not')
         self.packed = any(beyond) and all(
             (each % 100.0 < 60.0).all() and (each < 100.0 * limit).all() for each, limit in limits
         )
+
+    def _exchanged(self, table: Table, why: str) -> BagError:
+        north, east = (table.header(name) for name in self._names.values())
+        return BagError(
+            f'{table.path}: {north} and {east} look exchanged, since {why}; say --column '
+            f"'{self._names['latitude']}={east}' --column '{self._names['longitude']}={north}'"
+        )
+
+    def check_origin(self, table: Table, origin: tuple[float, float, float]) -> None:
+        """Raise `BagError` where the first position is near a stated origin only with latitude and
+        longitude exchanged."""
+        for row in table.first_rows:
+            with suppress(BadRow):
+                place = self.place(row)
+                ways = [
+                    float(np.linalg.norm(Origin(*origin).local(*each)[:2]))
+                    for each in (place, place[::-1])
+                    if abs(each[0]) <= 90.0
+                ]
+                if len(ways) == 2 and ways[1] < NEAR_ORIGIN < 0.1 * ways[0]:
+                    raise self._exchanged(table, f'the origin is {ways[0] / 1e3:.0f} km away')
+                return
 
     def place(self, row: Row) -> tuple[float, float]:
         """Latitude and longitude of a row. Raises `BadRow`."""
@@ -97,7 +130,8 @@ class Degrees:
 
     def _value(self, row: Row, axis: str) -> float:
         name = self._names[axis]
-        found = None if NUMBER.match(row.text(name)) else _DEGREES.match(row.text(name))
+        text = _LETTERS.sub(r"\1°\2'\3″", row.text(name))
+        found = None if NUMBER.match(text) else _DEGREES.match(text)
         if found is None:
             value, words = row.number(name), []
         else:
@@ -115,12 +149,12 @@ class Degrees:
         if (beside := self._signs[axis]) is not None:
             column, own = beside
             words.append(row.text(column) or 'nothing')
-        for word in words[-1:]:
-            sign = own.get(word.lower()) or sign_of(axis, word)
-            if sign is None or value < 0.0 < sign:
+        signs = {own.get(word.lower()) or sign_of(axis, word) for word in words}
+        for sign in signs:
+            if sign is None or len(signs) > 1 or value < 0.0 < sign:
                 raise BadRow(
                     f"{row.table.header(name)} is '{row.text(name)[:40]}' with the hemisphere "
-                    f"'{word[:20]}'"
+                    f"'{words[-1][:20]}'"
                 )
             value = sign * abs(value)
         return value
@@ -129,7 +163,9 @@ class Degrees:
         """The column of the hemisphere: one by its name, one of words for hemispheres beside the
         degrees, or the only one of such words; None without one."""
         at, name = table.index[self._names[axis]], f'{self._names[axis]}_hemisphere'
-        taken = {table.index[each] for each in self._names.values()}
+        if name in table.options.ignore:
+            return None
+        taken = {k for quantity, k in table.index.items() if quantity != name}
         words = {
             k: {cell.lower() for cell in table.first_cells(k)}
             for k in range(len(table.headers))
@@ -142,6 +178,10 @@ class Degrees:
             if found and all(word in letters or sign_of(axis, word) for word in found)
         ]
         beside = [k for k in (at + 1, at - 1) if k in fitting]
+        if words.get(table.index.get(name, -1)) and all(
+            NUMBER.match(word) for word in words[table.index[name]]
+        ):
+            del table.index[name]  # an offset to the north or east
         if name not in table.index:
             if not beside and len(fitting) != 1:
                 return None
@@ -149,7 +189,8 @@ class Degrees:
         found = words.get(table.index[name], set())
         if 'o' not in found:
             return name, {}
-        signs = {sign_of(axis, word) for word in found - {'o'}}
+        found |= set(plain(table.header(name)).split('_'))
+        signs = {sign_of(axis, word) for word in found - {'o'}} - {None}
         if len(signs) != 1:
             raise BagError(
                 f"{table.path}: 'O' in {table.header(name)} may be east (Ost) or west (Ouest, "
@@ -191,8 +232,12 @@ class LocalFrame:
                     '--column x=HEADER'
                 )
             table.require('x', 'y')
+        if metres and table.has('latitude', 'longitude') and not self.geodetic:
+            _ask_for_places(table)
         self.origin = checked_origin(origin) if self.geodetic else None
         self._degrees = Degrees(table) if self.geodetic else None
+        if self._degrees is not None and self.origin is not None:
+            self._degrees.check_origin(table, self.origin)
 
     def position(self, row: Row) -> tuple[float, float, float]:
         """Give x, y, z of a row in metres. Raises `BadRow`."""
@@ -207,7 +252,10 @@ class LocalFrame:
         """The origin, which is needed to convert back to latitude and longitude."""
         if self.origin is None:
             return {}
-        return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
+        notes = {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
+        if self._degrees is not None and self._degrees.packed:
+            notes['degrees'] = 'degrees and minutes in one number (DDMM.MM)'
+        return notes
 
     def _from_geodetic(
         self, latitude: float, longitude: float, row: Row
@@ -218,6 +266,28 @@ class LocalFrame:
             self.origin = (latitude, longitude, 0.0)
         east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
         return east, north, up
+
+
+def _ask_for_places(table: Table) -> None:
+    """Raise `BagError` where x and y move by another distance than latitude and longitude do."""
+    if table.is_blank('latitude', 'longitude') or {'x', 'y'} & set(table.options.columns):
+        return
+    degrees, metres, places, origin = Degrees(table), [], [], None
+    for row in table.first_rows:
+        with suppress(BadRow):
+            place = degrees.place(row)
+            origin = origin or Origin(*place)
+            metres.append([row.number('x'), row.number('y')])
+            places.append(origin.local(*place)[:2])
+    if len(metres) != len(places) or not metres:
+        return
+    ways = [np.linalg.norm(np.array(each) - each[0], axis=1).max() for each in (metres, places)]
+    if abs(ways[0] - ways[1]) > FARTHEST_APART + 0.1 * max(ways):
+        x, y, north, east = map(table.header, ('x', 'y', 'latitude', 'longitude'))
+        raise BagError(
+            f'{table.path}: {x} and {y} move by {ways[0]:.3g} m, {north} and {east} by '
+            f'{ways[1]:.3g} m; say which are not the positions: --ignore x or --ignore latitude'
+        )
 
 
 def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, list[float]]:
@@ -238,6 +308,20 @@ def checked_origin(origin: tuple[float, ...] | None) -> tuple[float, float, floa
 BEARINGS = ('bow', 'north', 'east')
 """Where bearings count from: clockwise from the bow or from north, counter-clockwise from east."""
 _TURN = 6.3
+
+
+def bearings_from(table: Table, stated: str | None, usual: str) -> str:
+    """Where bearings of a table count from: as stated, else as usual. Raises `BagError` where the
+    header has a word for the other one of north and bow."""
+    words = set(plain(table.header('bearing')).split('_'))
+    others = {'north': FROM_BOW, 'bow': FROM_NORTH}[usual]
+    if stated is None and words & others:
+        other = {'north': 'bow', 'bow': 'north'}[usual]
+        raise BagError(
+            f'{table.path}: {table.header("bearing")} may count from {other} or from {usual}; say '
+            f'--bearings {other} or --bearings {usual}'
+        )
+    return stated or usual
 
 
 class PolarRows:

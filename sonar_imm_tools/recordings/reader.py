@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from heapq import merge
 from itertools import islice
+import json
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,16 @@ from msg_adapters.headers import stamp_ns
 from sonar_imm.measurements import Rejection
 
 from .messages import cdr_of
-from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
+from .sources import (
+    BagError,
+    names_of_targets,
+    one_line,
+    open_sources,
+    RawMessage,
+    Source,
+    TARGET_NAMES,
+    TopicInfo,
+)
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
 
@@ -127,6 +137,14 @@ class BagReader:
             for source in self._sources
             for key, value in getattr(source, 'custom_data', {}).items()
         }
+
+    @property
+    def target_names(self) -> dict[str, str]:
+        """The names of targets by target ID, as `convert` notes them; empty without."""
+        try:
+            return names_of_targets(json.loads(self.custom_data.get(TARGET_NAMES, '{}')))
+        except (ValueError, RecursionError):
+            return {}
 
     @property
     def is_ros1(self) -> bool:

@@ -25,7 +25,7 @@ from attrs import frozen
 from sonar_imm.trackers import SYSTEMS
 
 from .convert.archives import NAMES as SNAPSHOT_NAMES
-from .convert.arrivals import names_tags
+from .convert.arrivals import name_columns, names_tags
 from .convert.nmea import SENTENCE
 from .csv_table import CsvOptions, CsvTable
 from .reader import BagReader
@@ -177,6 +177,7 @@ def _is_nmea(start: bytes) -> bool:
 def _of_table(table: CsvTable) -> Guess:
     columns = ', '.join(table.headers[:12])
     why = f'a table with the columns {columns}'
+    name_columns(table)
     if table.has('receiver', 'toa') or table.has('receiver', 'ping', 'arrival'):
         return Guess('arrivals', why)
     if table.has('receiver', 'stamp') and names_tags(table):

@@ -53,12 +53,23 @@ SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
+TARGET_NAMES = 'target_names'
+"""Note of a bag and of run.json: the names of targets by target ID, a mapping in JSON."""
+
+
 class BagError(Exception):
     """A recording that cannot be used, in one sentence for the user."""
 
     def __init__(self, sentence: str):
         self.sentence = in_one_line(sentence)
         super().__init__(self.sentence)
+
+
+def names_of_targets(value: Any) -> dict[str, str]:
+    """Return the texts of a mapping from target ID to name that is read from a file."""
+    if not isinstance(value, dict):
+        return {}
+    return {str(key): name for key, name in value.items() if isinstance(name, str)}
 
 
 class NoRecordingError(BagError):

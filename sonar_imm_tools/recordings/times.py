@@ -30,16 +30,6 @@ TIME_TEXT = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?' +
 _COMPACT = re.compile(r'(\d{4})(\d\d)(\d\d)[T ]?(\d\d)(\d\d)(\d\d)([.,]\d+)?' + _ZONE)
 TIME_OF_DAY = re.compile(r'(\d\d?):(\d\d)(?::(\d\d))?([.,]\d+)?\s*(?:([AaPp])\.?[Mm]\.?)?' + _ZONE)
 _DATE_AND_CLOCK = re.compile(r'(.*\S)[T ,]\s*(\d\d?:\d\d.*)$')
-_PARTS = re.compile(r'(\d\d?)([-/.])(\d\d?)\2(\d{4}|\d\d)$')
-_DATES = (
-    (re.compile(r'(\d{4})[-/.](\d\d?)[-/.](\d\d?)$'), (1, 2, 3)),
-    (re.compile(r'(\d{4})(\d\d)(\d\d)$'), (1, 2, 3)),
-    (re.compile(r'(\d\d?)\.(\d\d?)\.(\d{4})$'), (3, 2, 1)),
-    (re.compile(r'(\d\d?)_([a-z]+)_(\d{4})$'), (3, 2, 1)),
-    (re.compile(r'([a-z]+)_(\d\d?)_(\d{4})$'), (3, 1, 2)),
-    (re.compile(r'(\d{4})_([a-z]+)_(\d\d?)$'), (1, 2, 3)),
-)
-"""Forms of a date that can be read in one way only, with the places of year, month and day."""
 ORDERS = {'DMY': (2, 1, 0), 'MDY': (2, 0, 1), 'YMD': (0, 1, 2)}
 """Places of year, month and day in a date of three numbers."""
 _MONTHS = (
@@ -123,28 +113,38 @@ def dated(date: str, clock: str, header: str, order: str = '') -> str:
     """A date and a time of day as one text; header: of the date; order: of its numbers, as in
     `ORDERS`, empty where it is not known. Raises `BadRow` for a date that can be read in several
     ways."""
-    for form, places in _DATES:
-        for text in (date, plain(date)):
-            if found := form.match(text):
-                year, month, day = (_number(found.group(place)) for place in places)
-                return f'{year:04d}-{month:02d}-{day:02d} {clock_text(clock)}'
-    if order and (found := _PARTS.match(date)):
-        parts = [int(found.group(place)) for place in (1, 3, 4)]
-        year, month, day = (parts[place] for place in ORDERS[order])
-        return f'{year + 2000 * (year < 100):04d}-{month:02d}-{day:02d} {clock_text(clock)}'
-    raise BadRow(
-        f"{header} is '{date[:40]}', which can be read in several ways: say --date-order "
-        f'{", ".join(orders_of([date]) or ORDERS)}, or write 2024-05-31',
-        'date in several ways',
-    )
+    orders = orders_of([date])
+    if not order or order not in orders:
+        order = orders[0] if len(orders) == 1 else ''
+    if not order:
+        flags = ' or '.join(f'--date-order {each}' for each in orders)
+        several = f'can be read in several ways: say {flags}, or'
+        raise BadRow(
+            f"{header} is '{date[:40]}', which {several if orders else 'is no date;'} "
+            'write 2024-05-31',
+            'date in several ways' if orders else 'no date',
+        )
+    year, month, day = (_parts(date)[place] for place in ORDERS[order])
+    number = int(month) if month.isdecimal() else _month(month)
+    return f'{int(year) + 2000 * (len(year) == 2)}-{number:02d}-{int(day):02d} {clock_text(clock)}'
 
 
-def _number(text: str) -> int:
-    """A number, or that of a month by its name; 0 for other words."""
-    if text.isdecimal():
-        return int(text)
+def _parts(date: str) -> list[str]:
+    """The three parts of a date, numbers or the name of a month; empty for other texts."""
+    parts = plain(date).split('_')
+    if len(parts) == 1 and len(date) == 8 and date.isdecimal():
+        parts = [date[:4], date[4:6], date[6:]]
+    if len(parts) == 1 and len(date) == 6 and date.isdecimal():
+        parts = [date[:2], date[2:4], date[4:]]
+    numbers = sum(part.isdecimal() and len(part) in (1, 2, 4) for part in parts)
+    named = sum(_month(part) > 0 for part in parts)
+    return parts if len(parts) == 3 and numbers + named == 3 and numbers >= 2 else []
+
+
+def _month(word: str) -> int:
+    """The number of a month by its name; 0 for other words."""
     names = enumerate(_MONTHS, start=1)
-    return next((k for k, starts in names if text.startswith(tuple(starts.split()))), 0)
+    return next((k for k, starts in names if word.startswith(tuple(starts.split()))), 0)
 
 
 def split_time(text: str) -> tuple[str, str] | None:
@@ -157,24 +157,22 @@ def split_time(text: str) -> tuple[str, str] | None:
 
 
 def orders_of(dates: Sequence[str]) -> list[str]:
-    """The orders in which all dates of three numbers, the year with two or four digits, are dates
-    of the calendar; none where there is another text."""
-    fitting = []
-    for order, places in ORDERS.items():
-        for date in dates:
-            found = _PARTS.match(date)
-            if found is None:
-                return []
-            year, month, day = ([found[1], found[3], found[4]][place] for place in places)
-            if (
-                order == 'YMD'
-                and len(found[4]) == 4
-                or not (1 <= int(month) <= 12 and 1 <= int(day) <= 31)
-            ):
-                break
-        else:
-            fitting.append(order)
-    return fitting
+    """The orders in which all texts are dates of the calendar. Between points the day is first,
+    unless the year is."""
+    return [order for order in ORDERS if all(_fits(date, order) for date in dates)]
+
+
+def _fits(date: str, order: str) -> bool:
+    parts = _parts(date)
+    if not parts:
+        return False
+    year, month, day = (parts[place] for place in ORDERS[order])
+    if any(len(part) == 4 and part.isdecimal() for part in (month, day)) or len(year) == 1:
+        return False
+    if order == 'MDY' and '.' in date and month.isdecimal():
+        return False
+    known = 1 <= int(month) <= 12 if month.isdecimal() else _month(month) > 0
+    return known and year.isdecimal() and day.isdecimal() and 1 <= int(day) <= 31
 
 
 def hhmmss(text: str) -> str:

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from msg_adapters.table import encode_table
 from sonar_imm.truth import TrueTrack, Truth
 
-from .conversion import ConversionReport, converter, Record, write_bag
+from .conversion import ConversionReport, converter, flags_of, Record, write_bag
 from .convert_options import TruthOptions
 from .csv_table import CsvOptions, Row
 from .messages import ros_message
@@ -66,7 +66,7 @@ def convert_truth(path: Path, how: TruthOptions, report: ConversionReport) -> No
     several targets, whose names become track ids in order of appearance unless they are numbers.
     values: as in `TruthOptions`.
     """
-    records = truth_records(path, report, how.options, how.frame_id, how.origin)
+    records = _records(path, report, how.options, how.frame_id, how.origin)
     write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
 
@@ -77,7 +77,18 @@ def truth_records(
     frame_id: str,
     origin: tuple[float, ...] | None,
 ) -> list[Record]:
-    """Read a truth CSV into records; bad rows and notes go to `report`."""
+    """Read the truth beside another file into records; bad rows and notes go to `report`."""
+    with flags_of('truth', report):
+        return _records(path, report, options, frame_id, origin)
+
+
+def _records(
+    path: str | Path,
+    report: ConversionReport,
+    options: CsvOptions | None,
+    frame_id: str,
+    origin: tuple[float, ...] | None,
+) -> list[Record]:
     table = open_table(path, options)
     table.require('stamp')
     frame = LocalFrame(table, origin)

@@ -447,7 +447,11 @@ FORMATS = [
         'GeoJSON: points, lines with `coordTimes` or `times`', 'dive.geojson', geojson, 'diver'
     ),
     Format(
-        'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM', 'gps.log', nmea, 'diver'
+        'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM; USRTH, PSIMSSB (C, H) of a '
+        'USBL',
+        'gps.log',
+        nmea,
+        'diver',
     ),
     Format('AIS: messages 1, 2, 3, 18, 19, 27', 'harbour.nmea', ais, 'diver'),
     Format(

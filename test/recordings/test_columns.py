@@ -13,11 +13,16 @@
 # limitations under the License.
 """What columns of tables mean: input, and the expected value or sentence."""
 
+import re
+
 import pytest
 
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import KINDS
 from sonar_imm_tools.recordings.csv_table import CsvOptions, CsvTable
+from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.places import Degrees
+from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.recordings.times import BadRow
@@ -119,6 +124,12 @@ PLACES = [
     ('lat,lon', "59°25.8'S,10°28.2'W", (-59.43, -10.47)),
     ('lat,lon', '"59°25\'48.0""N","10°28\'12""W"', (59.43, -10.47)),
     ('lat,lon', '59:25:48,10:28:12', (59.43, 10.47)),
+    ('lat,lon', '59d25m48s,10d28m12s', (59.43, 10.47)),
+    ('lat,lon', '59d25m48sS,10D28M12S W', (-59.43, -10.47)),
+    ('lat,lon', "N 59° 25.8',W 10° 28.2'", (59.43, -10.47)),
+    ('lat,lon', '5.943e1,1.047e1', (59.43, 10.47)),
+    ('lat,N/S,lon,E/W', '59.43S,S,10.47,W', (-59.43, -10.47)),
+    ('lat,lon,NS,EW', '59.43,10.47,3.5,-7', (59.43, 10.47)),
     ('lat,lon', '59.43 S,10.47 W', (-59.43, -10.47)),
     ('lat,lon', '59.43S,10.47W', (-59.43, -10.47)),
     ('lat,lon', '-59 25.8,-10 28.2', (-59.43, -10.47)),
@@ -139,6 +150,7 @@ def test_degrees_in_every_spelling(table, header, cells, place):
         ('lat,N/S,lon,E/W', '33.5,,70.25,W', "hemisphere 'nothing'"),
         ('lat,N/S,lon,E/W', '-33.5,N,70.25,W', "hemisphere 'N'"),
         ('lat,lon', '33.5 E,70.25 N', "hemisphere 'E'"),
+        ('lat,N/S,lon,E/W', '33.5 N,S,70.25,W', "hemisphere 'S'"),
         ('lat,lon', '59 75.8,10 28.2', "lat is '59 75.8'"),
         ('lat,lon', '0,0', 'receivers without a fix'),
         ('lat,lon', '0.0000001,0.0000001', 'receivers without a fix'),
@@ -155,11 +167,16 @@ def test_what_is_no_position_is_a_bad_row(table, header, cells, words):
 
 
 @pytest.mark.parametrize(
-    'cells, place',
-    [('33,S,70,O\n33,S,70,W', (-33.0, 70.0)), ('33,S,70,O\n33,S,70,E', (-33.0, -70.0))],
+    'head, cells, place',
+    [
+        ('ew', '33,S,70,O\n33,S,70,W', (-33.0, 70.0)),
+        ('ew', '33,S,70,O\n33,S,70,E', (-33.0, -70.0)),
+        ('O/W', '33,S,70,O', (-33.0, 70.0)),
+        ('E/O', '33,S,70,O', (-33.0, -70.0)),
+    ],
 )
-def test_o_is_east_beside_west_and_west_beside_east(table, cells, place):
-    made = table(f'lat,ns,lon,ew\n{cells}\n')
+def test_o_is_east_beside_west_and_west_beside_east(table, head, cells, place):
+    made = table(f'lat,ns,lon,{head}\n{cells}\n')
     assert Degrees(made).place(next(iter(made))) == place
 
 
@@ -271,3 +288,183 @@ def test_columns_that_are_zero_throughout_give_way_to_filled_ones(tmp_path):
     rows = ''.join(f'{k},0,0.0,59.43,{10.47 + 1e-4 * k}\n' for k in range(9))
     source.write_text('Time,East,North,Lat,Lon\n' + rows)
     assert 'latitude = Lat' in KINDS['fixes'](source, tmp_path / 'out').notes['columns of in.csv']
+
+
+@pytest.mark.parametrize(
+    'header, cells, words',
+    [
+        ('lat,Latitude,lon', '59.0,59.1,10', 'Latitude and lat may both be latitude'),
+        ('lat,Latitude,lon', '59.1,59.1,10', ''),
+        ('lat,target_lat,lon,target_lon', '59.0,59.1,10,11', ''),
+        ('Depth (m),Depth (ft)', '10,32.8', ''),
+        ('Depth (m),Tiefe', '10,32.8', 'may both be depth'),
+        ('heading,gyro', '90,95', 'may both be heading'),
+        ('east,easting', '1,2', 'may both be x'),
+    ],
+)
+def test_two_columns_of_one_quantity_are_a_question(table, header, cells, words):
+    text = f'time,{header}\n1,{cells}\n'
+    (row,) = made = table(text)
+    quantity = next(name for name in ('latitude', 'depth', 'heading', 'x') if name in made.index)
+    if not words:
+        assert row.number(quantity) > 0.0
+        return
+    with pytest.raises(BagError, match=words):
+        row.number(quantity)
+    for name in header.split(',')[:2]:
+        (row,) = table(text, columns={quantity: name})
+        assert row.number(quantity) > 0.0
+
+
+def test_metres_and_degrees_that_disagree_are_a_question(tmp_path):
+    source = tmp_path / 'in.csv'
+    for scale in (1.0, 3.0):
+        rows = ''.join(
+            f'{k},{1.93 * scale * 57 * k:.2f},0,59.0,{10 + 1e-3 * 2 * k:.4f}\n' for k in range(20)
+        )
+        source.write_text('time,x,y,lat,lon\n' + rows)
+        if scale == 1.0:
+            assert KINDS['fixes'](source, tmp_path / 'agree').messages == {'/fix': 20}
+            continue
+        with pytest.raises(BagError, match='--ignore x or --ignore latitude'):
+            KINDS['fixes'](source, tmp_path / 'out')
+        for name, column in (('x', 'latitude = lat'), ('latitude', 'x')):
+            how = CsvOptions(ignore=[name])
+            notes = KINDS['fixes'](source, tmp_path / f'without_{name}', options=how).notes
+            assert column in notes['columns of in.csv']
+
+
+@pytest.mark.parametrize('places', ['lat;lon', 'Breite;Länge', 'x;y'])
+def test_positions_beside_range_and_bearing_are_a_question(tmp_path, places):
+    """Those of the target or those of a vessel: each reading has its option."""
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k};59.4;10.{k};{80 + k * k};50;{k}0\n' for k in range(1, 9))
+    source.write_text(f'time;{places};heading;range;bearing_deg\n{rows}', encoding='utf-8')
+    with pytest.raises(BagError) as caught:
+        KINDS['fixes'](source, tmp_path / 'out')
+    sentence = caught.value.sentence
+    assert '--ignore range' in sentence and 'convert relative' in sentence
+    report = KINDS['fixes'](source, tmp_path / 'target', options=CsvOptions(ignore=['range']))
+    assert report.messages == {'/fix': 8}
+    pairs = re.findall("--column '(vessel_[a-z]+)=([^']+)'", sentence)
+    how = CsvOptions(columns=dict(pairs))
+    assert KINDS['relative'](source, tmp_path / 'vessel', options=how).messages['/relative'] == 8
+
+
+@pytest.mark.parametrize(
+    'kind, header, asked',
+    [
+        ('relative', 'Azimut [°]', True),
+        ('relative', 'Demora (°)', True),
+        ('relative', 'Bearing true (deg)', True),
+        ('relative', 'Gisement [deg]', False),
+        ('relative', 'bearing_deg', False),
+        ('fixes', 'Gisement [deg]', True),
+        ('fixes', 'relative_bearing_deg', True),
+        ('fixes', 'Relèvement [deg]', False),
+    ],
+)
+def test_bearings_whose_word_is_of_another_direction_are_a_question(tmp_path, kind, header, asked):
+    source = tmp_path / 'in.csv'
+    head = {'relative': 'time;boat_x;boat_y;heading;range', 'fixes': 'time;range'}[kind]
+    cells = {'relative': '0;{k};90;50', 'fixes': '50'}[kind]
+    rows = ''.join(f'{k};{cells.format(k=k)};{k}0\n' for k in range(1, 9))
+    source.write_text(f'{head};{header}\n{rows}', encoding='utf-8')
+    if asked:
+        with pytest.raises(BagError, match='--bearings (bow or --bearings north|north or --bear)'):
+            KINDS[kind](source, tmp_path / 'out')
+    for bearings in ('north', 'bow') if kind == 'relative' and asked else (None,) * (not asked):
+        assert KINDS[kind](source, tmp_path / f'out_{bearings}', bearings=bearings).messages
+
+
+def test_a_depth_that_is_not_tracked_is_said_and_the_advice_helps(tmp_path):
+    source = tmp_path / 'in.csv'
+    source.write_text('time;x;y;Tiefe [m]\n' + ''.join(f'{k};1;{k};6,0\n' for k in range(1, 9)))
+    note = KINDS['fixes'](source, tmp_path / 'out').notes['depth']
+    assert 'Tiefe [m] is not tracked' in note and '--depth-std' in note
+    report = KINDS['fixes'](source, tmp_path / 'with', depth_std=0.5)
+    assert report.notes['depth'] == 'is tracked with --set dimensions=3'
+    with BagReader(report.path) as bag:
+        first = next(iter(measurements_of(bag, 'diver'))).measurement
+    assert first.position[2] == -6.0 and first.covariance[2, 2] == 0.25
+
+
+@pytest.mark.parametrize(
+    'place, asked', [('10.47,59.43', True), ('59.43,10.47', False), ('-20,150', False)]
+)
+def test_positions_near_a_stated_origin_only_when_exchanged_are_a_question(tmp_path, place, asked):
+    source = tmp_path / 'in.csv'
+    source.write_text(f'time,lat,lon\n1,{place}\n')
+    if not asked:
+        KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4))
+        return
+    with pytest.raises(BagError, match="--column 'latitude=lon' --column 'longitude=lat'"):
+        KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4))
+    how = CsvOptions(columns={'latitude': 'lon', 'longitude': 'lat'})
+    assert KINDS['fixes'](source, tmp_path / 'out', origin=(59.4, 10.4), options=how).messages
+
+
+@pytest.mark.parametrize('depths, asked', [('-5 -6', True), ('-0.1 6', False), ('0 0', False)])
+def test_a_depth_that_is_negative_throughout_is_asked_about(tmp_path, depths, asked):
+    source = tmp_path / 'in.csv'
+    rows = ''.join(f'{k},1,{k},{depth}\n' for k, depth in enumerate(depths.split(), start=1))
+    source.write_text(f'time,x,y,Depth\n{rows}')
+    questions = KINDS['fixes'](source, tmp_path / 'out').questions
+    assert any("'z=Depth' meant" in question for question in questions) == asked
+    how = CsvOptions(columns={'z': 'Depth'})
+    if asked:
+        assert not KINDS['fixes'](source, tmp_path / 'up', options=how).questions
+
+
+@pytest.mark.parametrize('header', ['lat,mode,lon', 'mode,lat,lon'])
+def test_one_column_of_hemispheres_alone_is_a_question(table, header):
+    cells = dict(zip(('lat', 'mode', 'lon'), ('33.5', 'S', '70.25')))
+    text = f'{header}\n' + ','.join(cells[name] for name in header.split(',')) + '\n'
+    with pytest.raises(BagError, match="'latitude_hemisphere=mode' or --ignore latitude_h"):
+        Degrees(table(text))
+    for how, latitude in (
+        ({'columns': {'latitude_hemisphere': 'mode'}}, -33.5),
+        ({'ignore': ['latitude_hemisphere']}, 33.5),
+    ):
+        made = table(text, **how)
+        assert Degrees(made).place(next(iter(made))) == (latitude, 70.25)
+
+
+def test_a_diver_named_s_is_no_hemisphere(table):
+    made = table('name,lat,lon,id\nS,33.5,70.25,E\n')
+    assert Degrees(made).place(next(iter(made)))[0] == 33.5
+
+
+@pytest.mark.parametrize(
+    'kind, head, cells',
+    [
+        ('fixes', 'time;lat;lon;Name', '{k};59.4;{x};Schmidt'),
+        ('relative', 'time;boat_lat;boat_lon;heading;range;bearing_deg;Zielname',
+         '{k};59.4;{x};90;50;10;Schmidt'),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize('end', ['gpx', 'kml', 'geojson', 'csv'])
+def test_names_of_targets_travel_to_the_export(tmp_path, kind, head, cells, end):
+    """From the table by bag and run.json to the name of the track."""
+    source = tmp_path / 'in.csv'
+    rows = [cells.format(k=k, x=10.0 + 1e-5 * k) for k in range(1, 31)]
+    source.write_text('\n'.join([head, *rows]) + '\n', encoding='utf-8')
+    bag = KINDS[kind](source, tmp_path / 'bag').path
+    assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
+    out = tmp_path / f'out.{end}'
+    assert main(['export', str(tmp_path / 'run'), str(out)]) == 0
+    assert 'Schmidt' in out.read_text(encoding='utf-8')
+    if end == 'gpx':
+        assert '<name>Schmidt</name>' in out.read_text(encoding='utf-8')
+
+
+def test_forms_that_were_found_out_are_said(tmp_path):
+    source = tmp_path / 'in.csv'
+    source.write_text(
+        'Date;Time;Lat;Lon\n'
+        + ''.join(f'25/12/2019;0959{k};5925.8;01028.{k}\n' for k in range(10, 20))
+    )
+    notes = KINDS['fixes'](source, tmp_path / 'out', options=CsvOptions(time_zone='UTC')).notes
+    assert notes['stamp of in.csv'] == 'Time is HHMMSS'
+    assert notes['date of in.csv'] == 'Date is DMY'
+    assert 'DDMM.MM' in notes['degrees']

@@ -138,7 +138,7 @@ def test_date_and_time_of_day_may_be_two_columns(table, header, cells, stamp):
     assert row.stamp_ns() == stamp
 
 
-@pytest.mark.parametrize('date', ['05/06/2019', '', '190909'])
+@pytest.mark.parametrize('date', ['05/06/2019', '190909', '12-Sep-17'])
 def test_a_date_that_can_be_read_in_several_ways_is_a_bad_row(table, date):
     (row,) = table(f'date,utc,x\n{date},18:01:08,1\n')
     with pytest.raises(BadRow, match='several ways'):

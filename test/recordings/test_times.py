@@ -54,6 +54,11 @@ def ns(text):
         ('date,time', ['9 Sep 2019,18:01:08'], '2019-09-09 18:01:08'),
         ('date,time', ['25/12/2019,18:01:08', '05/12/2019,18:01:08'], '2019-12-25 18:01:08'),
         ('date,time', ['12/25/2019,18:01:08', '12/05/2019,18:01:08'], '2019-12-25 18:01:08'),
+        ('Hora UTC,x', ['2019-12-25 18:01:08,1'], '2019-12-25 18:01:08'),
+        ('Date (UTC);Heure UTC', ['25-12-2019;18:01:08'], '2019-12-25 18:01:08'),
+        ('date,time', ['25-12-19,18:01:08', '05-13-19,18:01:08'], 'no date'),
+        ('date,time', ['2512 19,18:01:08'], 'no date'),
+        ('date,time', ['191225,18:01:08', '191301,18:01:08'], 'no date'),
         ('time,x', ['12/25/2019 6:01:08 PM,1'], '2019-12-25 18:01:08'),
         ('time,x', ['2019-12-25 12:01:08 AM,1'], '2019-12-25 00:01:08'),
         ('time,x', ['2019/12/25 18:01:08,1'], '2019-12-25 18:01:08'),
@@ -66,7 +71,11 @@ def ns(text):
     ],
 )  # fmt: skip
 def test_forms_of_dates_and_times(stamps, header, cells, wanted):
-    assert stamps(header, *cells, time_zone='UTC')[0] == ns(wanted)
+    if wanted == 'no date':
+        with pytest.raises(BadRow, match='is no date|several ways'):
+            stamps(header, *cells, time_zone='UTC')
+    else:
+        assert stamps(header, *cells, time_zone='UTC')[0] == ns(wanted)
 
 
 def test_times_of_day_in_one_number_pass_minutes_and_hours(stamps):
@@ -97,10 +106,20 @@ def test_two_readings_are_a_question_with_an_option_for_each(
         assert stamps(header, *cells, time_zone='UTC', time_unit=unit)[0] == ns(wanted)
 
 
-@pytest.mark.parametrize('order, wanted', [('DMY', '2019-06-05'), ('MDY', '2019-05-06')])
-def test_the_order_of_a_date_is_asked_for_and_stated(stamps, order, wanted):
-    cells = '05/06/2019,18:01:08'
-    with pytest.raises(BadRow, match='--date-order DMY, MDY'):
+@pytest.mark.parametrize(
+    'date, order, wanted',
+    [
+        ('05/06/2019', 'DMY', '2019-06-05'),
+        ('05/06/2019', 'MDY', '2019-05-06'),
+        ('12-Sep-17', 'DMY', '2017-09-12'),
+        ('12-Sep-17', 'YMD', '2012-09-17'),
+        ('190917', 'DMY', '2017-09-19'),
+        ('190917', 'YMD', '2019-09-17'),
+    ],
+)
+def test_the_order_of_a_date_is_asked_for_and_stated(stamps, date, order, wanted):
+    cells = f'{date},18:01:08'
+    with pytest.raises(BadRow, match=f'--date-order .*{order}'):
         stamps('date,time', cells, time_zone='UTC')
     assert stamps('date,time', cells, time_zone='UTC', date_order=order) == [
         ns(f'{wanted} 18:01:08')

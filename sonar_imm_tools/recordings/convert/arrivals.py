@@ -42,7 +42,8 @@ import numpy as np
 from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
-from ..conversion import ConversionReport, converter, Record, write_bag
+from ..columns import LOTEK, name_of, THELMA
+from ..conversion import ConversionReport, converter, flags_of, Record, write_bag
 from ..convert_options import ArrivalsOptions, DetectionsOptions
 from ..csv_table import CsvOptions, CsvTable, Row, Table
 from ..messages import ros_message
@@ -153,6 +154,7 @@ def write_pings(
 def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:
     """The number of each tag, as ``tx_id`` has it: its own, or its order from 1."""
     numbers = number_names([name for name in names if name])
+    report.target_names = numbers
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
     return numbers
@@ -170,6 +172,7 @@ def _is_passive(table: CsvTable) -> bool:
 
 def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> Arrival:
     """Read one line of the arrivals."""
+    row.require_valid()
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
     if receiver not in places:
         raise BadRow(f"the position of receiver '{receiver}' is not known")
@@ -187,6 +190,16 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     optional['var_toa'] = default if math.isnan(var_toa) else var_toa
     tag = row.text('tag') if passive and names_tags(row.table) else ''
     return Arrival(ping, time_ns, toa, transmitter, receiver, tuple(optional.values()), tag)
+
+
+def name_columns(table: Table) -> None:
+    """Find the columns of makers of receivers whose names mean other things elsewhere: ``TOA`` of
+    Lotek, the part of a second, and ``ID`` of Thelma beside a receiver, a tag."""
+    names = {name_of(header) for header in table.headers}
+    if LOTEK <= names and table.has('toa'):
+        table.index['fraction'] = table.index.pop('toa')
+    if THELMA <= names and table.has('id'):
+        table.index['tag'] = table.index['id']
 
 
 def names_tags(table: Table) -> bool:
@@ -240,6 +253,17 @@ def read_places(
     name: str,
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
     """Read the positions of receivers or transmitters by name, and the origin of local metres."""
+    with flags_of('receiver', report):
+        return _places(path, report, options, origin, name)
+
+
+def _places(
+    path: str | Path,
+    report: ConversionReport,
+    options: CsvOptions | None,
+    origin: tuple[float, ...] | None,
+    name: str,
+) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
     table = CsvTable(path, options)
     table.require(name)
     frame = LocalFrame(table, origin)

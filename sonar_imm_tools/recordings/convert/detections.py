@@ -27,7 +27,7 @@ the right time. Detections that do not go with the others (echoes) are left out 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,8 +42,9 @@ from ... import SECOND
 from ..conversion import ConversionReport, converter
 from ..convert_options import DetectionsOptions
 from ..csv_table import CsvTable, Row
+from ..sources import BagError
 from ..times import BadRow
-from .arrivals import Arrival, Places, read_places, Stations, write_pings
+from .arrivals import Arrival, name_columns, Places, read_places, Stations, write_pings
 
 HOUR = 3600.0
 LONGEST_SYNC = 60.0
@@ -53,6 +54,14 @@ FAR = 5.0
 """Standard deviations, by the median, at which a detection does not go with the others."""
 LEAST = 1e-6
 """Seconds; no clock is compared better."""
+LONGEST_PING = 1.0
+"""Seconds from the first to the last detection of a ping, at most, where none is stated."""
+LEAST_STAMPS = 10
+"""Stamps by which their resolution is judged."""
+RESOLUTIONS = (60.0, 1.0, 0.1, 0.01, 0.001)
+"""Seconds to which receivers or exports round their stamps."""
+SMALL = 1e-3
+"""Part of the size of an array below which the travel in one resolution does not matter."""
 
 
 class Received(NamedTuple):
@@ -96,17 +105,14 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
     if how.sync is not None:
         fixed = read_places(how.sync, report, how.receiver_options, origin, 'tag')[0]
     table = CsvTable(path, how.options)
+    name_columns(table)
     table.require('stamp', 'receiver', 'tag')
     names = list(places)
     numbers = {name: k for k, name in enumerate(names)}
 
     def parse(row: Row) -> tuple[int, str, int]:
-        receiver, tag = row.text('receiver'), row.text('tag')
-        if receiver not in places:
-            raise BadRow(f"the position of receiver '{receiver}' is not known", 'unknown receiver')
-        if not tag:
-            raise BadRow('the tag is empty')
-        return numbers[receiver], tag, row.stamp_ns()
+        row.require_valid()
+        return numbers[_receiver(row, numbers)], _tag(row), row.stamp_ns()
 
     rows = [parsed for _, parsed in report.read_rows(table, parse)]
     tags = list(dict.fromkeys(tag for _, tag, _ in rows))
@@ -117,6 +123,13 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
         np.array([stamp for _, _, stamp in rows], np.int64),
     )
     stamps, known, std = received.stamp_ns, np.ones(len(rows), bool), how.toa_std
+    size = _size(np.array(list(places.values()))) / how.sound_speed
+    rounding = _rounding(table, received.stamp_ns, size, how, report)
+    if len(names) > 1 and len(set(received.receiver.tolist())) == 1:
+        report.questions.append(
+            f'{path.name}: all detections are of {names[received.receiver[0]]}; a position needs '
+            'three receivers or more'
+        )
     if fixed:
         at = np.array([fixed.get(tag, (np.nan,) * 3) for tag in tags]).reshape(-1, 3)
         clocks = compare_clocks(
@@ -127,19 +140,21 @@ def convert_detections(path: Path, how: DetectionsOptions, report: ConversionRep
             how.clock_interval * HOUR,
         )
         stamps, known = clocks.right(received)
-        std = std or (None if np.isnan(clocks.std) else max(clocks.std, LEAST))
+        std = std or (None if np.isnan(clocks.std) else max(clocks.std, rounding or LEAST))
         _note(report, clocks, names)
         for k in np.flatnonzero(~known)[:1]:
             report.problems.append(
                 f'{int((~known).sum())} detections have no common time, the first of receiver '
                 f'{names[received.receiver[k]]}: it shares no ping of a fixed tag with the others'
             )
+    std = std or rounding
     pings: dict[tuple[object, str], list[Arrival]] = {}
     for tag in tags:
         if tag in fixed:
             continue
         own = np.flatnonzero((received.tag == number[tag]) & known)
-        for ping, members in enumerate(gather(received.receiver[own], stamps[own], how.window)):
+        window = how.window or _window(received.receiver[own], stamps[own], size, tag, report)
+        for ping, members in enumerate(gather(received.receiver[own], stamps[own], window)):
             pings[ping, tag] = [
                 _arrival(int(stamps[k]), names[received.receiver[k]], tag, std)
                 for k in own[members]
@@ -169,16 +184,97 @@ def _arrival(stamp_ns: int, receiver: str, tag: str, std: float | None) -> Arriv
     return Arrival('', stamp_ns, np.nan, '', receiver, (var, *(np.nan,) * 6), tag)
 
 
+def _receiver(row: Row, known: Mapping[str, int]) -> str:
+    """The name of the receiver: that of the row, also behind its model or with one left out."""
+    text = row.text('receiver')
+    named = [text] if text in known else []
+    named = named or [f'{row.text("model")}-{text}'] if row.text('model') else named
+    found = [name for name in named if name in known] or [
+        name for name in known if text and name.endswith(f'-{text}')
+    ]
+    if len(found) != 1:
+        raise BadRow(f"the position of receiver '{text}' is not known", 'unknown receiver')
+    return found[0]
+
+
+def _tag(row: Row) -> str:
+    """The tag of a row, with its code space where that stands in a column of its own."""
+    text, space = row.text('tag'), row.text('code_space')
+    if not text:
+        raise BadRow('the tag is empty')
+    return text if not space or text.startswith(space) else f'{space}-{text}'
+
+
+def _size(places: FloatArray) -> float:
+    """The longest distance between places (n, 3)."""
+    return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max(initial=0.0))
+
+
+def _rounding(
+    table: CsvTable,
+    stamp_ns: IntArray,
+    size: float,
+    how: DetectionsOptions,
+    report: ConversionReport,
+) -> float | None:
+    """The standard deviation of stamps that are rounded, s; None where their resolution is small
+    beside `size`, the seconds of travel across the receivers. Raises `BagError` where it is as
+    large."""
+    steps = stamp_ns - how.options.time_offset_ns
+    step = next((each for each in RESOLUTIONS if not (steps % round(each * SECOND)).any()), 0.0)
+    if len(stamp_ns) < LEAST_STAMPS or step < SMALL * size or not size:
+        return None
+    std = step / 12.0**0.5
+    text = (
+        f'the stamps have a resolution of {step:g} s, {step * how.sound_speed:.3g} m of travel, '
+        f'and the receivers are up to {size * how.sound_speed:.3g} m apart'
+    )
+    if how.toa_std is not None:
+        if how.toa_std < std:
+            report.questions.append(f'{table.path.name}: {text}: is --toa-std {std:.2g} meant?')
+        return None
+    if step > size:
+        raise BagError(
+            f'{table.path}: {text}. If another column holds the part of a second: --column '
+            f'fraction=HEADER. To convert it all the same: --toa-std {std:.2g}'
+        )
+    report.notes['resolution'] = f'{text}; the standard deviation of arrivals is {std:.2g} s'
+    return std
+
+
+def usual_period(receiver: IntArray, seconds: FloatArray) -> float:
+    """The median time between detections of one tag by the same receiver, s; infinite without."""
+    steps = [np.diff(np.sort(seconds[receiver == each])) for each in np.unique(receiver)]
+    every = np.concatenate([*steps, np.empty(0)])
+    return float(np.median(every)) if len(every) else np.inf
+
+
+def _window(
+    receiver: IntArray, stamp_ns: IntArray, size: float, tag: str, report: ConversionReport
+) -> float:
+    """The longest ping, s: no longer than half of the time between pings. Raises `BagError` where
+    sound takes longer across the receivers, `size` s."""
+    seconds = (stamp_ns - stamp_ns.min(initial=0)) / SECOND
+    half = 0.5 * usual_period(receiver, seconds)
+    if half < size:
+        raise BagError(
+            f'the same receivers hear {tag} each {2.0 * half:.3g} s, and sound takes {size:.3g} s '
+            'across them: which detections are of one ping is not clear. Say the longest time '
+            f'between the first and the last of a ping, e.g. --window {size:.2g}'
+        )
+    if half < LONGEST_PING:
+        report.notes['window'] = f'{half:.3g} s: half of the time between the pings of {tag}'
+    return min(LONGEST_PING, half)
+
+
 def gather(receiver: IntArray, stamp_ns: IntArray, window: float) -> list[IntArray]:
     """Rows of each transmission of one tag: those within `window` seconds of the first, each
     receiver once, with its first detection."""
     found: list[IntArray] = []
     order = np.argsort(stamp_ns, kind='stable')
-    begin = 0
+    stamps, begin = stamp_ns[order], 0
     while begin < len(order):
-        inside = np.searchsorted(
-            stamp_ns[order], stamp_ns[order[begin]] + round(window * SECOND), side='right'
-        )
+        inside = np.searchsorted(stamps, stamps[begin] + round(window * SECOND), side='right')
         members = order[begin:inside]
         first = np.unique(receiver[members], return_index=True)[1]
         found.append(members[np.sort(first)])
@@ -243,12 +339,7 @@ def _sync_groups(
     groups: list[IntArray] = []
     for tag in np.flatnonzero(np.isfinite(tags).all(axis=1)):
         own = np.flatnonzero(received.tag == tag)
-        steps = [
-            np.diff(np.sort(seconds[own[received.receiver[own] == receiver]]))
-            for receiver in np.unique(received.receiver[own])
-        ]
-        every = np.concatenate(steps) if steps else np.empty(0)
-        window = min(LONGEST_SYNC, 0.5 * float(np.median(every))) if len(every) else LONGEST_SYNC
+        window = min(LONGEST_SYNC, 0.5 * usual_period(received.receiver[own], seconds[own]))
         stamps = np.round(reduced[own] * SECOND).astype(np.int64)
         groups += [own[found] for found in gather(received.receiver[own], stamps, window)]
     return [group for group in groups if len(group) > 1], reduced

@@ -28,12 +28,12 @@ from msg_adapters.scans import write_scan
 from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
-from ..columns import name_of, UNRELATED
+from ..columns import name_of, rank_of, UNRELATED
 from ..conversion import ask_for_units, ConversionReport, converter, Record, write_bag
 from ..convert_options import FixesOptions
 from ..csv_table import Row, Table
 from ..messages import ros_message
-from ..places import LocalFrame, origin_parameters, PolarRows
+from ..places import bearings_from, LocalFrame, origin_parameters, PolarRows
 from ..sources import BagError, quoted
 from ..times import BadRow
 from ..track_files import open_table
@@ -73,8 +73,18 @@ def write_fixes(
             )
         if not how.bearings:
             _ask_for_vessel(table)
-        bearings = how.bearings or 'north'
+        bearings = bearings_from(table, how.bearings, 'north')
         polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+    elif table.has('range', 'bearing') and _may_be_of_vessel(table):
+        names = ('x', 'y') if table.has('x', 'y') else ('latitude', 'longitude')
+        headers = [table.header(name) for name in names]
+        columns = ' '.join(f"--column 'vessel_{n}={h}'" for n, h in zip(names, headers))
+        raise BagError(
+            f'{table.path}: {" and ".join(headers)} may be the position of the target, or that of '
+            f'a vessel from which {table.header("range")} and {table.header("bearing")} are '
+            f'measured. Of the target: --ignore range. Of a vessel: sonar-imm convert relative '
+            f'{quoted(table.path)} OUT_BAG {columns}'
+        )
     frame = None if polar else LocalFrame(table, how.origin)
     origin = frame.origin if frame else None
     place = ('range', 'bearing') if polar else ('x', 'y')
@@ -100,7 +110,7 @@ def write_fixes(
         fix = Fix(
             stamp_ns=stamp_ns,
             position=position,
-            covariance=_with_height(row, covariance),
+            covariance=_with_height(row, covariance, how.depth_std),
             frame_id=how.frame_id,
         )
         check_size(fix)
@@ -123,6 +133,15 @@ def write_fixes(
         for line, _ in empty:
             report.bad_row(table.path, f'line {line}', f'{" and ".join(place)} are empty')
         empty = []
+    if depth := next((name for name in ('z', 'depth') if table.has(name)), ''):
+        known = how.depth_std is not None or table.has('var_z') or table.has('std_z')
+        if not table.is_blank(depth):
+            report.notes['depth'] = (
+                'is tracked with --set dimensions=3'
+                if known
+                else f'{table.header(depth)} is not tracked, since no column is its standard '
+                'deviation; say --depth-std METRES'
+            )
     named = _names_divers(table, rows, report)
     records: Iterable[Record]
     if named or empty:
@@ -190,6 +209,15 @@ def by_name(stamps: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
     return found
 
 
+def _may_be_of_vessel(table: Table) -> bool:
+    """Say whether positions beside range and bearing have neither a word for the target nor one of
+    a vessel beside them, nor were named by hand."""
+    names = [name for name in ('x', 'y', 'latitude', 'longitude') if table.has(name)]
+    vessel = any(table.has(name) for name in ('vessel_x', 'vessel_latitude'))
+    ranks = [rank_of(name, table.header(name)) for name in names]
+    return not vessel and min(ranks) >= 0 and not set(names) & set(table.options.columns)
+
+
 def _has_places(table: Table) -> bool:
     return table.has('x', 'y') or table.has('latitude', 'longitude')
 
@@ -219,6 +247,7 @@ def _scans(
     """Scans of the rows with the same stamp, each with the number of its diver where the rows are
     named, and those at the stamps `empty`, in which nobody was seen."""
     numbers = number_names([name for _, _, name in rows if name]) if named else {}
+    report.target_names = numbers
     if any(str(number) != name for name, number in numbers.items()):
         report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
     by_stamp: dict[int, list[tuple[Fix, int]]] = {stamp_ns: [] for stamp_ns in empty}
@@ -269,10 +298,15 @@ def _covariance(row: Row) -> np.ndarray | None:
     return np.array([[var_x, cov_xy], [cov_xy, var_y]])
 
 
-def _with_height(row: Row, covariance: np.ndarray | None) -> np.ndarray | None:
-    """`covariance` (2, 2) with what the row states of z, (3, 3); as it is where nothing."""
+def _with_height(
+    row: Row, covariance: np.ndarray | None, depth_std: float | None
+) -> np.ndarray | None:
+    """`covariance` (2, 2) with what the row states of z, or `depth_std`, m, as (3, 3); as it is
+    where nothing is known."""
     variance = row.optional('var_z') if row.table.has('var_z') else row.optional('std_z')
     variance = variance if row.table.has('var_z') else variance * abs(variance)
+    if not variance > 0.0 and depth_std is not None:
+        variance = depth_std**2
     if not variance > 0.0 or row.empty('z') and row.empty('depth') and row.empty('height'):
         return covariance
     whole = np.full((3, 3), np.nan)

@@ -27,6 +27,7 @@ import numpy as np
 
 from msg_adapters.arrivals import FARTHEST
 from msg_adapters.fixes import write_geodetic, write_relative
+from msg_adapters.inputs.topic import tag_numbers
 from msg_adapters.navigation import write_heading, write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.measurements import Fixes, RelativeFix, VesselFix, VesselHeading, VesselPose
@@ -35,7 +36,7 @@ from ..conversion import ConversionReport, converter, Leaps, Record, write_bag
 from ..convert_options import RelativeOptions
 from ..csv_table import CsvTable, Row
 from ..messages import ros_message
-from ..places import checked_origin, Degrees, origin_parameters, PolarRows
+from ..places import bearings_from, checked_origin, Degrees, origin_parameters, PolarRows
 from ..sources import BagError
 from ..times import BadRow
 from ..truth import truth_records
@@ -72,8 +73,10 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     degrees = Degrees(table, 'vessel_') if geodetic else None
     polar = None
     if not table.has('forward', 'starboard'):
-        polar = PolarRows(table, how.bearings, how.range_std, how.bearing_std_deg)
-    levelled = polar is not None and how.bearings != 'bow'
+        table.require('range', 'bearing')
+        bearings = bearings_from(table, how.bearings, 'bow')
+        polar = PolarRows(table, bearings, how.range_std, how.bearing_std_deg)
+    levelled = polar is not None and bearings != 'bow'
     if not levelled and not table.has('heading'):
         left = [
             header
@@ -137,6 +140,8 @@ def convert_relative(path: Path, how: RelativeOptions, report: ConversionReport)
     known |= {'relative_axes': 'enu' if levelled else 'flu', 'frame_id': how.frame_id}
     if tags:
         known['tags'] = list(dict.fromkeys(tags.values()))
+        numbers = tag_numbers(known['tags'])
+        report.target_names = {name: numbers[tag] for name, tag in tags.items()}
     write_bag(
         report.path,
         records,

@@ -20,7 +20,7 @@ position has one standard deviation on its axes; times 2.45 it holds 95 %.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -62,6 +62,11 @@ class Tracks:
         for number in np.unique(numbers):
             yield int(number), np.flatnonzero(numbers == number)
 
+    def name(self, number: int, rows: IntArray) -> str:
+        """The name of the target of a track, else the number of the track."""
+        names = self.columns.get('target_name', np.array([''] * len(self)))[rows]
+        return str(next((name for name in names[::-1] if name), number))
+
     def row(self, k: int) -> dict[str, Any]:
         """What JSON and text can hold of a row: None for what is not known."""
         found = {}
@@ -73,23 +78,29 @@ class Tracks:
         return found
 
 
-def tracks_of(estimates: Sequence[Estimate], degrees: Degrees | None) -> Tracks:
+def tracks_of(
+    estimates: Sequence[Estimate], degrees: Degrees | None, names: Mapping[str, str] | None = None
+) -> Tracks:
     """The rows of all confirmed and coasting tracks of a run.
 
-    degrees: for estimates that do not say themselves where they lie on Earth. Raises `BagError`
+    degrees: for estimates that do not say themselves where they lie on Earth. names: of targets by
+    target ID, for the column ``target_name``. Raises `BagError`
     where there is nothing to export.
     """
     parts = [_rows(estimate) for estimate in estimates if len(estimate)]
     parts = [part for part in parts if len(part['stamp_ns'])]
     if not parts:
         raise BagError('there are no confirmed tracks to export')
-    names = dict.fromkeys(name for part in parts for name in part)
+    columns_of_any = dict.fromkeys(name for part in parts for name in part)
     columns = {
         name: np.concatenate(
             [part.get(name, np.full(len(part['stamp_ns']), np.nan)) for part in parts]
         )
-        for name in names
+        for name in columns_of_any
     }
+    if names and 'target_id' in columns:
+        ids = (str(int(each)) if np.isfinite(each) else '' for each in columns['target_id'])
+        columns['target_name'] = np.array([names.get(each, '') for each in ids])
     order = np.lexsort((columns['stamp_ns'], columns['track_id']))
     columns = {name: column[order] for name, column in columns.items()}
     if degrees is not None:
@@ -209,6 +220,7 @@ def _write_geojson(path: Path, tracks: Tracks, name: str) -> None:
         if len(points) > 1:
             about = {
                 'track_id': number,
+                'name': tracks.name(number, rows),
                 'begin_utc': points[0]['time_utc'],
                 'end_utc': points[-1]['time_utc'],
             }
@@ -239,7 +251,7 @@ def _write_gpx(path: Path, tracks: Tracks, name: str) -> None:
     ElementTree.SubElement(ElementTree.SubElement(root, 'metadata'), 'name').text = name
     for number, rows in tracks.each():
         track = ElementTree.SubElement(root, 'trk')
-        ElementTree.SubElement(track, 'name').text = str(number)
+        ElementTree.SubElement(track, 'name').text = tracks.name(number, rows)
         segment = ElementTree.SubElement(track, 'trkseg')
         for k in rows:
             point = tracks.row(int(k))
@@ -266,7 +278,7 @@ def _write_kml(path: Path, tracks: Tracks, name: str) -> None:
     for turn, (number, rows) in enumerate(tracks.each()):
         colour = COLOURS[turn % len(COLOURS)]
         placemark = ElementTree.SubElement(document, 'Placemark')
-        ElementTree.SubElement(placemark, 'name').text = str(number)
+        ElementTree.SubElement(placemark, 'name').text = tracks.name(number, rows)
         line = ElementTree.SubElement(ElementTree.SubElement(placemark, 'Style'), 'LineStyle')
         # KML writes alpha, blue, green, red.
         ElementTree.SubElement(line, 'color').text = f'ff{colour[5:7]}{colour[3:5]}{colour[1:3]}'

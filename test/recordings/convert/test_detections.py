@@ -15,14 +15,16 @@
 """Receivers with clocks of their own, compared by tags that lie at known places."""
 
 import csv
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
 
-from sonar_imm_tools.recordings.convert import convert_detections
+from sonar_imm_tools.recordings.convert import convert_detections, CsvOptions
 from sonar_imm_tools.recordings.convert.detections import compare_clocks, gather, Received
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 SECOND, SPEED, BEGIN = 10**9, 1480.0, 1_717_149_600 * 10**9
@@ -177,3 +179,129 @@ def test_bad_rows_are_counted(tmp_path, row):
         tmp_path / 'd.csv', tmp_path / 'out', receivers=tmp_path / 'stations.csv'
     )
     assert report.bad_rows == 1 and report.messages == {'/arrivals': 1}
+
+
+STATIONS = {'VR2-101': (0, 0), 'VR2-102': (240, 0), 'VR2-103': (240, 240), 'VR2-104': (0, 240)}
+START = 1_748_941_200.0
+
+
+def heard(period=30.0, pings=20):
+    """(seconds since 1970, receiver) of a tag at rest at 100, 60."""
+    return sorted(
+        (START + 5.0 + period * k + np.hypot(x - 100, y - 60) / 1500.0, name)
+        for k in range(pings)
+        for name, (x, y) in STATIONS.items()
+    )
+
+
+def text_of(t, digits=6, form='%Y-%m-%d %H:%M:%S'):
+    moment = datetime.fromtimestamp(int(t), timezone.utc).strftime(form)
+    return moment + (f'.{int(t % 1 * 10**digits):0{digits}d}' if digits else '')
+
+
+def exported(folder, head, line, rows=None, **options):
+    lines = [line(t, name) for t, name in rows or heard()]
+    (folder / 'export.csv').write_text('\n'.join([head, *lines]) + '\n')
+    places = [f'{name},{x},{y},-3' for name, (x, y) in STATIONS.items()]
+    (folder / 'stations.csv').write_text('receiver,x,y,z\n' + '\n'.join(places) + '\n')
+    table = CsvOptions(time_zone='UTC', columns=options.pop('columns', {}))
+    return convert_detections(
+        folder / 'export.csv',
+        folder / 'out',
+        receivers=folder / 'stations.csv',
+        options=table,
+        **options,
+    )
+
+
+VDAT = (
+    'VEMCO DATA LOG,2.0.0,vdat\nRECORD TYPE,FIELD\nDIAG_DESC,Device Time (UTC),Model\n'
+    'DET_DESC,Device Time (UTC),Time,Model,Serial Number,Channel,Full ID,ID'
+)
+
+
+@pytest.mark.parametrize(
+    'head, line',
+    [
+        ('station,receiver,tagName,codeSpace,dateCollectedUTC',
+         lambda t, r: f'S1,{r},A69-1602-7001,A69-1602,{text_of(t)}'),
+        ('animal_id,detection_timestamp_utc,transmitter_codespace,transmitter_id,receiver_sn',
+         lambda t, r: f'9,{text_of(t)},A69-1602,7001,{r}'),
+        ('date_time,tag_serial_number,acoustic_tag_id,receiver_id,station_name',
+         lambda t, r: f'{text_of(t)},1187,A69-1602-7001,{r},bh'),
+        ('Timestamp,Receiver,CodeSpace,Signal,Valid',
+         lambda t, r: f'{text_of(t)},{r},A69-1602,7001,TRUE'),
+        ('Date,Time,TOA,Tag ID,Receiver,Power',
+         lambda t, r: f'{text_of(t, 0, "%m/%d/%y")},{text_of(t, 0, "%H:%M:%S")},{t % 1:.6f},'
+                      f'A69-1602-7001,{r},147'),
+        ('Date and Time (UTC),ID,Data,Protocol,Receiver,Microsecond',
+         lambda t, r: f'{text_of(t, 0)},A69-1602-7001,0,S256,{r},{int(t % 1 * 1e6)}'),
+        (VDAT,
+         lambda t, r: f'DIAG,{text_of(t)},{r[:3]}\nDET,{text_of(t)},{text_of(t)},VR2,{r[4:]},69,'
+                      'A69-1602-7001,7001'),
+        ('Date and Time (UTC),Receiver,Transmitter',
+         lambda t, r: f'{text_of(t)},{r[4:]},A69-1602-7001'),
+    ],
+    ids='otn glatos etn actel lotek thelma vdat serial_number'.split(),
+)  # fmt: skip
+def test_exports_of_makers_and_networks(tmp_path, head, line):
+    report = exported(tmp_path, head, line)
+    assert (report.bad_rows, report.messages) == (0, {'/arrivals': 20})
+    assert 'A69-1602-7001 is 1' in report.notes['tag']
+    first = arrivals_of(report.path)[0]
+    assert sorted(first.rx_id) == [1, 2, 3, 4]
+    wanted = [t for t, _ in heard()[:4]]
+    assert first.stamp_ns * 1e-9 == pytest.approx(wanted[0], abs=2e-6)
+    assert sorted(first.toa) == pytest.approx([t - wanted[0] for t in wanted], abs=2e-6)
+    assert sniff(tmp_path / 'export.csv').kind == 'detections'
+
+
+def test_detections_that_are_marked_as_invalid_are_left_out(tmp_path):
+    head = 'Timestamp,Receiver,Transmitter,Valid'
+    report = exported(
+        tmp_path, head, lambda t, r: f'{text_of(t)},{r},7,{str(r != "VR2-101").upper()}'
+    )
+    assert report.bad_rows == 20 and set(arrivals_of(report.path)[0].rx_id) == {2, 3, 4}
+
+
+@pytest.mark.parametrize(
+    'digits, std, words',
+    [(0, None, '1 s, 1.5e+03 m'), (1, 0.1, '0.1 s, 150 m'), (2, 0.01, '0.01 s'), (6, None, '')],
+)
+def test_the_resolution_of_stamps_is_said_and_heeded(tmp_path, digits, std, words):
+    head = 'Date and Time (UTC),Receiver,Transmitter'
+    args = tmp_path, head, lambda t, r: f'{text_of(t, digits)},{r},7'
+    if digits == 0:
+        with pytest.raises(BagError) as caught:
+            exported(*args)
+        assert words in caught.value.sentence and '--toa-std 0.29' in caught.value.sentence
+        assert exported(*args, toa_std=0.29).messages == {'/arrivals': 20}
+        return
+    report = exported(*args)
+    assert words in report.notes.get('resolution', '')
+    var = arrivals_of(report.path)[0].var_toa
+    assert var == pytest.approx(std**2 / 12) if std else np.isnan(var).all()
+
+
+@pytest.mark.parametrize('period, words', [(0.7, '0.35 s'), (1.0, '0.5 s'), (30.0, '')])
+def test_pings_within_a_second_are_not_joined(tmp_path, period, words):
+    head = 'Date and Time (UTC),Receiver,Transmitter'
+    line = lambda t, r: f'{text_of(t)},{r},7'  # noqa: E731
+    report = exported(tmp_path, head, line, heard(period))
+    assert report.messages == {'/arrivals': 20} and words in report.notes.get('window', '')
+
+
+def test_pings_faster_than_sound_crosses_the_array_are_a_question(tmp_path):
+    head = 'Date and Time (UTC),Receiver,Transmitter'
+    line = lambda t, r: f'{text_of(t)},{r},7'  # noqa: E731
+    with pytest.raises(BagError, match='each 0.2 s, and sound takes 0.226 s.*--window 0.23'):
+        exported(tmp_path, head, line, heard(0.2))
+    assert exported(tmp_path, head, line, heard(0.2), window=0.23).messages
+
+
+def test_one_receiver_alone_is_said(tmp_path):
+    rows = [row for row in heard() if row[1] == 'VR2-101']
+    report = exported(
+        tmp_path, 'Time (UTC),Receiver,Tag', lambda t, r: f'{text_of(t)},{r},7', rows
+    )
+    assert 'all detections are of VR2-101' in report.questions[0]

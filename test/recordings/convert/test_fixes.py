@@ -324,3 +324,28 @@ def test_the_origin_of_latitudes_is_told_the_tracker(convert):
 
 def test_metres_have_no_parameters(convert):
     assert not (convert('time,x,y\n1,2,3\n').path / 'parameters.yaml').exists()
+
+
+@pytest.mark.parametrize(
+    'truth, words, helps',
+    [
+        ('time,x,y\n2024-05-31 10:00:00,1,2\n', '--truth-time-zone UTC', {'time_zone': 'UTC'}),
+        ('time,a,b\n5,1,2\n', '--truth-column x=HEADER', {'columns': {'x': 'a', 'y': 'b'}}),
+        ('time,Lat,Lon\n5,115.1,-33.5\n', "--truth-column 'latitude=Lon'",
+         {'columns': {'latitude': 'Lon', 'longitude': 'Lat'}}),
+    ],
+)  # fmt: skip
+def test_advice_about_the_truth_names_the_options_of_the_truth(
+    convert, tmp_path, truth, words, helps
+):
+    path = tmp_path / 'truth.csv'
+    path.write_text(truth)
+    try:
+        said = ' '.join(convert('time,x,y\n5,1,2\n', truth=path).problems)
+    except BagError as error:
+        said = error.sentence
+    assert words in said
+    report = KINDS['fixes'](
+        tmp_path / 'in.csv', tmp_path / 'helped', truth=path, truth_options=CsvOptions(**helps)
+    )
+    assert report.messages['/truth/estimate'] == 1 and report.problems == []
