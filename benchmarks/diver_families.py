@@ -385,7 +385,7 @@ def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: A
         'followed': float(np.mean(there)),
         'tracks': float(tracker._stream.state.life.next_id - 1),
         'warns': float('times as large as reported' in warnings),
-        'advice': float((re.findall(r'are ([\d.e+]+) times too small', warnings) or ['nan'])[0]),
+        'advice': float((re.findall(r'small by a factor ([\d.e+]+)', warnings) or ['nan'])[0]),
     }
 
 
