@@ -44,7 +44,6 @@ from .depth import replace_rows, respread_depths
 from .explanations import (
     expect_measurements,
     expect_residuals,
-    fit_each,
     fit_measurements,
     MOST_EXPLANATIONS,
     PingMeasurements,
@@ -279,11 +278,10 @@ def _explain_echoes(
     Tracks that explain more pairs choose first, confirmed before tentative ones: a ghost fits only
     its own echoes. A track with fewer than half of the pairs is not updated.
     """
-    x, P, mu, _ = (np.concatenate(column) for column in zip(*mixtures))
-    likelihood, nis = fit_each(x, P, config.target_z, ping.measured)
-    first = np.cumsum([0, *(len(mixture.mu) for mixture in mixtures[:-1])])
-    fit = np.log(np.maximum(np.add.reduceat(mu[:, None] * likelihood, first), 1e-300))
-    near = (np.minimum.reduceat(nis, first) < NEAR) & ping.echo
+    # Track by track: many arrivals of many tracks at once take much memory.
+    fits = [fit_measurements(*each[:3], config.target_z, ping.measured) for each in mixtures]
+    fit, nis = (np.array(column) for column in zip(*fits))
+    near = (nis < NEAR) & ping.echo
     pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
     explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
     rank = 2 * (len(pairs) - explained) + (known.life.status == TENTATIVE)

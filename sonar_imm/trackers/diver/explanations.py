@@ -47,7 +47,7 @@ PRUNE = 14.0
 MOST_EXPLANATIONS = 128
 """Explanations of a hypothesis at once; beyond, the worst give way."""
 
-MOST_NUMBERS = 2**22
+MOST_NUMBERS = 2**20
 """Numbers in the covariances of a list, about: a longer one is updated in parts, to spare
 memory."""
 
