@@ -18,8 +18,10 @@ import math
 
 from helpers.diver_runs import SECOND
 import numpy as np
+import pytest
 
 from sonar_imm.estimation import imm
+from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.fixes import associate_gnn, compare
 from sonar_imm.trackers.diver.innovations import (
@@ -128,3 +130,22 @@ def test_the_account_of_innovations():
         0.5 * np.sum(own**2 + earlier**2),
     ]
     np.testing.assert_allclose(new[:5], want * MEMORY / want[0])
+
+
+@pytest.mark.parametrize('pairing', ['jipda', 'gnn'])
+def test_a_row_that_is_far_away_sees_the_fixes_of_its_track(pairing):
+    """Otherwise the row would keep its prediction for ever."""
+    tracker = DiverTracker(DiverConfig(association=pairing))
+    for second in range(1, 6):
+        tracker.process(scan(second, PLACES[:1] + 0.5 * second))
+    item = scan(6, PLACES[:1] + 3.0)
+    now = Scan.from_items([item], tracker.config, {})
+    known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
+    blocks = []
+    for x, P in known.rows.blocks:
+        moved = x.copy()
+        moved[0, :2] += 1e3
+        blocks.append(Gaussians(moved, P))
+    known = known.replace(rows=known.rows.replace(blocks=tuple(blocks)))
+    pairs = compare(known, now.fixes[0], tracker.models, 0.01)
+    assert len(known.rows) > 1 and set(pairs.assumption) == set(range(len(pairs.among.row)))
