@@ -140,35 +140,3 @@ def apply_gain(
     for a in range(len(x)):  # row by row: what one step needs stays at hand
         # K_a (HP)_b and its mirror image, plus K_a S K_b where both have a gain.
         P[a] -= root[a] * (root if estimated[a] else moved)
-
-
-def consider_models(
-    x: FloatArray,
-    P: FloatArray,
-    c: FloatArray,
-    innovation: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-    estimated: BoolArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """`imm.update` with considered components: x (T, M, n), P (T, M, n, n), c (T, M), innovation
-    (T, M, m), H (M, m, n), R (T, m, m). Gives x, P, mu, the NIS (T,) of the mixture and whether
-    (T,) it was finite."""
-    PHt = P @ np.swapaxes(H, -1, -2)
-    S = H @ PHt + R[:, None]
-    x1, P1 = x.copy(), P.copy()
-    for t, j in np.ndindex(*c.shape):
-        x1[t, j], P1[t, j] = consider_update(
-            x[t, j], P[t, j], H[j], R[t], innovation[t, j], estimated
-        )
-    squared = np.einsum(
-        'tjm,tjm->tj', innovation, np.linalg.solve(S, innovation[..., None])[..., 0]
-    )
-    with np.errstate(divide='ignore'):
-        weight = np.log(c) - 0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * S)[1])
-    share = np.exp(weight - weight.max(axis=1, keepdims=True))
-    mean = np.einsum('tj,tjm->tm', c, innovation)
-    spread = innovation - mean[:, None]
-    S_mix = np.einsum('tj,tjmk->tmk', c, S + spread[..., :, None] * spread[..., None, :])
-    nis = np.einsum('tm,tm->t', mean, np.linalg.solve(S_mix, mean[..., None])[..., 0])
-    return x1, P1, share / share.sum(axis=1, keepdims=True), nis, np.asarray(np.isfinite(nis))

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation import imm
-from sonar_imm.estimation.consider import consider_models, consider_scalar, consider_update
+from sonar_imm.estimation.consider import consider_scalar, consider_update
 
 
 def test_the_update_of_the_vectors():
@@ -91,15 +91,3 @@ def test_mixing_leaves_what_is_considered_as_it_is():
     np.testing.assert_allclose(x[0], v['out_X0'], atol=1e-9)
     np.testing.assert_allclose(P[0], v['out_P0'], atol=1e-9)
     np.testing.assert_allclose(c[0], v['out_c'], atol=1e-9)
-
-
-def test_models_with_nothing_considered_are_those_of_imm():
-    rng = np.random.default_rng(2)
-    A = rng.normal(size=(1, 3, 4, 4))
-    x, P = rng.normal(size=(1, 3, 4)), A @ np.swapaxes(A, -1, -2)
-    c, H, R = np.array([[0.5, 0.3, 0.2]]), rng.normal(size=(3, 2, 4)), np.eye(2)[None]
-    z = rng.normal(size=(1, 3, 2))
-    got = consider_models(x, P, c, z, H, R, np.ones(4, bool))
-    want = imm.update(x, P, c, z, H[None], R)
-    for a, b in zip(got[:4], (want.x, want.P, want.mu, want.nis)):
-        np.testing.assert_allclose(a, b, atol=1e-10)
