@@ -127,12 +127,14 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
         for part in _parts(among.target, len(group.z))
     ]
     if len(each) == 1:
-        return Pairs(among, *each[0])
+        assumption, fix, log, whole, nis = each[0]
+        return Pairs(among, assumption, fix, expected, log, whole, nis)
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
         np.concatenate(assumption),
         np.concatenate(fix),
+        expected,
         np.concatenate(log),
         np.concatenate(whole),
         np.concatenate(nis) if by_nis else None,
@@ -143,6 +145,8 @@ def _parts(target: IntArray, fixes: int) -> list[slice]:
     """Return slices of the assumptions, each with all assumptions of its tracks: a table of all
     tracks and thousands of fixes would take hundreds of megabytes."""
     count = max(1, MAX_TABLE // max(fixes, 1))
+    if len(target) <= count:
+        return [slice(0, len(target))]
     first = np.append(np.flatnonzero(np.diff(target, prepend=-1)), len(target))
     cuts = [0]
     for start, stop in zip(first, first[1:]):
@@ -396,8 +400,9 @@ def update_tracks(
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
     blocks, factors = [], []
-    for block, part, mask in zip(rows.blocks, models.parts, estimated):
-        innovations = bank.weigh(block, row, z, R, part.measured)
+    each = zip(rows.blocks, models.parts, pairs.expected, estimated)
+    for block, part, expected, mask in each:
+        innovations = bank.compare(*expected, among.row[assumption], z, R)
         ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
         block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
         blocks.append(block)

@@ -63,6 +63,8 @@ class Pairs(NamedTuple):
     """(p,) index of the assumption."""
     fix: IndexArray
     """(p,) index of the fix."""
+    expected: list[tuple[FloatArray, FloatArray]]
+    """Prediction of a fix by each row, for each block of models: see `bank.predict_fix`."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray
