@@ -91,11 +91,6 @@ class Rows:
         weight = np.where(counted | none[self.target], np.exp(self.logw), 0.0)
         return weight / np.add.reduceat(weight, first)[self.target]
 
-    def normalized_weight(self) -> FloatArray:
-        """Return the weights (N,) normalised over the whole table, for rows of one target."""
-        weight = np.exp(self.logw - self.logw.max())
-        return np.asarray(weight / weight.sum())
-
     def select(self, rows: IndexArray) -> Rows:
         """Return the rows of the given indices, which may repeat. `parent` holds the indices."""
         return Rows(
@@ -194,10 +189,11 @@ def _first_rows(target: IntArray) -> IndexArray:
 
 
 def reduce_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.ndarray:
-    """Reduce values (A, ...) of each target by a ufunc such as ``np.maximum``, to (T, ...).
-    target:
+    """Reduce the values of each target by a ufunc such as ``np.maximum``.
 
-    (A,) in rising order.
+    :param values: (A, ...).
+    :param target: (A,) in rising order.
+    :returns: (T, ...).
     """
     if not len(values):
         return values
@@ -205,9 +201,10 @@ def reduce_targets(verb: np.ufunc, values: np.ndarray, target: IntArray) -> np.n
 
 
 def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
-    """Return ln sum exp (T, ...) of log (A, ...) over each target. target:
+    """Return ln sum exp (T, ...) over each target.
 
-    (A,) in rising order.
+    :param log: (A, ...).
+    :param target: (A,) in rising order.
     """
     if not len(log):
         return np.empty((0, *log.shape[1:]))

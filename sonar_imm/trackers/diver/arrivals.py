@@ -232,10 +232,10 @@ def _accumulate_residuals(
 
 def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
     """Return the hypotheses of a track, row by row."""
-    rows = known.rows.select(known.row_indices(track))
+    rows = known.track_rows(track)
     x, P = models.to_common(rows.blocks)
     N, M, n = x.shape
-    mu = rows.normalized_weight()[:, None] * rows.mu
+    mu = rows.weight[:, None] * rows.mu
     scale = np.repeat(rows.key['scale'], M)
     return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
 

@@ -49,7 +49,7 @@ from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, repair_covariances
+from .known import Feature, Known, repair_covariances, track_positions
 from .models import ModelSet
 from .scan import Group, Height, Ping
 
@@ -205,8 +205,7 @@ def _restart_depth(
     known: Known, track: int, value: float, variance: float, models: ModelSet, config: DiverConfig
 ) -> Known:
     """Restart the depth of one track at `value`."""
-    own = known.row_indices(track)
-    rows = known.rows.select(own)
+    own, rows = known.row_indices(track), known.track_rows(track)
     x, P = models.to_common(rows.blocks)
     for row in range(len(rows)):
         reset_depth(x[row], P[row], models.height, value, variance, config)
@@ -246,8 +245,8 @@ def _update_track(
     :returns: the new state and the NIS of the mixture. A NIS above `threshold` changes nothing.
     """
     own = known.row_indices(track)
-    rows, value = known.rows.select(own), height.value - float(height.gain @ z)
-    weight = rows.normalized_weight()[:, None] * rows.mu
+    rows, value = known.track_rows(track), height.value - float(height.gain @ z)
+    weight = rows.weight[:, None] * rows.mu
     masks = layout.estimated_masks(models)
     parts = [
         _depth_innovations(block, part.fix_matrix, part.height, height, value)
@@ -353,6 +352,7 @@ def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) 
     if models.height < 0 or models.rows_per_track == 1 or not len(known) or not echo.any():
         return known
     weights, means, variances = _row_depths(known.rows, models)
+    positions, _ = track_positions(known, models)
     measured = seen.measured
     for track in range(len(known)):
         own = known.row_indices(track)
@@ -361,15 +361,13 @@ def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) 
         between, within = float(weight @ (mean - middle) ** 2), float(weight @ variance)
         if not between < AGREE * within:
             continue
-        rows = known.rows.select(own)
-        x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
-        place = np.append(np.einsum('r,rm,ram->a', weight, rows.mu, x), middle)
+        place = np.append(positions[track], middle)
         bend = _path_curvature(place, measured.rx[echo])
         if not seen.passive:
             bend = bend + _path_curvature(place, measured.tx[echo])
         deviation = 0.5 * bend * (within + between) / np.sqrt(measured.variance[echo])
         if deviation.max() > BENT:
-            new = _spread_rows(rows, layout.mask, models)
+            new = _spread_rows(known.track_rows(track), layout.mask, models)
             known = known.replace(rows=replace_rows(known.rows, own, *new))
             known = count_respread(known, track)
     return known
@@ -399,7 +397,7 @@ def _spread_rows(
     estimated: (n,) mask, see `estimation.consider`.
     """
     place = models.height
-    each = rows.normalized_weight()[:, None] * rows.mu
+    each = rows.weight[:, None] * rows.mu
     K, total = len(each), each.sum(axis=0)
     share = np.where(total > 0.0, each / np.where(total > 0.0, total, 1.0), 1.0 / K)
     x, P = models.to_common(rows.blocks)

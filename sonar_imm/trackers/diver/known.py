@@ -148,6 +148,11 @@ class Known:
         """Return the row indices of a track."""
         return np.flatnonzero(self.rows.target == track)
 
+    def track_rows(self, track: int) -> Rows:
+        """Return the rows of one track, as those of target 0."""
+        rows = self.rows.select(self.row_indices(track))
+        return evolve(rows, target=np.zeros(len(rows), np.int64))
+
     def require_like(self, other: Known, constants: int) -> None:
         """Check that the state fits the models of `other`, a state without tracks.
 
@@ -191,9 +196,9 @@ class Known:
 
 
 def row_outputs(rows: Rows, maps: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return mean (N, q) and covariance (N, q, q) of motion outputs of each row. maps:
+    """Return mean (N, q) and covariance (N, q, q) of motion outputs of each row.
 
-    (q, n', m) of each block.
+    :param maps: (q, n', m) of each block.
     """
     blocks = [
         Gaussians(block.x[:, : E.shape[1]], block.P[:, : E.shape[1], : E.shape[1]])

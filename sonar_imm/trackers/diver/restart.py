@@ -32,7 +32,7 @@ from ...estimation.rows import Rows
 from . import fixes
 from .births import with_velocities_at_fix
 from .instruments import Layout
-from .known import Feature, Known, predict_over, track_outputs
+from .known import Feature, Known, predict_over, track_outputs, track_positions
 from .models import ModelSet
 from .scan import Group
 
@@ -89,7 +89,11 @@ def restart_lost_tracks(
     for track, row in _rejected_fixes(known, group, hit, left, group.pairs.track_log):
         z, R, new = group.z[row], group.R[row], None
         hidden = seen is not None and seen.is_outside[track]
-        lost = _can_reach(known, track, z, group) if hidden else _may_be_lost(known, track, group)
+        lost = (
+            _can_reach(known, track, z, group, models)
+            if hidden
+            else _may_be_lost(known, track, group)
+        )
         if np.isfinite(rejected[track, 0]) and lost:
             new = restarted_track(
                 known, track, rejected[track], z, R, group, models, chain, layout
@@ -140,15 +144,12 @@ def _may_be_lost(known: Known, track: int, group: Group) -> bool:
     return bool(missed ** (before + 1) <= LOST)
 
 
-def _can_reach(known: Known, track: int, z: FloatArray, group: Group) -> bool:
+def _can_reach(known: Known, track: int, z: FloatArray, group: Group, models: ModelSet) -> bool:
     """Return whether the target can have moved to z (2,) since its last hit."""
-    rows = known.rows.select(known.row_indices(track))
-    weight = rows.normalized_weight()
-    x = np.concatenate([block.x[:, :2] for block in rows.blocks], axis=2)
-    mean = np.einsum('r,rm,ram->a', weight, rows.mu, x)
+    mean, _ = track_positions(known, models)
     passed = (known.stamp_ns - int(known.life.last_hit_ns[track])) * 1e-9
     fastest = group.config.speed_mean + 3.0 * group.config.speed_std
-    return bool(np.hypot(*(z - mean)) <= fastest * passed)
+    return bool(np.hypot(*(z - mean[track])) <= fastest * passed)
 
 
 def restarted_track(

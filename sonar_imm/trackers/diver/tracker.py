@@ -109,7 +109,6 @@ class DiverTracker:
         self.config, models = config, self.models
         self.rules = track_rules(config)
         layout = lru_cache(maxsize=16)(partial(Instruments.layout, config=config, models=models))
-        self._layout_of = layout
 
         def layouts(known: Known) -> Layout:
             return layout(known.memory['instruments'])
