@@ -37,7 +37,7 @@ from ...estimation.association import assign, association_cost, gate_threshold, 
 from ...estimation.covariance import add_jitter, is_psd
 from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
-from . import coverage, offsets
+from . import coverage, offsets, sides
 from .config import DiverConfig
 from .coverage_map import Coverage, DetectionProbability
 from .depth import replace_rows, respread_depths
@@ -192,11 +192,14 @@ def _associate_ping(
     if not len(known) or seen.pairs <= int(ping.passive):
         return known, free & (name == NOBODY)
     known = respread_depths(known, seen, layout, models)
+    line = sides.line_of_ping(ping, rows, config)
+    if line is not None:
+        known = sides.doubt_near_line(known, models, layout, line)
     mixtures = [track_mixture(known, track, models) for track in range(len(known))]
     if name != NOBODY:
         update = _update_track(mixtures[int(own[0])], seen, config, layout)
         updates = {} if update is None else {int(own[0]): update}
-        known = apply_updates(known, updates, models)
+        known = apply_updates(known, updates, models, line)
         return _accumulate_residuals(known, updates, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
     updates, taken, score = explain(known, mixtures, seen, config, layout)
@@ -205,7 +208,7 @@ def _associate_ping(
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.nominal))
     free[seen.row[taken & seen.echo]] = False
     free &= free.all() or not ping.passive  # all arrivals of a tag belong to one track
-    known = apply_updates(known, updates, models).with_columns(score=score)
+    known = apply_updates(known, updates, models, line).with_columns(score=score)
     return _accumulate_residuals(known, updates, ping, seen, config, models), free
 
 
@@ -240,8 +243,10 @@ def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
     return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
 
 
-def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSet) -> Known:
-    """Return the state with the updated tracks."""
+def apply_updates(
+    known: Known, updates: dict[int, TrackUpdate], models: ModelSet, line: sides.Line | None
+) -> Known:
+    """Return the state with the updated tracks. line: that of all instruments, if there is one."""
     if not updates:
         return known
     nis, nis_dof, repairs = known['nis'].copy(), known['nis_dof'].copy(), 0
@@ -257,13 +262,14 @@ def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSe
         blocks = models.to_blocks(after.x.reshape(-1, M, n), after.P.reshape(-1, M, n, n))
         with np.errstate(divide='ignore'):
             logw = np.maximum((top + np.log(weight))[:, 0], LEAST_LOG)
+        if line is not None and line.tells_nothing:
+            logw = sides.hold_sides(rows.logw[own], logw, rows.key['side'][own])
         rows = replace_rows(rows, own, blocks, inside, logw)
         nis[track] += update.nis
         nis_dof[track] += np.uint16(update.dof)
         repairs += update.after.repairs
-    return (
-        known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof).add_counts(repairs=repairs)
-    )
+    known = known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof)
+    return sides.drop_sides(known.add_counts(repairs=repairs))
 
 
 def _explain_echoes(

@@ -35,7 +35,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
 from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import depth
+from . import depth, sides
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, track_positions
@@ -120,6 +120,9 @@ def _locate_births(
     name = tag_id(ping)
     places = [(fix.position, fix.covariance)]
     places += [(place.position, place.covariance) for place in fix.alternatives]
+    line = sides.line_of_ping(ping, used, config)
+    if line is not None:
+        places = sides.without_images(places, line)
     return [Birth(*place, ping, used, target_id=name) for place in places], rows[fix.used]
 
 
@@ -267,6 +270,11 @@ def birth_rows(
                     config,
                 )
     rows = models.make_rows(x, P, mu, logw)
+    for track, birth in enumerate(births):
+        if birth.ping is not None and birth.rows is not None:
+            line = sides.line_of_ping(birth.ping, birth.rows, config)
+            if line is not None:
+                rows = sides.with_images(rows, track, models, layout, line)
     seen_by = births[0].seen_by
     return (
         rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)

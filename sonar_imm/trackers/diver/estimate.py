@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, clutter, depth, offsets
+from . import births, clutter, depth, offsets, sides
 from .config import DiverConfig
 from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known, row_outputs
@@ -39,7 +39,10 @@ def estimate_of(
     known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
     mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
-        covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
+        places = sides.likely_positions(known, models, mean)
+        covariance = offsets.with_assumed_errors(
+            known.memory['recent'], places, covariance, config
+        )
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -48,6 +51,7 @@ def estimate_of(
         'track_state': known.life.status,
         **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
         'target_id': known['target_id'].astype(np.int32),
+        **sides.side_columns(known, models),
         **family_extras(known, models),
     }
     if models.height >= 0 and models.rows_per_track > 1:
@@ -118,7 +122,7 @@ def health(known: Known, waiting: int) -> dict[str, float]:
     }
 
 
-def warnings(known: Known, config: DiverConfig) -> list[str]:
+def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
     """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
@@ -134,6 +138,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),
+        *sides.warnings(known, models),
         *births.start_warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]

@@ -63,6 +63,7 @@ from .models import ModelSet
 from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
 from .scan import Group
+from .sides import in_doubt
 
 FEATURES = {
     'nis': Feature(math.nan),
@@ -431,12 +432,13 @@ def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tup
 def _protected_rows(rows: Rows) -> BoolArray:
     """Return which rows (N,) are kept at any total weight.
 
-    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
-    scales of at least `MIN_PUBLISHED_SCALE`.
+    These are depth hypotheses, rows of tracks whose side is in doubt, the heaviest row of each
+    track, and rows of sufficient weight among scales of at least `MIN_PUBLISHED_SCALE`.
     """
     first, scale = rows.first, rows.key['scale']
     # A start depth is a state: all rows of such a track are kept, also the first.
     protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    protected |= in_doubt(rows)[rows.target]
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
@@ -474,17 +476,22 @@ def redistribute_weights(known: Known) -> Known:
     """Redistribute a small fraction of the scale weights.
 
     The fraction is spread over the scales from 1, over the smaller scales, and over these two
-    groups. So the relative weights of the scales from 1 do not depend on the smaller scales.
+    groups. So the relative weights of the scales from 1 do not depend on the smaller scales. The
+    weights of the sides of a track stay as they are.
     """
     rows, borrowed = known.rows, known.borrowed
     target = np.concatenate([rows.target, borrowed.target])
     scale = np.concatenate([rows.key['scale'], borrowed.key])
     weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
-    group = 2 * target + (scale >= MIN_PUBLISHED_SCALE)
-    total = np.bincount(group, weight, minlength=2 * len(known))
-    size = np.bincount(group, minlength=2 * len(known))
-    groups = (size.reshape(-1, 2) > 0).sum(axis=1)[target]
-    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + REDISTRIBUTED_FRACTION / groups
+    # Tracks with assumptions in the list have one side.
+    label = np.concatenate([rows.key['side'], rows.key['side'][rows.first][borrowed.target]])
+    _, side = np.unique([target, label], axis=1, return_inverse=True)
+    side = side.ravel()
+    group = 2 * side + (scale >= MIN_PUBLISHED_SCALE)
+    total, size = np.bincount(group, weight), np.bincount(group)
+    groups = np.bincount(np.unique(group) // 2)[side]
+    fresh = REDISTRIBUTED_FRACTION * np.bincount(side, weight)[side] / groups
+    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + fresh
     logw = np.log(
         after
         * (

@@ -261,7 +261,11 @@ class ModelSet:
             logw.reshape(T * K),
             np.repeat(np.arange(T), K),
             np.full(T * K, -1),
-            {'scale': np.tile(scale, T), 'start': np.tile(start, T)},
+            {
+                'scale': np.tile(scale, T),
+                'start': np.tile(start, T),
+                'side': np.zeros(T * K, np.int64),
+            },
         )
 
     def to_blocks(self, x: FloatArray, P: FloatArray) -> tuple[Gaussians, ...]:

@@ -62,6 +62,7 @@ from . import (
     offsets,
     pruning,
     restart,
+    sides,
 )
 from .config import DiverConfig
 from .coverage_map import configured_coverage
@@ -132,6 +133,7 @@ class DiverTracker:
             models.families
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
+            lambda known, group: sides.drop_sides(known),
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
             covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
@@ -205,7 +207,7 @@ class DiverTracker:
 
     def warnings(self) -> list[str]:
         """Return warnings about implausible or unused input."""
-        tracker_warnings = estimate.warnings(self._stream.state, self.config)
+        tracker_warnings = estimate.warnings(self._stream.state, self.config, self.models)
         return [*self._georeferencer.warnings(), *tracker_warnings]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
