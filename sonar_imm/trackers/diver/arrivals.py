@@ -193,8 +193,7 @@ def _associate_ping(
         return known, free & (name == NOBODY)
     known = respread_depths(known, seen, layout, models)
     line = sides.line_of_ping(ping, rows, config)
-    if line is not None:
-        known = sides.doubt_near_line(known, models, layout, line)
+    known = sides.doubt_near_line(known, models, layout, line)
     mixtures = [track_mixture(known, track, models) for track in range(len(known))]
     if name != NOBODY:
         update = _update_track(mixtures[int(own[0])], seen, config, layout)

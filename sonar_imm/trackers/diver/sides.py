@@ -266,11 +266,15 @@ def sides_of(known: Known, track: int, models: ModelSet) -> list[Side]:
     return sorted(found, key=lambda side: -side.weight)
 
 
-def doubt_near_line(known: Known, models: ModelSet, layout: Layout, line: Line) -> Known:
-    """Give each side that lies near the line its image, with an equal weight.
+def doubt_near_line(
+    known: Known, models: ModelSet, layout: Layout, line: Line | None
+) -> Known:
+    """Give each side that lies near the line, if there is one, its image, with an equal weight.
 
     An image that is already a side of the track is replaced.
     """
+    if line is None:
+        return known
     kept, logw = np.ones(len(known.rows), np.bool_), known.rows.logw.copy()
     new: list[Rows] = []
     for track in range(len(known)):
