@@ -330,14 +330,24 @@ class HydrophonesOptions(_Options):
 
 @frozen(kw_only=True)
 class SegyOptions(_Options):
-    """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
+    """Traces of a sub-bottom profiler in SEG-Y or SU to /trace. Needs segyio.
 
-    Stamps come from the trace headers; traces within one second are spread over it.
+    Stamps, recording delay, sample interval and places come from the headers of each trace; traces
+    within one second are spread over it.
     """
 
     EXAMPLES: ClassVar = (
         'line.seg line.bag', 'line.seg line.bag --sample-spacing 0.376 --first-sample 12',
+        'line.sgy line.bag --time-zone +02:00 --crs 32631',
     )
+    time_zone: str = option('', 'ZONE', 'Zone of times whose headers say they are local.')
+    start: str = option('', 'TIME',
+        'Time of the first trace, e.g. 2024-05-31T10:00:00Z, where the headers hold no date.')
+    rate: float = option(1.0, '',
+        'Traces per second, where the headers hold no times.', kind='float', range=(1e-6, 1e6))
+    crs: int | None = option(None, 'EPSG',
+        'Coordinate system of places in metres or feet. Needs rasterio.', kind='int',
+        range=(1, None))
     sample_spacing: float | None = option(None, 'METRES',
         'Depth from sample to sample; by default from the sample interval.', kind='float',
         above=0.0)
