@@ -73,6 +73,14 @@ class _WithTruth(_Places):
 
 
 @frozen(kw_only=True)
+class _Navigated(_Options):
+    nav: Path | str | None = option(None, '',
+        'CSV of where the instrument was: stamp, x and y [m] or latitude and longitude [deg], '
+        'heading [deg, clockwise from north], z or depth, roll, pitch [deg].', kind='file')
+    nav_options: CsvOptions = group(CsvOptions, 'nav', 'the navigation')
+
+
+@frozen(kw_only=True)
 class _OfSonar(_Options):
     frame_id: str = option('sonar', '', 'Frame of the sonar.')
 
@@ -233,12 +241,14 @@ class TruthOptions(_Places):
 
 
 @frozen(kw_only=True)
-class SnapshotsOptions(_OfSonar):
+class SnapshotsOptions(_Navigated):
     """Array snapshots in a numpy archive (npz) to /snapshot.
 
     Arrays: iq, complex, (bins, staves) or (pings, bins, staves), and range [m] or time [s];
     optional sound_speed, frequency, element_spacing or spacing_wavelengths, stamp, noise_variance,
-    signal_variance. Usual names are recognised.
+    signal_variance. With latitude and longitude, or x and y [m], and heading [deg] or yaw [rad],
+    one value per ping, /nav is written; z or sonar_depth, roll, pitch and altitude are optional.
+    Usual names are recognised; arrays that are not used are listed.
     """
 
     EXAMPLES: ClassVar = (
@@ -250,6 +260,7 @@ class SnapshotsOptions(_OfSonar):
         'Channels, from 0, of each stave; those joined by + are summed.', parse=_staves)
     ping_rate: float = option(10.0, '',
         'Pings per second, when there are no stamps.', kind='float', range=(0.001, 1000.0))
+    frame_id: str = option('sonar', '', 'Frame of the sonar.')
 
 
 @frozen(kw_only=True)
@@ -303,7 +314,7 @@ class InterferometerOptions(_Options):
 
 
 @frozen(kw_only=True)
-class HydrophonesOptions(_Options):
+class HydrophonesOptions(_Navigated):
     """Sound of a vertical array to /pressure. Needs soundfile.
 
     WAV or FLAC with a channel for each hydrophone, the deepest first; --channels says another
@@ -329,7 +340,7 @@ class HydrophonesOptions(_Options):
 
 
 @frozen(kw_only=True)
-class SegyOptions(_Options):
+class SegyOptions(_Navigated):
     """Traces of a sub-bottom profiler in SEG-Y or SU to /trace. Needs segyio.
 
     Stamps, recording delay, sample interval and places come from the headers of each trace; traces
@@ -366,7 +377,7 @@ class SegyOptions(_Options):
 
 
 @frozen(kw_only=True)
-class TracesOptions(_Options):
+class TracesOptions(_Navigated):
     """Traces in a numpy archive (npz) or CSV to /trace.
 
     Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and

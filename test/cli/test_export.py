@@ -60,6 +60,12 @@ def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):
     assert text[:, 0] == pytest.approx(points['x'] + 500_000.0, abs=1e-3)
     assert np.asarray(las.y) == pytest.approx(points['y'] + 6_000_000.0, abs=1e-3)
     assert np.asarray(las.z) == pytest.approx(text[:, 2], abs=1.1e-3)
+    assert las.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    # Since 2017 GPS is 18 s ahead; the epoch is 1980-01-06, less 10^9 s.
+    utc = np.asarray(las.gps_time) + 1e9 - 18.0 + 315_964_800.0
+    assert utc == pytest.approx(1e-9 * points.stamp_ns, abs=1e-3)
+    assert (np.asarray(las.return_number) == 1).all()
+    assert (np.asarray(las.number_of_returns) == 1).all()
     with rasterio.open(tmp_path / 'a.tif') as file:
         depth, uncertainty, _, count = file.read([1, 2, 3, 4])
         assert file.crs.to_epsg() == 32632 and np.nansum(count) >= 0.9 * len(points)

@@ -36,6 +36,7 @@ from ..messages import ros_message
 from ..sources import BagError
 from ..times import BadRow, moment_ns
 from ..writer import BagWriter
+from .navigation import navigation_of_table
 
 if TYPE_CHECKING:
     import soundfile
@@ -52,6 +53,7 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
 
     The bag gets ``parameters.yaml`` with the number of hydrophones.
     """
+    places = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
     with _opened(path) as audio:
         channels = _channels(audio, how.channels)
         start_ns = _start_ns(path, how)
@@ -76,6 +78,9 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
             _write_blocks(audio, bag, report, how, channels, start_ns, rows)
             if not bag.count:
                 raise report.nothing(path)
+            for stamp_ns, topic, message in places:
+                bag.write(topic, message, stamp_ns)
+                report.messages[topic] += 1
 
 
 def _write_blocks(

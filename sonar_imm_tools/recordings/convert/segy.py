@@ -48,6 +48,7 @@ from ..messages import ros_message
 from ..positions import write_position
 from ..segy_lines import read_segy, SegyLine
 from ..sources import BagError
+from .navigation import navigation_of_table
 
 READ_OPTIONS = ('time_zone', 'start', 'rate', 'crs')
 """Options that `read_segy` has, too."""
@@ -91,7 +92,9 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
         if sigma is not None and window is not usual:
             noise = np.interp(window.depth(line), usual.depth(line), sigma)
         records += _records(report, Path(path), line, window, noise, how)
-    records += _positions(line) if records else []
+    if records:
+        beside = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
+        records += beside or _positions(line)
     return write_bag(
         out,
         records,
