@@ -212,7 +212,7 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     las.classification = np.full(len(points), 40, np.uint8)
     las.user_data = points['label'].astype(np.uint8)
     las.point_source_id = points['side'].astype(np.uint16)
-    seconds = points.stamp_ns * 1e-9
+    seconds = points.stamp_ns.astype(np.float64) * 1e-9
     # Adjusted standard GPS time, which the flag says.
     las.gps_time = seconds + gps_minus_utc(seconds) - GPS_EPOCH - 1e9
     header.global_encoding.gps_time_type = GpsTimeType.STANDARD
