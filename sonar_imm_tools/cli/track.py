@@ -124,7 +124,8 @@ def command(
 ) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
-    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
+    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`; the exit code is 1 if no
+    measurement was used. The same command writes the
     same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
     used, if there is one. --set changes single parameters.
 
@@ -153,6 +154,8 @@ def command(
         if len(runs) == 1 and scheduler is None:
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
             print_json(run) if as_json else _print(run, out_dir)
+            if not run['estimates'] and not run['counts'].get('used', 0):
+                raise click.exceptions.Exit(1)
             return
         failures: list[Outcome] = []
     else:
@@ -354,6 +357,8 @@ def _print(run: Mapping[str, Any], out_dir: Path) -> None:
         say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
     for problem in run['problems']:
         say(f'  problem: {problem}')
+    if not run['estimates'] and not run['counts'].get('used', 0):
+        say('  no measurement was used')
     if run['rows'] == 0:
         say('  no track was made; sonar-imm info may show why')
 
