@@ -406,6 +406,11 @@ class XtfOptions(_Detecting):
     EXAMPLES: ClassVar = ('line.xtf line.bag', 'line.xtf line.bag --side port')
     side: str = option('starboard', '', 'Side whose echoes are found.',
         choices=('starboard', 'port'))
+    units: str = option('auto', '', 'Units of the places; auto: what the file says.',
+        choices=('auto', 'degrees', 'metres'))
+    frequency: float | None = option(None, 'HZ',
+        'Which channel of a side, of several frequencies; by default the first one.',
+        kind='float', above=0.0)
     port_samples: str = option('far', '',
         'Which sample of a port channel comes first: most programs write the farthest.',
         choices=('far', 'near'))
