@@ -86,6 +86,13 @@ def _shard(
     show_default=True,
     help='Messages in the order of arrival, or sorted by their stamps.',
 )
+@click.option(
+    '--sound-speed',
+    type=click.Path(path_type=Path),
+    metavar='FILE',
+    help='Profile of sound speed (CARIS .svp, Kongsberg .asvp, Sea-Bird .cnv, CSV): rays of '
+    'bathymetry bend by it, other systems take its mean.',
+)
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
 @click.option(
     '--jobs',
@@ -177,6 +184,20 @@ class Plan:
     overwrite: bool = False
     strict: bool = False
     parquet: bool = False
+    sound_speed: Path | None = None
+
+    def _overrides(self, system: System) -> dict[str, str]:
+        """Return the parameters that the options of the command set. Raises `BagError`."""
+        if self.sound_speed is None:
+            return self.overrides
+        from ..recordings.sound_speed import mean_speed, read_profile
+
+        profile = read_profile(self.sound_speed)
+        pairs = [f'{value:.3f}' for pair in zip(*profile) for value in pair]
+        water = {'sound_speed': f'{mean_speed(profile):.3f}'}
+        if any(spec.name == 'sound_speed_profile' for spec in system.config_type().specs()):
+            water = {'sound_speed_profile': f'[{", ".join(pairs)}]'}
+        return {**water, **self.overrides}
 
     def parameters_of(self, bag: Path) -> Path | OwnParameters | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
@@ -202,8 +223,9 @@ class Plan:
             for sentence in remarks_on_topics(reader, system.name, found):
                 note(sentence)
         params = self.parameters_of(bag)
-        config, node = load_config(system, params, self.overrides)
-        detector = load_detector(system, params, self.overrides)
+        overrides = self._overrides(system)
+        config, node = load_config(system, params, overrides)
+        detector = load_detector(system, params, overrides)
         several = len(found) > 1
         return [
             Job(
