@@ -325,7 +325,8 @@ class HydrophonesOptions(_Navigated):
     EXAMPLES: ClassVar = (
         '20240531_100000.wav drift.bag', 'array.wav drift.bag --channels 3,2,1,0 --depth 120',
     )
-    start: str = option('', 'TIME', 'Time of the first sample, e.g. 2024-05-31T10:00:00Z.')
+    start: str = option('', 'TIME',
+        'Time of the first sample, e.g. 2024-05-31T10:00:00Z, now, or 0 if it does not matter.')
     time_zone: str = option('UTC', 'ZONE', 'Zone of a time that does not say it.')
     channels: Sequence[int] | None = option(None, 'CHANNELS',
         'Channels of the hydrophones, from 0, the deepest first; all in their order by default.',

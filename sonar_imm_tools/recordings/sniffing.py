@@ -66,7 +66,8 @@ def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
     start = start_of(path)
     if not start:
         raise BagError(f'{path} is empty')
-    if start[:4] == b'RIFF' and start[8:12] == b'WAVE' or start[:4] in (b'fLaC', b'RF64'):
+    riff = start[:4] in (b'RIFF', b'RIFX') and start[8:12] == b'WAVE'
+    if riff or start[:4] in (b'fLaC', b'RF64'):
         return Guess('hydrophones', 'sound of hydrophones')
     if start[:2] == b'PK':
         return _of_archive(path)

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import re
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -150,9 +151,12 @@ def _start_ns(path: Path, how: HydrophonesOptions) -> int:
         found = _NAMED.search(path.stem)
         if found is None:
             raise BagError(
-                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z'
+                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z, or '
+                '--start 0 where the time of day is of no use'
             )
         text = '20{}-{}-{} {}:{}:{}'.format(*found.groups())
+    if text in ('0', 'now'):
+        return SECOND if text == '0' else time.time_ns()
     try:
         start_ns = moment_ns(text, lambda: how.time_zone)
     except BadRow as error:
