@@ -84,12 +84,12 @@ def command(
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
     its standard deviation as text), .csv, .las and .laz (points with all columns), .tif (a grid
     of depth, uncertainty, label, count and what competes with the depth); they come from
-    recordings with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
-    the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
-    Where the recording has no fixes by satellite, the places of horizons come from its navigation,
-    with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml, .geojson (lines and points
-    with uncertainty and model), .csv and .parquet; --crs and --origin say where they lie where the
-    run does not.
+    recordings with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson
+    (points along the track), .sgy, .segy or .seg (the file given by --segy with picks in place
+    of its samples). Where the recording has no fixes by satellite, the places of horizons come
+    from its navigation, with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml,
+    .geojson (lines and points with uncertainty and model), .csv and .parquet; --crs and
+    --origin say where they lie where the run does not.
     """
     from ..offline.run_folder import RunFolder
     from ..recordings.sources import BagError
