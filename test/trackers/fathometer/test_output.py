@@ -37,12 +37,12 @@ def spectra():
 
 
 def received(spectra, low, high, **options):
-    """Depth, response and noise between `low` and `high`."""
+    """Depth and response between `low` and `high`, and the noise at the layer."""
     stated = scenario('small').instruments()
     config = FathometerConfig(**stated, noise_depth_min=0.0, noise_depth_max=0.0, **options)
     lattice = Lattice(low, 0.03, int((high - low) / 0.03))
     found = array_response(spectra, lattice, config, ARRAY)
-    return found.depth, found.amplitude, found.sigma[0]
+    return found.depth, found.amplitude, np.interp(LAYER, found.depth, found.sigma)
 
 
 @pytest.mark.parametrize('output', ['coherence', 'correlation'])
