@@ -25,10 +25,10 @@ from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
 from . import births, clutter, depth, offsets
 from .config import DiverConfig
-from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known, row_outputs
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
+from .scales import estimated_scales, weight_without_small_scales
 
 
 def estimate_of(

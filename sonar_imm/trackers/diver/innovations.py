@@ -35,8 +35,9 @@ first limit is at five sigma. Motion absorbs part of larger errors: the NIS stay
 excess.
 """
 
-TOO_SMALL, ENOUGH = 2.0, 12.0
-"""Scale above which covariances are too small, and the evidence that triggers a warning.
+TOO_SMALL, MOST, ENOUGH = 2.0, 10.0, 12.0
+"""Scale above which covariances are too small, the scale above which one fix counts no more, and
+the evidence that triggers a warning.
 
 The evidence is the accumulated log of the scale over `TOO_SMALL`: 8 groups of fixes at scale 10,
 17 at scale 4. With correct covariances it stayed below 4 in four hours of `simulate` scenarios.
@@ -95,7 +96,7 @@ class FixConsistency(NamedTuple):
             return self
         # The smallest scale counts: other tracks may follow wrong fixes.
         least = float(scale[~tentative].min())
-        evidence = max(self.evidence + math.log(least / TOO_SMALL), 0.0)
+        evidence = max(self.evidence + math.log(min(least, MOST) / TOO_SMALL), 0.0)
         return self._replace(scale=least, evidence=evidence)
 
     @property
