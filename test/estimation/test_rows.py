@@ -14,7 +14,6 @@
 
 """The table of rows: what belongs together stays together, and no weight is lost."""
 
-
 import math
 
 from attrs import evolve

@@ -488,6 +488,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         return AFLOAT if anything and self.velocity_std == usual else self.velocity_std
 
     @property
+    def has_usual_fix_std(self) -> bool:
+        """Whether `fix_std` is its default."""
+        return bool(self.fix_std == fields(type(self)).fix_std.default)
+
+    @property
     def usual_clutter(self) -> float:
         """The density of false fixes where none is learnt."""
         return self.clutter_density or CLUTTER

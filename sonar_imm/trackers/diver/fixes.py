@@ -77,6 +77,7 @@ FEATURES = {
     'white': Feature(math.nan, (2,)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
+    'reported': Feature(math.nan, (3,)),
 }
 """nis, nis_dof: of this scan, NaN and 0 without a hit.
 
@@ -87,6 +88,8 @@ white: whitened innovation of the last fix.
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
 evidence: sum of the detection probabilities of the track.
+
+reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
 """
 
 FAR = 80.0
@@ -484,6 +487,9 @@ def _record_innovations(
     known: Known, group: Group, association: Association, models: ModelSet
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
+    if len(group.z):
+        covariances = group.is_stated, group.config.has_usual_fix_std
+        known = known.with_memory(fixes=known.memory['fixes'].with_covariances(*covariances))
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
@@ -508,8 +514,9 @@ def _record_innovations(
         before,
     )
     after = after.with_scale(scale, tentative)
-    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof')}
+    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
     columns['white'][tracks] = white
+    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.
