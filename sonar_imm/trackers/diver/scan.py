@@ -154,6 +154,8 @@ class Group:
     """Name of the sensor."""
     seen_from: FloatArray | None = None
     """(2,) sensor position; None if unknown."""
+    is_stated: bool = True
+    """True if a fix states its covariance."""
     learnt_clutter: float = CLUTTER
     """Estimated clutter density, 1/m^2, if `clutter_density` is not set."""
     detection: DetectionProbability | None = field(default=None, init=False)
@@ -303,8 +305,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     if scan.covariance is not None:
         covariance = scan.covariance[rows]
     R = np.ascontiguousarray(covariance[:, :2, :2])
-    if not (stated := np.isfinite(R)).all():
-        R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
+    stated = np.isfinite(R).all(axis=(1, 2))
+    R[~stated] = np.eye(2) * config.fix_std**2
     heights = (
         Heights.from_fixes(position, covariance, config.covariance_scale)
         if config.dimensions == 3
@@ -313,7 +315,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _sensor_position(config)
-    return Group(z, R * config.covariance_scale, config, *named_rows)
+    is_stated = bool(stated.any())
+    return Group(z, R * config.covariance_scale, config, *named_rows, is_stated=is_stated)
 
 
 def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
@@ -321,10 +324,14 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
     R = np.empty((len(fixes), 2, 2))
+    is_stated = False
     for row, fix in enumerate(fixes):
         z[row] = fix.position[:2]
         stated = None if fix.covariance is None else fix.covariance[:2, :2]
-        R[row] = unknown if stated is None or math.isnan(stated[0, 0]) else stated
+        if stated is None or math.isnan(stated[0, 0]):
+            R[row] = unknown
+        else:
+            R[row], is_stated = stated, True
     heights, factor = None, config.covariance_scale
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
@@ -332,9 +339,9 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
         heights = Heights.from_fixes(
             np.array([fix.position for fix in fixes]), np.array(whole), factor
         )
-    more = None, config.fixes_are_scans, heights, fixes[0].sensor
+    more = None, config.fixes_are_scans, heights, fixes[0].sensor, _sensor_position(config)
     return _with_sensor_position(
-        fixes[0], Group(z, R * factor, config, *more, _sensor_position(config))
+        fixes[0], Group(z, R * factor, config, *more, is_stated=is_stated)
     )
 
 

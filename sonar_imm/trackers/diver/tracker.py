@@ -62,6 +62,7 @@ from . import (
     offsets,
     pruning,
     restart,
+    scales,
 )
 from .config import DiverConfig
 from .coverage_map import configured_coverage
@@ -241,7 +242,9 @@ class DiverTracker:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
         has_scales = len(previous) and len(self.models.scales) > 1
-        start = fixes.redistribute_weights(previous) if has_scales else previous
+        start = (
+            scales.redistribute_weights(previous, self.models.scales) if has_scales else previous
+        )
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )
