@@ -60,6 +60,7 @@ UNUSED_REASONS = frozenset(
     {
         'doubted',
         'full',
+        'heading_unmeasured',
         'navigation_gap',
         'navigation_missing',
         'no_origin',

@@ -37,7 +37,7 @@ from ...estimation.association import assign, association_cost, gate_threshold, 
 from ...estimation.covariance import add_jitter, is_psd
 from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
-from . import coverage, offsets, sides
+from . import coverage, offsets, ranges, sides
 from .config import DiverConfig
 from .coverage_map import Coverage, DetectionProbability
 from .depth import replace_rows, respread_depths
@@ -49,11 +49,11 @@ from .explanations import (
     PingMeasurements,
     subset_ping,
 )
-from .fixes import MIN_PUBLISHED_SCALE
 from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
+from .scales import MIN_PUBLISHED_SCALE
 from .scan import MOST_MEASUREMENTS, Ping, ping_measurements, tag_id
 
 MOST_SUBSETS = 6
@@ -184,15 +184,15 @@ def _associate_ping(
         return known, free
     instruments = known.memory['instruments'].with_receivers(ping, config)
     layout = instruments.layout(config, models)
-    every = np.ones(len(known.borrowed), np.bool_)
-    table, borrowed = restore_rows(known.rows, known.borrowed, 'scale', every)
+    usual = np.isin(known.borrowed.key['scale'], models.row_scales)
+    table, borrowed = restore_rows(known.rows, known.borrowed, usual)
     known = known.replace(rows=layout.rows_with_new_constants(table, models), borrowed=borrowed)
     known = known.with_memory(instruments=instruments)
+    known, line = ranges.line_of(known, ping, config)
     seen = ping_measurements(ping, rows, config, models, layout)
     if not len(known) or seen.pairs <= int(ping.passive):
         return known, free & (name == NOBODY)
     known = respread_depths(known, seen, layout, models)
-    line = sides.line_of_ping(ping, rows, config)
     known = sides.doubt_near_line(known, models, layout, line)
     mixtures = [track_mixture(known, track, models) for track in range(len(known))]
     if name != NOBODY:
@@ -261,14 +261,14 @@ def apply_updates(
         blocks = models.to_blocks(after.x.reshape(-1, M, n), after.P.reshape(-1, M, n, n))
         with np.errstate(divide='ignore'):
             logw = np.maximum((top + np.log(weight))[:, 0], LEAST_LOG)
-        if line is not None and line.tells_nothing:
-            logw = sides.hold_sides(rows.logw[own], logw, rows.key['side'][own])
         rows = replace_rows(rows, own, blocks, inside, logw)
         nis[track] += update.nis
         nis_dof[track] += np.uint16(update.dof)
         repairs += update.after.repairs
+    if line is not None and line.tells_nothing:
+        rows = sides.with_sides_of(known.rows, rows)
     known = known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof)
-    return sides.drop_sides(known.add_counts(repairs=repairs))
+    return sides.drop_sides(known.add_counts(repairs=repairs), models, line)
 
 
 def _explain_echoes(

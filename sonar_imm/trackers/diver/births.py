@@ -35,7 +35,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
 from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import depth, sides
+from . import depth, ranges, sides
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, track_positions
@@ -204,7 +204,9 @@ def spawn_stage(
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
             columns['learnt'] = chain.initial_counts(len(births))
-            columns['existence'] = [birth.existence for birth in births]
+            existence = np.array([birth.existence for birth in births])
+            columns['existence'] = existence
+            columns['least_existence'] = np.fmin(columns['least_existence'], existence)
             columns['target_id'] = [birth.target_id for birth in births]
             life = known.life.born(len(births), known.stamp_ns, rules)
             rows = birth_rows(births, models, layout, config)
@@ -271,7 +273,9 @@ def birth_rows(
                 )
     rows = models.make_rows(x, P, mu, logw)
     for track, birth in enumerate(births):
-        if birth.ping is not None and birth.rows is not None:
+        if birth.fit is not None:
+            rows = rows.replace_target(track, ranges.fitted_rows(birth.fit, models, layout))
+        elif birth.ping is not None and birth.rows is not None:
             line = sides.line_of_ping(birth.ping, birth.rows, config)
             if line is not None:
                 rows = sides.with_images(rows, track, models, layout, line)

@@ -47,8 +47,8 @@ class Assumptions(NamedTuple):
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
         return cls(
-            np.concatenate([np.arange(N), borrowed.find_lenders(rows, 'scale')])[order],
-            np.concatenate([scale, borrowed.key])[order],
+            np.concatenate([np.arange(N), borrowed.find_lenders(rows)])[order],
+            np.concatenate([scale, borrowed.key['scale']])[order],
             np.concatenate([rows.logw, borrowed.logw])[order],
             target[order],
             order < N,

@@ -15,11 +15,14 @@
 """Sides of a line of instruments.
 
 Arrivals at instruments on one line are the same from both sides of it. So a track has the mirror
-image of each of its rows as a row of equal weight: from the start, and again whenever a side comes
-within `NEAR` standard deviations of the line. Its rows are told apart by the key ``side``.
+image of each of its rows as a row of equal weight from the start. Its rows are told apart by the
+key ``side``. Later, a side that comes near the line gets its image again. With distance d and
+standard deviation s of the side across the line, the weights of a place and of its image are as
+``exp(-(d - d)^2 / 2 s^2) : exp(-(d + d)^2 / 2 s^2)``: the likelihood of the arrivals is the same.
 
-A ping of such instruments does not change the weights of the sides. Everything else does: a
-receiver off the line, a bearing, a fix. A side of negligible weight ends.
+Otherwise a ping of such instruments does not change the weights of the sides. Everything else
+does: a receiver off the line, a bearing, a fix. A side ends when its weight is negligible, or when
+these bring two sides together.
 
 The image of a heading lies between two headings in general. It is shared between these two, in
 proportion to the angles.
@@ -40,23 +43,29 @@ from ...estimation.rows import log_sum, ROW_LOST, Rows
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Known, row_outputs
+from .known import Feature, Known, row_outputs
 from .models import HEADING, ModelSet
 from .offsets import ASSUMED
 from .scan import systematic_variance, toa_variance
+
+FEATURES = {'doubts': Feature(0, kind=np.int64)}
+"""doubts: number of pings since the track was last on one side."""
 
 COLLINEAR = 0.02
 """Ratio of the second to the first singular value of instrument positions below which they lie on
 a line."""
 
-NEAR = 3.0
-"""Standard deviations from the line within which a side comes into doubt."""
-
 SAME = 9.0
 """Squared Mahalanobis distance within which a position is the image of another."""
 
+TOGETHER = 1.0
+"""Squared Mahalanobis distance, in position and velocity, within which two sides are one."""
+
 MOST_SIDES = 4
 """Maximum number of sides of a track."""
+
+LASTING = 5
+"""Number of pings after which a doubt is said."""
 
 NOT_TOLD = (
     'two receivers do not tell on which side of their line the target is: side_probability is the '
@@ -116,11 +125,17 @@ def line_of_ping(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> Line 
     points = ping.rx[used, :2]
     if not ping.passive:
         points = np.concatenate([ping.tx[used, :2], points])
-    variance = (toa_variance(ping, config) + systematic_variance(ping, config))[used].mean()
+    return line_through(points, path_noise(ping, used, config))
+
+
+def path_noise(ping: Arrivals, rows: IndexArray, config: DiverConfig) -> float:
+    """Return the standard deviation of the path lengths of `rows`, m, at least that of the assumed
+    positions of receivers."""
+    variance = (toa_variance(ping, config) + systematic_variance(ping, config))[rows].mean()
     noise = config.sound_speed * math.sqrt(variance)
     if config.systematic_errors != 'exact' and not config.receiver_position_std:
         noise = max(noise, ASSUMED['receiver_position_std'])
-    return line_through(points, noise)
+    return noise
 
 
 # -- images --------------------------------------------------------------------------------------
@@ -241,17 +256,17 @@ class Side(NamedTuple):
     weight: float
     """Its probability."""
     mean: FloatArray
-    """(2,) position."""
+    """(4,) position and velocity; (2,) of a position alone."""
     covariance: FloatArray
-    """(2, 2)."""
+    """Its covariance."""
 
 
 def sides_of(known: Known, track: int, models: ModelSet) -> list[Side]:
     """Return the sides of a track, the most probable first."""
     own = known.row_indices(track)
     rows = known.track_rows(track)
-    maps = tuple(part.outputs[:2] for part in models.parts)
-    mean, covariance = row_outputs(rows, maps)
+    plane = [models.outputs.index(name) for name in ('px', 'py', 'vx', 'vy')]
+    mean, covariance = row_outputs(rows, tuple(part.outputs[plane] for part in models.parts))
     found = []
     for side in np.unique(rows.key['side']):
         mine = np.flatnonzero(rows.key['side'] == side)
@@ -266,10 +281,8 @@ def sides_of(known: Known, track: int, models: ModelSet) -> list[Side]:
     return sorted(found, key=lambda side: -side.weight)
 
 
-def doubt_near_line(
-    known: Known, models: ModelSet, layout: Layout, line: Line | None
-) -> Known:
-    """Give each side that lies near the line, if there is one, its image, with an equal weight.
+def doubt_near_line(known: Known, models: ModelSet, layout: Layout, line: Line | None) -> Known:
+    """Give each side that lies near the line, if there is one, its image.
 
     An image that is already a side of the track is replaced.
     """
@@ -282,24 +295,26 @@ def doubt_near_line(
         count, label = len(sides), int(known.rows.key['side'][known.row_indices(track)].max())
         while sides:
             side = sides.pop(0)
-            across = line.across
-            distance = abs(float(across @ (side.mean - line.point)))
-            if distance > NEAR * math.sqrt(float(across @ side.covariance @ across)):
+            share = crossed_share(side, line)
+            if share < ROW_LOST or side.weight <= 0.0:
                 continue
-            image, weight = line.image(side.mean), side.weight
-            twin = next((other for other in sides if _is_at(other, image, side)), None)
+            image, other = line.image(side.mean[:2]), 0.0
+            twin = next((each for each in sides if _is_at(each, image, side)), None)
             if twin is not None:
                 sides.remove(twin)
                 kept[twin.rows] = False
-                weight += twin.weight
+                other = twin.weight
             elif count == MOST_SIDES:
                 continue
             count, label = count + (twin is None), label + 1
-            logw[side.rows] += math.log(0.5 * weight / side.weight)
             mirrored = mirror_rows(known.rows.select(side.rows), models, layout, line)
             key = {**mirrored.key, 'side': np.full(len(mirrored), label)}
+            stays = (1.0 - share) * side.weight + share * other
+            beyond = share * side.weight + (1.0 - share) * other
+            image_logw = logw[side.rows] + math.log(beyond / side.weight)
+            logw[side.rows] += math.log(stays / side.weight)
             parent = np.full(len(mirrored), -1)
-            new.append(evolve(mirrored, logw=logw[side.rows], key=key, parent=parent))
+            new.append(evolve(mirrored, logw=image_logw, key=key, parent=parent))
     if not new:
         return known
     left = np.flatnonzero(kept)
@@ -310,38 +325,78 @@ def doubt_near_line(
     return known.replace(rows=rows)
 
 
+def crossed_share(side: Side, line: Line) -> float:
+    """Return which share of a side lies beyond the line, at its image: see the module."""
+    across = line.across
+    distance = float(across @ (side.mean[:2] - line.point))
+    variance = float(across @ side.covariance[:2, :2] @ across)
+    if not variance > 0.0:
+        return 0.0
+    return 1.0 / (1.0 + math.exp(min(2.0 * distance**2 / variance, 700.0)))
+
+
 def _is_at(side: Side, place: FloatArray, other: Side) -> bool:
     """Return whether a side lies at a place (2,), the image of `other`."""
-    apart = side.mean - place
-    spread = side.covariance + other.covariance
+    apart = side.mean[:2] - place
+    spread = (side.covariance + other.covariance)[:2, :2]
     return bool(apart @ np.linalg.solve(spread, apart) < SAME)
 
 
 def hold_sides(before: FloatArray, after: FloatArray, side: IntArray) -> FloatArray:
-    """Return log weights `after` (k,) of the rows of a track, with the side weights `before`."""
+    """Return log weights `after` (k,) of the rows of a track, with the shares of the sides as they
+    were `before`."""
     held, every = after.copy(), np.zeros(len(after), np.int64)
+
+    def growth(own: BoolArray) -> float:
+        return float(log_sum(after[own], every[own])[0] - log_sum(before[own], every[own])[0])
+
+    whole = growth(every == 0)
     for each in np.unique(side):
         own = side == each
-        held[own] += log_sum(before[own], every[own])[0] - log_sum(after[own], every[own])[0]
+        held[own] += whole - growth(own)
     return held
 
 
-def drop_sides(known: Known) -> Known:
-    """End the sides whose weight is negligible."""
+def with_sides_of(before: Rows, after: Rows) -> Rows:
+    """Return the rows `after`, the same rows as `before`, with the side weights of `before`."""
+    logw = after.logw.copy()
+    for target in np.flatnonzero(in_doubt(before)).tolist():
+        own = before.target == target
+        logw[own] = hold_sides(before.logw[own], after.logw[own], before.key['side'][own])
+    return after.replace(logw=logw)
+
+
+def drop_sides(known: Known, models: ModelSet, line: Line | None = None) -> Known:
+    """End the sides of negligible weight, and the lighter of two that came together; none after a
+    ping of a `line` that tells nothing."""
     rows = known.rows
     doubtful = in_doubt(rows)
-    if not doubtful.any():
+    if not doubtful.any() or line is not None and line.tells_nothing:
         return known
-    side, kept = rows.key['side'], np.ones(len(rows), np.bool_)
+    kept, logw = np.ones(len(rows), np.bool_), rows.logw.copy()
     for track in np.flatnonzero(doubtful).tolist():
-        own = known.row_indices(track)
-        weight = np.bincount(side[own], rows.weight[own])
-        lost = weight[side[own]] < ROW_LOST
-        kept[own[lost]] = False
+        left: list[Side] = []
+        for side in sides_of(known, track, models):
+            heavier = next((other for other in left if _are_together(side, other)), None)
+            if heavier is None and side.weight >= ROW_LOST:
+                left.append(side)
+                continue
+            kept[side.rows] = False
+            if heavier is not None:
+                logw[heavier.rows] += math.log1p(side.weight / heavier.weight)
     if kept.all():
         return known
-    left = np.flatnonzero(kept)
-    return known.replace(rows=evolve(rows.select(left), parent=rows.parent[left]))
+    index = np.flatnonzero(kept)
+    rows = evolve(evolve(rows, logw=logw).select(index), parent=rows.parent[index])
+    side = np.where(in_doubt(rows)[rows.target], rows.key['side'], 0)
+    return known.replace(rows=rows.replace(key={**rows.key, 'side': side}))
+
+
+def _are_together(side: Side, other: Side) -> bool:
+    """Return whether two sides are at one place, with one velocity."""
+    apart = side.mean - other.mean
+    spread = side.covariance + other.covariance
+    return bool(apart @ np.linalg.solve(spread, apart) < TOGETHER)
 
 
 def without_images(
@@ -358,6 +413,12 @@ def without_images(
     return [(place.mean, place.covariance) for place in left]
 
 
+def count_doubts(known: Known) -> Known:
+    """Return the state with the number of pings in doubt."""
+    doubts = np.where(in_doubt(known.rows), known['doubts'] + 1, 0)
+    return known.with_columns(doubts=doubts)
+
+
 # -- what is published ---------------------------------------------------------------------------
 
 
@@ -367,7 +428,7 @@ def likely_positions(known: Known, models: ModelSet, mean: FloatArray) -> FloatA
         return mean
     place = mean.copy()
     for track in np.flatnonzero(in_doubt(known.rows)).tolist():
-        place[track, :2] = sides_of(known, track, models)[0].mean
+        place[track, :2] = sides_of(known, track, models)[0].mean[:2]
     return place
 
 
@@ -379,14 +440,15 @@ def side_columns(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     for track in np.flatnonzero(in_doubt(known.rows)).tolist():
         first, second, *_ = sides_of(known, track, models)
         out['side_probability'][track] = first.weight
-        out['mirror_x'][track], out['mirror_y'][track] = second.mean
+        out['mirror_x'][track], out['mirror_y'][track] = second.mean[:2]
     return out
 
 
 def warnings(known: Known, models: ModelSet) -> list[str]:
     """Return the warning while a confirmed track may be at two places."""
-    for track in np.flatnonzero(in_doubt(known.rows) & (known.life.status != TENTATIVE)).tolist():
+    doubtful = in_doubt(known.rows) & (known['doubts'] >= LASTING)
+    for track in np.flatnonzero(doubtful & (known.life.status != TENTATIVE)).tolist():
         first, *others = sides_of(known, track, models)
-        if not all(_is_at(other, first.mean, first) for other in others):
+        if not all(_is_at(other, first.mean[:2], first) for other in others):
             return [NOT_TOLD]
     return []

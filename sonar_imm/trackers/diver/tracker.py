@@ -61,7 +61,9 @@ from . import (
     names,
     offsets,
     pruning,
+    ranges,
     restart,
+    scales,
     sides,
 )
 from .config import DiverConfig
@@ -123,17 +125,19 @@ class DiverTracker:
             **pruning.FEATURES,
             **coverage.FEATURES,
             **depth.FEATURES,
+            **sides.FEATURES,
             'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            clutter.estimate_densities,
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
             self._associate,
             models.families
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
-            lambda known, group: sides.drop_sides(known),
+            lambda known, group: sides.drop_sides(known, models),
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
             covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
@@ -173,6 +177,7 @@ class DiverTracker:
             instruments=Instruments(),
             clutter=clutter.Clutters(),
             last_named=names.LastNamed(),
+            ranges=ranges.Ranges(),
         )
 
     def restored(self) -> None:
@@ -228,7 +233,7 @@ class DiverTracker:
 
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, previous.memory['clutter'].densities())
+        scan = Scan.from_items(items, self.config)
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:
@@ -243,7 +248,10 @@ class DiverTracker:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
         has_scales = len(previous) and len(self.models.scales) > 1
-        start = fixes.redistribute_weights(previous) if has_scales else previous
+        start = previous
+        if has_scales:
+            start = scales.redistribute_weights(previous, self.models.scales)
+            start = start.replace(rows=sides.with_sides_of(previous.rows, start.rows))
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )
@@ -269,9 +277,12 @@ class DiverTracker:
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
+        known = sides.count_doubts(known)
         layout = self._layouts(known)
         known = births.restart_track(known, ping, free, self.models, layout, self.config)
         scan.births += births.births_from_ping(ping, free, self.config)
+        known, more = ranges.births_from_range(known, ping, free, self.config)
+        scan.births += more
         return known
 
     def _update_transitions(self, known: Known, scan: Scan) -> Known:
