@@ -34,7 +34,7 @@ import numpy as np
 from ...acoustics.arrivals_3d import EMISSION
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
-from ...estimation.covariance import add_jitter, is_psd
+from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
 from . import coverage, offsets, ranges, sides
@@ -45,6 +45,7 @@ from .explanations import (
     expect_measurements,
     expect_residuals,
     fit_measurements,
+    joint_nis,
     MOST_EXPLANATIONS,
     PingMeasurements,
     subset_ping,
@@ -443,22 +444,8 @@ def make_track_update(
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.subsample(good)
         residual, covariance, dof = expected_residuals(before, own, config.target_z)
-        nis = _joint_nis(residual, covariance, own.measured.variance)
+        nis = joint_nis(residual, covariance, own.measured.variance)
     return TrackUpdate(after, good, nis, dof)
-
-
-def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
-
-    If rounding makes S singular, use eigenvalues in units of the variances.
-    """
-    S = covariance + np.diag(variance)
-    if is_psd(S) or not np.isfinite(S).all():
-        return float(residual @ np.linalg.solve(S, residual))
-    weight = 1.0 / np.sqrt(variance)
-    values, vectors = np.linalg.eigh(weight[:, None] * covariance * weight)
-    whitened = vectors.T @ (weight * residual)
-    return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
 
 
 def update_by_ping(

@@ -17,9 +17,10 @@
 One range is a circle or an ellipse. Ranges from several places, of buoys in turn or of a ship that
 moves, determine a position and a velocity. After `LEAST` free ranges, then at every `EVERY`-th,
 the last `WINDOW` of them are fitted by (x, y, vx, vy), with a normal prior of the velocity and
-with accelerations as a target of such speeds has them. The search starts at several places of the first circle. A track starts with a side (`sides`) for each
-minimum, if there are at most two, if each is known to `MOST_STD` and so well that the paths do not
-bend within it, and if the ranges fit.
+with accelerations as a target of such speeds has them. The search starts at several places of the
+first circle. A track starts with a side (`sides`) for each minimum, if there are at most two, if
+each is known to `MOST_STD` and so well that the paths do not bend within it, and if the ranges
+fit.
 
 Ranges from a line have a mirror image. The best minimum and its image are the two sides then, and
 no range of the line changes their weights. Ranges from one place start no track.
@@ -133,9 +134,12 @@ class Ranges(NamedTuple):
         if int(used.sum()) < LEAST:
             return None
         square = config.speed_mean**2 + config.speed_std**2
-        problem = _Problem(
+        problem = Problem(
             (self.stamp_ns[used] - self.stamp_ns[-1]) * 1e-9,
-            *(part[used] for part in (self.tx, self.rx, self.path, self.variance)),
+            self.tx[used],
+            self.rx[used],
+            self.path[used],
+            self.variance[used],
             float(np.mean(start_depths(config))),
             config.velocity_std,
             0.5 * square * (1.0 - config.stay_probability) / config.reference_step,
@@ -234,7 +238,7 @@ def _with_headings(rows: Rows, models: ModelSet, source: int) -> Rows:
 # -- the fit -------------------------------------------------------------------------------------
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """R path lengths to fit."""
 
     time: FloatArray
@@ -255,7 +259,7 @@ class _Problem(NamedTuple):
     """Spectral density of the acceleration on each axis, m^2/s^3: the target may turn."""
 
 
-def fit_ranges(problem: _Problem, line: Line | None) -> Fit | None:
+def fit_ranges(problem: Problem, line: Line | None) -> Fit | None:
     """Fit position and velocity at time 0.
 
     :param line: line of the instruments.
@@ -286,7 +290,7 @@ def fit_ranges(problem: _Problem, line: Line | None) -> Fit | None:
     return found if line is None else _with_image(found, line)
 
 
-def _is_straight(x: FloatArray, variance: float, problem: _Problem) -> bool:
+def _is_straight(x: FloatArray, variance: float, problem: Problem) -> bool:
     """Return whether the paths bend by less than a standard deviation within the `variance` of a
     position: one Gaussian describes it then.
 
@@ -313,7 +317,7 @@ def _with_image(fit: Fit, line: Line) -> Fit:
     )
 
 
-def _search(problem: _Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _search(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the ends x (S, 4) of the searches by Levenberg and Marquardt, their chi-squares (S,),
     infinite without convergence, and information matrices (S, 4, 4)."""
     angle = 2.0 * math.pi * np.arange(STARTS) / STARTS
@@ -342,7 +346,7 @@ def _search(problem: _Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _normal_equations(
-    x: FloatArray, problem: _Problem
+    x: FloatArray, problem: Problem
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return chi-square (S,), information (S, 4, 4) and gradient (S, 4) at x (S, 4).
 

@@ -388,8 +388,8 @@ def drop_sides(known: Known, models: ModelSet, line: Line | None = None) -> Know
         return known
     index = np.flatnonzero(kept)
     rows = evolve(evolve(rows, logw=logw).select(index), parent=rows.parent[index])
-    side = np.where(in_doubt(rows)[rows.target], rows.key['side'], 0)
-    return known.replace(rows=rows.replace(key={**rows.key, 'side': side}))
+    label = np.where(in_doubt(rows)[rows.target], rows.key['side'], 0)
+    return known.replace(rows=rows.replace(key={**rows.key, 'side': label}))
 
 
 def _are_together(side: Side, other: Side) -> bool:
