@@ -361,7 +361,7 @@ def birth_from_start(start: Start, config: DiverConfig) -> Birth:
         stated = Heights.from_fixes(start.position[None], start.covariance[None], 1.0)
         height = stated and stated.row(0)
     plane = start.position[:2], start.covariance[:2, :2]
-    return Birth(*plane, measured=False, height=height)
+    return Birth(*plane, target_id=start.target_id, measured=False, height=height)
 
 
 def make_room(
@@ -374,6 +374,8 @@ def make_room(
     going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
         going &= _agrees_with_start(known, start, config, models)
+    if start.target_id != NOBODY:
+        going = going | (known['target_id'] == start.target_id)
     left = known.select(~going)
     if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
         return left, True
