@@ -105,7 +105,9 @@ class Ranges(NamedTuple):
     variance: Annotated[FloatArray, 'p'] = np.zeros(0)
     """(R,) m^2."""
     free: int = 0
-    """Number of single arrivals of no track since a track was confirmed."""
+    """Number of single arrivals of no track since a track started from them."""
+    alone: int = 0
+    """The same, since a track was last confirmed."""
 
     def with_range(
         self, stamp_ns: int, tx: FloatArray, rx: FloatArray, path: float, variance: float
@@ -118,6 +120,7 @@ class Ranges(NamedTuple):
             np.append(self.path, path)[-WINDOW:],
             np.append(self.variance, variance)[-WINDOW:],
             self.free,
+            self.alone,
         )
 
     @property
@@ -171,8 +174,8 @@ def births_from_range(
     if own is None or not free[own[0]] or np.isfinite(ping.bearing[own[0]]):
         return known, []
     ranges: Ranges = known.memory['ranges']
-    count = ranges.free + 1
-    ranges = ranges._replace(free=count)
+    count, tracked = ranges.free + 1, (known.life.status != TENTATIVE).any()
+    ranges = ranges._replace(free=count, alone=0 if tracked else ranges.alone + 1)
     fit = None
     if not ping.passive and tag_id(ping) == NOBODY:
         row = own[0]
@@ -185,16 +188,15 @@ def births_from_range(
             fit = ranges.fit(config)
     if fit is None:
         return known.with_memory(ranges=ranges), []
-    ranges = ranges._replace(path=np.full(len(ranges.path), np.nan), free=0)
+    ranges = ranges._replace(path=np.full(len(ranges.path), np.nan), free=0, alone=0)
     birth = Birth(fit.x[0, :2], fit.P[0, :2, :2], measured=False, fit=fit)
     return known.with_memory(ranges=ranges), [birth]
 
 
 def warnings(known: Known) -> list[str]:
     """Return the warning while single arrivals start no track."""
-    waits = known.memory['ranges'].free >= LEAST
     tracked = (known.life.status != TENTATIVE).any()
-    return [NO_TRACK] if waits and not tracked else []
+    return [NO_TRACK] if known.memory['ranges'].alone >= LEAST and not tracked else []
 
 
 def _single(ping: Arrivals) -> IntArray | None:
