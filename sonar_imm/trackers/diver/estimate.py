@@ -108,7 +108,7 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = estimated_scales(known.rows)
+    out['covariance_scale'] = estimated_scales(known.rows, known.memory['reporting'])
     return out
 
 

@@ -142,7 +142,7 @@ class FixConsistency(NamedTuple):
         small = self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED
         return small and self.mean_nis <= OPTIMISTIC
 
-    def warnings(self, bias_stated: bool, largest: float) -> list[str]:
+    def warnings(self, bias_stated: bool, largest: float = MOST) -> list[str]:
         """Return warnings about wrong covariances: for families when the evidence suffices,
         otherwise after `MEMORY` fixes.
 
