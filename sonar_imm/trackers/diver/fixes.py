@@ -69,12 +69,13 @@ from .scales import (
     weight_without_small_scales,
 )
 from .scan import Group
+from .sensors import MOST_SENSORS
 
 FEATURES = {
     'nis': Feature(math.nan),
     'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (2,)),
+    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
     'reported': Feature(math.nan, (3,)),
@@ -83,7 +84,7 @@ FEATURES = {
 
 score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
-white: whitened innovation of the last fix.
+white: whitened innovation of the last fix of each sensor.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
@@ -502,15 +503,23 @@ def _record_innovations(
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
     if len(group.z):
-        covariances = group.is_stated, group.config.has_usual_fix_std
-        known = known.with_memory(fixes=known.memory['fixes'].with_covariances(*covariances))
+        known = _with_consistency(
+            known,
+            group,
+            known.memory['fixes']
+            .of(group.number)
+            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
+        )
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
     fix = association.fix[tracks]
     seen = tuple(part.fix_matrix for part in models.parts)
-    mean, covariance = known.rows.combine(
-        *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)
+    rows, late = known.rows, known.rows.key['delay'][:, group.number]
+    each = zip(rows.blocks, models.parts)
+    moved = tuple(bank.move_along(block, part.outputs[2:4], -late) for block, part in each)
+    mean, covariance = rows.combine(
+        *row_outputs(rows.replace(blocks=moved), seen), weight_without_small_scales(rows)
     )
     scale = (
         estimated_scales(known.rows, group.number)[tracks]
@@ -519,21 +528,29 @@ def _record_innovations(
     )
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes']
+    before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
         covariance[tracks],
         group.z[fix],
         R,
-        known['white'][tracks],
+        known['white'][tracks, group.number],
         tentative,
         before,
     )
     after = after.with_scale(scale, tentative)
     columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
-    columns['white'][tracks] = white
+    columns['white'][tracks, group.number] = white
     columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.
-    return known.with_columns(**columns).with_memory(fixes=after, recent=RecentPairs())
+    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
+        recent=RecentPairs()
+    )
+
+
+def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
+    """Return the state with the consistency of the sensor of a group."""
+    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
+    return known.with_memory(fixes=fixes)

@@ -37,7 +37,7 @@ from ...measurements import (
 from ..navigation import NavigationBuffer
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
-from .innovations import FixConsistency
+from .innovations import FixConsistency, SensorConsistency
 from .instruments import Instruments
 from .known import Known
 from .names import LastNamed
@@ -50,6 +50,14 @@ STATE_TYPES = (
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(NavigationBuffer, Origin),
     *(Known, Rows, Borrowed, Gaussians, Tracks),
-    *(NisMemory, FixConsistency, HeightCounts, Instruments, BiasTest, RecentPairs),
+    *(
+        NisMemory,
+        FixConsistency,
+        SensorConsistency,
+        HeightCounts,
+        Instruments,
+        BiasTest,
+        RecentPairs,
+    ),
     *(Clutter, Clutters, LastNamed, Sensors),
 )

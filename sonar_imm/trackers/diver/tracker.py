@@ -67,7 +67,7 @@ from . import (
 from .config import DiverConfig
 from .coverage_map import configured_coverage
 from .georeferencing import Georeferencer
-from .innovations import FixConsistency
+from .innovations import SensorConsistency
 from .instruments import Instruments, Layout
 from .known import Feature, Known, predict_over
 from .models import build_models, ModelSet
@@ -165,7 +165,7 @@ class DiverTracker:
     def _empty_state(self, life: Tracks) -> Known:
         nobody = Known.empty(life, self.models, self.models.n, self.features)
         return nobody.with_memory(
-            fixes=FixConsistency(),
+            fixes=SensorConsistency(),
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
