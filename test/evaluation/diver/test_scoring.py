@@ -94,7 +94,7 @@ def test_raw_fixes_are_scored_beside_the_track():
 
 
 def test_track_and_fixes_are_compared_at_the_same_stamps():
-    """A track that begins late, and fixes of which one is an outlier: of single fixes all count."""
+    """A track that begins late, and an outlier: of single fixes all count."""
     estimates, truth, times = single_run(count=40)
     fixes = [
         Fix(stamp_ns=stamp, position=[*(place + [0.0, 2.0 if k < 20 else 1.0]), 0.0])
