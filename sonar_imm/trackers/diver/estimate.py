@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, clutter, depth, offsets
+from . import births, clutter, depth, offsets, polling
 from .config import DiverConfig
 from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known, row_outputs
@@ -129,11 +129,16 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         advice += ', or set instrument errors: ' + ', '.join(unset)
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
     exceeds = memory['excess'] >= ENOUGH
+    starving = polling.warnings(memory['single'], config)
+    # Of tracks that starve, nothing else is told by the fixes.
+    fixes = [] if starving else memory['fixes'].warnings(config.fix_bias_std > 0.0)
+    no_track = [] if starving else clutter.warnings(memory['clutter'], config, tracked)
     return [
-        *memory['fixes'].warnings(config.fix_bias_std > 0.0),
+        *starving,
+        *fixes,
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
-        *clutter.warnings(memory['clutter'], config, tracked),
+        *no_track,
     ]

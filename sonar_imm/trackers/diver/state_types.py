@@ -42,6 +42,7 @@ from .instruments import Instruments
 from .known import Known
 from .names import LastNamed
 from .offsets import BiasTest, RecentPairs
+from .polling import SingleFixes
 
 STATE_TYPES = (
     *STREAM_TYPES,
@@ -50,5 +51,5 @@ STATE_TYPES = (
     *(NavigationBuffer, Origin),
     *(Known, Rows, Borrowed, Gaussians, Tracks),
     *(NisMemory, FixConsistency, HeightCounts, Instruments, BiasTest, RecentPairs),
-    *(Clutter, Clutters, LastNamed),
+    *(Clutter, Clutters, LastNamed, SingleFixes),
 )

@@ -60,6 +60,7 @@ from . import (
     fixes,
     names,
     offsets,
+    polling,
     pruning,
     restart,
 )
@@ -126,6 +127,7 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            polling.remember_single_fixes,
             clutter.estimate_densities,
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
@@ -171,6 +173,7 @@ class DiverTracker:
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=clutter.Clutters(),
+            single=polling.SingleFixes(),
             last_named=names.LastNamed(),
         )
 
