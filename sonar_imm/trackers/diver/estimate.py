@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, clutter, depth, offsets, polling
+from . import arrival_stamps, births, clutter, depth, offsets, polling
 from .config import DiverConfig
 from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known, row_outputs
@@ -138,6 +138,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *fixes,
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
+        *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
         *no_track,

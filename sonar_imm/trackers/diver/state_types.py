@@ -35,6 +35,7 @@ from ...measurements import (
     VesselPose,
 )
 from ..navigation import NavigationBuffer
+from .arrival_stamps import ArrivalStamps, Resolution
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
 from .innovations import FixConsistency
@@ -52,4 +53,5 @@ STATE_TYPES = (
     *(Known, Rows, Borrowed, Gaussians, Tracks),
     *(NisMemory, FixConsistency, HeightCounts, Instruments, BiasTest, RecentPairs),
     *(Clutter, Clutters, LastNamed, SingleFixes),
+    *(ArrivalStamps, Resolution),
 )

@@ -52,6 +52,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
+    arrival_stamps,
     births,
     clutter,
     coverage,
@@ -174,6 +175,7 @@ class DiverTracker:
             instruments=Instruments(),
             clutter=clutter.Clutters(),
             single=polling.SingleFixes(),
+            stamps=arrival_stamps.ArrivalStamps(),
             last_named=names.LastNamed(),
         )
 
@@ -268,6 +270,10 @@ class DiverTracker:
         """Update the tracks by a ping, and store the births it shows."""
         from . import arrivals  # imported late: not needed for fixes
 
+        known, usable = arrival_stamps.with_resolution(known, ping, self.config)
+        if usable is None:
+            return known
+        ping = usable
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
