@@ -75,7 +75,7 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height
-        group.births.append(Birth(*place, group.rotation_sensor))
+        group.births.append(Birth(*place, group.rotation_sensor, group.number))
     return known
 
 
@@ -200,7 +200,7 @@ def spawn_stage(
 
     def with_tracks(known: Known, found: Sequence[Birth]) -> Known:
         layout = layouts(known)
-        for _, group in groupby(found, key=lambda birth: birth.seen_by and birth.seen_by[0]):
+        for _, group in groupby(found, key=_sensor_of):
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
             columns['learnt'] = chain.initial_counts(len(births))
@@ -225,6 +225,11 @@ def spawn_stage(
         return known
 
     return spawn
+
+
+def _sensor_of(birth: Birth) -> tuple[int, str | None]:
+    """Return the number of the sensor of a birth, and its name if it has a bearing error."""
+    return birth.number, birth.seen_by and birth.seen_by[0]
 
 
 def max_total_tracks(config: DiverConfig) -> int:
@@ -271,10 +276,11 @@ def birth_rows(
                     models.height,
                     config,
                 )
-    rows = models.make_rows(x, P, mu, logw)
+    rows = models.make_rows(x, P, mu, logw, births[0].number)
     for track, birth in enumerate(births):
         if birth.fit is not None:
-            rows = rows.replace_target(track, ranges.fitted_rows(birth.fit, models, layout))
+            own = ranges.fitted_rows(birth.fit, models, layout, birth.number)
+            rows = rows.replace_target(track, own)
         elif birth.ping is not None and birth.rows is not None:
             line = sides.line_of_ping(birth.ping, birth.rows, config)
             if line is not None:

@@ -69,12 +69,13 @@ from .scales import (
     weight_without_small_scales,
 )
 from .scan import Group
+from .sensors import MOST_SENSORS
 
 FEATURES = {
     'nis': Feature(math.nan),
     'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (2,)),
+    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
     'reported': Feature(math.nan, (3,)),
@@ -83,7 +84,7 @@ FEATURES = {
 
 score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
-white: whitened innovation of the last fix.
+white: whitened innovation of the last fix of each sensor.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
@@ -119,8 +120,14 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
 
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
-    among = Assumptions.from_rows(known.rows, known.borrowed)
+    among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
     blocks, parts = known.rows.blocks, models.parts
+    if among.delay.any():
+        every = np.concatenate([np.arange(len(known.rows)), among.lent])
+        blocks = tuple(
+            bank.move_along(block.select(every), part.outputs[2:4], -among.delay)
+            for block, part in zip(blocks, parts)
+        )
     expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
     by_nis = models.families is None
     each = [
@@ -169,7 +176,7 @@ def _compare_part(
     :param min_probability: of a model whose NIS counts; None if no NIS is needed.
     """
     rows, z, R = known.rows, group.z, group.R
-    among = Assumptions._make(column[part] for column in among)
+    among = among.select(part)
     track = among.target - (among.target[0] if len(among.target) else 0)
     off = _box_distance(expected, among, z, R)
     if len(z) > 1 and group.target_id is None:
@@ -181,7 +188,8 @@ def _compare_part(
         near = known['target_id'][np.unique(among.target), None] == group.target_id
     assumption, fix = np.nonzero(near[track])
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
-    compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
+    seen = among.seen[assumption]
+    compared = tuple(bank.compare(*each, seen, z[fix], scaled) for each in expected)
     log = _mixture_log_density(rows.mu[row], compared)
     table = np.square(np.maximum(off, 1.0, out=off), out=off)
     table *= -0.5 * FAR
@@ -208,9 +216,12 @@ def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> Flo
         )
 
 
-def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
-    """Return the log density of a fix z (2,), R (2, 2) under the rows of one track."""
-    every, scale = np.arange(len(rows)), rows.key['scale']
+def track_log_density(
+    rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet, sensor: int
+) -> float:
+    """Return the log density of a fix z (2,), R (2, 2) of a sensor under the rows of one new
+    track."""
+    every, scale = np.arange(len(rows)), rows.key['scale'][:, sensor]
     many = np.tile(z, (len(rows), 1)), R * scale[:, None, None]
     compared = [
         bank.weigh(block, every, *many, part.measured)
@@ -235,9 +246,9 @@ def _box_distance(
     widest = np.array([R[:, 0, 0].max(), R[:, 1, 1].max()])
     low, high = np.full((len(among.row), 2), np.inf), np.full((len(among.row), 2), -np.inf)
     for h, S in expected:
-        spread = S[among.row][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
+        spread = S[among.seen][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
         reach = np.sqrt(FAR * np.maximum(spread, 0.0))
-        place = h[among.row]
+        place = h[among.seen]
         low = np.minimum(low, (place - reach).min(axis=2))
         high = np.maximum(high, (place + reach).max(axis=2))
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-300)
@@ -403,8 +414,10 @@ def update_tracks(
     whole = pairs.track_log[track[used], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
     factor: FloatArray = np.add(missed[among.target], gain)
+    weighed = np.asarray(association.beta.any(axis=1))
     if rejected is not None:
         factor *= _rejected_factor(pairs, *rejected)
+        weighed = weighed | (rejected[1] > 0.0)
     rows, borrowed = _update_weights(known, among, factor)
     rows, borrowed, left = drop_weightless_rows(rows, borrowed, protected_rows(rows))
     # Pairs of the remaining rows, in row order.
@@ -415,17 +428,19 @@ def update_tracks(
     row, weight, whole = row[own], weight[own, None], whole[own, None]
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
-    blocks, factors = [], []
+    blocks, factors, late = [], [], rows.key['delay'][:, group.number]
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
-        innovations = bank.compare(*expected, among.row[assumption], z, R)
+        innovations = bank.compare(*expected, among.seen[assumption], z, R)
+        block = bank.move_along(block, part.outputs[2:4], -late)
         ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
         block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
-        blocks.append(block)
+        blocks.append(bank.move_along(block, part.outputs[2:4], late))
         factors.append(factor)
     sound, repairs = repair_covariances(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    rows, borrowed = restore_rows(rows, borrowed, can_restore(rows, borrowed))
+    again = can_restore(rows, borrowed) & weighed[borrowed.target]
+    rows, borrowed = restore_rows(rows, borrowed, again)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
@@ -490,36 +505,54 @@ def _record_innovations(
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
     if len(group.z):
-        covariances = group.is_stated, group.config.has_usual_fix_std
-        known = known.with_memory(fixes=known.memory['fixes'].with_covariances(*covariances))
+        known = _with_consistency(
+            known,
+            group,
+            known.memory['fixes']
+            .of(group.number)
+            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
+        )
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
     fix = association.fix[tracks]
     seen = tuple(part.fix_matrix for part in models.parts)
-    mean, covariance = known.rows.combine(
-        *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)
+    rows, late = known.rows, known.rows.key['delay'][:, group.number]
+    each = zip(rows.blocks, models.parts)
+    moved = tuple(bank.move_along(block, part.outputs[2:4], -late) for block, part in each)
+    mean, covariance = rows.combine(
+        *row_outputs(rows.replace(blocks=moved), seen), weight_without_small_scales(rows)
     )
     scale = (
-        estimated_scales(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
+        estimated_scales(known.rows, group.number)[tracks]
+        if len(models.scales) > 1
+        else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes']
+    before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
         covariance[tracks],
         group.z[fix],
         R,
-        known['white'][tracks],
+        known['white'][tracks, group.number],
         tentative,
         before,
     )
     after = after.with_scale(scale, tentative)
     columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
-    columns['white'][tracks] = white
+    columns['white'][tracks, group.number] = white
     columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.
-    return known.with_columns(**columns).with_memory(fixes=after, recent=RecentPairs())
+    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
+        recent=RecentPairs()
+    )
+
+
+def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
+    """Return the state with the consistency of the sensor of a group."""
+    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
+    return known.with_memory(fixes=fixes)

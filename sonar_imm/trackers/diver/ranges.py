@@ -207,7 +207,7 @@ def _single(ping: Arrivals) -> IntArray | None:
     return rows
 
 
-def fitted_rows(fit: Fit, models: ModelSet, layout: Layout) -> Rows:
+def fitted_rows(fit: Fit, models: ModelSet, layout: Layout, sensor: int) -> Rows:
     """Return the rows of a track: a side for each minimum of the fit."""
     table: Rows | None = None
     for k, (x, P, weight) in enumerate(zip(fit.x, fit.P, fit.weight)):
@@ -217,7 +217,7 @@ def fitted_rows(fit: Fit, models: ModelSet, layout: Layout) -> Rows:
             own = np.flatnonzero(models.families.kind == VELOCITY)
             at[:, :, own, :4], covariance[:, :, own, :4, :4] = x, P
         share = math.log(weight / models.rows_per_track)
-        rows = models.make_rows(at, covariance, states[2], np.full(at.shape[:2], share))
+        rows = models.make_rows(at, covariance, states[2], np.full(at.shape[:2], share), sensor)
         if models.families is not None:
             rows = _with_headings(rows, models, int(own[0]))
         key = {**rows.key, 'side': np.full(len(rows), k)}
