@@ -40,6 +40,7 @@ from attrs import evolve, Factory, frozen
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acoustics.envelopes import from_normal
 from ...acoustics.fathometer import sediment_thickness
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
@@ -65,7 +66,7 @@ from .slopes import (
 
 IdArray = NDArray[np.uint32]
 BOTTOM_REACH = 12.0
-"""How many `depth_std` the first return in scatter may jump and keep its id."""
+"""How many `depth_std` the floor may jump and keep its id."""
 PRIOR, OUTLIERS, RECORDS = 0.25, 0.05, 30
 MOST_WAYS = 200
 _NEAR = 6.0
@@ -107,12 +108,15 @@ class Identities:
         is_bottom: FloatArray,
         config: FathometerConfig,
         variance: FloatArray | None = None,
+        *,
+        floor_known: bool = False,
     ) -> tuple[Identities, IdArray]:
         """Ids (K,) for reflectors at `depth` (K,) of the next record, is_bottom (K,) the
-        probability of each to be the first return, variance (K,) of the depth, m^2."""
+        probability of each to be the floor, variance (K,) of the depth, m^2; floor_known: that is
+        more than which of them is the first."""
         ids = nearest_ids(depth, self.reflectors, config)
         bottom_id = self.bottom_id
-        if config.scatter_decay and len(depth):
+        if floor_known and len(depth):
             bottom_id = self._follow_bottom(depth, is_bottom, ids, config)
         new = np.flatnonzero(ids == 0)
         living = np.array([known.track_id for known in self.reflectors], np.uint32)
@@ -126,7 +130,7 @@ class Identities:
             for known in self.reflectors
             if known.track_id not in ids and known.missed < config.track_memory
         ]
-        if config.scatter_decay and len(depth) and not bottom_id:
+        if floor_known and len(depth) and not bottom_id:
             bottom_id = _id_of_bottom(ids, is_bottom)
         return Identities((*seen, *missed), next_id, bottom_id), ids
 
@@ -170,7 +174,7 @@ class Identities:
     def _follow_bottom(
         self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig
     ) -> int:
-        """Give the first return the id of the one before, and say which it has now, 0 for a new
+        """Give the floor the id of the one before, and say which it has now, 0 for a new
         one.
 
         Within the reach of a reflector it has that id before any other looks for the nearest.
@@ -243,8 +247,10 @@ def _commons(reflectors: Sequence[Identified], config: FathometerConfig) -> list
 @frozen(eq=False)
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
-    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
-    above it; heave and heave_std: stated minus true depth of the array, m, 0 where it is no state.
+    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability to be the floor,
+    without an envelope that nothing lies above it; above_bottom (K,): to lie above the floor, NaN
+    without an envelope; heave and heave_std: stated minus true depth of the array, m, 0 where it
+    is no state.
 
     What they share: the error of the array's depth, datum_std (m), a part of the covariance; and
     that of the speed of sound, speed_std (K,), m, the same share of the depth of each below the
@@ -256,6 +262,9 @@ class Reflectors:
     covariance: FloatArray
     existence: FloatArray
     is_bottom: FloatArray
+    above_bottom: FloatArray = Factory(
+        lambda self: np.full(len(self.depth), np.nan), takes_self=True
+    )
     speed_std: FloatArray = Factory(lambda self: np.zeros(len(self.depth)), takes_self=True)
     datum_std: float = 0.0
     heave: float = 0.0
@@ -282,32 +291,61 @@ def reflectors_of(
 ) -> Reflectors:
     """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
     heave: its mean and standard deviation, m, where it is a state."""
-    depth = lattice.first + lattice.step * members.place
-    sigma = np.interp(depth + (heave[0] if heave else 0.0), response.depth, response.sigma)
+    depth, lift = lattice.first + lattice.step * members.place, heave[0] if heave else 0.0
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
     covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse)
-    scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
+    amplitude, slope = members.amplitude, np.interp(depth + lift, response.depth, response.sigma)
+    is_bottom, above_bottom = members.foremost, np.full(len(depth), np.nan)
+    if response.floor is None:
+        amplitude = slope * amplitude
+    else:
+        # A normal number of an envelope, back in the unit of the trace.
+        rms = np.interp(depth + lift, response.depth, response.rms)
+        amplitude, slope = (rms * each for each in from_normal(amplitude))
+        is_bottom, above_bottom = response.floor.labels(depth + lift)
+    scale = np.stack([np.full(len(depth), lattice.step), slope], axis=-1)
     covariance *= scale[:, :, None] * scale[:, None, :]
     # The particles know depths as they follow from the depth stated with this record: it alone
     # fixes them to some centimetres, so that the errors of earlier records have no say.
     # Where it is a state, the places of the particles are spread by what is not known of it.
     if heave is None:
         covariance[:, 0, 0] += config.array_depth_std**2
-    # Where the depth of the array is not known, depths count from it.
-    height = depth + (heave[0] if heave else 0.0) - np.nan_to_num(response.reference_depth)
-    speed_std = np.abs(height) * config.sound_speed_std / config.sound_speed
     return Reflectors(
         depth,
-        sigma * members.amplitude,
+        amplitude,
         covariance,
         members.existence,
-        members.foremost,
-        speed_std,
+        is_bottom,
+        above_bottom,
+        _speed_std(depth + lift, response, config),
         heave[1] if heave else config.array_depth_std,
         *(heave or (0.0, 0.0)),
     )
+
+
+def _speed_std(depth: FloatArray, response: Response, config: FathometerConfig) -> FloatArray:
+    """What the error of the speed of sound makes of depths (K,), m."""
+    # Where the depth of the array is not known, depths count from it.
+    height = depth - np.nan_to_num(response.reference_depth)
+    return np.asarray(np.abs(height) * config.sound_speed_std / config.sound_speed)
+
+
+def bottom_columns(
+    reflectors: Reflectors, response: Response, config: FathometerConfig
+) -> dict[str, float]:
+    """Depth of the floor and its standard deviation, m, and how deep the transmit pulse reaches;
+    NaN where that is not known, as for all but envelopes."""
+    if response.floor is None:
+        return dict.fromkeys(('bottom_depth', 'bottom_depth_std', 'blanked'), np.nan)
+    depth, std = response.floor.depth
+    speed = _speed_std(np.array([depth]), response, config)[0]
+    return {
+        'bottom_depth': depth - reflectors.heave,
+        'bottom_depth_std': float(np.sqrt(std**2 + speed**2 + reflectors.datum_std**2)),
+        'blanked': response.floor.blanked,
+    }
 
 
 def _conditional_variance(
@@ -341,14 +379,15 @@ def sediment_depths(
     keeps its depth."""
     if not len(reflectors.depth):
         return np.empty(0), np.empty(0)
-    bottom = reflectors.depth[np.argmax(reflectors.is_bottom)]
+    row = int(np.argmax(np.nan_to_num(reflectors.is_bottom)))
+    bottom = reflectors.depth[row]
     time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
     speed = config.sediment_sound_speed or config.sound_speed
     thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
     speed_std = reflectors.speed_std
     if config.sediment_sound_speed:
         # Below the bottom the water's speed tells the time only, which is seen.
-        speed_std = np.minimum(speed_std, speed_std[np.argmax(reflectors.is_bottom)])
+        speed_std = np.minimum(speed_std, speed_std[row])
     variance = reflectors.covariance[:, 0, 0] + np.square(speed_std)
     variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
     depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
@@ -390,15 +429,18 @@ def write_estimate(
         'depth_relative_std': np.full(rows, np.nan),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
+        'above_bottom': np.full(rows, np.nan),
         'multiple_probability': np.full(rows, np.nan),
         'dipping': np.zeros(rows),
         'slope': np.zeros(rows),
         'slope_std': np.zeros(rows),
         'sediment_depth': np.full(rows, np.nan),
         'sediment_depth_std': np.full(rows, np.nan),
-        'sigma': np.full(rows, float(np.median(response.sigma))),
+        'sigma': np.full(rows, response.noise),
         'preview': np.full(rows, int(preview), np.uint8),
     }
+    for name, value in bottom_columns(reflectors, response, config).items():
+        extras[name] = np.full(rows, value)
     if len(ids):
         state[:] = np.column_stack([reflectors.depth, reflectors.amplitude])
         covariance[:] = reflectors.covariance
@@ -415,6 +457,7 @@ def write_estimate(
         for name, values in zip(('dipping', 'slope', 'slope_std'), slopes):
             extras[name][:] = values
         extras['is_bottom'][:] = reflectors.is_bottom
+        extras['above_bottom'][:] = reflectors.above_bottom
         found = sediment_depths(reflectors, config)
         extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found
     zero = np.zeros(rows)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...acoustics.pulse import SampledPulse
+from ...estimation.onset import OnsetState
 from ...estimation.set_filter import SetStep, Weighted
 from ...estimation.set_model import Sets
 from ...estimation.set_shifts import ShiftPath
@@ -28,11 +29,13 @@ from .reflectors import Identified, Identities, Multiples, Seen
 from .response import Lattice, Response
 from .slopes import Slope
 from .tracker import Taken
+from .water import SeenFloor
 
 STATE_TYPES = (
     *STREAM_TYPES,
     *(CrossSpectra, Pressure, Trace, Origin),
     *(Beginning, Pace, Response, SampledPulse, Lattice, Taken),
     *(SetStep, Weighted, Sets, ShiftPath),
+    *(SeenFloor, OnsetState),
     *(Identities, Identified, Slope, Multiples, Seen),
 )

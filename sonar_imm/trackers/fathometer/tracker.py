@@ -102,10 +102,10 @@ from .response import (
     rank_deficient,
     residual_sigma,
     Response,
-    scatter_of,
     trace_response,
 )
 from .slopes import slopes_followed
+from .water import Water
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
@@ -148,6 +148,7 @@ class FathometerTracker:
         '_health',
         '_fit',
         '_phones',
+        '_water',
     )
 
     response: Response | None
@@ -167,6 +168,7 @@ class FathometerTracker:
     _health: dict[str, float]
     _fit: Fit
     _phones: PhoneFaults
+    _water: Water
 
     def __init__(self, config: FathometerConfig):
         self.config = config
@@ -200,6 +202,7 @@ class FathometerTracker:
         self._health = {}
         self._fit = Fit()
         self._phones = PhoneFaults()
+        self._water = Water(self.config)
 
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
@@ -219,7 +222,7 @@ class FathometerTracker:
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
         heave_differs = config.array_depth_std != self.config.array_depth_std
-        self.config = config
+        self.config = self._water.config = config
         if self._lattice is not None:
             self._settled = config.settled(self._lattice.hydrophones)
         if config.heave != 'none' and heave_differs:
@@ -264,7 +267,8 @@ class FathometerTracker:
                 f'in {heaving} records the array heaves by more than {MOST_HEAVE:g} m: their '
                 'echoes are weaker than they should be'
             )
-        return [*found, *self._phones.warnings(), *self._fit.warnings(self.config)]
+        found += self._phones.warnings() + self._water.warnings()
+        return [*found, *self._fit.warnings(self.config)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -296,7 +300,8 @@ class FathometerTracker:
                 self._begin(lattice_of_trace(item, self.config))
             assert self._padded is not None
             reference = math.nan if depth is None else depth
-            return self._record(trace_response(item, self._padded, self.config, reference))
+            response = trace_response(item, self._padded, self.config, reference, self._water)
+            return self._record(response)
         self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
             return self._record(self._array_response(Collected(item, item.snapshots), 0))
@@ -388,7 +393,6 @@ class FathometerTracker:
             amplitude_memory=config.amplitude_memory,
             negative_probability=config.negative_share,
             shift=heave_shift(config, step),
-            scatter=scatter_of(config, lattice),
             start=independent_orders(config.order_min, config.orders),
         )
 
@@ -445,7 +449,9 @@ class FathometerTracker:
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
         variance = reflectors.covariance[:, 0, 0]
-        return known.name(reflectors.depth, reflectors.is_bottom, self.config, variance)
+        floor_known = bool(self._water.active)
+        bottom = reflectors.is_bottom
+        return known.name(reflectors.depth, bottom, self.config, variance, floor_known=floor_known)
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step, records, self._pace = self._filtered(response)
@@ -462,7 +468,7 @@ class FathometerTracker:
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,
-            sigma=float(np.median(response.sigma)),
+            sigma=response.noise,
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
         positive = self._settled.polarity == 'positive'
@@ -534,7 +540,7 @@ class FathometerTracker:
         pmf, sums, shift = self._filter.summarise(step)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
-        modes = bool(self.config.scatter_decay)
+        modes = bool(self._water.active)
         members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
         if shift:
