@@ -225,6 +225,9 @@ class FathometerConfig(StampParameters):
     # -- output -----------------------------------------------------------------------------------
     existence_min: float = live(0.5, '',
         'least probability of existence with which a reflector is reported', range=(0.0, 1.0))
+    detectable_sigmas: float = live(4.0, '',
+        'amplitude, in units of the noise, above which reflectors are surely held: the columns '
+        'prob_detectable_k are of the number of those above it', range=(0.1, 1000.0))
     multiples: str = live('mark', '',
         'whether reflectors get a probability of being multiples of others, from their depths '
         'below the surface: mark or off; they are never left out', choices=MULTIPLES)

@@ -24,8 +24,9 @@ from ...estimation.set_model import Sets
 from ...estimation.set_shifts import ShiftPath
 from ...intake.stream import STREAM_TYPES
 from ...measurements import CrossSpectra, Pressure, Trace
+from .multiples import Multiples, Seen
 from .pressure import Beginning, Pace
-from .reflectors import Identified, Identities, Multiples, Seen
+from .reflectors import Identified, Identities
 from .response import Lattice, Response
 from .slopes import Slope
 from .tracker import Taken

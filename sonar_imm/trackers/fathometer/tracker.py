@@ -69,6 +69,7 @@ from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .fit import Fit
+from .multiples import Multiples, seen_as
 from .phones import PhoneFaults
 from .pressure import (
     Collected,
@@ -82,11 +83,9 @@ from .reflectors import (
     IdArray,
     Identified,
     Identities,
-    Multiples,
     nearest_ids,
     Reflectors,
     reflectors_of,
-    seen_as,
     write_estimate,
 )
 from .response import (
@@ -449,9 +448,14 @@ class FathometerTracker:
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
         variance = reflectors.covariance[:, 0, 0]
-        floor_known = bool(self._water.active)
-        bottom = reflectors.is_bottom
-        return known.name(reflectors.depth, bottom, self.config, variance, floor_known=floor_known)
+        return known.name(
+            reflectors.depth,
+            reflectors.is_bottom,
+            self.config,
+            variance,
+            strength=reflectors.strength,
+            floor_known=bool(self._water.active),
+        )
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step, records, self._pace = self._filtered(response)
@@ -529,9 +533,8 @@ class FathometerTracker:
             span = self._lattice.step * self._lattice.cells
             seen = seen_as(reflectors, ids, self._settled, records)
             multiple = self._multiples.probabilities(seen, self._settled, span)
-        slopes = known.slopes(ids)
         return write_estimate(
-            reflectors, ids, pmf, multiple, slopes, response, self.config, preview=preview
+            reflectors, ids, pmf, multiple, known, response, self.config, preview=preview
         )
 
     def _summarise(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
