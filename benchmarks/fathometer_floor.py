@@ -42,7 +42,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.trackers.fathometer.water import Water
-from sonar_imm_tools.recordings.convert.segy import read_segy
+from sonar_imm_tools.recordings.segy_lines import read_segy
 
 STEP, SAMPLES, RECORDS, PULSE, NOISE = 0.05, 400, 120, 0.15, 0.02
 SETTLED, APART, SPACING = 10, 0.75, 0.376
