@@ -29,7 +29,7 @@ POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
 PHONE_CORRECTIONS = ('off', 'gains', 'full')
 WATERS = ('auto', 'off')
-HEAVES = ('none', 'independent', 'memory')
+HEAVES = ('auto', 'none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
 MVDR_GAIN = 3.0
 """By how much further echoes stand out with mvdr than with the conventional processor."""
@@ -60,10 +60,11 @@ class FathometerConfig(StampParameters):
         'standard deviation of the stated depth of the array, a part of the error of every '
         'reflector; 0: depths are judged as seen from the array', range=(0.0, 1000.0))
 
-    heave: str = parameter('none', '',
+    heave: str = parameter('auto', '',
         'whether the error of the stated depth of the array (array_depth_std) is a state that all '
         'reflectors share: none; independent (a new error in each record); memory (correlated by '
-        'heave_memory)', choices=HEAVES)
+        'heave_memory); auto: none until the reflectors of an array move together by more than '
+        'twice of it, then independent with the error that was found', choices=HEAVES)
     heave_memory: float = parameter(0.9, '',
         'heave memory: share of the error of the array depth that stays from record to record',
         range=(0.01, 0.99))
@@ -257,7 +258,7 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
-        if self.heave != 'none' and not self.array_depth_std:
+        if self.heave in ('independent', 'memory') and not self.array_depth_std:
             problems.append(f'heave {self.heave} needs array_depth_std')
         if self.particles * self.order_max > MAX_MEMBERS:
             problems.append(

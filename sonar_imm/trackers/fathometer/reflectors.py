@@ -316,9 +316,11 @@ def reflectors_of(
     pulse: Pulse,
     config: FathometerConfig,
     heave: tuple[float, float] | None = None,
+    array_depth_found: float = 0.0,
 ) -> Reflectors:
     """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
-    heave: its mean and standard deviation, m, where it is a state."""
+    heave: its mean and standard deviation, m, where it is a state; array_depth_found: error of the
+    array's depth, m, that counts where it is more than what is told."""
     depth, lift = lattice.first + lattice.step * members.place, heave[0] if heave else 0.0
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
@@ -338,8 +340,9 @@ def reflectors_of(
     # The particles know depths as they follow from the depth stated with this record: it alone
     # fixes them to some centimetres, so that the errors of earlier records have no say.
     # Where it is a state, the places of the particles are spread by what is not known of it.
+    datum_std = max(config.array_depth_std, array_depth_found)
     if heave is None:
-        covariance[:, 0, 0] += config.array_depth_std**2
+        covariance[:, 0, 0] += datum_std**2
     return Reflectors(
         depth,
         amplitude,
@@ -349,7 +352,7 @@ def reflectors_of(
         members.amplitude,
         above_bottom,
         _speed_std(depth + lift, response, config),
-        heave[1] if heave else config.array_depth_std,
+        heave[1] if heave else datum_std,
         *(heave or (0.0, 0.0)),
     )
 
@@ -439,6 +442,7 @@ def write_estimate(
     response: Response,
     config: FathometerConfig,
     *,
+    array_depth_found: float = 0.0,
     preview: bool = False,
 ) -> Estimate:
     """One row per reflector, multiple (K,) the probability that it is a multiple, known: with the
@@ -470,6 +474,7 @@ def write_estimate(
         name: np.full(rows, value)
         for name, value in {
             **bottom_columns(reflectors, response, config),
+            'array_depth_found': array_depth_found,
             'detectable_amplitude': detectable_amplitude(response, config),
         }.items()
     }
