@@ -23,11 +23,14 @@ from typing import ClassVar
 from attrs import define, field
 import numpy as np
 
+from ...acoustics.pulse import Pulse
 from .config import FathometerConfig
 from .reflectors import Reflectors
 from .response import Response
 
 _RECORDS, _LEAST = 100, 10
+_DEEP, _OF_STRONGEST = 6.0, 0.25
+"""How deep a negative echo is, in sigma and of the strongest one."""
 _FULL, _UNEXPLAINED, _NEGATIVE, _LEFT, _NONE = 0.5, 0.05, 1e-9, 0.5, 0.2
 
 
@@ -119,3 +122,17 @@ class Fit:
                 'an array with pulse processor'
             )
         return sentences
+
+
+def left_negative(
+    reflectors: Reflectors, response: Response, pulse: Pulse, config: FathometerConfig
+) -> bool:
+    """Whether a negative echo is left where no reflector is, that no side lobe explains."""
+    with np.errstate(all='ignore'):
+        b = response.amplitude / response.sigma
+    least = max(_DEEP, _OF_STRONGEST * float(b.max()))
+    deep = np.flatnonzero(b < -least)
+    away = response.depth[deep, None] - reflectors.depth - reflectors.heave
+    echoes = pulse(away) @ reflectors.amplitude
+    left = b[deep] - echoes / response.sigma[deep] < -least
+    return bool(np.any(left & (np.abs(away) > config.min_separation).all(axis=1)))

@@ -25,6 +25,7 @@ there is depend on the instrument; the rest is common (`envelope_parameters`).
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -56,6 +57,8 @@ MAX_CELLS = 100_000
 MAX_MOVES = 8_000_000
 """Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
 tables of moves, 32 where reflectors of either sign are looked for."""
+LEAST_SHIFT, MORE_ROOM = 0.02, 0.25
+"""Shares of the window of a trace: by how much it shifts to count, and what room is made."""
 MAX_SIGMAS = 1e6
 LOUDEST = 1e100
 """Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
@@ -157,6 +160,22 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
         step = trace.step / np.ceil(0.5 * trace.step / config.depth_std)
     first = trace.depth[0] + step * np.ceil((low - trace.depth[0]) / step - 1e-6)
     return _checked(float(first), float(step), min(high, float(trace.depth[-1])), config)
+
+
+def widened(lattice: Lattice, trace: Trace, config: FathometerConfig) -> Lattice | None:
+    """Lattice with room for a trace whose window has shifted, None where it has room, or depths
+    are configured. Raises `Rejection` for too many depths."""
+    low, high = float(trace.depth[0]), float(trace.depth[-1])
+    last = lattice.first + lattice.step * (lattice.cells - 1)
+    least = max(lattice.step, LEAST_SHIFT * (high - low))
+    if config.depth_max or (low > lattice.first - least and high < last + least):
+        return None
+    # More than it takes: the window may go on shifting.
+    room = MORE_ROOM * (high - low)
+    above = math.ceil((lattice.first - low + room) / lattice.step) if low < lattice.first else 0
+    end = high + room if high > last else last
+    first = lattice.first - max(above, 0) * lattice.step
+    return evolve(_checked(first, lattice.step, end, config), hydrophones=lattice.hydrophones)
 
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:

@@ -69,7 +69,7 @@ from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .datum import DatumError
-from .fit import Fit
+from .fit import Fit, left_negative
 from .multiples import Multiples, seen_as
 from .phones import PhoneFaults
 from .pressure import (
@@ -103,6 +103,7 @@ from .response import (
     residual_sigma,
     Response,
     trace_response,
+    widened,
 )
 from .slopes import slopes_followed
 from .water import Water
@@ -110,8 +111,6 @@ from .water import Water
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
 LONGEST_GAP = 5000
-_DEEP, _OF_STRONGEST = 6.0, 0.25
-"""How deep a negative echo is, in sigma and of the strongest one."""
 
 
 @frozen(eq=False)
@@ -306,6 +305,11 @@ class FathometerTracker:
             depth = self._array_depth(item, 0)
             if self._lattice is None:
                 self._begin(lattice_of_trace(item, self._own))
+            elif wider := widened(self._lattice, item, self._own):
+                self._begin_anew(wider)
+                if self._water.active:
+                    own = wider.depth
+                    self._water.widen(float(own[0]), float(own[-1]))
             assert self._padded is not None
             reference = math.nan if depth is None else depth
             response = trace_response(item, self._padded, self._own, reference, self._water)
@@ -495,7 +499,9 @@ class FathometerTracker:
             order=float(self._own.order_min + int(np.argmax(pmf))),
         )
         positive = self._settled.polarity == 'positive'
-        negative = positive and self._left_negative(reflectors, response)
+        negative = positive and left_negative(
+            reflectors, response, response.pulse or self.pulse, self._own
+        )
         self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self._own)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
@@ -523,20 +529,17 @@ class FathometerTracker:
             self._own = datum.effective(self.config)
             self._begin(lattice)
             return
+        self._forget_sets()
+
+    def _begin_anew(self, lattice: Lattice) -> None:
+        """Go on with other depths. The reflectors keep their ids."""
+        self._begin(lattice)
+        self._forget_sets()
+
+    def _forget_sets(self) -> None:
         self._before = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken.clear()
-
-    def _left_negative(self, reflectors: Reflectors, response: Response) -> bool:
-        """Whether a negative echo is left where no reflector is, that no side lobe explains."""
-        with np.errstate(all='ignore'):
-            b = response.amplitude / response.sigma
-        least = max(_DEEP, _OF_STRONGEST * float(b.max()))
-        deep = np.flatnonzero(b < -least)
-        away = response.depth[deep, None] - reflectors.depth - reflectors.heave
-        echoes = (response.pulse or self.pulse)(away) @ reflectors.amplitude
-        left = b[deep] - echoes / response.sigma[deep] < -least
-        return bool(np.any(left & (np.abs(away) > self._own.min_separation).all(axis=1)))
 
     def _preview(self, response: Response) -> Estimate:
         response, step, records, _ = self._filtered(response)

@@ -219,6 +219,17 @@ class Water:
         self.first, self.step = float(trace.depth[below[0]]), trace.step
         self.cells = len(below)
 
+    def widen(self, first: float, last: float) -> None:
+        """Look at the line anew, at the depths from `first` to `last`, m, too."""
+        step, low = self.step, max(first, self.config.blanking)
+        above = max(0, math.ceil((self.first - low) / step - 1e-6))
+        cells = max(self.cells, math.floor((last - self.first) / step + 1e-6) + 1)
+        fresh = Water(self.config)
+        fresh.active, fresh.step = True, step
+        fresh.first, fresh.cells = self.first - above * step, cells + above
+        for name in self.STATE:
+            setattr(self, name, getattr(fresh, name))
+
     @property
     def depth(self) -> FloatArray:
         """Depths (n,) that traces are put on, m."""
@@ -349,6 +360,8 @@ class Water:
         begin = onset + math.ceil(5.0 * self._pulse) + 2
         if onset < 0 or not np.isfinite(trace[begin:]).any():
             return
+        if not np.nanmax(trace[begin:]) > np.nanmax(trace[onset:begin], initial=0.0):
+            return  # nothing of it is louder: noise lies anywhere
         mean = float(self._state.onset[:-1] @ np.arange(len(self._state.onset) - 1))
         below = begin + int(np.nanargmax(trace[begin:]))
         self._beside = np.vstack([self._beside[1 - STILL_RECORDS :], [mean, below]])

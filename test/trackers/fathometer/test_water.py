@@ -139,6 +139,27 @@ def test_missing_samples_and_other_depths_are_taken():
     assert np.mean([each['is_bottom'].max() > 0.9 for each in rows[9:]]) > 0.9
 
 
+def test_a_window_that_shifts_is_followed_under_the_same_ids():
+    """The recording delay of a line that gets deeper is changed once: 8 m of 12 m are new."""
+    traces, floor = line(9, records=60)
+    shifted = []
+    for k, each in enumerate(traces):
+        deeper = 0.1 * k
+        first = 6.0 if k < 30 else 9.0
+        depth = np.arange(first, first + 12.0, 0.05)
+        amplitude = np.interp(depth, each.depth + deeper, each.amplitude, right=0.02)
+        shifted.append(Trace(stamp_ns=each.stamp_ns, depth=depth, amplitude=amplitude))
+    options = {'noise_sigma': 0.02, 'pulse': 'gaussian', 'pulse_width': 0.15, 'particles': 1000}
+    tracker, rows = run(shifted, **options)
+    assert tracker.counts['used'] == 60 and not tracker.counts['other_depths']
+    named = set()
+    for k, row in enumerate(rows):
+        near = np.abs(row['depth'] - floor[k] - 0.1 * k) < 0.5
+        assert near.any() and row['is_bottom'][near].max() > 0.5
+        named |= set(row['track_id'][near].tolist())
+    assert len(named) == 1
+
+
 def test_a_short_trace_is_no_line():
     water = Water(FathometerConfig())
     water.begin(Trace(stamp_ns=1, depth=np.arange(10.0), amplitude=np.ones(10)))
