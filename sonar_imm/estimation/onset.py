@@ -62,7 +62,7 @@ class OnsetState:
     """Posterior of the onset (n,), the last cell for none, and of the transmit pulse (R,)."""
 
     onset: Annotated[FloatArray, 'n']
-    ring: Annotated[FloatArray, 'R']
+    ring: Annotated[FloatArray, 'r']
 
     @property
     def found(self) -> int:

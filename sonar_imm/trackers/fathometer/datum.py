@@ -35,7 +35,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from .config import FathometerConfig
 
-CHANGES, LEAST = 40, 15
+CHANGES, LEAST, MOST = 40, 15, 1000.0
 _MAD, _FAR, _LEAST_FAR = 1.4826, 4.0, 0.08
 _TIMES, _LEAST_ERROR = 2.0, 0.05
 
@@ -55,12 +55,17 @@ class DatumError:
         if not self.followed:
             self._changes = np.append(self._changes[1 - CHANGES :], change)
 
+    def require(self) -> None:
+        """Raise ValueError where the state, which may come from a file, is impossible."""
+        if not (np.isfinite(self._changes).all() and 0.0 <= self.followed <= MOST):
+            raise ValueError('no array is as deep as that')
+
     @property
     def found(self) -> float:
         """Standard deviation, m; 0 while it is not known."""
         if self.followed:
             return self.followed
-        return found_std(self._changes) if len(self._changes) >= LEAST else 0.0
+        return min(found_std(self._changes), MOST) if len(self._changes) >= LEAST else 0.0
 
     def exceeds(self, config: FathometerConfig) -> bool:
         """Whether the error is far greater than what is told."""

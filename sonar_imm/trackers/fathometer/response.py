@@ -118,7 +118,7 @@ class Response:
     pulse: SampledPulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
     noise_wraps: bool = False
-    phones: Annotated[FloatArray, '4,M'] = field(factory=lambda: np.empty((4, 0)), repr=False)
+    phones: Annotated[FloatArray, '4m'] = field(factory=lambda: np.empty((4, 0)), repr=False)
     rms: Annotated[FloatArray, 'r'] = field(factory=lambda: np.empty(0), repr=False)
     floor: SeenFloor | None = field(default=None, repr=False)
 
@@ -163,12 +163,14 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
 
 
 def widened(lattice: Lattice, trace: Trace, config: FathometerConfig) -> Lattice | None:
-    """Lattice with room for a trace whose window has shifted, None where it has room, or depths
-    are configured. Raises `Rejection` for too many depths."""
+    """Lattice with room for a trace whose window has shifted, None where it has room, lies further
+    away than it is long, or depths are configured. Raises `Rejection` for too many depths."""
     low, high = float(trace.depth[0]), float(trace.depth[-1])
     last = lattice.first + lattice.step * (lattice.cells - 1)
     least = max(lattice.step, LEAST_SHIFT * (high - low))
     if config.depth_max or (low > lattice.first - least and high < last + least):
+        return None
+    if low > 2.0 * last - lattice.first or high < 2.0 * lattice.first - last:
         return None
     # More than it takes: the window may go on shifting.
     room = MORE_ROOM * (high - low)
@@ -278,6 +280,9 @@ def _envelope_response(
     trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float, water: Water
 ) -> Response:
     """An envelope as normal numbers against its noise and the scatter below its floor."""
+    known = trace.amplitude[np.isfinite(trace.amplitude)]
+    if not np.ptp(known) > 0.0:
+        raise Rejection('no_noise', 'the record has no noise to compare its peaks with')
     b, scale, floor = water.take(trace)
     depth, own = lattice.depth, water.depth
     pulse = None

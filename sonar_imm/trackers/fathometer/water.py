@@ -193,7 +193,7 @@ class Water:
     first: float = field(init=False, default=0.0)
     step: float = field(init=False, default=0.0)
     cells: int = field(init=False, default=0)
-    _traces: Annotated[FloatArray, 'T,n'] = field(init=False, factory=lambda: np.empty((0, 0)))
+    _traces: Annotated[FloatArray, 'tn'] = field(init=False, factory=lambda: np.empty((0, 0)))
     _count: int = field(init=False, default=0)
     _noise: Annotated[FloatArray, 'n'] = field(init=False, factory=lambda: np.empty(0))
     _loudest: float = field(init=False, default=1.0)
@@ -206,7 +206,7 @@ class Water:
     _seen: float = field(init=False, default=0.0)
     _noted: int = field(init=False, default=0)
     _dry: int = field(init=False, default=0)
-    _beside: Annotated[FloatArray, 'K,2'] = field(init=False, factory=lambda: np.empty((0, 2)))
+    _beside: Annotated[FloatArray, 'k2'] = field(init=False, factory=lambda: np.empty((0, 2)))
 
     def begin(self, trace: Trace) -> None:
         """Lay out the depths by the first trace of a line, and see whether it is an envelope."""
@@ -218,6 +218,26 @@ class Water:
             return
         self.first, self.step = float(trace.depth[below[0]]), trace.step
         self.cells = len(below)
+
+    def require(self) -> None:
+        """Raise ValueError where the state, which may come from a file, does not fit itself."""
+        n = self.cells
+        good = not self.active or (n >= LEAST_SAMPLES and 0.0 < self.step < math.inf)
+        good = good and math.isfinite(self.first) and self._traces.shape[1] in (0, n)
+        numbers = self._pulse, self._lead, self._lead_std, self._loudest, self._seen
+        good = good and all(math.isfinite(number) and number >= 0.0 for number in numbers)
+        good = good and self._pulse > 0.0 and min(self._count, self._ring, self._noted) >= 0
+        if self._state is not None:
+            seen = len(self._state.onset)
+            good = good and len(self._noise) == n == len(self._scatter) and 2 <= seen <= n
+            good = good and bool((self._noise > 0.0).all() and np.isfinite(self._noise).all())
+            good = good and bool((self._scatter >= 0.0).all() and np.isfinite(self._scatter).all())
+            longest = len(self._chain().start().ring)
+            good = good and len(self._state.ring) == longest
+            for p in (self._state.onset, self._state.ring):
+                good = good and bool((p >= 0.0).all()) and math.isclose(float(p.sum()), 1.0)
+        if not good:
+            raise ValueError('the water is of no line')
 
     def widen(self, first: float, last: float) -> None:
         """Look at the line anew, at the depths from `first` to `last`, m, too."""
