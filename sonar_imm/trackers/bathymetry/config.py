@@ -45,8 +45,18 @@ DEFAULT_STAY, BANK_STAY = 0.995, 0.998
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 BANKS = ('height_bank', 'scatter_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
-MODEL_SETS = ('height_rw_ncs', *SCALAR_SETS)
-"""The sets of one state, which the grid engine can run."""
+MODEL_SETS = ('terrain', 'height_rw_ncs', *SCALAR_SETS)
+"""`SCALAR_SETS`: those of one state, which the grid engine can run."""
+TERRAIN_MODELS = 9
+OF_OTHER_SETS = (
+    'sigmas',
+    'sigmas_deg',
+    'scatters',
+    'transition_matrix',
+    'stay_probability',
+    'initial_probabilities',
+)
+"""Parameters that `terrain` does not take."""
 NAVIGATION = ('auto', 'required', 'ignored')
 LAYOVER = ('ignored', 'gated', 'resolved')
 
@@ -151,8 +161,9 @@ class BathymetryConfig(MountingParameters):
 
     # -- computation -----------------------------------------------------------------------------
     engine: str = live('auto', '',
-        'particles, or grid (exact, without Monte Carlo noise, for sets of one state); auto: grid '
-        'for height_bank and scatter_bank, else particles', choices=('auto', 'particles', 'grid'))
+        'gaussian (for terrain alone), particles, or grid (exact, without Monte Carlo noise, for '
+        'sets of one state); auto: gaussian for terrain, grid for height_bank and scatter_bank, '
+        'else particles', choices=('auto', 'gaussian', 'particles', 'grid'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
     grid_step: float = live(0.0, '',
@@ -163,8 +174,8 @@ class BathymetryConfig(MountingParameters):
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
-        'states (forward-backward on the grid: everything); auto: states for height_bank and '
-        'scatter_bank on the grid, which find little without, else none',
+        'states (outward and inward, everything: terrain and the grid); auto: states for terrain, '
+        'and for height_bank and scatter_bank on the grid, which find little without, else none',
         choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
         'strength with which the model labels of neighbouring pings influence each other; 0: not '
@@ -215,7 +226,9 @@ class BathymetryConfig(MountingParameters):
     def check(self) -> list[str]:
         problems = super().check() + self._ship_problems() + self._check_sigmas()
         models = self.model_count()
-        if self.model_set == 'scatter_bank':
+        if self.is_terrain:
+            problems += self._terrain_problems()
+        elif self.model_set == 'scatter_bank':
             problems += self._scatter_problems()
         else:
             problems += chain_problems(
@@ -223,17 +236,22 @@ class BathymetryConfig(MountingParameters):
             )
             if self.scatters:
                 problems.append('scatters is for scatter_bank only')
-        if self.runs_on_grid and self.model_set not in SCALAR_SETS:
+        if self.engine == 'gaussian' and not self.is_terrain:
+            problems.append('engine gaussian is for model_set terrain only')
+        if self.runs_on_grid and self.model_set not in (*SCALAR_SETS, 'terrain'):
             problems.append(
                 f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
                 f'{self.model_set} has two'
             )
-        if self.smoothing == 'states' and not self.runs_on_grid:
-            problems.append('smoothing of the states needs engine grid; particles smooth modes')
+        if self.smoothing == 'states' and not (self.runs_on_grid or self.is_terrain):
+            problems.append(
+                'smoothing of the states needs model_set terrain or engine grid; particles smooth '
+                'modes'
+            )
         if self.ping_coupling > 0.0 and self.smoothing_used == 'none':
             problems.append(
-                'ping_coupling needs what a whole ping says of each bin: smoothing states (engine '
-                'grid) or modes'
+                'ping_coupling needs what a whole ping says of each bin: smoothing states (model '
+                'set terrain, or engine grid) or modes'
             )
         if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
             problems.append(
@@ -257,6 +275,15 @@ class BathymetryConfig(MountingParameters):
                 )
         return problems
 
+    def _terrain_problems(self) -> list[str]:
+        given = [name for name in OF_OTHER_SETS if getattr(self, name)]
+        problems = [f'terrain has models of its own: it takes no {name}' for name in given]
+        if self.engine not in ('auto', 'gaussian'):
+            problems.append(f'terrain runs on engine gaussian, not on {self.engine}')
+        if self.smoothing == 'modes':
+            problems.append('terrain smooths states, or nothing (none)')
+        return problems
+
     def _scatter_problems(self) -> list[str]:
         problems = []
         if self.transition_matrix or self.initial_probabilities:
@@ -276,6 +303,8 @@ class BathymetryConfig(MountingParameters):
         return problems
 
     def _check_sigmas(self) -> list[str]:
+        if self.is_terrain:
+            return []
         if self.model_set == 'angle_two_rw':
             problems = ['angle_two_rw takes sigmas_deg, not sigmas'] if self.sigmas else []
             if len(self.sigmas_deg) not in (0, 3):
@@ -320,11 +349,17 @@ class BathymetryConfig(MountingParameters):
         return self.engine == 'grid' or (self.engine == 'auto' and self.in_bank)
 
     @property
+    def is_terrain(self) -> bool:
+        """Whether the models are those of `terrain`, and the engine the Gaussian one."""
+        return self.model_set == 'terrain'
+
+    @property
     def smoothing_used(self) -> str:
         """``none``, ``modes`` or ``states``."""
         if self.smoothing != 'auto':
             return self.smoothing
-        return 'states' if self.in_bank and self.runs_on_grid else 'none'
+        whole = self.is_terrain or (self.in_bank and self.runs_on_grid)
+        return 'states' if whole else 'none'
 
     @property
     def stay_used(self) -> float:
@@ -355,5 +390,7 @@ class BathymetryConfig(MountingParameters):
         """Number of models in the set these parameters describe."""
         if self.model_set == 'angle_two_rw':
             return 2
+        if self.is_terrain:
+            return TERRAIN_MODELS
         smooth = 2 if self.model_set == 'scatter_bank' else 0
         return smooth + len(self.sigmas_used)

@@ -15,10 +15,10 @@
 """One ping, from the snapshot to the estimate: no ping needs another one, so these are functions.
 
 `look` says which bins hold an echo and which models there are, `run` runs the models along the
-ping, by particles or on a grid, and `summarise` makes the answer, a table and what to count. The
-same numbers come out wherever and whenever a ping is computed; a recording's pings can be shared
-out over processes. Particles and grid take the same models and the same likelihood, and give the
-same answer up to the Monte Carlo noise of the particles.
+ping, by Gaussian filters, by particles or on a grid, and `summarise` makes the answer, a table and
+what to count. The same numbers come out wherever and whenever a ping is computed; a recording's
+pings can be shared out over processes. All take the same likelihood. Particles and grid take the
+same models too, and give the same answer up to the Monte Carlo noise of the particles.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, grid_cells, TerrainModels
+from .terrain import run_terrain
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
@@ -103,14 +104,15 @@ class Ping:
 @frozen(eq=False)
 class Look:
     """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
-    noise; layover: None where it is ignored; floor_below: how far below the array the floor is
-    said to be, m."""
+    noise; loudest (T,): direction sine from which each bin is; layover: None where it is ignored;
+    floor_below: how far below the array the floor is said to be, m."""
 
     ping: Ping
     swath: Swath
     models: TerrainModels
     likelihood: PingLikelihood
     loud: BoolArray
+    loudest: FloatArray
     layover: Layover | None
     floor_below: float
 
@@ -157,11 +159,11 @@ def look(ping: Ping) -> Look:
     """The likelihood of each bin, and the models for it."""
     config = ping.config
     swath, floor_below = _swath(ping)
-    likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
+    likelihood, loud, loudest = ping_likelihood(ping.snapshot, config, swath, floor_below)
     first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
     second = _layover(ping, swath, likelihood)
-    return Look(ping, swath, models, likelihood, loud, second, floor_below)
+    return Look(ping, swath, models, likelihood, loud, loudest, second, floor_below)
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
@@ -185,7 +187,11 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     config, models, likelihood = seen.config, seen.models, seen.likelihood
     if favour is not None:
         models = evolve(models, favour=favour)
-    if config.runs_on_grid:
+    if config.is_terrain:
+        peak = seen.swath.height_from(seen.loudest)
+        smooth = config.smoothing_used == 'states'
+        track = with_constants(run_terrain(models, likelihood, peak, smooth=smooth), likelihood)
+    elif config.runs_on_grid:
         cells = grid_cells(config, models)
         track = run_grid(models, likelihood, cells, smooth=config.smoothing_used == 'states')
     else:
@@ -239,7 +245,7 @@ def run_particles(
             )
             if watch is not None:
                 watch(first + b, particles)
-    return _with_constants(track, ping)
+    return with_constants(track, ping)
 
 
 def filter_bins(
@@ -292,18 +298,18 @@ def run_grid(
         kept = filter_scatter(p, moves, ping, window, track, smooth)
         if smooth:
             smooth_scatter(kept, window, moves, ping, track)
-        return _with_constants(track, ping)
+        return with_constants(track, ping)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:
         smooth_ping(kept, window, motion, ping, track)
-    return _with_constants(track, ping)
+    return with_constants(track, ping)
 
 
 def _empty(T: int, M: int, n: int) -> Track:
     return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
 
 
-def _with_constants(track: Track, ping: PingLikelihood) -> Track:
+def with_constants(track: Track, ping: PingLikelihood) -> Track:
     """The same with log likelihoods of the samples, not only of what depends on the state."""
     constant = np.where(ping.echo, ping.constant, 0.0)
     return track._replace(log_likelihood=track.log_likelihood + constant)
@@ -426,7 +432,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'label_probability': track.probability[np.arange(len(label)), label],
         **_label_columns(seen, track, floor),
     }
-    if config.in_bank:
+    if config.in_bank or config.is_terrain:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     extras |= second
     if posed is not None:
