@@ -26,7 +26,7 @@ from attrs import evolve, frozen
 
 from ...acoustics.laplace import LIKELIHOODS
 from ...acoustics.rays import profile_problem
-from ...acoustics.sounding import ErrorBudget
+from ...acoustics.sounding import ErrorBudget, GeometryDoubt
 from ...parameters import live
 from ..model_checks import chain_problems
 from ..shared_parameters import MountingParameters
@@ -47,7 +47,13 @@ BANKS = ('height_bank', 'scatter_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
 MODEL_SETS = ('terrain', 'height_rw_ncs', *SCALAR_SETS)
 """`SCALAR_SETS`: those of one state, which the grid engine can run."""
+SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
+"""m/s, of a sound speed that a snapshot states, and of one that nobody does."""
+BEND_STD = 0.5
+"""m/s, of the mean sound speed below the array: what bends a ray."""
 TERRAIN_MODELS = 9
+STEEP_DEG = 60.0
+"""An array that looks down by so much runs angle models."""
 OF_OTHER_SETS = (
     'sigmas',
     'sigmas_deg',
@@ -67,8 +73,11 @@ class BathymetryConfig(MountingParameters):
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = live('height_two_rw', '',
-        'terrain models run side by side', choices=MODEL_SETS)
+    model_set: str = live('terrain', '',
+        'terrain models run side by side: terrain has models of its own for smooth and rough '
+        'floors, height_two_rw with engine particles is the filter of the paper; an array that '
+        'looks down (tilt_deg of 60 or more) runs angle_two_rw in place of terrain',
+        choices=MODEL_SETS)
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
         'ncs; empty: values that suit most floors; height_bank takes any number of values, '
@@ -219,8 +228,14 @@ class BathymetryConfig(MountingParameters):
     heave_std: float = live(0.05, 'm', 'standard deviation of z in nav', range=(0.0, 100.0))
     position_std: float = live(0.1, 'm',
         'standard deviation of x and of y in nav', range=(0.0, 10_000.0))
-    sound_speed_std: float = live(0.5, 'm/s',
-        'standard deviation of the sound speed', range=(0.0, 100.0))
+    tilt_std_deg: float = live(0.2, 'deg',
+        'standard deviation of tilt_deg, the same in all pings; 0: exact', range=(0.0, 45.0))
+    spacing_std: float = live(0.01, '',
+        'standard deviation of the distance between staves, as a share of it; 0: exact',
+        range=(0.0, 0.5))
+    sound_speed_std: float = live(-1.0, 'm/s',
+        'standard deviation of the sound speed, the same in all pings; 0: exact; -1: 2 where the '
+        'snapshot states its sound speed, else 15', range=(-1.0, 100.0))
     # fmt: on
 
     def check(self) -> list[str]:
@@ -277,9 +292,14 @@ class BathymetryConfig(MountingParameters):
 
     def _terrain_problems(self) -> list[str]:
         given = [name for name in OF_OTHER_SETS if getattr(self, name)]
-        problems = [f'terrain has models of its own: it takes no {name}' for name in given]
+        problems = [
+            f'terrain has models of its own and takes no {name}: height_two_rw and other sets do'
+            for name in given
+        ]
         if self.engine not in ('auto', 'gaussian'):
-            problems.append(f'terrain runs on engine gaussian, not on {self.engine}')
+            problems.append(
+                f'terrain runs on engine gaussian, not on {self.engine}, which is for other sets'
+            )
         if self.smoothing == 'modes':
             problems.append('terrain smooths states, or nothing (none)')
         return problems
@@ -340,7 +360,36 @@ class BathymetryConfig(MountingParameters):
             heading=math.radians(self.heading_std_deg),
             heave=self.heave_std,
             position=self.position_std,
-            sound_speed=self.sound_speed_std,
+            sound_speed=BEND_STD,
+        )
+
+    def doubt(self, stated: float | None) -> GeometryDoubt:
+        """What all pings have in common; stated: the sound speed that a snapshot states, m/s."""
+        std = self.sound_speed_std
+        if std < 0.0:
+            std = SPEED_STD_OF_NONE if stated is None else SPEED_STD
+        speed = stated or self.sound_speed
+        return GeometryDoubt(math.radians(self.tilt_std_deg), self.spacing_std, std / speed)
+
+    @property
+    def looks_down(self) -> bool:
+        """Whether the array looks down so steeply that heights say too little of directions."""
+        return abs(self.tilt_deg) >= STEEP_DEG
+
+    def as_used(self) -> BathymetryConfig:
+        """The same with the models that an array that looks down can run. Below it the height of
+        a floor changes infinitely fast with the direction."""
+        if not (self.is_terrain and self.looks_down):
+            return self
+        smoothing = 'modes' if self.ping_coupling > 0.0 else 'none'
+        return evolve(
+            self,
+            model_set='angle_two_rw',
+            engine='auto',
+            smoothing=smoothing,
+            angle_drift=False,
+            initial_mean=0.0,
+            initial_std=0.0,
         )
 
     @property

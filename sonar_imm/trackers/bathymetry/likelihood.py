@@ -45,7 +45,7 @@ from ...acoustics import (
 from ...acoustics import geometry as frames
 from ...acoustics.array import across_track, angle_of_depth, depth_of_angle, multipath_sines
 from ...acoustics.geometry import Pose
-from ...acoustics.sounding import ErrorBudget, Looks
+from ...acoustics.sounding import ErrorBudget, GeometryDoubt, Looks
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from .config import BathymetryConfig
@@ -172,6 +172,13 @@ class Swath:
         return sounding.uncertainties(
             floor.variance, -offset[:, 2], distance, budget, self.sound_speed
         )
+
+    def doubt(self, floor: Floor, doubt: GeometryDoubt) -> tuple[FloatArray, FloatArray]:
+        """Vertical and horizontal variance (T,) m^2 of the floor that all pings have in common."""
+        offset = floor.xyz if self.looks is None else floor.xyz - self.looks.position
+        distance = np.linalg.norm(offset[:, :2], axis=1)
+        angle = np.nan_to_num(floor.angle)
+        return sounding.geometry_variance(-offset[:, 2], distance, angle, doubt)
 
     def _launch(self, depth: FloatArray) -> FloatArray:
         """r sin(phi) (T,) of floors `depth` (T,) below the array."""

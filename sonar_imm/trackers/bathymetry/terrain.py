@@ -22,7 +22,7 @@ range; over a bin of width dS ::
 or, where a model does not follow the slope, s' ~ N(0, slope0^2) and b' = b + walk e'. The height
 of a bin lies about the base with a standard deviation `scatter`. All slopes have one stationary
 law, N(0, slope0^2), and the chain of the models is reversible, so that a ping backwards obeys the
-same models: `terrain_kernels` filters it both ways and fuses.
+same models: `terrain_filter` filters it both ways and fuses.
 
 The chain follows from how far each kind of floor goes on (`STAY`) and how much of all floor it is
 (`SHARE`): the flow from i to j is ``B_ij x_i x_j``, B = 1 but for level and steady floor, which
@@ -32,17 +32,11 @@ are hard to tell apart, and x such that each model is left as often as its stay 
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import chain
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from .grid_kernels import PingLikelihood, Track
-from .terrain_kernels import filter_terrain, NODES, ROWS
-
-if TYPE_CHECKING:
-    from .models import TerrainModels
 
 SLOPE0 = 0.35
 """Standard deviation of all slopes."""
@@ -132,38 +126,3 @@ def terrain_of(width: float) -> Terrain:
         stationary=stationary,
         width=width,
     )
-
-
-def run_terrain(
-    models: TerrainModels,
-    ping: PingLikelihood,
-    peak: FloatArray,
-    *,
-    smooth: bool,
-    temper: float = 1.0,
-) -> Track:
-    """The filter along a ping, given the bins before each one, or with `smooth` the whole ping.
-    peak (T,): the height from which the beam of a bin is strongest, NaN where none is known.
-    temper: the log likelihood of a bin counts so much."""
-    terrain, g = models.terrain, ping.geometry
-    assert terrain is not None
-    T, M = len(ping.ranges), len(models.names)
-    work = np.empty((ROWS, NODES * M))
-    spread = ping.spread if ping.spread.shape[1] else None
-    launch = g.launch if len(g.launch) else None
-    mean, variance, probability = np.empty(T), np.empty(T), np.empty((T, M))
-    log_likelihood = np.empty(T)
-    groups: tuple[tuple[Any, ...], ...] = (
-        (terrain.walk, terrain.phi, terrain.follow, terrain.scatter, terrain.coast),
-        (terrain.transition, terrain.stationary, SLOPE0, terrain.width),
-        (float(models.mean[0]), float(models.std[0]), models.favour, temper),
-        (ping.echo, ping.form, ping.base, spread, ping.signal, ping.table),
-        (peak, np.empty(T), g.height, g.reach, g.cos_tilt, g.sin_tilt, g.spacing),
-        (launch, g.row, g.first_depth, g.depth_step),
-        (np.empty((2, T, M, 6)), np.empty((M, 5)), np.empty((M, 6)), np.empty(M)),
-        (np.empty(M, np.int64), work, work.view(np.int64)),
-        (mean, variance, probability, log_likelihood),
-    )
-    filter_terrain(3 if smooth else 1, *chain.from_iterable(groups))
-    nothing = np.full(T, np.nan)
-    return Track(mean[:, None], variance[:, None, None], probability, log_likelihood, nothing)

@@ -511,6 +511,8 @@ def filter_terrain(
                 if not known or not work[18, a] > 0.0:
                     work[16, a] = pred[j, 0]
                     work[17, a] = pred[j, 2] + scatter[j] * scatter[j]
+                else:  # what a pulse wider than a bin does not see of the scatter
+                    work[17, a] += (1.0 - temper) * scatter[j] * scatter[j]
             center, wide = 0.0, 0.0
             for a in range(count):
                 center += mu[who[a]] * work[16, a]

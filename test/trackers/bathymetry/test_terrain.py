@@ -19,7 +19,7 @@ import math
 from pathlib import Path
 
 from attrs import evolve
-from helpers.bathymetry_cases import floor
+from helpers.bathymetry_cases import EXACT, floor
 import numpy as np
 from oracles.array_likelihood import log_likelihood
 from oracles.terrain import smoothed
@@ -27,16 +27,18 @@ import pytest
 
 from sonar_imm.acoustics import array
 from sonar_imm.acoustics.laplace import log_density, log_density_slope
+from sonar_imm.acoustics.variances import bins_alike
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.bathymetry.models import TerrainModels
 from sonar_imm.trackers.bathymetry.ping import look, Ping
-from sonar_imm.trackers.bathymetry.terrain import run_terrain, SLOPE0, Terrain, terrain_of
+from sonar_imm.trackers.bathymetry.terrain import SLOPE0, Terrain, terrain_of
+from sonar_imm.trackers.bathymetry.terrain_filter import run_terrain
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 FOLDER = Path(__file__).parents[2] / 'vectors' / 'bathymetry_by_default'
 STEP = 2.0 * math.pi * 0.5
-TERRAIN = BathymetryConfig(model_set='terrain', layover='ignored')
+TERRAIN = BathymetryConfig(model_set='terrain', layover='ignored', **EXACT)
 
 
 def vectors(name):
@@ -385,9 +387,9 @@ def test_nothing_but_noise_is_the_start():
 @pytest.mark.parametrize(
     'values, words',
     [
-        ({'sigmas': [0.1, 0.2]}, 'it takes no sigmas'),
-        ({'stay_probability': 0.99}, 'it takes no stay_probability'),
-        ({'transition_matrix': [1.0]}, 'it takes no transition_matrix'),
+        ({'sigmas': [0.1, 0.2]}, 'takes no sigmas'),
+        ({'stay_probability': 0.99}, 'takes no stay_probability'),
+        ({'transition_matrix': [1.0]}, 'takes no transition_matrix'),
         ({'engine': 'particles'}, 'terrain runs on engine gaussian, not on particles'),
         ({'smoothing': 'modes'}, 'terrain smooths states, or nothing'),
         (
@@ -420,3 +422,98 @@ def test_slopes_are_followed_and_smooth(slope):
         rough.append((made.extras['rough'][used] > 0.5).mean())
     assert math.sqrt(np.mean(errors)) < 0.06
     assert np.mean(inside) > 0.85 and np.mean(rough) < 0.05
+
+
+def test_bins_finer_than_the_pulse_are_counted_as_the_vectors_say():
+    case = vectors('array')
+    iq = samples(case['oversampled_iq'])
+    everywhere = np.ones(len(iq), bool)
+    assert bins_alike(iq, everywhere) == pytest.approx(float(case['tau']), abs=1e-9)
+    for ping in samples(case['iq']):
+        assert bins_alike(ping, everywhere) == 1.0
+    assert bins_alike(np.zeros((5, 8), complex), np.zeros(5, bool)) == 1.0
+
+
+def test_bins_finer_than_the_pulse_are_tempered_and_said():
+    """A boxcar over four bins: without the factor the error is .027 m."""
+    tracker, square, inside = BathymetryTracker(TERRAIN), [], []
+    for seed in range(5):
+        ranges = 25.0 + 0.05 * np.arange(403)
+        iq = np.array(floor(0.0, ranges=ranges, seed=seed).iq, np.complex128)
+        # The middle of four bins is half a bin beyond the second one.
+        four = Snapshot(
+            stamp_ns=1000 + seed,
+            range=ranges[:400] + 0.075,
+            iq=0.5 * sum(iq[k : k + 400] for k in range(4)),
+            noise_variance=np.ones(400),
+        )
+        (made,) = tracker.process(four)
+        used = made.extras['valid'] > 0
+        error = made.state[used, 0]
+        square.append(np.square(error).mean())
+        inside.append((np.abs(error) < 2.0 * np.sqrt(made.covariance[used, 0, 0])).mean())
+    assert math.sqrt(np.mean(square)) < 0.015 and np.mean(inside) > 0.9
+    assert tracker.health()['independent_bins'] == pytest.approx(1.0 / 2.75, rel=0.1)
+    assert any(each.startswith('bins are finer than the pulse: 2.') for each in tracker.warnings())
+
+
+@pytest.mark.parametrize('tilt', [90.0, -75.0, 60.0])
+def test_an_array_that_looks_down_runs_angles_and_says_so(tilt):
+    config = BathymetryConfig(tilt_deg=tilt, initial_mean=3.0, initial_std=2.0)
+    tracker = BathymetryTracker(config)
+    ping = floor(0.0, ranges=15.2 + 0.05 * np.arange(60), tilt_deg=tilt)
+    (made,) = tracker.process(ping)
+    assert made.state_names == ('angle',) and tracker.config is config
+    assert np.isfinite(made.state).all()
+    told = f'the array looks down (tilt {tilt:g} deg): angle models are used'
+    assert tracker.warnings().count(told) == 1
+    level = BathymetryTracker(BathymetryConfig(tilt_deg=59.0))
+    assert level.process(floor(0.0, tilt_deg=59.0))[0].state_names == ('height',)
+
+
+def test_what_the_geometry_leaves_open_is_in_the_covariance_and_told_apart():
+    ping = floor(0.0)
+    (plain,), (made,) = (
+        BathymetryTracker(evolve(TERRAIN, **values)).process(ping)
+        for values in ({}, {'tilt_std_deg': 0.2, 'spacing_std': 0.01, 'sound_speed_std': -1.0})
+    )
+    common = np.square(made.extras['geometry_std'].astype(float))
+    assert made.state == pytest.approx(plain.state, abs=1e-12)
+    assert made.covariance[:, 0, 0] - plain.covariance[:, 0, 0] == pytest.approx(common, rel=1e-5)
+    assert (plain.extras['geometry_std'] == 0.0).all() and common.min() > 0.0
+    stated = evolve(ping, sound_speed=1500.0)
+    (surer,) = BathymetryTracker(evolve(TERRAIN, sound_speed_std=-1.0)).process(stated)
+    (told,) = BathymetryTracker(evolve(TERRAIN, sound_speed_std=2.0)).process(stated)
+    (unsure,) = BathymetryTracker(evolve(TERRAIN, sound_speed_std=15.0)).process(stated)
+    (automatic,) = BathymetryTracker(evolve(TERRAIN, sound_speed_std=-1.0)).process(ping)
+    np.testing.assert_array_equal(surer.extras['geometry_std'], told.extras['geometry_std'])
+    np.testing.assert_array_equal(automatic.extras['geometry_std'], unsure.extras['geometry_std'])
+
+
+@pytest.mark.parametrize('model_set', ['terrain', 'angle_two_rw'])
+def test_an_array_that_is_not_what_it_is_said_to_be_is_inside_what_is_said(model_set):
+    """Tilt, spacing and sound speed wrong in each ping: of the filter alone little is inside."""
+    rng = np.random.default_rng(8)
+    ranges = 25.0 + 0.1 * np.arange(300)
+    inside = []
+    for values in (EXACT, {'sound_speed_std': 2.0}):
+        tracker = BathymetryTracker(
+            BathymetryConfig(model_set=model_set, layover='ignored', **values)
+        )
+        rng = np.random.default_rng(8)
+        for seed in range(6):
+            tilt, spacing, speed = rng.normal(size=3) * (0.2, 0.01, 2.0 / 1500.0)
+            wrong = {'tilt_deg': 30.0 + tilt, 'spacing': 0.5 * (1.0 + spacing + speed)}
+            true = floor(0.0, ranges=ranges * (1.0 + speed), seed=seed, **wrong)
+            (made,) = tracker.process(evolve(true, range=ranges))
+            used = made.extras['valid'] > 0
+            sd = np.sqrt(made.covariance[:, 0, 0])
+            error = made.state[:, 0]
+            if model_set != 'terrain':  # the tilt is no error of an angle from broadside
+                error = error - (
+                    np.arcsin(15.0 / (ranges * (1.0 + speed))) - np.radians(30.0 + tilt)
+                )
+            inside.append((np.abs(error) < 2.0 * sd)[used].mean())
+    assert np.mean(inside[6:]) > 0.85
+    if model_set == 'terrain':
+        assert np.mean(inside[:6]) < 0.6
