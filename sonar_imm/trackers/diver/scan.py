@@ -40,6 +40,7 @@ from .instruments import Layout
 from .known import Known, Prediction
 from .models import ModelSet
 from .pairs import Association, Pairs
+from .sensors import Sensors
 
 LEAST_VAR_TOA = 1e-13
 """Minimum variance of an arrival time, s^2: 0.5 mm of path. Below it, the joint covariance with a
@@ -124,6 +125,8 @@ class Birth(NamedTuple):
     """The z of the fix; None if the fix has no z."""
     seen_by: tuple[str, FloatArray] | None = None
     """Name and position (2,) of a sensor with a bearing error; None for others."""
+    number: int = 0
+    """Number of the sensor (`sensors`)."""
 
 
 MOST_BIRTHS = 1.5
@@ -138,8 +141,9 @@ before a later one."""
 class Group:
     """D fixes of one stamp and sensor, with at most one per target.
 
-    Later stages use the slots `learnt_clutter` and `elapsed` (`clutter`), `detection`
-    (`coverage`), `pairs` and `association` (`fixes`), and `births`. One stage writes each slot.
+    The tracker sets `number`. Later stages use the slots `learnt_clutter` and `elapsed`
+    (`clutter`), `detection` (`coverage`), `pairs` and `association` (`fixes`), and `births`. One
+    stage writes each slot.
     """
 
     z: FloatArray
@@ -158,10 +162,14 @@ class Group:
     """Name of the sensor."""
     seen_from: FloatArray | None = None
     """(2,) sensor position; None if unknown."""
+    is_stated: bool = True
+    """True if a fix states its covariance."""
     learnt_clutter: FloatArray | None = field(default=None, init=False)
     """(D,) estimated clutter density at each fix, 1/m^2; None if none is estimated."""
     elapsed: float = field(default=FIRST_LOOK, init=False)
     """Time since the scan before of this sensor, s."""
+    number: int = field(default=0, init=False)
+    """Number of the sensor (`sensors`)."""
     detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
     association: Association | None = field(default=None, init=False)
@@ -216,12 +224,26 @@ class Scan:
     """Target IDs of fixes and pings."""
     complete: bool
     """True if a track without a measurement was missed."""
+    numbers: set[int] = field(factory=set, init=False)
+    """Numbers of the sensors."""
     previous: Known = field(init=False)
     """State before the scan."""
     prediction: Prediction = field(init=False)
     """Prediction to the scan."""
     births: list[Birth] = field(factory=list, init=False)
     """Births from pings."""
+
+    def number_sensors(self, known: Sensors) -> Sensors:
+        """Number the sensors of the scan; arrivals are of the sensor without a name.
+
+        Return all sensors.
+        """
+        for name in [group.sensor for group in self.fixes] + [''] * bool(self.pings):
+            known = known.with_sensor(name)
+            self.numbers.add(known.number(name))
+        for group in self.fixes:
+            group.number = known.number(group.sensor)
+        return known
 
     @classmethod
     def from_items(cls, items: Sequence[Measurement], config: DiverConfig) -> Scan:
@@ -304,8 +326,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     if scan.covariance is not None:
         covariance = scan.covariance[rows]
     R = np.ascontiguousarray(covariance[:, :2, :2])
-    if not (stated := np.isfinite(R)).all():
-        R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
+    stated = np.isfinite(R).all(axis=(1, 2))
+    R[~stated] = np.eye(2) * config.fix_std**2
     heights = (
         Heights.from_fixes(position, covariance, config.covariance_scale)
         if config.dimensions == 3
@@ -314,7 +336,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _sensor_position(config)
-    return Group(z, R * config.covariance_scale, config, *named_rows)
+    is_stated = bool(stated.any())
+    return Group(z, R * config.covariance_scale, config, *named_rows, is_stated=is_stated)
 
 
 def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
@@ -322,10 +345,14 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
     R = np.empty((len(fixes), 2, 2))
+    is_stated = False
     for row, fix in enumerate(fixes):
         z[row] = fix.position[:2]
         stated = None if fix.covariance is None else fix.covariance[:2, :2]
-        R[row] = unknown if stated is None or math.isnan(stated[0, 0]) else stated
+        if stated is None or math.isnan(stated[0, 0]):
+            R[row] = unknown
+        else:
+            R[row], is_stated = stated, True
     heights, factor = None, config.covariance_scale
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
@@ -333,9 +360,9 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
         heights = Heights.from_fixes(
             np.array([fix.position for fix in fixes]), np.array(whole), factor
         )
-    more = None, config.fixes_are_scans, heights, fixes[0].sensor
+    more = None, config.fixes_are_scans, heights, fixes[0].sensor, _sensor_position(config)
     return _with_sensor_position(
-        fixes[0], Group(z, R * factor, config, *more, _sensor_position(config))
+        fixes[0], Group(z, R * factor, config, *more, is_stated=is_stated)
     )
 
 
