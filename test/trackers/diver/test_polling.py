@@ -84,5 +84,5 @@ def test_a_constant_offset_is_no_second_target_in_any_stretch(offset, std):
         last = slice(max(0, end - MOST_FIXES), end)
         assert turn_of(stamps[last], places[last]) is None
     # A second target goes his own way.
-    other = places + np.outer(t % 2, (8.0, 0.05)) * np.column_stack([np.ones(300), t])
+    other = places + np.outer(t % 2, (8.0, 0.15)) * np.column_stack([np.ones(300), t])
     assert turn_of(stamps[:MOST_FIXES], other[:MOST_FIXES]) == pytest.approx(2.0)
