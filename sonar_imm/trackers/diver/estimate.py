@@ -155,12 +155,12 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     # Of tracks that starve, nothing else is told by the fixes.
     fixes = memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
     of_scans = [
+        *(assumed if config.has_usual_fix_std else []),
         *fixes,
         *late_warnings(known),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]
     return [
-        *(assumed if config.has_usual_fix_std else []),
         *(starving or of_scans),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
