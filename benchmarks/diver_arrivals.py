@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.study import final_estimates, Parts, study
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -68,7 +68,8 @@ class Score(NamedTuple):
 
 def path(seed: int, motion: str = 'legs', **values: Any) -> TrueTrack:
     """A diver of the simulator."""
-    return simulate(scenario('multistatic', {'motion': motion, **values}), seed).truth[0]
+    scene = simulate(scenario('multistatic', {'motion': motion, **values}), seed)
+    return truths(scene, TrueTrack)[0]
 
 
 def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> Arrivals:
@@ -93,14 +94,14 @@ def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> 
 def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
     """Track a diver; estimates without a confirmed track are left out."""
     at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
-    rows = []
+    rows: list[tuple[float, float, float]] = []
     for stamp, estimate in sorted(
         final_estimates(DiverTracker(DiverConfig(**values)), pings).items()
     ):
         for row in np.flatnonzero(estimate.extras['track_state'] > 0)[:1]:
             error = estimate.state[row, :2] - track.position[at[stamp], :2]
             nees = error @ np.linalg.solve(estimate.covariance[row, :2, :2], error)
-            rows.append((at[stamp], error @ error, nees))
+            rows.append((at[stamp], float(error @ error), float(nees)))
     return Score(*np.reshape(rows, (-1, 3)).T)
 
 
@@ -177,7 +178,7 @@ def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None
 
 # -- few receivers a ping ------------------------------------------------------------------------
 
-KINDS = {
+KINDS: dict[str, tuple[bool, dict[str, Any]]] = {
     'echo, 1 s': (False, {'duration': 99.0}),
     'tag, 1 s': (True, {'duration': 99.0}),
     'tag, 29 s': (True, {'duration': 2000.0, 'step': 29.0, 'turn_deg': 180.0}),

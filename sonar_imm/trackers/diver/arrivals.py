@@ -245,7 +245,7 @@ def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
 
 
 def apply_updates(
-    known: Known, updates: dict[int, TrackUpdate], models: ModelSet, line: sides.Line | None
+    known: Known, updates: dict[int, TrackUpdate], models: ModelSet, line: sides.Line | None = None
 ) -> Known:
     """Return the state with the updated tracks. line: that of all instruments, if there is one."""
     if not updates:
