@@ -43,7 +43,7 @@ from .config import DiverConfig
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths, VELOCITY
-from .scan import Birth, systematic_variance, tag_id, toa_variance
+from .scan import Birth, Fit, systematic_variance, tag_id, toa_variance
 from .sides import Line, line_of_ping, line_through, path_noise
 
 LEAST, EVERY, WINDOW = 5, 3, 20
@@ -78,17 +78,6 @@ NO_TRACK = (
     'line are due'
 )
 """Warning while single arrivals are received and no track is confirmed."""
-
-
-class Fit(NamedTuple):
-    """Minima of the ranges: K states (x, y, vx, vy) at the last range."""
-
-    x: FloatArray
-    """(K, 4)."""
-    P: FloatArray
-    """(K, 4, 4)."""
-    weight: FloatArray
-    """(K,) probabilities."""
 
 
 class Ranges(NamedTuple):

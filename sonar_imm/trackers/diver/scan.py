@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 from attrs import define, evolve, field
 import numpy as np
@@ -41,9 +41,6 @@ from .known import Known, Prediction
 from .models import ModelSet
 from .pairs import Association, Pairs
 from .sensors import Sensors
-
-if TYPE_CHECKING:
-    from .ranges import Fit
 
 LEAST_VAR_TOA = 1e-13
 """Minimum variance of an arrival time, s^2: 0.5 mm of path. Below it, the joint covariance with a
@@ -105,6 +102,17 @@ class Heights(NamedTuple):
         if not math.isfinite(self.value[d]):
             return None
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
+
+
+class Fit(NamedTuple):
+    """Minima of single ranges (`ranges`): K states (x, y, vx, vy) at the last range."""
+
+    x: FloatArray
+    """(K, 4)."""
+    P: FloatArray
+    """(K, 4, 4)."""
+    weight: FloatArray
+    """(K,) probabilities."""
 
 
 class Birth(NamedTuple):
