@@ -51,7 +51,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, replace_rows, take
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
@@ -187,10 +187,15 @@ class DepthSlices:
         return fresh
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
-        to be repaired."""
+        to be repaired; silent (T,): those that go on with what they do."""
         return self.predict_unchanged(mixture, before.pose, after.pose, dt)
 
     def predict_unchanged(
@@ -360,10 +365,19 @@ class BehaviourSlices(DepthSlices):
         return self._unshift(Mixture(x, P, mu), z, sonar)
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
-        mixed = mixtures.mix(*mixture, self._prior, self.slices, self._transition(dt), DROPPED)
-        return self.predict_unchanged(Mixture(*mixed), before.pose, after.pose, dt)
+        rows = np.arange(len(mixture.mu)) if silent is None else np.flatnonzero(~silent)
+        if len(rows):
+            chain = self._transition(dt)
+            mixed = mixtures.mix(*take(mixture, rows), self._prior, self.slices, chain, DROPPED)
+            mixture = replace_rows(mixture, rows, Mixture(*mixed))
+        return self.predict_unchanged(mixture, before.pose, after.pose, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         return np.asarray(mu @ self._of)
