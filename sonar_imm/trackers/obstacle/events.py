@@ -50,12 +50,14 @@ from .scales import Scales, SURE
 from .state import Known, Obstacles
 
 
-def compare(table: Obstacles, ping: Ping, filter_: DepthSlices) -> tuple[Compared, int]:
+def compare(
+    table: Obstacles, ping: Ping, filter_: DepthSlices, widest: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Compared, int]:
     """Return each obstacle beside the echoes in its gate, and how many covariances had to be
-    repaired."""
+    repaired; widest: see `DepthSlices.visible`."""
     mixture, echoes, config = table.mixture, ping.echoes, filter_.config
     h, C = filter_.expected(mixture, ping.sonar)
-    V, ahead = filter_.visible(mixture, ping.sonar)
+    V, ahead = filter_.visible(mixture, ping.sonar, widest)
     threshold = gate_threshold(config.gate_probability, 2)
     near = mixtures.gate(h, C, mixture.mu, echoes.z, echoes.R, threshold)
     t, i = np.nonzero(near)
