@@ -31,22 +31,19 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation import imm
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray, take
-from ...estimation.association import gate_threshold, Tracks
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
 from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
 from .avoidance import course
-from .beam import apply_elevations, elevation_fits, Elevations, outlier_probability
+from .beam import apply_elevations, Elevations
 from .config import ObstacleConfig
-from .filters import DepthSlices, HeightPrior, Mixture, Sonar
+from .filters import HeightPrior, Mixture, Sonar
 from .ground import GroundMap
+from .matches import Match
 
 SMALLEST, WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
-_H = np.eye(2)[None, None]
-"""Range and azimuth are states."""
 
 
 class Mount:
@@ -70,27 +67,28 @@ class Mount:
 @frozen(eq=False)
 class Echoes:
     """The echoes of one ping: range and azimuth z (D, 2), m and rad positive to starboard, with
-    covariance R (D, 2, 2); extended (D,): whether an extent is stated; heights: their elevations,
-    None where none is measured."""
+    covariance R (D, 2, 2); extended (D,): whether an extent is stated; stated (D, 2): which
+    variances are; heights: their elevations, None where none is measured."""
 
     z: FloatArray
     R: FloatArray
     extended: BoolArray
+    stated: BoolArray
     heights: Elevations | None = None
 
     @staticmethod
-    def of(ping: Detections, config: ObstacleConfig) -> Echoes:
-        """Return the rows that are echoes. One that is as uncertain as it is far says nothing and
-        is left out."""
+    def of(ping: Detections, config: ObstacleConfig, scale: FloatArray | float = 1.0) -> Echoes:
+        """Return the rows that are echoes, with `scale` (2,) times their variances. One that is as
+        uncertain as it is far says nothing and is left out."""
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         variance = np.column_stack([ping.var_range, ping.var_bearing])
         stated = np.isfinite(variance) & (variance > SMALLEST)
         variance = np.where(stated, variance, default_variance(config))
         real = np.isfinite(z[:, 0]) & (np.abs(z[:, 1]) < 0.5 * np.pi)
         real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
-        R, extended = variance[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
+        R, extended = (scale * variance)[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
         heights = Elevations.of(ping.elevation[real], ping.var_elevation[real], config)
-        return Echoes(z[real], R[real], extended[real], heights)
+        return Echoes(z[real], R[real], extended[real], stated[real], heights)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -98,17 +96,9 @@ class Echoes:
     def rows(self, which: IndexArray | BoolArray) -> Echoes:
         """Return some of the echoes."""
         heights = self.heights and take(self.heights, which)
-        return Echoes(self.z[which], self.R[which], self.extended[which], heights)
-
-    def fits(
-        self, mixture: Mixture, h: FloatArray, C: FloatArray, pose: Pose, config: ObstacleConfig
-    ) -> FloatArray:
-        """Return how well each echo fits each obstacle (T, D), see `imm.gate`; h (T, K, 2), C (T,
-        K, 2, 2): what is expected."""
-        if self.heights:
-            return elevation_fits(mixture, h, pose, self.z, self.R, self.heights, config)
-        threshold = gate_threshold(config.gate_probability, 2)
-        return imm.gate(h, _H, C, mixture.mu, self.z, self.R, threshold)
+        return Echoes(
+            self.z[which], self.R[which], self.extended[which], self.stated[which], heights
+        )
 
     def height_prior(
         self, sonar: Sonar, ground: GroundMap, config: ObstacleConfig
@@ -120,23 +110,13 @@ class Echoes:
         return HeightPrior(ends, *ground.below(self.z, sonar, config))
 
     def update_height(
-        self,
-        mixture: Mixture,
-        before: tuple[Mixture, FloatArray, FloatArray] | None,
-        filter_: DepthSlices,
-        pose: Pose,
-    ) -> Mixture:
-        """Return the obstacles after the elevation of one echo each. before: the mixture before
-        their range and azimuth, what was expected of these and the covariance R (T, 2, 2) used;
-        None for obstacles that begin."""
+        self, mixture: Mixture, pose: Pose, config: ObstacleConfig
+    ) -> tuple[Mixture, FloatArray]:
+        """Return the obstacles after the elevation of one echo each, and the log (T,) of its
+        density beside that of clutter."""
         if not self.heights:
-            return mixture
-        doubt: FloatArray | float = filter_.config.outlier_probability
-        if before is not None:
-            old, h, R = before
-            density = filter_.outlier_density
-            doubt = outlier_probability(old, h, self.z, R, float(doubt), density)
-        return apply_elevations(mixture, self.heights, doubt, pose, filter_.config)
+            return mixture, np.zeros(len(self))
+        return apply_elevations(mixture, self.heights, pose, config)
 
 
 def default_variance(config: ObstacleConfig) -> FloatArray:
@@ -144,33 +124,12 @@ def default_variance(config: ObstacleConfig) -> FloatArray:
     return np.square([config.range_std, np.radians(config.bearing_std_deg)])
 
 
-class Match(NamedTuple):
-    """The echo `chosen` (T,) by each obstacle, -1 for none, of which `expected` (T, K, 2) was
-    expected, and the log density `fit` (T,) of what was found."""
-
-    chosen: IntArray
-    expected: FloatArray
-    fit: FloatArray
-
-    @property
-    def hit(self) -> BoolArray:
-        """(T,) Which obstacles gave an echo."""
-        return self.chosen >= 0
-
-
-class Verdict(NamedTuple):
-    """The tracks `life` that live on, `stays` (T,) which these are, and which lie `ahead` (T,)."""
-
-    life: Tracks
-    stays: BoolArray
-    ahead: BoolArray
-
-
 @define(eq=False)
 class Ping:
     """One ping on its way through the stages. What a stage tells later ones stands in a slot that
     no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
-    was, by `predict`; `match` by `associate`; `verdict` by `judge`."""
+    was, by `predict`; `match` by `associate`; `stays` (T,) the tracks that do not end, and `over`
+    (T,) those that are remembered if so, by `judge`."""
 
     stamp_ns: int
     sonar: Sonar
@@ -179,7 +138,8 @@ class Ping:
     before: Sonar = field(init=False)
     dt: float = field(init=False)
     match: Match = field(init=False)
-    verdict: Verdict = field(init=False)
+    stays: BoolArray = field(init=False)
+    over: BoolArray = field(init=False)
 
 
 class Inbox(NamedTuple):
@@ -244,10 +204,11 @@ class Inbox(NamedTuple):
         altitude: Altitude | None,
         mount: Mount,
         config: ObstacleConfig,
+        scale: FloatArray,
     ) -> Ping:
-        """Return the ping that one of the `released` ones is."""
+        """Return the ping that one of the `released` ones is; scale (2,): of its variances."""
         sonar = self._sonar(detections.stamp_ns, altitude, mount, config)
-        return Ping(detections.stamp_ns, sonar, Echoes.of(detections, config), self.ground)
+        return Ping(detections.stamp_ns, sonar, Echoes.of(detections, config, scale), self.ground)
 
     def _sonar(
         self, stamp_ns: int, altitude: Altitude | None, mount: Mount, config: ObstacleConfig
