@@ -44,6 +44,7 @@ Source: docs/obstacle.md, sections Methods and Behaviours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Annotated, NamedTuple
 
@@ -51,7 +52,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
 from ...estimation.association import gate_threshold
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
@@ -132,6 +133,11 @@ class Mixture(NamedTuple):
         return np.asarray(means.all(axis=(1, 2)) & covariances.all(axis=(1, 2, 3)))
 
 
+def joined(mixtures: Sequence[Mixture]) -> Mixture:
+    """Return the targets of several mixtures as one."""
+    return Mixture(*(np.concatenate(parts) for parts in zip(*mixtures)))
+
+
 class View(NamedTuple):
     """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
     covariance; the interval of the offset; probability that the obstacle is above; its place in
@@ -199,6 +205,30 @@ class DepthSlices:
         to be repaired."""
         return self.predict_unchanged(mixture, before.pose, after.pose, dt)
 
+    def advance_each(
+        self,
+        mixture: Mixture,
+        before: Sequence[Sonar],
+        after: Sequence[Sonar],
+        dt: FloatArray,
+    ) -> tuple[Mixture, int]:
+        """`advance` of each target by itself, from one sonar of its own to another."""
+        if not len(before):
+            return mixture, 0
+        steps = zip(before, after, dt.tolist())
+        done = [self.advance(take(mixture, np.array([t])), *step) for t, step in enumerate(steps)]
+        return joined([each for each, _ in done]), sum(repairs for _, repairs in done)
+
+    def whereabouts(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        """Mean place (T, 3) in the world and velocity (T, 3) of the targets, NED."""
+        m = unscented.points(mixture.x, *sonar.pose, self.cone)
+        place = geometry.to_world(sonar.pose, np.einsum('tk,tka->ta', mixture.mu, m))
+        velocity = np.zeros(place.shape)
+        if self.moves.any():
+            weight = np.where(self.moves, mixture.mu, 0.0)
+            velocity[:, :2] = np.einsum('tk,tka->ta', weight, mixture.x[..., COMMON:])
+        return place, velocity
+
     def predict_unchanged(
         self, mixture: Mixture, before: Pose, after: Pose, dt: float
     ) -> tuple[Mixture, int]:
@@ -211,10 +241,17 @@ class DepthSlices:
         """What the components do in `dt` seconds."""
         return self._still
 
-    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+    def expected(
+        self, mixture: Mixture, sonar: Sonar, met: Sequence[Sonar] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
-        without the sonar's own error."""
-        return self._echo(mixture, sonar), np.ascontiguousarray(mixture.P[..., :2, :2])
+        without the sonar's own error; met: sonars that see one target each."""
+        if met and sonar.late is not None:
+            seen = [self._echo(take(mixture, np.array([t])), own) for t, own in enumerate(met)]
+            h = np.concatenate(seen)
+        else:
+            h = self._echo(mixture, sonar)
+        return h, np.ascontiguousarray(mixture.P[..., :2, :2])
 
     def update(
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar

@@ -23,7 +23,7 @@ azimuths to starboard; places go out as ENU.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from attrs import define, field, frozen
@@ -47,6 +47,14 @@ SMALLEST, WIDEST = 1e-12, 0.25
 nothing."""
 _H = np.eye(2)[None, None]
 """Range and azimuth are states."""
+INSTANT = 0.01
+"""Seconds within which a ping is one instant."""
+ROUNDS = 3
+"""In which the beam that turns and an obstacle meet."""
+SKEWED = 0.3
+"""m, from which it matters that the vehicle moves during a ping."""
+KEPT_AT_FIRST = 30.0
+"""Seconds of navigation that are kept as long as nobody knows how long a scan takes."""
 
 
 class Mount:
@@ -71,12 +79,14 @@ class Mount:
 class Echoes:
     """The echoes of one ping: range and azimuth z (D, 2), m and rad positive to starboard, with
     covariance R (D, 2, 2); extended (D,): whether an extent is stated; heights: their elevations,
-    None where none is measured."""
+    None where none is measured; late (D,): s after the stamp, None where all are of one
+    instant."""
 
     z: FloatArray
     R: FloatArray
     extended: BoolArray
     heights: Elevations | None = None
+    late: FloatArray | None = None
 
     @staticmethod
     def of(ping: Detections, config: ObstacleConfig) -> Echoes:
@@ -90,7 +100,8 @@ class Echoes:
         real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
         R, extended = variance[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
         heights = Elevations.of(ping.elevation[real], ping.var_elevation[real], config)
-        return Echoes(z[real], R[real], extended[real], heights)
+        late = times(z[:, 1], ping.time_offset)[real] if ping.takes > INSTANT else None
+        return Echoes(z[real], R[real], extended[real], heights, late)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -98,7 +109,8 @@ class Echoes:
     def rows(self, which: IndexArray | BoolArray) -> Echoes:
         """Return some of the echoes."""
         heights = self.heights and take(self.heights, which)
-        return Echoes(self.z[which], self.R[which], self.extended[which], heights)
+        late = None if self.late is None else self.late[which]
+        return Echoes(self.z[which], self.R[which], self.extended[which], heights, late)
 
     def fits(
         self, mixture: Mixture, h: FloatArray, C: FloatArray, pose: Pose, config: ObstacleConfig
@@ -144,6 +156,71 @@ def default_variance(config: ObstacleConfig) -> FloatArray:
     return np.square([config.range_std, np.radians(config.bearing_std_deg)])
 
 
+def times(azimuth: FloatArray, offset: FloatArray) -> FloatArray:
+    """Return the times (D,), s, of detections at these azimuths, of which some are NaN: as of
+    those beside them."""
+    known = np.flatnonzero(np.isfinite(offset) & np.isfinite(azimuth))
+    order = known[np.argsort(azimuth[known], kind='stable')]
+    return np.where(np.isfinite(offset), offset, np.interp(azimuth, azimuth[order], offset[order]))
+
+
+class Met(NamedTuple):
+    """Where the sonar was, and how long ago, s, when its beam met each of T obstacles; poses: the
+    same as arrays, position (T, 3) and R (T, 3, 3)."""
+
+    sonars: tuple[Sonar, ...]
+    ago: FloatArray
+    poses: Pose
+
+    @classmethod
+    def of(cls, sonars: Iterable[Sonar], ago: FloatArray) -> Met:
+        sonars = tuple(sonars)
+        position = np.array([sonar.pose.position for sonar in sonars]).reshape(-1, 3)
+        R = np.array([sonar.pose.R for sonar in sonars]).reshape(-1, 3, 3)
+        return cls(sonars, ago, Pose(position, R))
+
+    def joined(self, others: Met) -> Met:
+        """Return these and others behind them."""
+        return Met.of((*self.sonars, *others.sonars), np.concatenate([self.ago, others.ago]))
+
+    def rows(self, which: IndexArray | BoolArray) -> Met:
+        """Return those of some obstacles."""
+        ago = self.ago[which]
+        index = np.arange(len(self.ago))[which]
+        return Met.of((self.sonars[i] for i in index), ago)
+
+
+@frozen(eq=False)
+class Sweep:
+    """A ping that takes time: echoes in order of their azimuth (D,), each so much `late` (D,), s
+    (all before the stamp); at: the sonar at any instant, s after the stamp."""
+
+    azimuth: FloatArray
+    late: FloatArray
+    at: Callable[[float], Sonar]
+
+    @classmethod
+    def of(cls, echoes: Echoes, at: Callable[[float], Sonar]) -> Sweep | None:
+        """Return that of a ping, None where all is of one instant."""
+        if echoes.late is None or not len(echoes):
+            return None
+        order = np.argsort(echoes.z[:, 1], kind='stable')
+        return cls(echoes.z[order, 1], echoes.late[order], at)
+
+    def met(self, place: FloatArray, velocity: FloatArray, since: float) -> Met:
+        """When the beam met obstacles at the places (T, 3) that move with velocity (T, 3), NED,
+        the stamp being `since` s later than that; not earlier than then."""
+        ago = np.zeros(len(place))
+        for i in range(len(place)):
+            late = 0.0
+            for _ in range(ROUNDS):
+                m = geometry.to_body(self.at(late).pose, place[i] + velocity[i] * (since + late))
+                late = float(np.interp(np.arctan2(m[1], m[0]), self.azimuth, self.late))
+                late = max(late, -since)
+            ago[i] = -late
+        return Met.of((self.at(-each) for each in ago), ago)
+
+
 class Match(NamedTuple):
     """The echo `chosen` (T,) by each obstacle, -1 for none, of which `expected` (T, K, 2) was
     expected, and the log density `fit` (T,) of what was found."""
@@ -170,22 +247,40 @@ class Verdict(NamedTuple):
 class Ping:
     """One ping on its way through the stages. What a stage tells later ones stands in a slot that
     no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
-    was, by `predict`; `match` by `associate`; `verdict` by `judge`."""
+    was, and in a ping that takes time where the obstacles were `met`, by `predict`; `match` by
+    `associate`; `verdict` by `judge`. sweep: of a ping that takes time; untimed: s that it took
+    where nobody says when it met what."""
 
     stamp_ns: int
     sonar: Sonar
     echoes: Echoes
     ground: GroundMap
+    sweep: Sweep | None = None
+    untimed: float = 0.0
+    met: Met | None = field(init=False, default=None)
     before: Sonar = field(init=False)
     dt: float = field(init=False)
     match: Match = field(init=False)
     verdict: Verdict = field(init=False)
 
+    def pose(self, which: IndexArray | slice = slice(None)) -> Pose:
+        """Return where the sonar was when it met some of the obstacles: one pose, or of each."""
+        if self.met is None:
+            return self.sonar.pose
+        return Pose(self.met.poses.position[which], self.met.poses.R[which])
+
+    def skew(self) -> tuple[float, float]:
+        """Return how long a ping took whose echoes have no times, s, and how far the vehicle went
+        meanwhile, m; zeros where that does not matter."""
+        wrong = float(np.hypot(*self.sonar.course[:2])) * self.untimed
+        return (self.untimed, wrong) if wrong >= SKEWED else (0.0, 0.0)
+
 
 class Inbox(NamedTuple):
     """What came and is not used up. waiting: pings without a pose yet, each with the altitude
     then; ground: soundings so far; skipped: pings so far for which navigation had a gap; missing:
-    pings so far that were given up because too many waited."""
+    pings so far that were given up because too many waited; scan_ns: longest ping so far, -1
+    before the first one."""
 
     navigation: NavigationBuffer = NavigationBuffer()
     altitude: Altitude | None = None
@@ -193,6 +288,7 @@ class Inbox(NamedTuple):
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
     missing: int = 0
+    scan_ns: int = -1
 
     def received(self, items: Iterable[Measurement]) -> Inbox:
         """Return the inbox with all measurements of one stamp."""
@@ -215,6 +311,7 @@ class Inbox(NamedTuple):
             ground=ground,
             waiting=tuple(waiting[given_up:]),
             missing=self.missing + given_up,
+            scan_ns=max([self.scan_ns, *(nanoseconds(ping.takes) for ping in pings)]),
         )
 
     def released(
@@ -232,7 +329,7 @@ class Inbox(NamedTuple):
 
     def _readiness(self, ping: Detections, config: ObstacleConfig) -> Readiness:
         return self.navigation.readiness(
-            ping.stamp_ns,
+            ping.stamp_ns - nanoseconds(ping.takes),
             ping.stamp_ns + _late_ns(config),
             nanoseconds(config.max_navigation_gap),
             nanoseconds(config.max_extrapolation),
@@ -246,8 +343,13 @@ class Inbox(NamedTuple):
         config: ObstacleConfig,
     ) -> Ping:
         """Return the ping that one of the `released` ones is."""
-        sonar = self._sonar(detections.stamp_ns, altitude, mount, config)
-        return Ping(detections.stamp_ns, sonar, Echoes.of(detections, config), self.ground)
+        stamp_ns, echoes = detections.stamp_ns, Echoes.of(detections, config)
+
+        def at(late: float) -> Sonar:
+            return self._sonar(stamp_ns + nanoseconds(late), altitude, mount, config)
+
+        sweep = Sweep.of(echoes, at)
+        return Ping(stamp_ns, at(0.0), echoes, self.ground, sweep, detections.untimed)
 
     def _sonar(
         self, stamp_ns: int, altitude: Altitude | None, mount: Mount, config: ObstacleConfig
@@ -268,7 +370,8 @@ class Inbox(NamedTuple):
     def forgetting(self, stamp_ns: int, config: ObstacleConfig) -> Inbox:
         """Return the inbox without the poses that no ping needs any more."""
         oldest = self.waiting[0][0].stamp_ns if self.waiting else stamp_ns
-        kept = self.navigation.since(oldest - nanoseconds(config.course_window))
+        longest = nanoseconds(KEPT_AT_FIRST) if self.scan_ns < 0 else self.scan_ns
+        kept = self.navigation.since(oldest - longest - nanoseconds(config.course_window))
         return self._replace(navigation=kept)
 
 

@@ -29,6 +29,7 @@ from typing import Annotated, Any, NamedTuple
 from attrs import frozen
 import numpy as np
 
+from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import append, BoolArray, FloatArray, take
 from ...estimation.association import TENTATIVE, TrackRules, Tracks
@@ -38,7 +39,7 @@ from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
 from .filters import DepthSlices, Mixture, Sonar
 from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
-from .pings import Inbox, Mount
+from .pings import Inbox, Mount, Ping
 
 
 class Obstacles(NamedTuple):
@@ -58,7 +59,8 @@ class Known(NamedTuple):
     that are not in view any more; repairs: covariances repaired so far; broken: tracks ended so
     far because their numbers were not finite; alike: whether most obstacles move alike
     (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
-    confirmed obstacles."""
+    confirmed obstacles; untimed: s that the pings took that are the most wrong for it, and m by
+    which they are, where their echoes have no times."""
 
     stamp_ns: int
     sonar: Sonar
@@ -70,6 +72,7 @@ class Known(NamedTuple):
     alike: bool = False
     pings_alike: int = 0
     innovations: NisMemory = NisMemory()
+    untimed: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def nothing(cls, filter_: DepthSlices, rules: TrackRules) -> Known:
@@ -173,7 +176,9 @@ def remember(
     return known._replace(memory=kept((*known.memory, *fresh), known.stamp_ns, config))
 
 
-def recall(known: Known, filter_: DepthSlices, rules: TrackRules, config: ObstacleConfig) -> Known:
+def recall(
+    known: Known, ping: Ping, filter_: DepthSlices, rules: TrackRules, config: ObstacleConfig
+) -> Known:
     """Return the same with tracks again of the landmarks that come into view, as long as there is
     room."""
     memory = known.memory
@@ -187,12 +192,18 @@ def recall(known: Known, filter_: DepthSlices, rules: TrackRules, config: Obstac
     for each in (memory[i] for i in sorted(back)):
         if each.track_id in known.life.track_id:
             continue  # numbers began anew, and this one lives
-        dt = (known.stamp_ns - each.stamp_ns) * 1e-9
+        dt, sonar, met = (known.stamp_ns - each.stamp_ns) * 1e-9, known.sonar, None
+        if ping.sweep is not None:
+            place = geometry.flip_world(each.place[None])
+            met = ping.sweep.met(place, np.zeros((1, 3)), dt)
+            sonar, dt = met.sonars[0], dt - float(met.ago[0])
         mixture, repairs = filter_.predict_unchanged(
-            each.mixture(filter_.K), each.sonar, known.sonar.pose, dt
+            each.mixture(filter_.K), each.sonar, sonar.pose, dt
         )
         if not mixture.is_finite()[0]:
             continue
+        if met is not None and ping.met is not None:
+            ping.met = ping.met.joined(met)
         number, std = each.body
         chance = odds(each.existence(known.stamp_ns, config.landmark_time))
         body = Bodies(np.array([number]), std[None])

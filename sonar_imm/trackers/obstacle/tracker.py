@@ -19,7 +19,10 @@ how an echo of a fixed obstacle must move, and that depends on how far above or 
 lies. The tracker follows each obstacle in sonar coordinates and learns its vertical offset on the
 way (`filters`). Navigation and pings arrive in any order (`pings`). A ping goes through
 
-    predict -> recall -> associate -> update -> judge -> remember -> end -> begin -> watch
+    predict -> recall -> associate -> update -> carry -> judge -> remember -> end -> begin -> watch
+
+A ping of a sonar that turns takes time: each obstacle is predicted to the instant at which the
+beam meets it, and carried on to the end of the ping after its update.
 
 Each stage is a pure function of what is `Known` and of the ping. The tuple of stages is built once
 from the parameters; a feature that is off has none. So a late message is put in its place by
@@ -31,7 +34,7 @@ Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daura
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 
 import numpy as np
 
@@ -45,9 +48,9 @@ from ..model_checks import track_rules
 from .avoidance import closest_approach
 from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
-from .filters import behaviour_columns, build_filter, Mixture, moving_alike
+from .filters import behaviour_columns, build_filter, joined, Mixture, moving_alike, Sonar
 from .memory import Memory
-from .pings import default_variance, Match, Mount, Ping, Verdict
+from .pings import default_variance, Echoes, Match, Mount, Ping, Verdict
 from .state import Known, ObstacleState, recall, remember
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
@@ -96,6 +99,7 @@ class ObstacleTracker:
             self._recall,
             self._associate,
             self._update,
+            self._carry,
             self._weigh_misses if evidence else None,
             self._judge,
             self._remember if remembers else None,
@@ -164,7 +168,15 @@ class ObstacleTracker:
     def warnings(self) -> list[str]:
         """What the sonar states and cannot be true, in a sentence for the user."""
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
-        return self._stream.state.known.innovations.warnings('detections', advice)
+        known = self._stream.state.known
+        sentences = known.innovations.warnings('detections', advice)
+        takes, wrong = known.untimed
+        if takes:
+            sentences.append(
+                f'a scan takes {takes:.1f} s and its detections have no times: one instant is '
+                f'taken for all, wrong by up to {wrong:.1f} m'
+            )
+        return sentences
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         # Nonsense overflows: what is not finite then is dropped and counted.
@@ -214,9 +226,17 @@ class ObstacleTracker:
         finite end."""
         ping.before = known.sonar
         ping.dt = (ping.stamp_ns - known.stamp_ns) * 1e-9 if known.stamp_ns else 0.0
-        mixture, repairs = self.filter.advance(
-            known.obstacles.mixture, ping.before, ping.sonar, ping.dt
-        )
+        mixture = known.obstacles.mixture
+        if ping.sweep is None:
+            mixture, repairs = self.filter.advance(mixture, ping.before, ping.sonar, ping.dt)
+        else:
+            where = self.filter.whereabouts(mixture, ping.before)
+            met = ping.sweep.met(*where, ping.dt)
+            before = [ping.before] * len(met.ago)
+            mixture, repairs = self.filter.advance_each(
+                mixture, before, met.sonars, ping.dt - met.ago
+            )
+            ping.met = met.rows(mixture.is_finite())
         is_finite = mixture.is_finite()
         broken = len(is_finite) - int(np.count_nonzero(is_finite))
         known = known.with_columns(mixture=mixture).only(is_finite)
@@ -236,16 +256,16 @@ class ObstacleTracker:
 
     def _recall(self, known: Known, ping: Ping) -> Known:
         """Begin the tracks again of landmarks that come into view."""
-        return recall(known, self.filter, self.rules, self.config)
+        return recall(known, ping, self.filter, self.rules, self.config)
 
     def _associate(self, known: Known, ping: Ping) -> Known:
         """Tell which echo each obstacle gave; confirmed tracks choose before tentative ones."""
         mixture, config = known.obstacles.mixture, self.config
-        h, C = self.filter.expected(mixture, ping.sonar)
+        h, C = self.filter.expected(mixture, ping.sonar, ping.met and ping.met.sonars)
         if not len(h) or not len(ping.echoes):
             ping.match = Match(np.full(len(h), -1), h, np.zeros(len(h)))
             return known
-        fit = ping.echoes.fits(mixture, h, C, ping.sonar.pose, config)
+        fit = ping.echoes.fits(mixture, h, C, ping.pose(), config)
         # As probable as an echo is at the range of each track.
         usual, p = config.detection_probability, self._chance(mixture)
         weighed = fit + np.log(p / (1.0 - p) * (1.0 - usual) / usual)[:, None]
@@ -265,12 +285,22 @@ class ObstacleTracker:
             echoes.extended, echoes.z, echoes.R, default_variance(self.config)
         )
         after, nis[hit], repairs = self.filter.update(before, h, echoes.z, R, ping.sonar)
-        after = echoes.update_height(after, (before, h, R), self.filter, ping.sonar.pose)
+        after = echoes.update_height(after, (before, h, R), self.filter, ping.pose(hit))
         return known.with_columns(
             mixture=replace_rows(table.mixture, hit, after),
             bodies=replace_rows(table.bodies, hit, bodies),
             nis=nis,
         )._replace(repairs=known.repairs + repairs)
+
+    def _carry(self, known: Known, ping: Ping) -> Known:
+        """Carry the obstacles of a ping that takes time on to its end."""
+        if ping.met is None:
+            return known
+        met = ping.met
+        mixture, repairs = self.filter.advance_each(
+            known.obstacles.mixture, met.sonars, [ping.sonar] * len(met.ago), met.ago
+        )
+        return known.with_columns(mixture=mixture)._replace(repairs=known.repairs + repairs)
 
     def _weigh_misses(self, known: Known, ping: Ping) -> Known:
         """Take in what it says of the height that some gave no echo."""
@@ -322,11 +352,28 @@ class ObstacleTracker:
         bodies, R = Bodies.unknown(len(which)).with_echoes(
             echoes.extended, echoes.z, echoes.R, default_variance(self.config)
         )
-        height = echoes.height_prior(ping.sonar, ping.ground, self.config)
-        mixture = self.filter.begin(echoes.z, R, ping.sonar, height)
-        mixture = echoes.update_height(mixture, None, self.filter, ping.sonar.pose)
+        mixture, repairs = self._begun(echoes, R, ping)
+        known = known._replace(repairs=known.repairs + repairs)
         life = known.life.born(len(which), ping.stamp_ns, self.rules)
         return known.joined(life, mixture, bodies)
+
+    def _begun(self, echoes: Echoes, R: FloatArray, ping: Ping) -> tuple[Mixture, int]:
+        """Return obstacles at echoes, as they are at the end of the ping, and how many covariances
+        had to be repaired."""
+        if ping.sweep is None or echoes.late is None:
+            return self._begun_at(echoes, R, ping, ping.sonar), 0
+        sonars = [ping.sweep.at(late) for late in echoes.late]
+        new = [
+            self._begun_at(echoes.rows(np.array([i])), R[i : i + 1], ping, sonar)
+            for i, sonar in enumerate(sonars)
+        ]
+        end = [ping.sonar] * len(new)
+        return self.filter.advance_each(joined(new), sonars, end, -echoes.late)
+
+    def _begun_at(self, echoes: Echoes, R: FloatArray, ping: Ping, sonar: Sonar) -> Mixture:
+        height = echoes.height_prior(sonar, ping.ground, self.config)
+        mixture = self.filter.begin(echoes.z, R, sonar, height)
+        return echoes.update_height(mixture, None, self.filter, sonar.pose)
 
     def _watch(self, known: Known, ping: Ping) -> Known:
         """Count what users are warned of."""
@@ -337,6 +384,7 @@ class ObstacleTracker:
             alike=alike,
             pings_alike=known.pings_alike + alike,
             innovations=known.innovations.after(nis[sure], 2),
+            untimed=max(known.untimed, ping.skew(), key=itemgetter(1)),
         )
 
     # -- what is published ------------------------------------------------------------------------

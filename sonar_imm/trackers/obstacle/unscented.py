@@ -80,17 +80,27 @@ class Step(NamedTuple):
 
 
 def points(x: FloatArray, p: FloatArray, R: FloatArray, cone: bool) -> FloatArray:
-    """Return where means (..., 4) lie, seen from the sonar at (p, R): (..., 3)."""
+    """Return where means (T, K, 4) lie, seen from the sonar at (p, R), or from one of each target,
+    p (T, 3) and R (T, 3, 3): (T, K, 3)."""
     placed = np.moveaxis(x[..., :PLACED], -1, 0)
-    return np.moveaxis(place(placed, p[2], R, cone), 0, -1)
+    return np.moveaxis(place(placed, *upright(p, R), cone), 0, -1)
 
 
-def place(x: FloatArray, depth: float, R: FloatArray, cone: bool) -> FloatArray:
+def upright(p: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return depth and vertical (3,) of the sonar at (p, R), or depths (T, 1) and verticals (3, T,
+    1) of those of T targets."""
+    if p.ndim == 1:
+        return p[2], R[2]
+    return p[:, 2, None], R[:, 2].T[..., None]
+
+
+def place(x: FloatArray, depth: FloatArray, down: FloatArray, cone: bool) -> FloatArray:
     """Return the points (3, ...) of ranges, azimuths and depths x (3, ...), seen from a sonar at
-    that depth, turned by R: `geometry.reconstruct`, where no point exists the nearest one."""
+    that depth, from which the vertical is `down` (3, ...): `geometry.reconstruct`, where no point
+    exists the nearest one."""
     d, drop = x[0], x[2] - depth
     cosine, sine = np.cos(x[1]), np.sin(x[1])
-    a, b, c = R[2]
+    a, b, c = down
     if cone:
         r, across, k = d * cosine, d * sine, a
         drop = drop - b * across
@@ -207,7 +217,7 @@ def _moved(
     """Return where the sigma points lie, seen by the sonar after the step, (3, 1 + 2 n, L)."""
     size = len(y)
     placed = sigma_points(y[:PLACED], F[:PLACED, :PLACED])
-    m = place(placed, step.p0[2], step.R0, step.cone)
+    m = place(placed, step.p0[2], step.R0[2], step.cone)
     # Points on other columns lie at the centre.
     side = [*range(1, PLACED + 1), *[0] * (size - PLACED)]
     back = [*range(PLACED + 1, 2 * PLACED + 1), *[0] * (size - PLACED)]
@@ -315,7 +325,7 @@ def relative(
     S[COMMON:, :, still] = S[:, COMMON:, still] = 0.0
     F = semidefinite_roots(S)[:, :PLACED] * np.sqrt(COMMON + KAPPA)
     placed = sigma_points(y[:PLACED], F[:PLACED])
-    world = np.tensordot(R[:2], place(placed, p[2], R, cone), axes=1)
+    world = np.tensordot(R[:2], place(placed, p[2], R[2], cone), axes=1)
     apart = np.full(y.shape[1], 0.5 / (COMMON + KAPPA))
     # Points on the other columns lie at the centre.
     centre = np.full(y.shape[1], (KAPPA + (COMMON - PLACED)) / (COMMON + KAPPA))
