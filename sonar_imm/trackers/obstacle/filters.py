@@ -19,8 +19,9 @@ obstacle above and one below the sonar swing to opposite sides; and on the appro
 closes more slowly the further off the course in the vertical it lies, whether above or below. Both
 are so weak at first, and the second so ambiguous, that no single Gaussian holds what is known. So
 the vertical reach of the beam is cut into slices, each an unscented Kalman filter over (d, delta,
-z, s), and their likelihoods say in which of them the obstacle is. What stays constant is the
-obstacle's own depth z; its offset follows from it and the vehicle's depth.
+z) and the errors of the navigation (`navigation_errors`), and their likelihoods say in which of
+them the obstacle is. What stays constant is the obstacle's own depth z; its offset follows from it
+and the vehicle's depth.
 
 **Behaviour.** Inside each slice runs an interacting multiple model filter over what the obstacle
 does; two more states e say how:
@@ -57,7 +58,7 @@ from ...estimation.association import gate_threshold
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
-from .unscented import COMMON, Motion, RELATIVE, STATES, Step
+from .unscented import COMMON, Motion, NAV, RELATIVE, STATES, Step
 
 BAND = 0.9
 """Probability of the interval `low` to `high`."""
@@ -96,7 +97,8 @@ class Sonar(NamedTuple):
     """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
     when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
     reference: how far below the navigation reference, whose altitude it is, the sonar lies, m.
-    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown."""
+    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown. velocity: (3,)
+    m/s of the sonar now, NED; turn: (3,) rad/s, rate at which it turns, in its own axes."""
 
     pose: Pose
     altitude: float = np.nan
@@ -104,6 +106,8 @@ class Sonar(NamedTuple):
     late_by: float = 0.0
     reference: float = 0.0
     course: Annotated[FloatArray, '3'] = NOWHERE
+    velocity: Annotated[FloatArray, '3'] = np.zeros(3)
+    turn: Annotated[FloatArray, '3'] = np.zeros(3)
 
     def seabed_below(self) -> float:
         """Depth of the sea floor below the sonar, m, NaN when unknown."""
@@ -159,9 +163,9 @@ class View(NamedTuple):
 
 
 class DepthSlices:
-    """A Gaussian sum over depth slices, states (d, delta, z, s)."""
+    """A Gaussian sum over depth slices, states (d, delta, z, s, psi, b_N, b_E, tau)."""
 
-    n = 4
+    n = COMMON
     behaviours: tuple[str, ...] = ('fixed',)
 
     def __init__(self, config: ObstacleConfig):
@@ -176,16 +180,18 @@ class DepthSlices:
         edge = np.radians(config.sector_edge_deg)
         self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
         self._noise = tuple(walk**2 for walk in config.drift())
+        std, walk = config.navigation_errors()
+        self._errors, self._walk = np.diag(np.square(std)), np.square(walk)
 
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
         B, K = len(z), self.K
-        x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
+        x, P = np.zeros((B, K, self.n)), np.zeros((B, K, self.n, self.n))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.config.scale_std**2
+        P[..., NAV, NAV] = self._errors
         span = depth_span(z, sonar, self.config, height)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
@@ -203,7 +209,7 @@ class DepthSlices:
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
-        return self.predict_unchanged(mixture, before.pose, after.pose, dt)
+        return self.predict_unchanged(mixture, before, after, dt)
 
     def advance_each(
         self,
@@ -230,10 +236,12 @@ class DepthSlices:
         return place, velocity
 
     def predict_unchanged(
-        self, mixture: Mixture, before: Pose, after: Pose, dt: float
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """`advance` of targets that go on with what they do."""
-        step = Step(*before, *after, np.array(self._noise) * dt, self.cone)
+        poses = (*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
+        rates = (before.velocity, before.turn, after.velocity, after.turn, self._walk * dt, dt)
+        step = Step(*poses, *rates)
         x, P, repaired = unscented.advance(*mixture, self._motion(dt), step)
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
@@ -293,7 +301,8 @@ class DepthSlices:
         state, own = mixtures.moment_match(x, P, mu, 3)
         state[:, 2] -= depth
         band = mixtures.bands(x[:, :, 2] - depth, np.sqrt(P[:, :, 2, 2]), mu, 0.5 * (1.0 - BAND))
-        near = unscented.relative(x, P, mu, self.moves, *sonar.pose, self.cone)
+        moves = np.tile(self.moves, mu.shape[1] // self.K)
+        near = unscented.relative(x, P, mu, moves, *sonar.pose, self.cone)
         together, both = mixtures.moment_match(*near, mu, RELATIVE)
         return View(
             state,
@@ -330,7 +339,8 @@ class DepthSlices:
 
 
 class BehaviourSlices(DepthSlices):
-    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
+    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, psi, b_N, b_E, tau,
+    e_N, e_E)."""
 
     n = STATES
 
@@ -385,7 +395,7 @@ class BehaviourSlices(DepthSlices):
         x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.config.scale_std**2
+        P[..., NAV, NAV] = self._errors
         x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
         P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
         mu = np.zeros((B, self.K))
@@ -410,10 +420,11 @@ class BehaviourSlices(DepthSlices):
         self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         mixed = mixtures.mix(*mixture, self._prior, self.slices, self._transition(dt), DROPPED)
-        return self.predict_unchanged(Mixture(*mixed), before.pose, after.pose, dt)
+        return self.predict_unchanged(Mixture(*mixed), before, after, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
-        return np.asarray(mu @ self._of)
+        parts = mu.reshape(len(mu), mu.shape[1] // self.K, self.K)
+        return np.asarray(parts.sum(axis=1) @ self._of)
 
     def _transition(self, dt: float) -> FloatArray:
         """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds

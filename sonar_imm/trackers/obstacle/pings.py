@@ -51,6 +51,8 @@ INSTANT = 0.01
 """Seconds within which a ping is one instant."""
 ROUNDS = 3
 """In which the beam that turns and an obstacle meet."""
+RATES_OVER_NS = 300_000_000
+"""Over which velocities are differences of poses."""
 SKEWED = 0.3
 """m, from which it matters that the vehicle moves during a ping."""
 KEPT_AT_FIRST = 30.0
@@ -249,7 +251,8 @@ class Ping:
     no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
     was, and in a ping that takes time where the obstacles were `met`, by `predict`; `match` by
     `associate`; `verdict` by `judge`. sweep: of a ping that takes time; untimed: s that it took
-    where nobody says when it met what."""
+    where nobody says when it met what. heard: what was known of the navigation before the update,
+    by `heed`."""
 
     stamp_ns: int
     sonar: Sonar
@@ -261,6 +264,7 @@ class Ping:
     before: Sonar = field(init=False)
     dt: float = field(init=False)
     match: Match = field(init=False)
+    heard: tuple[FloatArray, FloatArray] = field(init=False)
     verdict: Verdict = field(init=False)
 
     def pose(self, which: IndexArray | slice = slice(None)) -> Pose:
@@ -361,11 +365,27 @@ class Inbox(NamedTuple):
         height = np.nan
         if altitude and altitude.stamp_ns >= stamp_ns - nanoseconds(config.max_altitude_age):
             height = altitude.altitude
+        rates = self._rates(stamp_ns, pose, mount)
         late_ns = _late_ns(config)
         if not late_ns:
-            return Sonar(pose, height, reference=reference, course=straight)
+            return Sonar(pose, height, None, 0.0, reference, straight, *rates)
         late = mount.sonar(self.navigation.pose(stamp_ns + late_ns))
-        return Sonar(pose, height, late, late_ns * 1e-9, reference, straight)
+        return Sonar(pose, height, late, late_ns * 1e-9, reference, straight, *rates)
+
+    def _rates(self, stamp_ns: int, pose: Pose, mount: Mount) -> tuple[FloatArray, FloatArray]:
+        """Return velocity (3,) m/s, NED, and turn rate (3,) rad/s, in its own axes, of the sonar,
+        by the difference of poses."""
+        before_ns = max(stamp_ns - RATES_OVER_NS, self.navigation.stamps[0])
+        dt = (stamp_ns - before_ns) * 1e-9
+        if dt <= 0.0:
+            return np.zeros(3), np.zeros(3)
+        before = mount.sonar(self.navigation.pose(before_ns))
+        turned = before.R.T @ pose.R
+        turn = 0.5 * (turned - turned.T)[[2, 0, 1], [1, 2, 0]]
+        sine = float(np.linalg.norm(turn))
+        angle = np.arctan2(sine, 0.5 * (np.trace(turned) - 1.0))
+        scale = angle / sine if sine > 1e-9 else 1.0
+        return (pose.position - before.position) / dt, turn * scale / dt
 
     def forgetting(self, stamp_ns: int, config: ObstacleConfig) -> Inbox:
         """Return the inbox without the poses that no ping needs any more."""

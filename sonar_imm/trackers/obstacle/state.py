@@ -39,6 +39,7 @@ from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
 from .filters import DepthSlices, Mixture, Sonar
 from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
+from .navigation_errors import NavigationErrors
 from .pings import Inbox, Mount, Ping
 
 
@@ -60,7 +61,7 @@ class Known(NamedTuple):
     far because their numbers were not finite; alike: whether most obstacles move alike
     (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
     confirmed obstacles; untimed: s that the pings took that are the most wrong for it, and m by
-    which they are, where their echoes have no times."""
+    which they are, where their echoes have no times; navigation: its errors."""
 
     stamp_ns: int
     sonar: Sonar
@@ -73,6 +74,7 @@ class Known(NamedTuple):
     pings_alike: int = 0
     innovations: NisMemory = NisMemory()
     untimed: tuple[float, float] = (0.0, 0.0)
+    navigation: NavigationErrors = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
 
     @classmethod
     def nothing(cls, filter_: DepthSlices, rules: TrackRules) -> Known:
@@ -80,7 +82,9 @@ class Known(NamedTuple):
         K, n = filter_.K, filter_.n
         mixture = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
         sonar = Sonar(Pose(np.zeros(3), np.eye(3)))
-        return cls(0, sonar, Tracks.none(rules), _begun(mixture, Bodies.unknown(0), 0.0, False))
+        nobody = _begun(mixture, Bodies.unknown(0), 0.0, False)
+        errors = NavigationErrors.of(filter_.config)
+        return cls(0, sonar, Tracks.none(rules), nobody, navigation=errors)
 
     @property
     def confirmed(self) -> BoolArray:
@@ -197,9 +201,12 @@ def recall(
             place = geometry.flip_world(each.place[None])
             met = ping.sweep.met(place, np.zeros((1, 3)), dt)
             sonar, dt = met.sonars[0], dt - float(met.ago[0])
+        # Its place drifted as `navigation_grade` says, which holds for any time.
+        exact = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
         mixture, repairs = filter_.predict_unchanged(
-            each.mixture(filter_.K), each.sonar, sonar.pose, dt
+            exact.given_to(each.mixture(filter_.K)), Sonar(each.sonar), sonar, dt
         )
+        mixture = known.navigation.given_to(mixture)
         if not mixture.is_finite()[0]:
             continue
         if met is not None and ping.met is not None:

@@ -27,6 +27,7 @@ from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
 from .memory import Existence, Landmark
+from .navigation_errors import NavigationErrors
 from .pings import Inbox
 from .state import Known, Obstacles, ObstacleState
 
@@ -34,5 +35,5 @@ STATE_TYPES = (
     *STREAM_TYPES,
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
     *(ObstacleState, Inbox, Known, Obstacles, Tracks, NisMemory, Mixture, Sonar, Bodies),
-    *(MissEvidence, Existence, Landmark, GroundMap, Cells),
+    *(MissEvidence, Existence, Landmark, GroundMap, Cells, NavigationErrors),
 )

@@ -19,7 +19,8 @@ how an echo of a fixed obstacle must move, and that depends on how far above or 
 lies. The tracker follows each obstacle in sonar coordinates and learns its vertical offset on the
 way (`filters`). Navigation and pings arrive in any order (`pings`). A ping goes through
 
-    predict -> recall -> associate -> update -> carry -> judge -> remember -> end -> begin -> watch
+    predict -> recall -> associate -> heed -> update -> tell -> carry -> judge -> remember -> end
+    -> begin -> watch
 
 A ping of a sonar that turns takes time: each obstacle is predicted to the instant at which the
 beam meets it, and carried on to the end of the ping after its update.
@@ -37,6 +38,7 @@ from collections.abc import Callable, Collection, Sequence
 from operator import attrgetter, itemgetter
 
 import numpy as np
+from scipy.special import expit
 
 from ...estimates import Estimate, places
 from ...estimation.arrays import FloatArray, replace_rows, take
@@ -50,6 +52,14 @@ from .bodies import Bodies, with_common_errors
 from .config import ObstacleConfig
 from .filters import behaviour_columns, build_filter, joined, Mixture, moving_alike, Sonar
 from .memory import Memory
+from .navigation_errors import (
+    marginals,
+    messages,
+    NavigationErrors,
+    SURE,
+    told,
+    under_two_assumptions,
+)
 from .pings import default_variance, Echoes, Match, Mount, Ping, Verdict
 from .state import Known, ObstacleState, recall, remember
 
@@ -92,13 +102,16 @@ class ObstacleTracker:
         self.filter = build_filter(config)
         self.rules = track_rules(config)
         evidence, remembers = config.misses == 'evidence', config.max_landmarks > 0
+        several = bool(config.navigation_errors()[0].any())
         self._published = attrgetter('misses.shown' if evidence else 'mixture')
         self.stages = wanted(
             self._predict,
             self._predict_misses if evidence else None,
             self._recall,
             self._associate,
+            self._heed if several else None,
             self._update,
+            self._tell if several else None,
             self._carry,
             self._weigh_misses if evidence else None,
             self._judge,
@@ -150,6 +163,7 @@ class ObstacleTracker:
         state = self._stream.state
         known, inbox = state.known, state.inbox
         nis = known.obstacles.nis[np.isfinite(known.obstacles.nis)]
+        good = self._both(known)[1][known.confirmed]
         return {
             'tracks': len(known.life),
             'confirmed': int(known.confirmed.sum()),
@@ -163,6 +177,8 @@ class ObstacleTracker:
             'pings_moving_alike': known.pings_alike,
             'covariance_repairs': known.repairs,
             'landmarks': len(known.memory),
+            'navigation_good': float(good.mean()) if len(good) else float('nan'),
+            **known.navigation.health(),
         }
 
     def warnings(self) -> list[str]:
@@ -170,6 +186,8 @@ class ObstacleTracker:
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
         known = self._stream.state.known
         sentences = known.innovations.warnings('detections', advice)
+        shown = int(np.count_nonzero(known.confirmed))
+        sentences += known.navigation.warnings(known.sonar.course, shown)
         takes, wrong = known.untimed
         if takes:
             sentences.append(
@@ -216,7 +234,15 @@ class ObstacleTracker:
             known = remember(known, everybody, self.filter, self.mount, self.config)
         none = known.only(~everybody)
         return ObstacleState(
-            Known(0, none.sonar, none.life, none.obstacles, none.memory, none.repairs)
+            Known(
+                0,
+                none.sonar,
+                none.life,
+                none.obstacles,
+                none.memory,
+                none.repairs,
+                navigation=NavigationErrors.of(self.config),
+            )
         )
 
     # -- the stages -------------------------------------------------------------------------------
@@ -240,9 +266,11 @@ class ObstacleTracker:
         is_finite = mixture.is_finite()
         broken = len(is_finite) - int(np.count_nonzero(is_finite))
         known = known.with_columns(mixture=mixture).only(is_finite)
+        errors = known.navigation.predicted(ping.stamp_ns, ping.dt, self.config)
         return known._replace(
             stamp_ns=ping.stamp_ns,
             sonar=ping.sonar,
+            navigation=errors,
             repairs=known.repairs + repairs,
             broken=known.broken + broken,
         )
@@ -291,6 +319,24 @@ class ObstacleTracker:
             bodies=replace_rows(table.bodies, hit, bodies),
             nis=nis,
         )._replace(repairs=known.repairs + repairs)
+
+    def _heed(self, known: Known, ping: Ping) -> Known:
+        """Note what is known of the errors of the navigation before the update."""
+        ping.heard = marginals(known.obstacles.mixture)
+        return known
+
+    def _tell(self, known: Known, ping: Ping) -> Known:
+        """Tell all other obstacles what the update of each said of these errors."""
+        mixture = known.obstacles.mixture
+        chance = expit(known.obstacles.existence.now())
+        trust = np.where(known.confirmed & (chance > SURE), chance, 0.0)
+        L, eta = messages(ping.heard, marginals(mixture), trust)
+        if not L.any():
+            return known
+        if len(L) > 1:
+            mixture = told(mixture, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
+        known = known._replace(navigation=known.navigation.told(L, eta))
+        return known.with_columns(mixture=mixture)
 
     def _carry(self, known: Known, ping: Ping) -> Known:
         """Carry the obstacles of a ping that takes time on to its end."""
@@ -352,27 +398,37 @@ class ObstacleTracker:
         bodies, R = Bodies.unknown(len(which)).with_echoes(
             echoes.extended, echoes.z, echoes.R, default_variance(self.config)
         )
-        mixture, repairs = self._begun(echoes, R, ping)
+        mixture, repairs = self._begun(echoes, R, ping, known.navigation)
         known = known._replace(repairs=known.repairs + repairs)
         life = known.life.born(len(which), ping.stamp_ns, self.rules)
         return known.joined(life, mixture, bodies)
 
-    def _begun(self, echoes: Echoes, R: FloatArray, ping: Ping) -> tuple[Mixture, int]:
+    def _begun(
+        self, echoes: Echoes, R: FloatArray, ping: Ping, errors: NavigationErrors
+    ) -> tuple[Mixture, int]:
         """Return obstacles at echoes, as they are at the end of the ping, and how many covariances
         had to be repaired."""
         if ping.sweep is None or echoes.late is None:
-            return self._begun_at(echoes, R, ping, ping.sonar), 0
+            return self._begun_at(echoes, R, ping, errors, ping.sonar), 0
         sonars = [ping.sweep.at(late) for late in echoes.late]
         new = [
-            self._begun_at(echoes.rows(np.array([i])), R[i : i + 1], ping, sonar)
+            self._begun_at(echoes.rows(np.array([i])), R[i : i + 1], ping, errors, sonar)
             for i, sonar in enumerate(sonars)
         ]
         end = [ping.sonar] * len(new)
         return self.filter.advance_each(joined(new), sonars, end, -echoes.late)
 
-    def _begun_at(self, echoes: Echoes, R: FloatArray, ping: Ping, sonar: Sonar) -> Mixture:
+    def _begun_at(
+        self,
+        echoes: Echoes,
+        R: FloatArray,
+        ping: Ping,
+        errors: NavigationErrors,
+        sonar: Sonar,
+    ) -> Mixture:
         height = echoes.height_prior(sonar, ping.ground, self.config)
         mixture = self.filter.begin(echoes.z, R, sonar, height)
+        mixture = errors.given_to(mixture)
         return echoes.update_height(mixture, None, self.filter, sonar.pose)
 
     def _watch(self, known: Known, ping: Ping) -> Known:
@@ -389,8 +445,14 @@ class ObstacleTracker:
 
     # -- what is published ------------------------------------------------------------------------
 
+    def _both(self, known: Known) -> tuple[Mixture, FloatArray]:
+        """See `under_two_assumptions`."""
+        age = (known.stamp_ns - known.navigation.first_ns) * 1e-9
+        mixture = self._published(known.obstacles)
+        return under_two_assumptions(mixture, known.confirmed, age, self.config)
+
     def _estimate(self, ping: Known) -> Estimate:
-        mixture = self._published(ping.obstacles)
+        mixture, _ = self._both(ping)
         view = self.filter.view(mixture, ping.sonar)
         view = with_common_errors(
             view, ping.sonar, ping.obstacles.bodies, self.config.range_scale_std
