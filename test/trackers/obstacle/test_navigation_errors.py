@@ -17,14 +17,13 @@ assumptions."""
 
 from pathlib import Path
 
-from helpers.obstacle_runs import run, track_scene
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.trackers.obstacle import navigation_errors, unscented
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.filters import BehaviourSlices, Mixture, Sonar
+from sonar_imm.trackers.obstacle.filters import Mixture
 from sonar_imm.trackers.obstacle.navigation_errors import NavigationErrors
 from sonar_imm.trackers.obstacle.unscented import Motion, NAV, Step
 
@@ -146,9 +145,7 @@ def test_weights_of_components_that_are_told_are_their_evidence():
         assert_allclose(got.x[0, k], x[0, k] + gain @ v, rtol=1e-9, atol=1e-12)
         exact = P[0, k] - gain @ P[0, k][NAV]
         assert_allclose(got.P[0, k], exact, rtol=1e-8, atol=1e-12)
-        weight[k] = mu[0, k] * np.exp(-0.5 * v @ np.linalg.solve(S, v)) / np.sqrt(
-            np.linalg.det(S)
-        )
+        weight[k] = mu[0, k] * np.exp(-0.5 * v @ np.linalg.solve(S, v)) / np.sqrt(np.linalg.det(S))
     assert_allclose(got.mu[0], weight / weight.sum(), rtol=1e-9)
 
 
