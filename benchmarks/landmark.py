@@ -224,7 +224,7 @@ class Landmark:
         )  # fmt: skip
         return (
             Mixture(after.x, after.P, mixture.mu),
-            after.nis[:, 0],
+            after.log_likelihood[:, 0],
             int(np.count_nonzero(after.repaired)),
         )
 
@@ -249,10 +249,15 @@ class Landmark:
             seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
         )
 
-    def beam_probability(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+    def visible(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, BoolArray]:
         m = geometry.to_body(sonar.pose, mixture.x[..., :3])
-        spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
-        return mixtures.beam_probability(m, spread, mixture.mu, *self._beam)
+        away = np.linalg.norm(m, axis=-1)
+        P = np.zeros((*mixture.mu.shape, 3, 3))
+        # Range, azimuth and depth, as of the sonar.
+        P[..., 0, 0] = np.trace(mixture.P[..., :2, :2], axis1=-2, axis2=-1)
+        P[..., 1, 1] = P[..., 0, 0] / np.square(away)
+        P[..., 2, 2] = mixture.P[..., 2, 2]
+        return mixtures.visible(m, P, mixture.mu, *self._beam)
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])

@@ -28,6 +28,7 @@ _WITH_ITS_SET = 'was removed together with its model set'
 _ROLL = 'was removed: use the elevation of the echoes, or let the vehicle roll'
 _OWN_SET = 'was removed: families contains constant velocity; docs/howto/own_model.md adds a set'
 _CONSTANT = 'was removed: its default is a constant now'
+_LIFE = 'was removed: obstacles live by confirm_existence; for divers its default is a constant'
 _OF_TARGET = (
     'was removed: a preset has it (parameter target); a set of your own models may differ, see '
     'docs/howto/own_model.md'
@@ -94,14 +95,19 @@ GONE: dict[str, str] = {
             *('adaptation', 'adaptation_prior', 'adaptation_guard', 'reference_step'),
             *('longest_step', 'transceiver_lever_std', 'vessel_attitude_std_deg'),
             *('vessel_max_gap', 'vessel_max_extrapolation', 'fix_bias_time', 'survival_time'),
-            *('confirm_hits', 'confirm_window', 'delete_misses', 'gate_probability'),
+            *('confirm_hits', 'gate_probability'),
             *('max_gap', 'restart_after'),
             *('components', 'sway_time', 'speed_noise', 'behaviour_time', 'seabed_std'),
-            *('ground_std', 'ground_radius', 'sector_edge_deg', 'max_offset', 'altitude_std'),
+            *('ground_std', 'ground_radius', 'max_offset', 'altitude_std'),
             *('max_altitude_age', 'scale_std', 'course_window', 'landmark_time'),
             'max_navigation_gap',
         )
     },
+    **{f'parameter {name}': _LIFE for name in ('confirm_window', 'delete_misses')},
+    'parameter sector_edge_deg': 'was removed: the edges of the beam are smeared by 1.2 degrees',
+    'parameter outlier_probability': (
+        'was removed: an echo that is not of an obstacle is clutter (parameter clutter_density)'
+    ),
     'parameter systematic_errors': (
         'was removed: state how good instruments are; that they are exact says 1e-6 '
         '(parameter sound_speed_std)'

@@ -45,7 +45,7 @@ OF_SYSTEM = {
             *('ground_radius', 'sector_edge_deg', 'max_offset', 'altitude_std', 'course_window'),
             *('max_altitude_age', 'scale_std', 'landmark_time', 'max_navigation_gap', 'max_gap'),
             *('range_step', 'bearing_step_deg', 'detection_ranges', 'detection_factors'),
-            *('position_noise', 'yaw_noise_deg', 'depth_noise'),
+            *('position_noise', 'yaw_noise_deg', 'depth_noise', 'outlier_probability'),
         ),
         'obstacle',
     ),

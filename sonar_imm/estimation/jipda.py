@@ -61,6 +61,31 @@ def associate(
     return beta, missed, np.minimum(missed + beta.sum(axis=1), 1.0)
 
 
+def associate_classes(
+    ratio: FloatArray,
+    possible: BoolArray,
+    existence: FloatArray,
+    detection_probability: FloatArray,
+    visible: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return beta (T, D), none (T,) = Pr(no detection is the track's, whether it exists or not),
+    and the new existence (T, C) by class of detectability.
+
+    :param ratio: (T, D) f / lambda, f with the probability of each model to be visible.
+    :param possible: (T, D) False for pairs outside the gate.
+    :param existence: (T, C) probability that the target exists and is of each class.
+    :param detection_probability: (T, C) of a visible target of each class.
+    :param visible: (T, 1) or (T, C) probability that the target is visible.
+    """
+    seen = existence * detection_probability
+    detected, missed = seen.sum(axis=1), 1.0 - (seen * visible).sum(axis=1)
+    beta, none = marginals(detected[:, None] * ratio, missed, possible)
+    silent = existence * (1.0 - detection_probability * visible)
+    after = (none / missed)[:, None] * silent
+    share = seen / np.where(detected > 0.0, detected, 1.0)[:, None]
+    return beta, none, after + beta.sum(axis=1)[:, None] * share
+
+
 def nearest_older(
     mean: FloatArray, covariance: FloatArray, ids: IntArray, free: BoolArray, firm: BoolArray
 ) -> tuple[IntArray, FloatArray]:

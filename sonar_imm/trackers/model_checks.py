@@ -20,20 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..estimation.association import TrackRules
 from ..estimation.markov import check_transition_matrix
-from ..measurements import nanoseconds
-from .shared_parameters import TrackLifeParameters
-
-
-def track_rules(config: TrackLifeParameters) -> TrackRules:
-    """The rules of tracks that `config` states."""
-    return TrackRules(
-        config.confirm_hits,
-        config.confirm_window,
-        config.delete_misses,
-        nanoseconds(config.max_coast),
-    )
 
 
 def matrix_problems(

@@ -98,25 +98,9 @@ class TrackLifeParameters(Config):
 
     # fmt: off
     max_tracks: int = live(20, '', 'largest number of targets tracked at once', range=(1, 2000))
-    confirm_hits: int = live(3, '',
-        'number of hits within confirm_window that confirm a track', range=(1, 100))
-    confirm_window: int = live(5, '',
-        'number of latest scans or pings in which confirm_hits are counted to confirm a track',
-        range=(1, 100))
-    delete_misses: int = live(5, '',
-        'number of consecutive scans or pings without a hit that cover a confirmed target and so '
-        'end its track', range=(1, 10000))
+    confirm_hits: int = live(3, '', 'number of hits that confirm a track', range=(1, 100))
     max_coast: float = live(60.0, 's', 'time without a hit that ends any track', range=(0.01, 1e6))
     # fmt: on
-
-    def check(self) -> list[str]:
-        problems = super().check()
-        if self.confirm_hits > self.confirm_window:
-            problems.append(
-                f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
-                f'({self.confirm_window})'
-            )
-        return problems
 
 
 @frozen(kw_only=True, slots=False)

@@ -261,7 +261,7 @@ def test_the_obstacle_update_stays_positive_definite():
     h, z = np.zeros((500, 4, 2)), np.zeros((500, 2))
     repairs = 0
     for _ in range(5):
-        x, P, mu, _, repaired = mixtures.update(x, P, mu, h, z, R, 0.05, 1e-3)
+        x, P, mu, _, repaired = mixtures.update(x, P, mu, h, z, R)
         assert is_covariance(P)
         assert np.isfinite(x).all() and (mu >= 0.0).all()
         np.testing.assert_allclose(mu.sum(axis=1), 1.0, rtol=1e-12)

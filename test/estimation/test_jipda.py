@@ -24,12 +24,13 @@ import numpy as np
 from oracles import jipda as oracle
 import pytest
 
-from sonar_imm.estimation import bank, jipda
+from sonar_imm.estimation import bank, jipda, marginals
 from sonar_imm.estimation.bank import Gaussians
 
 VECTORS = np.load(
     Path(__file__).parents[1] / 'vectors' / 'diver_sea' / 'association.npz', allow_pickle=False
 )
+CLUTTER = Path(__file__).parents[1] / 'vectors' / 'obstacle_in_clutter' / 'joint_events.npz'
 CASES = ('jipda_2x2', 'jipda_3x3', 'jipda_1x2', 'jipda_2x0')
 FORMS = (oracle.associate, jipda.associate)
 
@@ -172,3 +173,27 @@ def test_log_odds():
     found = jipda.log_odds(np.array([0.0, 0.2, 0.9, 1.0]))
     assert found[0] == -np.inf and np.isfinite(found[3])
     np.testing.assert_allclose(found[1:3], np.log([0.25, 9.0]))
+
+
+def test_existence_by_class_of_detectability_against_enumeration(monkeypatch):
+    with np.load(CLUTTER) as v:
+        cases = [
+            {key.split('/')[1]: v[key] for key in v if key.startswith(f'{k:02d}/')}
+            for k in range(int(v['count']))
+        ]
+        probability = v['detection_probability']
+    for largest, answer in ((marginals.LARGEST, 'beta'), (0, 'beta_bp')):
+        monkeypatch.setattr(marginals, 'LARGEST', largest)
+        for case in cases:
+            T = len(case['q'])
+            beta, none, after = jipda.associate_classes(
+                case['ratio'],
+                np.ones(case['ratio'].shape, bool),
+                case['q'],
+                np.tile(probability, (T, 1)),
+                case['visible'][:, None],
+            )
+            np.testing.assert_allclose(beta, case[answer], atol=1e-9)
+            if largest:
+                np.testing.assert_allclose(none, case['missed'], atol=1e-9)
+                np.testing.assert_allclose(after, case['q_after'], atol=1e-9)

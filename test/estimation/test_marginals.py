@@ -67,11 +67,12 @@ def test_tracks_and_detections_may_change_roles(T, D):
 def test_rows_are_distributions_and_no_detection_is_given_away_twice(T, D):
     pair, none = marginals(*problem(T + D, T, D, share=0.9))
     np.testing.assert_allclose(pair.sum(axis=1) + none, 1.0, rtol=1e-12)
-    assert (pair >= 0.0).all() and (pair.sum(axis=0) <= 1.0 + 1e-12).all()
+    exact = min(T, D) <= module.LARGEST
+    assert (pair >= 0.0).all() and (pair.sum(axis=0) <= 1.0 + (1e-12 if exact else 1e-3)).all()
 
 
-def test_a_cluster_that_is_too_large_loses_its_least_probable_pairs(monkeypatch):
-    """Fourteen tracks side by side, each near its own detection: almost nothing is lost."""
+def test_a_cluster_that_is_too_large_is_solved_by_propagation(monkeypatch):
+    """Fourteen tracks side by side, each near its own detection."""
     at = np.arange(14.0)
     distance = np.square(at[:, None] - at[None] - 0.2)
     weight, missed = 90.0 * np.exp(-0.5 * distance / 0.2), np.full(14, 0.1)
@@ -79,8 +80,8 @@ def test_a_cluster_that_is_too_large_loses_its_least_probable_pairs(monkeypatch)
     pair, none = marginals(weight, missed, possible)
     monkeypatch.setattr(module, 'LARGEST', 14)
     exact, alone = marginals(weight, missed, possible)
-    assert 0.0 < np.abs(pair - exact).max() < 0.03
-    assert np.abs(none - alone).max() < 0.03
+    assert 0.0 < np.abs(pair - exact).max() < 0.02
+    assert np.abs(none - alone).max() < 0.02
 
 
 def test_equal_pairs_in_a_large_cluster_end():

@@ -22,6 +22,7 @@ import numpy as np
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
+from sonar_imm.trackers.obstacle.mixtures import innovations
 from sonar_imm.trackers.obstacle.pings import Echoes, Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
@@ -29,13 +30,16 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 SECOND = 10**9
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
 FIXED = {'behaviours': ('fixed',)}
+AS_STATED = {'variance_scale_min': 1.0, 'variance_scale_max': 1.0}
+"""Variances as detections state them: what is wrong shows in the innovations."""
 FAITHFUL = {
     **FIXED,
+    **AS_STATED,
     'components': 41,
     'max_offset': 12.0,
     'scale_std': 0.0,
     'navigation_noise': (0.0, 0.0, 0.0),
-    'outlier_probability': 0.0,
+    'clutter_density': 1e-9,
     'gate_probability': 0.9999999,
     'max_tracks': 1,
     'confirm_hits': 1,
@@ -168,8 +172,8 @@ def follow(measurements, config):
         else:
             mixture, _ = filter_.advance(mixture, before, sonar, 0.5)
             if len(z):
-                h, _ = filter_.expected(mixture, sonar)
-                mixture, squared, _ = filter_.update(mixture, h, z, R, sonar)
-                nis.append(squared[0])
+                h, C = filter_.expected(mixture, sonar)
+                nis.append(innovations(mixture.mu, z[:, None] - h, C + R[:, None])[2][0])
+                mixture = filter_.update(mixture, h, z, R, sonar)[0]
         before = sonar
     return np.array(nis), filter_.view(mixture, sonar)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from helpers.obstacle_runs import run, SECOND
+from helpers.obstacle_runs import AS_STATED, run, SECOND
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
@@ -64,7 +64,7 @@ def measurements(data, altitude=True):
 def track(data, altitude=True, **values):
     """The estimates of an encounter, ping by ping."""
     lever = tuple(float(value) for value in data['sonar_lever_flu'])
-    config = ObstacleConfig(sonar_lever=lever, **values)
+    config = ObstacleConfig(sonar_lever=lever, **{**AS_STATED, **values})
     return list(run(ObstacleTracker(config), measurements(data, altitude)).values())
 
 

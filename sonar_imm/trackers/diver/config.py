@@ -267,8 +267,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     gate_probability: float = inherited(
         DetectionParameters, 'gate_probability', 0.999, constant=True)
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
-    confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
-    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
+    confirm_window: int = constant(5, '',
+        'number of latest scans or pings in which confirm_hits are counted to confirm a track',
+        range=(1, 100))
+    delete_misses: int = constant(5, '',
+        'number of consecutive scans or pings without a hit that cover a confirmed target and so '
+        'end its track', range=(1, 10000))
     birth_density: float = live(1.2e-5, '1/m^2',
         'jipda: number of new divers expected in a scan, per square metre',
         range=(1e-12, 1.0))
@@ -363,6 +367,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         stated = [name for name in (*off, 'bearing_bias_std_deg') if getattr(self, name)]
         if self.systematic_errors == 'exact' and stated:
             problems.append(f'systematic_errors is exact, but {stated[0]} is not 0')
+        if self.confirm_hits > self.confirm_window:
+            problems.append(
+                f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
+                f'({self.confirm_window})'
+            )
         if self.depth_min > self.depth_max:
             problems.append(
                 f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'

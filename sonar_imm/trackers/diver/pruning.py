@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ...estimation import jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, TENTATIVE, TrackRules, Tracks
-from ...measurements import NOBODY
+from ...measurements import nanoseconds, NOBODY
 from . import names
 from .config import DiverConfig
 from .fixes import CONFIRM_EXISTENCE
@@ -60,6 +60,16 @@ NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
 probability, `names.scans_to_merge` raises the number of scans."""
 
 StatusArray = NDArray[np.uint8]
+
+
+def track_rules(config: DiverConfig) -> TrackRules:
+    """Return the rules of tracks that `config` states."""
+    return TrackRules(
+        config.confirm_hits,
+        config.confirm_window,
+        config.delete_misses,
+        nanoseconds(config.max_coast),
+    )
 
 
 def pruning_stage(

@@ -50,7 +50,6 @@ from ...estimation.consistency import excess, NisMemory
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
-from ..model_checks import track_rules
 from . import (
     births,
     clutter,
@@ -107,7 +106,7 @@ class DiverTracker:
     def _apply_config(self, config: DiverConfig) -> None:
         """Build everything that depends on the parameters, once per change."""
         self.config, models = config, self.models
-        self.rules = track_rules(config)
+        self.rules = pruning.track_rules(config)
         layout = lru_cache(maxsize=16)(partial(Instruments.layout, config=config, models=models))
 
         def layouts(known: Known) -> Layout:

@@ -20,10 +20,9 @@ the elevation of an echo as well: a third measurement of each component,
     eps(d, delta, z) = asin(m_z / d),    positive down, m the point seen from the sonar,
 
 linearised at the mean: within a depth slice it is nearly straight. A new obstacle has its slices
-over `REACH` standard deviations of the measured elevation, and no longer over the whole beam. An
-echo is gated in three dimensions; clutter is spread evenly over the height of the beam. Range and
-azimuth go into the update first, the elevation after them, with the probability that the echo is
-an outlier which they leave. Rows without elevation are treated as ever, also beside others.
+over `REACH` standard deviations of the measured elevation, and no longer over the whole beam.
+Range and azimuth go into the update first, the elevation after them; clutter is spread evenly over
+the height of the beam. Rows without elevation are treated as ever, also beside others.
 
 **Misses** (`misses: evidence`). Where an obstacle lies at the elevation eps, a ping shows it with
 the probability p B(eps): p is how often this obstacle gives an echo inside the beam, B the pattern
@@ -31,7 +30,7 @@ of the beam, 1 inside and 0 outside. So with the depth z of a component N(m, S),
 (z - m) / d, a ping multiplies the density of z by
 
     f(z) = 1 - p B(z)                        without an echo,
-    f(z) = outlier + (1 - outlier) B(z)      with one, which may not be the obstacle's.
+    f(z) = doubt + (1 - doubt) B(z)          with one, which may not be the obstacle's.
 
 B is the difference of two normal distribution functions, so that Z = E f is known in closed form;
 Z weighs the component, and its derivatives give mean and covariance of what is left of it,
@@ -61,11 +60,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ...acoustics.geometry import Pose
-from ...estimation import imm
 from ...estimation.arrays import BoolArray, FloatArray, replace_rows, take
-from ...estimation.association import gate_threshold
 from .config import ObstacleConfig
 from .filters import DepthSlices, Mixture, Sonar
+from .mixtures import weights
 from .unscented import points, upright
 
 REACH = 4.0
@@ -145,75 +143,18 @@ def _at_least(turn: FloatArray) -> FloatArray:
     return np.copysign(np.maximum(np.abs(turn), STEEPEST), turn)
 
 
-def elevation_fits(
-    mixture: Mixture,
-    h: FloatArray,
-    pose: Pose,
-    z: FloatArray,
-    R: FloatArray,
-    seen: Elevations,
-    config: ObstacleConfig,
-) -> FloatArray:
-    """Table (T, D) as of `imm.gate`, of detections z (D, 2), R (D, 2, 2) with the elevations
-    `seen`, of which h (T, K, 2) is expected. Densities are those per metre and radian beside
-    clutter that is as dense at any elevation in the beam."""
-    T, K, n = mixture.x.shape
-    angle, slope = expected_elevations(mixture, pose, config.azimuth_model == 'cone')
-    H = np.zeros((T, K, 3, n))
-    H[:, :, 0, 0] = H[:, :, 1, 1] = 1.0
-    H[:, :, 2, :3] = slope
-    fov = np.radians(config.vertical_fov_deg)
-    z3, R3 = np.zeros((len(z), 3)), np.zeros((len(z), 3, 3))
-    z3[:, :2], R3[:, :2, :2] = z, R
-    known = np.isfinite(seen.angle)
-    z3[:, 2] = np.where(known, seen.angle, 0.0)
-    R3[:, 2, 2] = np.where(known, seen.variance, fov**2 / 12.0)  # anywhere in the beam
-    h3 = np.concatenate([h, angle[..., None]], axis=-1)
-    threshold = gate_threshold(config.gate_probability, 3)
-    fit = imm.gate(h3, H, mixture.P, mixture.mu, z3, R3, threshold)
-    return np.asarray(fit + np.log(fov))
-
-
-def outlier_probability(
-    mixture: Mixture,
-    h: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    probability: float,
-    density: float,
-) -> FloatArray:
-    """Probability (T, K) that detections z (T, 2), R (T, 2, 2) of which h (T, K, 2) was expected
-    are outliers, as `mixtures.update` has it."""
-    s00 = mixture.P[..., 0, 0] + R[:, None, 0, 0]
-    s01 = mixture.P[..., 0, 1] + R[:, None, 0, 1]
-    s11 = mixture.P[..., 1, 1] + R[:, None, 1, 1]
-    r0, r1 = z[:, None, 0] - h[..., 0], z[:, None, 1] - h[..., 1]
-    determinant = s00 * s11 - s01 * s01
-    distance = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / determinant
-    own = (1.0 - probability) * np.exp(-0.5 * distance) / (2.0 * np.pi * np.sqrt(determinant))
-    other = probability * density
-    return np.asarray(other / np.maximum(own + other, 1e-300))
-
-
 def apply_elevations(
-    mixture: Mixture,
-    seen: Elevations,
-    outlier: FloatArray | float,
-    pose: Pose,
-    config: ObstacleConfig,
-) -> Mixture:
-    """After one elevation for each obstacle (T,), which is an outlier with the probability
-    `outlier` (T, K); matched in mean and covariance. NaN changes nothing."""
+    mixture: Mixture, seen: Elevations, pose: Pose, config: ObstacleConfig
+) -> tuple[Mixture, FloatArray]:
+    """After one elevation of each obstacle (T,), and the log (T,) of its density beside that of
+    clutter, which is as dense at any elevation in the beam. NaN changes nothing."""
     known = np.flatnonzero(np.isfinite(seen.angle))
     if len(known) < len(seen.angle):
+        log = np.zeros(len(seen.angle))
         if not len(known):
-            return mixture
-        some = outlier[known] if isinstance(outlier, np.ndarray) else outlier
-        return replace_rows(
-            mixture,
-            known,
-            apply_elevations(take(mixture, known), take(seen, known), some, pose, config),
-        )
+            return mixture, log
+        some, log[known] = apply_elevations(take(mixture, known), take(seen, known), pose, config)
+        return replace_rows(mixture, known, some), log
     x, P, mu = mixture
     angle, H = expected_elevations(mixture, pose, config.azimuth_model == 'cone')
     # Only range, azimuth and depth show.
@@ -221,16 +162,13 @@ def apply_elevations(
     S = g[..., 0] * H[..., 0] + g[..., 1] * H[..., 1] + g[..., 2] * H[..., 2]
     S += seen.variance[:, None]
     v = seen.angle[:, None] - angle
-    own = (1.0 - outlier) * np.exp(-0.5 * v * v / S) / np.sqrt(2.0 * np.pi * S)
-    likelihood = own + outlier / np.radians(config.vertical_fov_deg)
-    beta = own / np.maximum(likelihood, 1e-300)
+    with np.errstate(divide='ignore'):
+        log = np.log(mu) - 0.5 * (v * v / S + np.log(2.0 * np.pi * S))
     gain = g / S[..., None]
-    x1 = x + (beta * v)[..., None] * gain
-    less = beta * (S - (1.0 - beta) * v * v)
-    P1 = P - less[..., None, None] * (gain[..., :, None] * gain[..., None, :])
-    mu1 = mu * likelihood
-    total = mu1.sum(axis=1, keepdims=True)
-    return Mixture(x1, P1, np.where(total > 0.0, mu1 / np.maximum(total, 1e-300), mu))
+    x1 = x + v[..., None] * gain
+    P1 = P - S[..., None, None] * (gain[..., :, None] * gain[..., None, :])
+    mu1, sums = weights(log, mu)
+    return Mixture(x1, P1, mu1), sums + np.log(np.radians(config.vertical_fov_deg))
 
 
 # -- misses ---------------------------------------------------------------------------------------

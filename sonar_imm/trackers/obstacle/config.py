@@ -133,19 +133,23 @@ class ObstacleConfig(
         'full width of the sector that the sonar sees', range=(1.0, 170.0))
     vertical_fov_deg: float = parameter(15.0, 'deg',
         'full height of the beam of the sonar', range=(0.5, 90.0))
-    gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
-    clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.05,
+    variance_scale_min: float = live(0.1, '',
+        'least factor by which the variances of detections may be too large; it is learnt from '
+        'the echoes of obstacles; 1 in both: as stated', range=(1e-3, 1.0))
+    variance_scale_max: float = live(30.0, '',
+        'largest factor by which the variances of detections may be too small',
+        range=(1.0, 1e4))
+    gate_probability: float = inherited(
+        DetectionParameters, 'gate_probability', 0.9995, constant=True)
+    clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         description='number of false detections expected in a ping, per metre of range and '
-        'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
-    outlier_probability: float = live(0.02, '',
-        'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
+        'radian of bearing; 0: learnt, where they are', unit='1/(m rad)', range=(0.0, 1e4))
+    birth_rate: float = live(0.02, '1/s',
+        'number of new obstacles expected in the sector in a second', range=(1e-9, 1e3))
     detection_profile: tuple[float, ...] = live((), 'm, 1',
         'pairs of a range and the share of detection_probability that is left there, ranges '
         'rising; linear between them, constant beyond; empty: detection_probability counts at '
         'every range', range=(0.0, 1e5), kind='float[]')
-    sector_edge_deg: float = constant(0.0, 'deg',
-        'width at either edge of the sector in which an obstacle without an echo is not missed',
-        range=(0.0, 45.0))
     misses: str = parameter('ignored', '',
         'what pings without an echo say of the height of an obstacle: nothing (ignored), or that '
         'it is less probable in the beam (evidence)', choices=MISSES)
@@ -202,9 +206,12 @@ class ObstacleConfig(
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
-    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 4)
-    confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 6)
-    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 10)
+    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3,
+        description='expected number of hits that confirm a track, together with '
+        'confirm_existence')
+    confirm_existence: float = live(0.95, '',
+        'probability to be an obstacle from which a track is confirmed, together with '
+        'confirm_hits', range=(0.5, 0.9999))
 
     # -- memory ----------------------------------------------------------------------------------
     max_landmarks: int = live(200, '',

@@ -54,7 +54,6 @@ import numpy as np
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
-from ...estimation.association import gate_threshold
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
@@ -80,10 +79,9 @@ mooring lets go: one that swings twice as far as believed is outside of the 90 %
 all cases. Echoes soon tell the two apart, so the share hardly matters."""
 DROPPED = 1e-5
 """A slice that weighs less takes no further part, and a behaviour in one not in this ping."""
-OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
-"""1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
-density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which
-one that starts to move shows that it does."""
+DOUBT = 0.02
+"""Probability that an echo that is given to an obstacle is not its own, where that says something
+of its height."""
 SWITCHING = BEHAVIOURS[:3]
 ALIKE_AT_LEAST = 3
 ALIKE = 0.05
@@ -174,11 +172,7 @@ class DepthSlices:
         self.moves = np.zeros(self.K, np.bool_)
         self._still = Motion.none(self.K)
         self.cone = config.azimuth_model == 'cone'
-        self.outlier_density = _outlier_density(config)
         self._beam = beam_of(config)
-        vertical, horizontal, reach = self._beam
-        edge = np.radians(config.sector_edge_deg)
-        self._surely = (vertical, max(horizontal - float(edge), 0.0), reach)
         self._noise = tuple(walk**2 for walk in config.drift())
         std, walk = config.navigation_errors()
         self._errors, self._walk = np.diag(np.square(std)), np.square(walk)
@@ -264,11 +258,10 @@ class DepthSlices:
     def update(
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
-        """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,), and how
-        many covariances had to be repaired."""
-        outlier = self.config.outlier_probability
-        *after, nis, repaired = mixtures.update(*mixture, h, z, R, outlier, self.outlier_density)
-        return Mixture(*after), nis, int(np.count_nonzero(repaired))
+        """After detections z (T, 2), R (T, 2, 2) of the targets, of which `h` was expected; their
+        log density (T,), and how many covariances had to be repaired."""
+        *after, log, repaired = mixtures.update(*mixture, h, z, R)
+        return Mixture(*after), log, int(np.count_nonzero(repaired))
 
     def apply_echo(self, mixture: Mixture, sonar: Sonar, last: Sonar) -> Mixture:
         """With what an echo in this ping says of the height, or one in the ping before, of the
@@ -276,7 +269,7 @@ class DepthSlices:
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
-        other = np.full(len(m), self.config.outlier_probability)
+        other = np.full(len(m), DOUBT)
         vertical, *others = self._beam
         edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
         beam = edge, soft, *others
@@ -320,14 +313,12 @@ class DepthSlices:
         """Probability of each behaviour, (T, B)."""
         return np.ones((len(mu), 1))
 
-    def beam_probability(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        """Probability (T,) that the beam holds the target, not at the edge of its sector, and
-        whether (T,) it lies ahead."""
+    def visible(self, mixture: Mixture, pose: Pose) -> tuple[FloatArray, BoolArray]:
+        """Probability (T, K) that the beam holds each component, and which targets (T,) lie
+        ahead; pose: of the sonar, or of one for each target, see `unscented.points`."""
         x, P, mu = mixture
-        spread = np.sqrt(P[:, :, 2, 2]) / x[:, :, 0]
-        return mixtures.beam_probability(
-            unscented.points(x, *sonar.pose, self.cone), spread, mu, *self._surely
-        )
+        m = unscented.points(x, *pose, self.cone)
+        return mixtures.visible(m, P, mu, *self._beam)
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -352,7 +343,6 @@ class BehaviourSlices(DepthSlices):
         switching = [name for name in self.behaviours if name != 'seabed']
         if 'swaying' in switching:
             switching.insert(switching.index('swaying') + 1, 'swaying')
-        self.outlier_density = OUTLIER_DENSITY
         self.slices, self.M = config.components, len(switching)
         seabed = ['seabed'] * ('seabed' in self.behaviours)
         behaviour = np.array(switching * self.slices + seabed)
@@ -497,14 +487,6 @@ def depth_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[Float
     width = (highest - lowest) / K
     first = np.round((2.0 * lowest + width) / width) * 0.5 * width
     return first[:, None] + np.arange(K) * width[:, None], 0.5 * width
-
-
-def _outlier_density(config: ObstacleConfig) -> float:
-    """Of a detection that passed the gate but is not the target's: uniform over a gate as wide as
-    the sonar's own error makes it."""
-    threshold = gate_threshold(config.gate_probability, 2)
-    bearing_std = np.radians(config.bearing_std_deg)
-    return float(1.0 / (np.pi * threshold * config.range_std * bearing_std))
 
 
 def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:

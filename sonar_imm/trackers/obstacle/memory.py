@@ -20,17 +20,9 @@ view again the track goes on under its own number, without an echo at first. Not
 tracker knows of landmarks: a landmark that comes back is a track like any other, which an echo
 continues and misses end.
 
-**Existence.** A landmark that is not there any more has to go. The log-odds that a track is an
-obstacle change by
-
-    log(P_D f(z) / clutter_density)    with an echo z of predicted density f,
-    log(1 - B + B (1 - P_D)^n)         with the n pings without one since the last echo
-
-(integrated probabilistic data association with one echo), where B is the mean probability that the
-beam held it in these pings: either it did in all of them, or it lay above or below all the time.
-They are bounded, so that a few misses in plain view are enough to give up what was seen a hundred
-times. A track that ends by its misses is no landmark, nor is one that ends with less than one
-half. While nobody looks, the probability falls with `landmark_time`.
+**Existence.** A landmark keeps the existence and the class of detectability that its track had
+(`existence`). A track that ends by its misses is no landmark, nor is one that ends with less than
+one half. While nobody looks, the probability falls with `landmark_time`.
 
 **Drift.** The errors of navigation between two stamps are those between two pings, only more of
 them: coming back is one step of the prediction (`filters`), from the pose of the sonar when the
@@ -38,8 +30,7 @@ track ended to that of now. The grade `ins` makes a landmark uncertain by 0.6 m 
 landmark stays where it is: components that move are left out, and what mostly moves is not kept.
 Moored ones swing on.
 
-Source: docs/obstacle.md, section Memory; Musicki, Evans, Stankovic 1994, 'Integrated probabilistic
-data association', for the existence.
+Source: docs/obstacle.md, section Memory.
 """
 
 from __future__ import annotations
@@ -51,16 +42,12 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import FloatArray
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 
-SUREST = 9.2
-"""Bound of the log-odds of existence: 0.9999."""
 LEAST_WEIGHT = 1e-3
 """Components that weigh less are not kept."""
-HELD = 0.01
-"""A ping less probable than this to have held an obstacle counts for nothing."""
 RETURNS = 0.4
 """Cosine to the axis of the sonar, 66 degrees, from which a landmark may come back; a track ends
 beyond 78."""
@@ -69,7 +56,8 @@ beyond 78."""
 class Landmark(NamedTuple):
     """An obstacle that is not in view, as it was at `stamp_ns`, when its track ended.
 
-    seen_ns: last echo; log_odds: of its existence; sonar: pose then, NED and FRD; which (k,): the
+    seen_ns: last echo; classes (C,): its existence by class of detectability (`existence`), at
+    that time; sonar: pose then, NED and FRD; which (k,): the
     components that are kept, of the filter's, with their x (k, n), P (k, n, n) and weights mu
     (k,); body: number of echoes with an extent, and their standard deviations (2,) m; place (3,)
     m, covariance (3, 3) and low, high, the 90 % band of its height, all in the world, ENU."""
@@ -77,7 +65,7 @@ class Landmark(NamedTuple):
     track_id: int
     stamp_ns: int
     seen_ns: int
-    log_odds: float
+    classes: Annotated[FloatArray, 'C']
     sonar: Pose
     which: Annotated[np.ndarray, 'k']
     x: Annotated[FloatArray, 'kn']
@@ -101,7 +89,7 @@ class Landmark(NamedTuple):
     def existence(self, stamp_ns: int, landmark_time: float) -> float:
         """The probability that it is still there at `stamp_ns`."""
         age = max(stamp_ns - self.stamp_ns, 0) * 1e-9
-        return probability(self.log_odds) * math.exp(-age / landmark_time)
+        return float(self.classes.sum()) * math.exp(-age / landmark_time)
 
     def spread(self, stamp_ns: int, config: ObstacleConfig) -> FloatArray:
         """Covariance (3, 3) of its place at `stamp_ns`, ENU, with what navigation drifted."""
@@ -157,58 +145,3 @@ def in_view(memory: Memory, stamp_ns: int, sonar: Sonar, config: ObstacleConfig)
     seen = (np.abs(np.arctan2(m[:, 1], m[:, 0])) <= sector) & (m[:, 0] >= RETURNS * away)
     seen &= away <= config.max_range + reach
     return [int(i) for i in np.argsort(away, kind='stable') if seen[i]]
-
-
-class Existence(NamedTuple):
-    """Of T tracks: log-odds (T,) of their existence at the last echo; pings (T,) without one
-    since that may have held them; held (T,): their probability of that, summed; silence (T,): log
-    probability of no echo in all these pings of what was held."""
-
-    log_odds: Annotated[FloatArray, 'T']
-    pings: Annotated[FloatArray, 'T']
-    held: Annotated[FloatArray, 'T']
-    silence: Annotated[FloatArray, 'T']
-
-    @staticmethod
-    def of(log_odds: FloatArray) -> Existence:
-        """Of tracks that begin."""
-        return Existence(log_odds, *np.zeros((3, len(log_odds))))
-
-    def with_ping(
-        self, hit: BoolArray, fit: FloatArray, in_beam: FloatArray, p: FloatArray, clutter: float
-    ) -> Existence:
-        """After a ping with echoes of log density fit (T,) where `hit` (T,), of tracks that the
-        beam held with the probability in_beam (T,) and that would then be detected with p (T,).
-        clutter: density of false echoes."""
-        silent = ~hit & (in_beam > HELD)
-        since = (
-            self.pings + silent,
-            self.held + np.where(silent, in_beam, 0.0),
-            self.silence + np.where(silent, np.log1p(-np.minimum(p, 1.0 - 1e-9)), 0.0),
-        )
-        if not np.count_nonzero(hit):
-            return Existence(self.log_odds, *since)
-        found = self.now() + np.log(p / clutter) + np.where(hit, fit, 0.0)
-        log_odds = np.where(hit, _bounded(found), self.log_odds)
-        return Existence(log_odds, *(np.where(hit, 0.0, part) for part in since))
-
-    def now(self) -> FloatArray:
-        """Log-odds (T,) with the pings since the last echo."""
-        B = np.minimum(self.held / np.maximum(self.pings, 1.0), 1.0)
-        still = np.maximum(1.0 + B * np.expm1(self.silence), 1e-30)
-        return _bounded(self.log_odds + np.log(still))
-
-
-def _bounded(log_odds: FloatArray) -> FloatArray:
-    return np.minimum(np.maximum(log_odds, -SUREST), SUREST)  # np.clip takes far longer
-
-
-def probability(log_odds: float) -> float:
-    """Of log-odds."""
-    return 1.0 / (1.0 + math.exp(-log_odds))
-
-
-def odds(chance: float) -> float:
-    """Log-odds of a probability, as bounded as those of tracks."""
-    p = min(max(chance, 1e-9), 1.0 - 1e-9)
-    return min(max(math.log(p / (1.0 - p)), -SUREST), SUREST)

@@ -26,12 +26,19 @@ import math
 import numpy as np
 from scipy.special import ndtr
 
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.covariance import are_sound, LIMIT, with_jitter
 from .unscented import COMMON, NEGLIGIBLE
 
 AHEAD = 0.2
 """Cosine to the axis of the sonar, 78 degrees: beyond, range and azimuth fix nothing."""
+
+SMEAR = math.radians(1.2)
+"""Standard deviation of the edges of the beam, rad; in range, as a share of the reach."""
+UNSEEN = 0.01
+"""Least probability to be in the beam: nothing is ever certain to be unseen."""
+OPENS = 1e-6
+"""Least weight of a component that opens a gate."""
 
 ROOT_2PI = math.sqrt(2.0 * math.pi)
 
@@ -131,55 +138,112 @@ def _normalised(weight: FloatArray, before: FloatArray) -> FloatArray:
 # -- an echo -------------------------------------------------------------------------------------
 
 
+def gate(
+    h: FloatArray, C: FloatArray, mu: FloatArray, z: FloatArray, R: FloatArray, threshold: float
+) -> BoolArray:
+    """Return which detections (T, D) lie in the gate of some component of each target.
+
+    :param h: (T, K, 2) expected, with covariance C (T, K, 2, 2).
+    :param mu: (T, K) weights; components below `OPENS` open no gate.
+    :param z: (D, 2) with covariance R (D, 2, 2).
+    """
+    near = np.zeros((len(h), len(z)), np.bool_)
+    t, k = np.nonzero(mu >= OPENS)
+    if not len(t) or not len(z):
+        return near
+    a, b, d = (C[t, k, i, j][:, None] + R[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    v, w = (z[:, i] - h[t, k, i][:, None] for i in (0, 1))
+    inside = d * v * v - 2.0 * b * v * w + a * w * w <= threshold * (a * d - b * b)
+    which, first = np.unique(t, return_index=True)
+    near[which] = np.logical_or.reduceat(inside, first, axis=0)
+    return near
+
+
 def update(
+    x: FloatArray, P: FloatArray, mu: FloatArray, h: FloatArray, z: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Update with one detection per target, which is its own; range and azimuth are states.
+
+    h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). Return x, P, mu (T, K), the log density
+    (T,) of the detection, and where P (T, K) was repaired (`estimation.covariance`).
+    """
+    x1, P1, log = x.copy(), P.copy(), np.full(mu.shape, -np.inf)
+    repaired = np.zeros(mu.shape, np.bool_)
+    live = np.nonzero(mu > 0.0)
+    if len(live[0]):
+        S, v, noise = np.moveaxis(P[live], 0, -1), (z[:, None] - h)[live].T, R[live[0]]
+        noise = np.moveaxis(noise, 0, -1)
+        density, gain = _gain(S, v, noise)
+        shift = (gain * v).sum(axis=1)
+        after = _joseph(S, gain, noise)
+        after = 0.5 * (after + np.swapaxes(after, 0, 1))
+        bad = ~are_sound(after)
+        usable = np.isfinite(shift).all(axis=0) & np.isfinite(density)
+        if bad.any():
+            after, bad = with_jitter(after)
+            usable &= ~bad | are_sound(after)
+        x1[live] += np.where(usable, shift, 0.0).T
+        P1[live] = np.moveaxis(np.where(usable, after, 0.5 * (S + np.swapaxes(S, 0, 1))), -1, 0)
+        log[live] = np.log(mu[live]) + np.where(np.isfinite(density), density, -np.inf)
+        repaired[live] = bad | ~usable
+    return x1, P1, *weights(log, mu), repaired
+
+
+def weights(log: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return weights (T, K) proportional to exp log (T, K), those before where nothing is left,
+    and the log of the sums (T,)."""
+    best = log.max(axis=1, initial=-np.inf)
+    known = best > -np.inf
+    weight = np.exp(log - np.where(known, best, 0.0)[:, None])
+    total = weight.sum(axis=1)
+    sums = np.where(known, best + np.log(np.where(known, total, 1.0)), -np.inf)
+    return _normalised(weight, before), sums
+
+
+def combine(
     x: FloatArray,
     P: FloatArray,
     mu: FloatArray,
-    h: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    outlier_probability: float,
-    outlier_density: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Update with one detection per target that may be an outlier; range and azimuth are states.
+    given: tuple[FloatArray, FloatArray, FloatArray],
+    target: IndexArray,
+    share: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mixtures (T, K) of which none of several detections is the target's, or one,
+    moment-matched component by component.
 
-    h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
-    the target's, else it says nothing; both cases together are matched in mean and covariance.
-    Return x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
-    P (T, K) was repaired (`estimation.covariance`).
+    :param given: x (M, K, n), P (M, K, n, n) and mu (M, K) given that detection m is the target's.
+    :param target: (M,) rising, of which target each is.
+    :param share: (M,) probability that it is.
     """
-    outlier = outlier_probability * outlier_density
-    repaired = np.zeros(mu.shape, np.bool_)
-    r = z[:, None] - h
-    nis = _nis(mu, r, P[..., :2, :2] + R[:, None])
-    live = np.nonzero(mu != 0.0)
-    if not len(live[0]):
-        return x.copy(), P.copy(), mu.copy(), nis, repaired
-    S, v, noise = np.moveaxis(P[live], 0, -1), r[live].T, np.moveaxis(R[live[0]], 0, -1)
-    own, gain = _gain(S, v, noise, 1.0 - outlier_probability)
-    likelihood = own + outlier
-    beta = np.divide(own, likelihood, out=np.zeros_like(own), where=likelihood > 0.0)
-    shift = (gain * v).sum(axis=1)
-    after = _joseph(S, gain, noise)
-    after = (1.0 - beta) * S + beta * after + beta * (1.0 - beta) * shift[:, None] * shift[None]
-    after = 0.5 * (after + np.swapaxes(after, 0, 1))
-    bad = ~are_sound(after)
-    if bad.any():
-        after, bad = with_jitter(after)
-    usable = np.isfinite(after).all(axis=(0, 1)) & np.isfinite(shift).all(axis=0)
-    x1, P1, mu1 = x.copy(), P.copy(), np.zeros(mu.shape)
-    x1[live] += np.where(usable, beta * shift, 0.0).T
-    P1[live] = np.moveaxis(np.where(usable, after, S), -1, 0)
-    mu1[live] = mu[live] * np.where(usable, likelihood, outlier)
-    repaired[live] = bad | ~usable
-    return x1, P1, _normalised(mu1, mu), nis, repaired
+    T = len(mu)
+    none = np.maximum(1.0 - np.bincount(target, share, T), 0.0)
+    own, weight = none[:, None] * mu, share[:, None] * given[2]
+    total = own + _summed(weight, target, T)
+    left = total > 0.0
+    safe = np.where(left, total, 1.0)
+    own, weight = np.where(left, own / safe, 1.0), weight / safe[target]
+    mean = own[..., None] * x + _summed(weight[..., None] * given[0], target, T)
+    off, theirs = x - mean, given[0] - mean[target]
+    spread = own[..., None, None] * (P + off[..., :, None] * off[..., None, :])
+    more = weight[..., None, None] * (given[1] + theirs[..., :, None] * theirs[..., None, :])
+    covariance = spread + _summed(more, target, T)
+    return mean, 0.5 * (covariance + np.swapaxes(covariance, -1, -2)), _normalised(total, mu)
 
 
-def _gain(
-    S: FloatArray, v: FloatArray, R: FloatArray, probability: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return `probability` times the density (L,) of innovations v (2, L), and the gain (n, 2, L)
-    of the first two states with covariances S (n, n, L) and noise R (2, 2, L)."""
+def _summed(values: FloatArray, target: IndexArray, T: int) -> FloatArray:
+    """Return the sums (T, ...) of values (M, ...) of each target (M,), which rise."""
+    out = np.zeros((T, *values.shape[1:]))
+    first = np.searchsorted(target, target)
+    rank = np.arange(len(target)) - first
+    for turn in range(int(rank.max(initial=-1)) + 1):
+        rows = np.flatnonzero(rank == turn)
+        out[target[rows]] += values[rows]
+    return out
+
+
+def _gain(S: FloatArray, v: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the log density (L,) of innovations v (2, L), and the gain (n, 2, L) of the first two
+    states with covariances S (n, n, L) and noise R (2, 2, L)."""
     # A perfect measurement leaves a variance, and can be repeated.
     a, b, d = (S[i, j] + R[i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     a, d = (np.where(R[i, i] > LIMIT * c, c, c * (1.0 + LIMIT)) for i, c in ((0, a), (1, d)))
@@ -187,7 +251,7 @@ def _gain(
     rest = np.where(rest > LIMIT * d, rest, LIMIT * d)
     second = v[1] - b / a * v[0]
     nis = v[0] * v[0] / a + second * second / rest
-    density = probability * np.exp(-0.5 * nis) / (2.0 * math.pi * np.sqrt(a * rest))
+    density = -0.5 * nis - np.log(2.0 * math.pi * np.sqrt(a * rest))
     K1 = (S[:, 1] - b / a * S[:, 0]) / rest
     return density, np.stack([(S[:, 0] - b * K1) / a, K1], axis=1)
 
@@ -199,42 +263,45 @@ def _joseph(S: FloatArray, K: FloatArray, R: FloatArray) -> FloatArray:
     return left - a[:, None] * K[:, 0] - b[:, None] * K[:, 1]
 
 
-def _nis(mu: FloatArray, r: FloatArray, S: FloatArray) -> FloatArray:
-    """Return the normalised square (T,) of the mean of innovations r (T, K, 2) with covariances S
-    (T, K, 2, 2)."""
+def innovations(
+    mu: FloatArray, r: FloatArray, S: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean (T, 2), covariance (T, 2, 2) and normalised square (T,) of innovations r (T, K,
+    2) with covariances S (T, K, 2, 2) of mixtures with weights mu (T, K)."""
     mean = np.einsum('tk,tka->ta', mu, r)
     off = r - mean[:, None]
     whole = np.einsum('tk,tkab->tab', mu, S + off[..., :, None] * off[..., None, :])
     a, b, d = whole[:, 0, 0], whole[:, 0, 1], whole[:, 1, 1]
     determinant = np.maximum(a * d - b * b, LIMIT * a * d)
     v, w = mean.T
-    return np.asarray((d * v * v - 2.0 * b * v * w + a * w * w) / determinant)
+    return mean, whole, np.asarray((d * v * v - 2.0 * b * v * w + a * w * w) / determinant)
 
 
 # -- the beam ------------------------------------------------------------------------------------
 
 
-def beam_probability(
+def visible(
     m: FloatArray,
-    spread: FloatArray,
+    P: FloatArray,
     mu: FloatArray,
     vertical: float,
     horizontal: float,
     reach: float,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability (T,) that a beam of these half widths and that reach holds targets at
-    m (T, K, 3), seen from the sonar, with `spread` (T, K) rad in elevation; and whether (T,) they
-    lie `AHEAD`."""
+    """Return the probability (T, K) that a beam of these half widths and that reach holds
+    components at m (T, K, 3), seen from the sonar, with covariances P (T, K, n, n), at least
+    `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
     x, y, z = np.moveaxis(m, -1, 0)
     d = np.sqrt(x * x + y * y + z * z)
-    across, along = math.cos(horizontal), math.sin(horizontal)
-    # The sine of how far inside the edge the azimuth lies.
-    within = (d <= reach) & (along * x - across * np.abs(y) >= 0.0)
-    elevation, std = np.arcsin(z / d), np.maximum(spread, 1e-6)
-    inside = ndtr((vertical - elevation) / std) - ndtr((-vertical - elevation) / std)
+    smear = SMEAR * SMEAR
+    up, side = np.arcsin(z / d), np.arctan2(np.abs(y), x)
+    rise = 1.0 / np.sqrt(smear + P[..., 2, 2] / (d * d))
+    inside = ndtr((vertical - up) * rise) - ndtr((-vertical - up) * rise)
+    inside *= ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
+    inside *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
     mean = np.einsum('tk,tka->ta', mu, m)
     ahead = mean[:, 0] > AHEAD * np.sqrt((mean * mean).sum(axis=1))
-    return (mu * np.where(within, inside, 0.0)).sum(axis=1), ahead
+    return UNSEEN + (1.0 - UNSEEN) * inside, ahead
 
 
 def weight_by_beam(

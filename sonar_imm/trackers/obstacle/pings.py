@@ -31,22 +31,19 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation import imm
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray, take
-from ...estimation.association import gate_threshold, Tracks
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
 from ...measurements import Altitude, Detections, Ground, Measurement, nanoseconds, Navigation
 from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
 from .avoidance import course
-from .beam import apply_elevations, elevation_fits, Elevations, outlier_probability
+from .beam import apply_elevations, Elevations
 from .config import ObstacleConfig
-from .filters import DepthSlices, HeightPrior, Mixture, Sonar
+from .filters import HeightPrior, Mixture, Sonar
 from .ground import GroundMap
+from .matches import Match
 
 SMALLEST, WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
-_H = np.eye(2)[None, None]
-"""Range and azimuth are states."""
 INSTANT = 0.01
 """Seconds within which a ping is one instant."""
 ROUNDS = 3
@@ -80,30 +77,31 @@ class Mount:
 @frozen(eq=False)
 class Echoes:
     """The echoes of one ping: range and azimuth z (D, 2), m and rad positive to starboard, with
-    covariance R (D, 2, 2); extended (D,): whether an extent is stated; heights: their elevations,
-    None where none is measured; late (D,): s after the stamp, None where all are of one
-    instant."""
+    covariance R (D, 2, 2); extended (D,): whether an extent is stated; stated (D, 2): which
+    variances are; heights: their elevations, None where none is measured; late (D,): s after the
+    stamp, None where all are of one instant."""
 
     z: FloatArray
     R: FloatArray
     extended: BoolArray
+    stated: BoolArray
     heights: Elevations | None = None
     late: FloatArray | None = None
 
     @staticmethod
-    def of(ping: Detections, config: ObstacleConfig) -> Echoes:
-        """Return the rows that are echoes. One that is as uncertain as it is far says nothing and
-        is left out."""
+    def of(ping: Detections, config: ObstacleConfig, scale: FloatArray | float = 1.0) -> Echoes:
+        """Return the rows that are echoes, with `scale` (2,) times their variances. One that is as
+        uncertain as it is far says nothing and is left out."""
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         variance = np.column_stack([ping.var_range, ping.var_bearing])
         stated = np.isfinite(variance) & (variance > SMALLEST)
         variance = np.where(stated, variance, default_variance(config))
         real = np.isfinite(z[:, 0]) & (np.abs(z[:, 1]) < 0.5 * np.pi)
         real &= (z[:, 0] > 2.0 * np.sqrt(variance[:, 0])) & (variance[:, 1] < WIDEST)
-        R, extended = variance[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
+        R, extended = (scale * variance)[:, :, None] * np.eye(2), np.isfinite(ping.extent_range)
         heights = Elevations.of(ping.elevation[real], ping.var_elevation[real], config)
         late = times(z[:, 1], ping.time_offset)[real] if ping.takes > INSTANT else None
-        return Echoes(z[real], R[real], extended[real], heights, late)
+        return Echoes(z[real], R[real], extended[real], stated[real], heights, late)
 
     def __len__(self) -> int:
         return len(self.z)
@@ -112,17 +110,9 @@ class Echoes:
         """Return some of the echoes."""
         heights = self.heights and take(self.heights, which)
         late = None if self.late is None else self.late[which]
-        return Echoes(self.z[which], self.R[which], self.extended[which], heights, late)
-
-    def fits(
-        self, mixture: Mixture, h: FloatArray, C: FloatArray, pose: Pose, config: ObstacleConfig
-    ) -> FloatArray:
-        """Return how well each echo fits each obstacle (T, D), see `imm.gate`; h (T, K, 2), C (T,
-        K, 2, 2): what is expected."""
-        if self.heights:
-            return elevation_fits(mixture, h, pose, self.z, self.R, self.heights, config)
-        threshold = gate_threshold(config.gate_probability, 2)
-        return imm.gate(h, _H, C, mixture.mu, self.z, self.R, threshold)
+        return Echoes(
+            self.z[which], self.R[which], self.extended[which], self.stated[which], heights, late
+        )
 
     def height_prior(
         self, sonar: Sonar, ground: GroundMap, config: ObstacleConfig
@@ -134,23 +124,13 @@ class Echoes:
         return HeightPrior(ends, *ground.below(self.z, sonar, config))
 
     def update_height(
-        self,
-        mixture: Mixture,
-        before: tuple[Mixture, FloatArray, FloatArray] | None,
-        filter_: DepthSlices,
-        pose: Pose,
-    ) -> Mixture:
-        """Return the obstacles after the elevation of one echo each. before: the mixture before
-        their range and azimuth, what was expected of these and the covariance R (T, 2, 2) used;
-        None for obstacles that begin."""
+        self, mixture: Mixture, pose: Pose, config: ObstacleConfig
+    ) -> tuple[Mixture, FloatArray]:
+        """Return the obstacles after the elevation of one echo each, and the log (T,) of its
+        density beside that of clutter."""
         if not self.heights:
-            return mixture
-        doubt: FloatArray | float = filter_.config.outlier_probability
-        if before is not None:
-            old, h, R = before
-            density = filter_.outlier_density
-            doubt = outlier_probability(old, h, self.z, R, float(doubt), density)
-        return apply_elevations(mixture, self.heights, doubt, pose, filter_.config)
+            return mixture, np.zeros(len(self))
+        return apply_elevations(mixture, self.heights, pose, config)
 
 
 def default_variance(config: ObstacleConfig) -> FloatArray:
@@ -181,15 +161,18 @@ class Met(NamedTuple):
         R = np.array([sonar.pose.R for sonar in sonars]).reshape(-1, 3, 3)
         return cls(sonars, ago, Pose(position, R))
 
-    def joined(self, others: Met) -> Met:
-        """Return these and others behind them."""
-        return Met.of((*self.sonars, *others.sonars), np.concatenate([self.ago, others.ago]))
-
     def rows(self, which: IndexArray | BoolArray) -> Met:
         """Return those of some obstacles."""
         ago = self.ago[which]
         index = np.arange(len(self.ago))[which]
         return Met.of((self.sonars[i] for i in index), ago)
+
+
+def joined(met: Met | None, others: Met | None) -> Met | None:
+    """Return both, where there are any."""
+    if met is None or others is None:
+        return met
+    return Met.of((*met.sonars, *others.sonars), np.concatenate([met.ago, others.ago]))
 
 
 @frozen(eq=False)
@@ -223,36 +206,15 @@ class Sweep:
         return Met.of((self.at(-each) for each in ago), ago)
 
 
-class Match(NamedTuple):
-    """The echo `chosen` (T,) by each obstacle, -1 for none, of which `expected` (T, K, 2) was
-    expected, and the log density `fit` (T,) of what was found."""
-
-    chosen: IntArray
-    expected: FloatArray
-    fit: FloatArray
-
-    @property
-    def hit(self) -> BoolArray:
-        """(T,) Which obstacles gave an echo."""
-        return self.chosen >= 0
-
-
-class Verdict(NamedTuple):
-    """The tracks `life` that live on, `stays` (T,) which these are, and which lie `ahead` (T,)."""
-
-    life: Tracks
-    stays: BoolArray
-    ahead: BoolArray
-
-
 @define(eq=False)
 class Ping:
     """One ping on its way through the stages. What a stage tells later ones stands in a slot that
     no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
     was, and in a ping that takes time where the obstacles were `met`, by `predict`; `match` by
-    `associate`; `verdict` by `judge`. sweep: of a ping that takes time; untimed: s that it took
-    where nobody says when it met what. heard: what was known of the navigation before the update,
-    by `heed`."""
+    `associate`; `heard`, what was known of the navigation before the update, by `heed`; `stays`
+    (T,) the tracks that do not end, and `over` (T,) those that are remembered if so, by `judge`.
+    sweep: of a ping that takes time; untimed: s that it took where nobody says when it met
+    what."""
 
     stamp_ns: int
     sonar: Sonar
@@ -265,13 +227,14 @@ class Ping:
     dt: float = field(init=False)
     match: Match = field(init=False)
     heard: tuple[FloatArray, FloatArray] = field(init=False)
-    verdict: Verdict = field(init=False)
+    stays: BoolArray = field(init=False)
+    over: BoolArray = field(init=False)
 
-    def pose(self, which: IndexArray | slice = slice(None)) -> Pose:
-        """Return where the sonar was when it met some of the obstacles: one pose, or of each."""
-        if self.met is None:
-            return self.sonar.pose
-        return Pose(self.met.poses.position[which], self.met.poses.R[which])
+    def places(self) -> list[Sonar]:
+        """Return where the sonar was when it heard each echo."""
+        if self.sweep is None or self.echoes.late is None:
+            return [self.sonar] * len(self.echoes)
+        return [self.sweep.at(late) for late in self.echoes.late.tolist()]
 
     def skew(self) -> tuple[float, float]:
         """Return how long a ping took whose echoes have no times, s, and how far the vehicle went
@@ -345,9 +308,10 @@ class Inbox(NamedTuple):
         altitude: Altitude | None,
         mount: Mount,
         config: ObstacleConfig,
+        scale: FloatArray,
     ) -> Ping:
-        """Return the ping that one of the `released` ones is."""
-        stamp_ns, echoes = detections.stamp_ns, Echoes.of(detections, config)
+        """Return the ping that one of the `released` ones is; scale (2,): of its variances."""
+        stamp_ns, echoes = detections.stamp_ns, Echoes.of(detections, config, scale)
 
         def at(late: float) -> Sonar:
             return self._sonar(stamp_ns + nanoseconds(late), altitude, mount, config)

@@ -35,24 +35,33 @@ from ...estimation.arrays import append, BoolArray, FloatArray, take
 from ...estimation.association import TENTATIVE, TrackRules, Tracks
 from ...estimation.consistency import NisMemory
 from .beam import MissEvidence
+from .births import Brood
 from .bodies import Bodies, with_common_errors
+from .clutter import Clutter
 from .config import ObstacleConfig
+from .existence import Existence, PRIOR, SUREST
 from .filters import DepthSlices, Mixture, Sonar
-from .memory import Existence, in_view, kept, Landmark, LEAST_WEIGHT, Memory, odds
+from .memory import in_view, kept, Landmark, LEAST_WEIGHT, Memory
 from .navigation_errors import NavigationErrors
-from .pings import Inbox, Mount, Ping
+from .pings import Inbox, joined, Mount, Ping
+from .scales import Scales
+
+RULES = TrackRules(confirm_hits=2, confirm_window=2, delete_misses=1, max_coast_ns=0)
+"""Tracks begin tentative; `existence` says how they live."""
 
 
 class Obstacles(NamedTuple):
     """T obstacles in view: mixture over depth and behaviour; nis (T,), NaN without an echo;
     bodies: how far their echoes wander; misses: pings that did not show them, and what that says;
-    existence: how sure it is that they are there."""
+    existence: how sure it is that they are there; last (T, 2): their newest innovation in range
+    and bearing, in standard deviations, NaN without an echo in the newest ping."""
 
     mixture: Mixture
     nis: Annotated[FloatArray, 'T']
     bodies: Bodies
     misses: MissEvidence
     existence: Existence
+    last: Annotated[FloatArray, 'T2']
 
 
 class Known(NamedTuple):
@@ -60,8 +69,9 @@ class Known(NamedTuple):
     that are not in view any more; repairs: covariances repaired so far; broken: tracks ended so
     far because their numbers were not finite; alike: whether most obstacles move alike
     (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
-    confirmed obstacles; untimed: s that the pings took that are the most wrong for it, and m by
-    which they are, where their echoes have no times; navigation: its errors."""
+    confirmed obstacles; brood: echoes that may become tracks; clutter: false echoes so far;
+    scales: of the variances of the echoes; untimed: s that the pings took that are the most wrong
+    for it, and m by which they are, where their echoes have no times; navigation: its errors."""
 
     stamp_ns: int
     sonar: Sonar
@@ -73,18 +83,22 @@ class Known(NamedTuple):
     alike: bool = False
     pings_alike: int = 0
     innovations: NisMemory = NisMemory()
+    brood: Brood = ()
+    clutter: Clutter = Clutter.none()
+    scales: Scales = Scales.none()
     untimed: tuple[float, float] = (0.0, 0.0)
     navigation: NavigationErrors = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
 
     @classmethod
-    def nothing(cls, filter_: DepthSlices, rules: TrackRules) -> Known:
+    def nothing(cls, filter_: DepthSlices) -> Known:
         """Return what is known before the first ping."""
         K, n = filter_.K, filter_.n
         mixture = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
         sonar = Sonar(Pose(np.zeros(3), np.eye(3)))
-        nobody = _begun(mixture, Bodies.unknown(0), 0.0, False)
+        existence = Existence.of(np.empty((0, len(PRIOR))), K)
+        none = begun(mixture, Bodies.unknown(0), existence)
         errors = NavigationErrors.of(filter_.config)
-        return cls(0, sonar, Tracks.none(rules), nobody, navigation=errors)
+        return cls(0, sonar, Tracks.none(RULES), none, navigation=errors)
 
     @property
     def confirmed(self) -> BoolArray:
@@ -101,25 +115,19 @@ class Known(NamedTuple):
             return self
         return self._replace(life=self.life.only(kept), obstacles=take(self.obstacles, kept))
 
-    def joined(
-        self,
-        life: Tracks,
-        mixture: Mixture,
-        bodies: Bodies,
-        log_odds: float = 0.0,
-        silent: bool = False,
-    ) -> Known:
-        """Return the same with more obstacles, which `life` has already; log_odds: of their
-        existence; silent: they gave no echo."""
-        new = _begun(mixture, bodies, log_odds, silent)
+    def joined(self, life: Tracks, new: Obstacles) -> Known:
+        """Return the same with more obstacles, which `life` has already."""
         return self._replace(life=life, obstacles=append(self.obstacles, new))
 
 
-def _begun(mixture: Mixture, bodies: Bodies, log_odds: float, silent: bool) -> Obstacles:
+def begun(
+    mixture: Mixture, bodies: Bodies, existence: Existence, silent: bool = False
+) -> Obstacles:
+    """Return obstacles that begin; silent: without an echo."""
     T = len(mixture.mu)
     misses = MissEvidence.first(mixture, silent)
-    existence = Existence.of(np.full(T, log_odds))
-    return Obstacles(mixture, np.full(T, np.nan), bodies, misses, existence)
+    unseen = np.full((T, 2), np.nan)
+    return Obstacles(mixture, np.full(T, np.nan), bodies, misses, existence, unseen)
 
 
 @frozen(eq=False)
@@ -142,9 +150,9 @@ def remember(
     over = over & known.confirmed
     if not np.count_nonzero(over):
         return known
-    log_odds = known.obstacles.existence.now()
+    existence = known.obstacles.existence
     stays = known.obstacles.mixture.mu[:, filter_.moves].sum(axis=1) <= 0.5
-    which = np.flatnonzero(over & stays & (log_odds > 0.0))
+    which = np.flatnonzero(over & stays & (existence.probability() > 0.5))
     if not len(which):
         return known
     mixture, bodies = take(known.obstacles.mixture, which), take(known.obstacles.bodies, which)
@@ -164,7 +172,7 @@ def remember(
                 track_id=int(known.life.track_id[row]),
                 stamp_ns=known.stamp_ns,
                 seen_ns=int(known.life.last_hit_ns[row]),
-                log_odds=float(log_odds[row]),
+                classes=existence.classes[row],
                 sonar=known.sonar.pose,
                 which=weighs,
                 x=mixture.x[i, weighs],
@@ -180,9 +188,7 @@ def remember(
     return known._replace(memory=kept((*known.memory, *fresh), known.stamp_ns, config))
 
 
-def recall(
-    known: Known, ping: Ping, filter_: DepthSlices, rules: TrackRules, config: ObstacleConfig
-) -> Known:
+def recall(known: Known, ping: Ping, filter_: DepthSlices, config: ObstacleConfig) -> Known:
     """Return the same with tracks again of the landmarks that come into view, as long as there is
     room."""
     memory = known.memory
@@ -209,13 +215,14 @@ def recall(
         mixture = known.navigation.given_to(mixture)
         if not mixture.is_finite()[0]:
             continue
-        if met is not None and ping.met is not None:
-            ping.met = ping.met.joined(met)
+        ping.met = joined(ping.met, met)
         number, std = each.body
-        chance = odds(each.existence(known.stamp_ns, config.landmark_time))
+        chance = each.existence(known.stamp_ns, config.landmark_time)
+        classes = each.classes * (min(chance, SUREST) / each.classes.sum())
         body = Bodies(np.array([number]), std[None])
-        life = known.life.resumed(each.track_id, known.stamp_ns, rules)
-        known = known.joined(life, mixture, body, chance, silent=True)
+        life = known.life.resumed(each.track_id, known.stamp_ns, RULES)
+        existence = Existence.of(classes[None], filter_.K, float(config.confirm_hits))
+        known = known.joined(life, begun(mixture, body, existence, silent=True))
         known = known._replace(repairs=known.repairs + repairs)
     gone = set(back)
     memory = tuple(each for i, each in enumerate(memory) if i not in gone)

@@ -22,13 +22,17 @@ from ...estimation.consistency import NisMemory
 from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Detections, Ground, Navigation
 from ..navigation import NavigationBuffer
-from .beam import MissEvidence
+from .beam import Elevations, MissEvidence
+from .births import Seeds
 from .bodies import Bodies
+from .clutter import Clutter
+from .existence import Existence
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
-from .memory import Existence, Landmark
+from .memory import Landmark
 from .navigation_errors import NavigationErrors
-from .pings import Inbox
+from .pings import Echoes, Inbox
+from .scales import Scales
 from .state import Known, Obstacles, ObstacleState
 
 STATE_TYPES = (
@@ -36,4 +40,5 @@ STATE_TYPES = (
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
     *(ObstacleState, Inbox, Known, Obstacles, Tracks, NisMemory, Mixture, Sonar, Bodies),
     *(MissEvidence, Existence, Landmark, GroundMap, Cells, NavigationErrors),
+    *(Clutter, Echoes, Elevations, Scales, Seeds),
 )

@@ -25,6 +25,9 @@ way (`filters`). Navigation and pings arrive in any order (`pings`). A ping goes
 A ping of a sonar that turns takes time: each obstacle is predicted to the instant at which the
 beam meets it, and carried on to the end of the ping after its update.
 
+An echo that may be nobody's begins as a seed (`births`); `associate` makes tracks of those that
+the ping may meet again, and weighs all joint events of tracks and echoes (`events`).
+
 Each stage is a pure function of what is `Known` and of the ping. The tuple of stages is built once
 from the parameters; a feature that is off has none. So a late message is put in its place by
 taking the steps after it again (`intake.stream`).
@@ -37,21 +40,30 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from operator import attrgetter, itemgetter
 
+from attrs import evolve
 import numpy as np
-from scipy.special import expit
 
 from ...estimates import Estimate, places
-from ...estimation.arrays import FloatArray, replace_rows, take
-from ...estimation.association import assign_fits
+from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
-from ...measurements import Altitude, Detections, Ground, Measurement, Navigation
-from ..model_checks import track_rules
+from ...measurements import (
+    Altitude,
+    Detections,
+    Ground,
+    Measurement,
+    nanoseconds,
+    Navigation,
+)
 from .avoidance import closest_approach
-from .bodies import Bodies, with_common_errors
+from .births import grown, reconsidered, sown
+from .bodies import with_common_errors
 from .config import ObstacleConfig
-from .filters import behaviour_columns, build_filter, joined, Mixture, moving_alike, Sonar
+from .events import associate, claims, compare, learnt, updated
+from .existence import older_nearby
+from .filters import behaviour_columns, build_filter, Mixture, moving_alike
 from .memory import Memory
+from .mixtures import moment_match
 from .navigation_errors import (
     marginals,
     messages,
@@ -60,8 +72,8 @@ from .navigation_errors import (
     told,
     under_two_assumptions,
 )
-from .pings import default_variance, Echoes, Match, Mount, Ping, Verdict
-from .state import Known, ObstacleState, recall, remember
+from .pings import joined, Mount, Ping
+from .state import begun, Known, ObstacleState, recall, remember, RULES
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -69,10 +81,10 @@ Stage = Callable[[Known, Ping], Known]
 
 STATES = ('range', 'bearing', 'vertical_offset')
 MODELS = ('above', 'below')
-IN_BEAM = 0.9
-"""A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
-echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
-approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
+BEYOND = 1.3
+"""Share of the reach of the sonar beyond which a track ends."""
+SELDOM = 0.4
+"""Share of the pings that shows an obstacle, below which users are told how long it takes."""
 _SIDE = np.array([1.0, -1.0, 1.0])
 """ROS counts bearings to port."""
 _SIDES = np.outer(_SIDE, _SIDE)
@@ -100,7 +112,6 @@ class ObstacleTracker:
         """Make what follows from the parameters, once and not in every ping."""
         self.config = config
         self.filter = build_filter(config)
-        self.rules = track_rules(config)
         evidence, remembers = config.misses == 'evidence', config.max_landmarks > 0
         several = bool(config.navigation_errors()[0].any())
         self._published = attrgetter('misses.shown' if evidence else 'mixture')
@@ -126,7 +137,7 @@ class ObstacleTracker:
             (Detections, Navigation, Altitude, Ground),
             StreamRules.of(self.config),
             step=self._step,
-            initial=ObstacleState(known=Known.nothing(self.filter, self.rules)),
+            initial=ObstacleState(known=Known.nothing(self.filter)),
             survivor=self._survivor,
         )
         self.counts = self._stream.counts
@@ -177,24 +188,38 @@ class ObstacleTracker:
             'pings_moving_alike': known.pings_alike,
             'covariance_repairs': known.repairs,
             'landmarks': len(known.memory),
+            'seeds': sum(len(seeds.classes) for seeds in known.brood),
+            'clutter_a_ping': known.clutter.a_ping(),
+            **dict(
+                zip(('scale_range', 'scale_bearing'), known.scales.factor(self.config).tolist())
+            ),
             'navigation_good': float(good.mean()) if len(good) else float('nan'),
             **known.navigation.health(),
         }
 
     def warnings(self) -> list[str]:
-        """What the sonar states and cannot be true, in a sentence for the user."""
+        """What users should know of the echoes, in sentences."""
+        known, config = self._stream.state.known, self.config
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
-        known = self._stream.state.known
-        sentences = known.innovations.warnings('detections', advice)
+        found = known.scales.warnings(config) + known.clutter.warnings(config)
+        if known.innovations.verdict > 0:
+            found += known.innovations.warnings('detections', advice)
+        seen = known.obstacles.existence.detectability(config)[known.confirmed]
+        if len(seen) and np.count_nonzero(seen < SELDOM) > 0.5 * len(seen):
+            share = float(np.median(seen))
+            found.append(
+                f'obstacles are seen in {share:.0%} of the pings: they take '
+                f'{config.confirm_hits / share * known.clutter.interval:.0f} s to confirm'
+            )
         shown = int(np.count_nonzero(known.confirmed))
-        sentences += known.navigation.warnings(known.sonar.course, shown)
+        found += known.navigation.warnings(known.sonar.course, shown)
         takes, wrong = known.untimed
         if takes:
-            sentences.append(
+            found.append(
                 f'a scan takes {takes:.1f} s and its detections have no times: one instant is '
                 f'taken for all, wrong by up to {wrong:.1f} m'
             )
-        return sentences
+        return found
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         # Nonsense overflows: what is not finite then is dropped and counted.
@@ -221,7 +246,8 @@ class ObstacleTracker:
         inbox, ready = before.inbox.received(items).released(self.config)
         known, done = before.known, []
         for detections, altitude in ready:
-            ping = inbox.ping(detections, altitude, self.mount, self.config)
+            scale = known.scales.factor(self.config)
+            ping = inbox.ping(detections, altitude, self.mount, self.config, scale)
             for stage in self.stages:
                 known = stage(known, ping)
             done.append(known)
@@ -265,7 +291,8 @@ class ObstacleTracker:
             ping.met = met.rows(mixture.is_finite())
         is_finite = mixture.is_finite()
         broken = len(is_finite) - int(np.count_nonzero(is_finite))
-        known = known.with_columns(mixture=mixture).only(is_finite)
+        existence = known.obstacles.existence.later(ping.dt)
+        known = known.with_columns(mixture=mixture, existence=existence).only(is_finite)
         errors = known.navigation.predicted(ping.stamp_ns, ping.dt, self.config)
         return known._replace(
             stamp_ns=ping.stamp_ns,
@@ -284,41 +311,40 @@ class ObstacleTracker:
 
     def _recall(self, known: Known, ping: Ping) -> Known:
         """Begin the tracks again of landmarks that come into view."""
-        return recall(known, ping, self.filter, self.rules, self.config)
+        return recall(known, ping, self.filter, self.config)
 
     def _associate(self, known: Known, ping: Ping) -> Known:
-        """Tell which echo each obstacle gave; confirmed tracks choose before tentative ones."""
-        mixture, config = known.obstacles.mixture, self.config
-        h, C = self.filter.expected(mixture, ping.sonar, ping.met and ping.met.sonars)
-        if not len(h) or not len(ping.echoes):
-            ping.match = Match(np.full(len(h), -1), h, np.zeros(len(h)))
-            return known
-        fit = ping.echoes.fits(mixture, h, C, ping.pose(), config)
-        # As probable as an echo is at the range of each track.
-        usual, p = config.detection_probability, self._chance(mixture)
-        weighed = fit + np.log(p / (1.0 - p) * (1.0 - usual) / usual)[:, None]
-        chosen = assign_fits(weighed, ~known.confirmed, usual, config.clutter_density)
-        ping.match = Match(chosen, h, fit[np.arange(len(fit)), chosen])
-        return known
+        """Weigh all joint events of the obstacles and echoes, with tracks of those seeds that the
+        ping may meet."""
+        filter_, config, T = self.filter, self.config, len(known.life)
+        compared, repairs = compare(known.obstacles, ping, filter_, ping.met)
+        density = known.clutter.density(ping.echoes.z, config)
+        expected = density * (1.0 + claims(known.obstacles, compared, density, filter_))
+        brood = reconsidered(known.brood, known.clutter, config)
+        room = config.max_tracks - T
+        brood, banks = grown(brood, ping, expected, known.navigation, filter_, room)
+        for mixture, bodies, existence, met, repaired in banks:
+            new = begun(mixture, bodies, existence)
+            known = known.joined(known.life.born(len(new.nis), ping.stamp_ns, RULES), new)
+            theirs, more = compare(new, ping, filter_, met)
+            compared = compared.joined(theirs, len(compared.ahead))
+            repairs += repaired + more
+            ping.met = joined(ping.met, met)
+        ping.match = associate(known.obstacles, compared, density, filter_)
+        return known._replace(brood=brood, repairs=known.repairs + repairs)
 
     def _update(self, known: Known, ping: Ping) -> Known:
-        """Update the obstacles that gave an echo."""
-        table, hit = known.obstacles, np.flatnonzero(ping.match.hit)
-        nis = np.full(len(table.nis), np.nan)
-        if not len(hit):
-            return known.with_columns(nis=nis)
-        before, h = take(table.mixture, hit), ping.match.expected[hit]
-        echoes = ping.echoes.rows(ping.match.chosen[hit])
-        bodies, R = take(table.bodies, hit).with_echoes(
-            echoes.extended, echoes.z, echoes.R, default_variance(self.config)
+        """Update obstacles, existence, and what is known of false echoes and of variances."""
+        table, match, config = known.obstacles, ping.match, self.config
+        # Tracks that may be clutter themselves must not make it look rare.
+        false = 1.0 - match.beta[known.confirmed].sum(axis=0)
+        after = updated(table, match)
+        last, scales = learnt(known, ping, self.filter.moves, config)
+        return known._replace(
+            obstacles=after._replace(last=last),
+            clutter=known.clutter.after(ping.echoes.z, false, ping.dt),
+            scales=scales,
         )
-        after, nis[hit], repairs = self.filter.update(before, h, echoes.z, R, ping.sonar)
-        after = echoes.update_height(after, (before, h, R), self.filter, ping.pose(hit))
-        return known.with_columns(
-            mixture=replace_rows(table.mixture, hit, after),
-            bodies=replace_rows(table.bodies, hit, bodies),
-            nis=nis,
-        )._replace(repairs=known.repairs + repairs)
 
     def _heed(self, known: Known, ping: Ping) -> Known:
         """Note what is known of the errors of the navigation before the update."""
@@ -328,7 +354,7 @@ class ObstacleTracker:
     def _tell(self, known: Known, ping: Ping) -> Known:
         """Tell all other obstacles what the update of each said of these errors."""
         mixture = known.obstacles.mixture
-        chance = expit(known.obstacles.existence.now())
+        chance = known.obstacles.existence.probability()
         trust = np.where(known.confirmed & (chance > SURE), chance, 0.0)
         L, eta = messages(ping.heard, marginals(mixture), trust)
         if not L.any():
@@ -356,80 +382,38 @@ class ObstacleTracker:
         )
         return known.with_columns(misses=misses)
 
-    def _chance(self, mixture: Mixture) -> FloatArray:
-        """Probability (T,) that a ping shows obstacles that the beam holds."""
-        return self.config.detection_at(np.einsum('tk,tk->t', mixture.mu, mixture.x[..., 0]))
-
     def _judge(self, known: Known, ping: Ping) -> Known:
-        """Count hits and misses, weigh existence, and tell which tracks end."""
-        table, hit, config = known.obstacles, ping.match.hit, self.config
-        in_beam, ahead = self.filter.beam_probability(table.mixture, ping.sonar)
-        p = self._chance(table.mixture)
-        looked = ~known.confirmed | (in_beam * p > IN_BEAM * config.detection_probability)
-        life, stays = known.life.scan(hit, ping.stamp_ns, self.rules, looked=looked)
-        ping.verdict = Verdict(life, stays, ahead)
-        return known.with_columns(
-            existence=table.existence.with_ping(
-                hit, ping.match.fit, in_beam, p, config.clutter_density
-            )
+        """Confirm tracks, and tell which end and which of those are remembered."""
+        table, life, match = known.obstacles, known.life, ping.match
+        mean, covariance = moment_match(*table.mixture, 2)
+        confirmed = known.confirmed
+        partner = older_nearby(
+            mean, covariance, life.track_id.astype(np.int64), confirmed, match.hit
         )
+        existence = table.existence.near(partner)
+        status = existence.status(life.status, match.hit, self.config)
+        last_hit_ns = np.where(match.hit, ping.stamp_ns, life.last_hit_ns)
+        life = evolve(life, status=status, age=life.age + 1, last_hit_ns=last_hit_ns)
+        coasted = ping.stamp_ns - last_hit_ns > nanoseconds(self.config.max_coast)
+        passed = ~match.compared.ahead | (mean[:, 0] > BEYOND * self.config.max_range)
+        ended = existence.ended(confirmed)
+        ping.over = (passed | coasted) & ~ended
+        ping.stays = ~(ended | passed | coasted)
+        return known._replace(life=life).with_columns(existence=existence)
 
     def _remember(self, known: Known, ping: Ping) -> Known:
         """Keep what passed, or was not seen for long, as landmarks."""
-        stays, ahead = ping.verdict.stays, ping.verdict.ahead
-        coasted = known.stamp_ns - known.life.last_hit_ns > self.rules.max_coast_ns
-        over = np.where(stays, ~ahead, coasted & ~ping.match.hit)
-        return remember(known, over, self.filter, self.mount, self.config)
+        return remember(known, ping.over, self.filter, self.mount, self.config)
 
     def _end(self, known: Known, ping: Ping) -> Known:
         """End the tracks that are over or passed."""
-        life, stays, ahead = ping.verdict
-        table = known.obstacles if stays.all() else take(known.obstacles, stays)
-        return known._replace(obstacles=table, life=life).only(ahead[stays])
+        return known.only(ping.stays)
 
     def _begin(self, known: Known, ping: Ping) -> Known:
-        """Begin a track at each echo that nobody gave, as long as there is room."""
-        free = np.ones(len(ping.echoes), np.bool_)
-        free[ping.match.chosen[ping.match.hit]] = False
-        which = np.flatnonzero(free)[: max(0, self.config.max_tracks - len(known.life))]
-        if not len(which):
-            return known
-        echoes = ping.echoes.rows(which)
-        bodies, R = Bodies.unknown(len(which)).with_echoes(
-            echoes.extended, echoes.z, echoes.R, default_variance(self.config)
-        )
-        mixture, repairs = self._begun(echoes, R, ping, known.navigation)
-        known = known._replace(repairs=known.repairs + repairs)
-        life = known.life.born(len(which), ping.stamp_ns, self.rules)
-        return known.joined(life, mixture, bodies)
-
-    def _begun(
-        self, echoes: Echoes, R: FloatArray, ping: Ping, errors: NavigationErrors
-    ) -> tuple[Mixture, int]:
-        """Return obstacles at echoes, as they are at the end of the ping, and how many covariances
-        had to be repaired."""
-        if ping.sweep is None or echoes.late is None:
-            return self._begun_at(echoes, R, ping, errors, ping.sonar), 0
-        sonars = [ping.sweep.at(late) for late in echoes.late]
-        new = [
-            self._begun_at(echoes.rows(np.array([i])), R[i : i + 1], ping, errors, sonar)
-            for i, sonar in enumerate(sonars)
-        ]
-        end = [ping.sonar] * len(new)
-        return self.filter.advance_each(joined(new), sonars, end, -echoes.late)
-
-    def _begun_at(
-        self,
-        echoes: Echoes,
-        R: FloatArray,
-        ping: Ping,
-        errors: NavigationErrors,
-        sonar: Sonar,
-    ) -> Mixture:
-        height = echoes.height_prior(sonar, ping.ground, self.config)
-        mixture = self.filter.begin(echoes.z, R, sonar, height)
-        mixture = errors.given_to(mixture)
-        return echoes.update_height(mixture, None, self.filter, sonar.pose)
+        """Sow a seed at each echo."""
+        match = ping.match
+        false = 1.0 - match.beta.sum(axis=0)
+        return known._replace(brood=sown(known.brood, ping, false, match.density, self.config))
 
     def _watch(self, known: Known, ping: Ping) -> Known:
         """Count what users are warned of."""
@@ -466,6 +450,8 @@ class ObstacleTracker:
             'vertical_offset_lo': view.low,
             'vertical_offset_hi': view.high,
             'nis': ping.obstacles.nis,
+            'existence': ping.obstacles.existence.probability(),
+            'detection_probability': ping.obstacles.existence.detectability(self.config),
             **places(place),
             **{name: place_covariance[:, i, j] for name, i, j in _PLACE_COVARIANCES},
         }

@@ -14,7 +14,7 @@
 
 """What the obstacle tracker predicts of each ping, for `evaluation.tuning`: the sum of
 `evaluation.diver.predictive`, in range and bearing over the sector that the sonar sees, of tracks
-as far as they are in the beam. A new track is an obstacle with probability 1/2.
+as far as they are in the beam, each with its own existence.
 """
 
 from __future__ import annotations
@@ -27,14 +27,12 @@ import numpy as np
 
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.events import detected, ratios
 from sonar_imm.trackers.obstacle.pings import Ping
 from sonar_imm.trackers.obstacle.state import Known
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
 from ..tuning import Scores, Tunable
-
-NEW = 0.5
-"""Probability that a track that begins is an obstacle."""
 
 
 def for_tuning(config: ObstacleConfig) -> ObstacleConfig:
@@ -53,7 +51,8 @@ def tunables(config: ObstacleConfig, measurements: Sequence[Any]) -> list[Tunabl
         found.append(Tunable(name='bearing_std_deg', start=bearing, scanned=True))
     p = config.detection_probability
     found.append(Tunable(name='detection_probability', start=p, kind='logit'))
-    found.append(Tunable(name='clutter_density', start=config.clutter_density))
+    if config.clutter_density > 0.0:
+        found.append(Tunable(name='clutter_density', start=config.clutter_density))
     for name in ('sway_std', 'max_speed'):
         if (start := getattr(config, name)) > 0.0:
             found.append(Tunable(name=name, start=start, usual=False))
@@ -65,26 +64,20 @@ class Scored(ObstacleTracker):
 
     def __init__(self, config: ObstacleConfig, measurements: Sequence[Any] = ()):
         self.scores: Scores = {}
-        self.existence: dict[int, float] = {}
         self.area = config.max_range * math.radians(config.horizontal_fov_deg)
         super().__init__(config)
 
     def _associate(self, known: Known, ping: Ping) -> Known:
         known = super()._associate(known, ping)
-        config, T, echoes = self.config, len(known.life), len(ping.echoes)
-        score = echoes * math.log(config.clutter_density) - config.clutter_density * self.area
-        if T:
-            log_f = np.where(ping.match.hit, ping.match.fit, -np.inf)
-            mixture = known.obstacles.mixture
-            chance = self._chance(mixture)
-            in_beam, _ = self.filter.beam_probability(mixture, ping.sonar)
-            for track, track_id in enumerate(known.life.track_id.tolist()):
-                p = float(chance[track] * np.clip(in_beam[track], 0.01, 1.0))
-                gap = log_f[track] - math.log(config.clutter_density)
-                ratio = math.exp(min(gap, 600.0)) if np.isfinite(gap) else 0.0
-                r = self.existence.get(track_id, NEW)
-                total = 1.0 - r * p + r * p * ratio
-                score += math.log(total)
-                self.existence[track_id] = r * (1.0 - p + p * ratio) / total
-        self.scores[ping.stamp_ns] = score, echoes if T else 0
+        match, table = ping.match, known.obstacles
+        score = float(np.log(match.density).sum()) - known.clutter.mean(self.config) * self.area
+        every = table.existence.classes * detected(table, self.filter)
+        visible = table.existence.visible(table.mixture.mu, match.compared.visible)
+        seen, missed = every.sum(axis=1), 1.0 - (every * visible).sum(axis=1)
+        g = ratios(match.compared, match.density, len(seen))
+        own = np.zeros(len(seen))
+        hit = np.flatnonzero(match.hit)
+        own[hit] = g[hit, match.compared.echo[match.pair[hit]]]
+        score += float(np.log(missed + seen * own).sum())
+        self.scores[ping.stamp_ns] = score, len(ping.echoes) if len(seen) else 0
         return known

@@ -114,7 +114,7 @@ def view_of(state, place):
 
 def test_a_track_that_was_missed_keeps_its_size():
     tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
-    for k, echoes in enumerate(([40.0], [], [38.5])):
+    for k, echoes in enumerate(([40.0], [39.25], [], [37.75])):
         stamp = (k + 1) * SECOND
         tracker.process(navigation(rows('approach_dst+3_noisy')[2 * k], stamp))
         n = len(echoes)
@@ -129,7 +129,8 @@ def test_a_track_that_was_missed_keeps_its_size():
                 extent_bearing=[0.003] * n,
             )
         )
-        assert tracker._stream.state.known.obstacles.bodies.number[0] == 1.0 + k // 2
+        number = tracker._stream.state.known.obstacles.bodies.number
+        assert number.tolist() == [[], [2.0], [2.0], [3.0]][k]
 
 
 def image_run(setting, seed):

@@ -28,7 +28,6 @@ from sonar_imm.trackers.obstacle.beam import (
     apply_elevations,
     Elevations,
     expected_elevations,
-    outlier_probability,
 )
 from sonar_imm.trackers.obstacle.filters import depth_span, HeightPrior, Mixture, Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
@@ -45,7 +44,6 @@ FAITHFUL = {
     'scale_std': 0.0,
     'navigation_noise': (0.0, 0.0, 0.0),
     'range_scale_std': 0.0,
-    'outlier_probability': 0.0,
     'range_std': 0.15,
     'bearing_std_deg': 0.25,
 }
@@ -149,38 +147,24 @@ def test_an_update_is_that_of_kalman_among_outliers():
     mixture, config = some_mixture(), ObstacleConfig()
     angle, H = expected_elevations(mixture, POSE, False)
     seen = Elevations(np.array([0.01, np.nan, -0.05]), np.array([3e-4, 1.0, 1e-4]))
-    after = apply_elevations(mixture, seen, 0.1, POSE, config)
+    after, log = apply_elevations(mixture, seen, POSE, config)
     np.testing.assert_array_equal(after.x[1], mixture.x[1])
     np.testing.assert_array_equal(after.mu[1], mixture.mu[1])
+    assert log[1] == 0.0
     for t in (0, 2):
         weight = np.empty(4)
         for j in range(4):
             P, h = mixture.P[t, j], np.append(H[t, j], np.zeros(3))
             S = h @ P @ h + seen.variance[t]
             v, K = seen.angle[t] - angle[t, j], P @ h / S
-            own = 0.9 * norm.pdf(v, 0.0, np.sqrt(S))
-            weight[j] = own + 0.1 / np.radians(config.vertical_fov_deg)
-            beta = own / weight[j]
-            # The mixture of both cases, matched.
-            mean = mixture.x[t, j] + beta * K * v
-            np.testing.assert_allclose(after.x[t, j], mean)
-            cases = [(beta, mixture.x[t, j] + K * v, P - np.outer(K, K) * S)]
-            cases.append((1.0 - beta, mixture.x[t, j], P))
-            spread = sum(b * (C + np.outer(m - mean, m - mean)) for b, m, C in cases)
-            np.testing.assert_allclose(after.P[t, j], spread, atol=1e-12)
-        np.testing.assert_allclose(after.mu[t], mixture.mu[t] * weight / (mixture.mu[t] @ weight))
-
-
-def test_an_echo_that_range_and_azimuth_call_an_outlier_says_nothing_of_the_height():
-    mixture = some_mixture(T=1, K=1)
-    z, R = mixture.x[:, 0, :2] + [[9.0, 0.0]], np.diag([0.02, 2e-5])[None]
-    doubt = outlier_probability(mixture, mixture.x[..., :2], z, R, 0.02, 1.0)
-    assert doubt[0, 0] > 0.999
-    seen = Elevations(np.array([0.05]), np.array([1e-4]))
-    after = apply_elevations(mixture, seen, doubt, POSE, ObstacleConfig())
-    np.testing.assert_allclose(after.x, mixture.x, atol=0.02)
-    near = outlier_probability(mixture, mixture.x[..., :2], mixture.x[:, 0, :2], R, 0.02, 1.0)
-    assert near[0, 0] < 0.05
+            weight[j] = norm.pdf(v, 0.0, np.sqrt(S))
+            np.testing.assert_allclose(after.x[t, j], mixture.x[t, j] + K * v)
+            np.testing.assert_allclose(after.P[t, j], P - np.outer(K, K) * S, atol=1e-12)
+        total = mixture.mu[t] @ weight
+        np.testing.assert_allclose(after.mu[t], mixture.mu[t] * weight / total)
+        # Beside clutter at any elevation in the beam.
+        fov = np.radians(config.vertical_fov_deg)
+        assert log[t] == pytest.approx(np.log(total * fov))
 
 
 def test_new_obstacles_lie_where_the_elevation_says():

@@ -21,11 +21,20 @@ from scipy.stats import norm
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.trackers.obstacle.beam import MissEvidence
-from sonar_imm.trackers.obstacle.filters import DepthSlices, EDGE, Mixture, SOFT, Sonar
+from sonar_imm.trackers.obstacle.filters import (
+    DepthSlices,
+    EDGE,
+    Mixture,
+    SOFT,
+    Sonar,
+)
+from sonar_imm.trackers.obstacle.filters import (
+    DOUBT as OTHER,
+)
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
-P_D, OTHER = 0.9, 1e-4
+P_D = 0.9
 STILL = {'scale_std': 0.0, 'navigation_noise': (0.0, 0.0, 0.0)}
 DEPTH = 20.0
 HALF = np.radians(7.5)
@@ -77,9 +86,7 @@ def test_an_obstacle_is_believed_where_an_exact_grid_filter_believes_it(offset, 
     lies and nothing of the side; where it is no longer seen tells."""
     pitch, step = np.radians(-3.0), 0.75
     turned = geometry.rotation(0.0, pitch, 0.0)
-    config = ObstacleConfig(
-        behaviours=('fixed',), components=41, outlier_probability=OTHER, **STILL
-    )
+    config = ObstacleConfig(behaviours=('fixed',), components=41, **STILL)
     filter_ = DepthSlices(config)
     rng = np.random.default_rng(5)
     way = 45.0

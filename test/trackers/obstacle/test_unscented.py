@@ -137,48 +137,68 @@ def test_places_equal_sampling():
     assert_allclose(covariance[0], np.cov(world.T), rtol=0.05, atol=0.2)
 
 
-def test_soft_update_equals_two_cases_put_together():
+def test_an_update_and_its_hypotheses_put_together():
+    """Of the first target one of two echoes, or none; of the third one or none."""
     rng = np.random.default_rng(4)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before)
-    z = x[:, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
+    target = np.array([0, 0, 2])
+    z = x[target, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
     R = np.tile(np.diag([0.025, 2.5e-5]), (3, 1, 1))
-    h = np.ascontiguousarray(x[..., :2])
-    after, covariance, weight, nis, _ = mixtures.update(x, P, mu, h, z, R, 0.1, 0.5)
+    h = np.ascontiguousarray(x[target][..., :2])
+    *given, log, _ = mixtures.update(x[target], P[target], mu[target], h, z, R)
+    share = np.array([0.5, 0.2, 0.6])
+    after, covariance, weight = mixtures.combine(x, P, mu, tuple(given), target, share)
     H = np.eye(2, 4)
-    for t in range(3):
-        likelihood = np.empty(4)
+    none = 1.0 - np.bincount(target, share, 3)
+    cases = {t: [[(none[t] * mu[t, k], x[t, k], P[t, k])] for k in range(4)] for t in (0, 2)}
+    for m, t in enumerate(target):
+        own = np.empty(4)
+        updated = []
         for k in range(4):
-            S = H @ P[t, k] @ H.T + R[t]
-            v = z[t] - x[t, k, :2]
-            own = 0.9 * np.exp(-0.5 * v @ np.linalg.solve(S, v))
-            own /= 2.0 * np.pi * np.sqrt(np.linalg.det(S))
-            likelihood[k] = mu[t, k] * (own + 0.05)
+            S, v = H @ P[t, k] @ H.T + R[m], z[m] - x[t, k, :2]
+            own[k] = mu[t, k] * np.exp(-0.5 * v @ np.linalg.solve(S, v))
+            own[k] /= 2.0 * np.pi * np.sqrt(np.linalg.det(S))
             gain = P[t, k] @ H.T @ np.linalg.inv(S)
-            cases = [(own / (own + 0.05), x[t, k] + gain @ v, (np.eye(4) - gain @ H) @ P[t, k])]
-            cases.append((1.0 - cases[0][0], x[t, k], P[t, k]))
-            mean = sum(share * centre for share, centre, _ in cases)
-            spread = sum(
-                share * (C + np.outer(centre - mean, centre - mean)) for share, centre, C in cases
-            )
+            updated.append((x[t, k] + gain @ v, (np.eye(4) - gain @ H) @ P[t, k]))
+        assert_allclose(log[m], np.log(own.sum()), rtol=1e-9)
+        for k in range(4):
+            cases[t][k].append((share[m] * own[k] / own.sum(), *updated[k]))
+        # The innovation is that of the mixture, of which the components' means are a part.
+        r = z[m] - x[t, :, :2]
+        mean, whole, nis = mixtures.innovations(mu[t][None], r[None], P[t][None, :, :2, :2] + R[m])
+        off = r - mu[t] @ r
+        S = np.einsum('k,kij->ij', mu[t], P[t, :, :2, :2] + R[m] + off[:, :, None] * off[:, None])
+        assert_allclose(mean[0], mu[t] @ r)
+        assert_allclose(whole[0], S)
+        assert_allclose(nis[0], mu[t] @ r @ np.linalg.solve(S, mu[t] @ r), rtol=1e-9)
+    for t in (0, 2):
+        for k in range(4):
+            total = sum(w for w, _, _ in cases[t][k])
+            mean = sum(w * m for w, m, _ in cases[t][k]) / total
+            spread = sum(w * (C + np.outer(m - mean, m - mean)) for w, m, C in cases[t][k]) / total
+            assert_allclose(weight[t, k], total, rtol=1e-9)
             assert_allclose(after[t, k], mean, rtol=1e-9)
             assert_allclose(covariance[t, k], spread, rtol=1e-7, atol=1e-12)
-        assert_allclose(weight[t], likelihood / likelihood.sum(), rtol=1e-9)
-        # The innovation is that of the mixture, of which the components' means are a part.
-        v = z[t] - x[t, :, :2]
-        off = v - mu[t] @ v
-        S = np.einsum('k,kij->ij', mu[t], P[t, :, :2, :2] + R[t] + off[:, :, None] * off[:, None])
-        assert_allclose(nis[t], mu[t] @ v @ np.linalg.solve(S, mu[t] @ v), rtol=1e-9)
+    assert_allclose(after[1], x[1])
+    assert_allclose(weight[1], mu[1])
 
 
-def test_an_update_that_no_component_explains_keeps_the_weights():
+def test_an_update_that_no_component_explains_keeps_finite_weights():
     x, P = np.zeros((1, 2, 4)), np.tile(np.eye(4) * 1e-6, (1, 2, 1, 1))
     mu, z = np.array([[0.3, 0.7]]), np.full((1, 2), 1e3)
-    *_, weight, nis, _ = mixtures.update(
-        x, P, mu, x[..., :2].copy(), z, np.eye(2)[None] * 1e-6, 0.0, 1.0
-    )
-    assert_allclose(weight, mu)
-    assert nis[0] > 1e6
+    R = np.eye(2)[None] * 1e-6
+    *_, weight, log, _ = mixtures.update(x, P, mu, x[..., :2].copy(), z, R)
+    assert_allclose(weight, mu, rtol=1e-4)
+    assert log[0] < -1e6
+
+
+def test_only_echoes_near_some_component_are_in_the_gate():
+    h = np.array([[[0.0, 0.0], [5.0, 0.0]], [[9.0, 0.0], [9.0, 0.0]], [[3.0, 0.0], [3.0, 0.0]]])
+    C, mu = np.tile(np.eye(2), (3, 2, 1, 1)), np.array([[1.0, 0.5], [0.5, 0.0], [0.0, 0.0]])
+    z, R = np.array([[0.5, 0.0], [7.0, 0.0], [60.0, 0.0]]), np.tile(np.eye(2), (3, 1, 1))
+    near = mixtures.gate(h, C, mu, z, R, 3.0)
+    assert near.tolist() == [[True, True, False], [False, True, False], [False] * 3]
 
 
 def test_quantiles_of_mixtures():

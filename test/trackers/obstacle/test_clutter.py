@@ -1,0 +1,275 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Obstacles in clutter: density, existence, seeds, scales, and the tracker among false echoes."""
+
+from pathlib import Path
+
+from attrs import evolve
+from helpers.obstacle_runs import followed, run, SECOND
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.stats import multivariate_normal
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.measurements import Detections
+from sonar_imm.trackers.obstacle.births import BEHAVIOURS, met, Seeds, sown, unmet
+from sonar_imm.trackers.obstacle.clutter import Clutter
+from sonar_imm.trackers.obstacle.existence import (
+    detection,
+    Existence,
+    MERGED,
+    older_nearby,
+    PRIOR,
+    SUREST,
+)
+from sonar_imm.trackers.obstacle.filters import Sonar
+from sonar_imm.trackers.obstacle.ground import GroundMap
+from sonar_imm.trackers.obstacle.pings import Echoes, Ping
+from sonar_imm.trackers.obstacle.scales import Scales
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'obstacle_in_clutter'
+CONFIG = ObstacleConfig()
+LEVER = (2.0, 0.0, -0.3)
+
+
+# -- density of false echoes -------------------------------------------------------------------
+
+
+def after_pings(z, ping, false):
+    clutter = Clutter.none()
+    for k in range(int(ping.max()) + 1):
+        which = ping == k
+        clutter = clutter.after(z[which], np.full(which.sum(), false), 0.5)
+    return clutter
+
+
+def test_the_density_is_that_of_the_nearest_false_echoes():
+    with np.load(VECTORS / 'clutter.npz') as v:
+        clutter = after_pings(v['rows'], v['ping'], float(v['weight']))
+        assert_allclose(clutter.density(v['query'], CONFIG), v['density'], rtol=1e-9)
+    assert clutter.interval == 0.5
+    believed = evolve(CONFIG, clutter_density=0.3)
+    assert clutter.density(np.ones((2, 2)), believed).tolist() == [0.3, 0.3]
+
+
+def test_before_there_are_false_echoes_the_density_is_a_prior():
+    z = np.array([[50.0, 0.1]])
+    assert_allclose(Clutter.none().density(z, CONFIG), 0.02)
+    quiet = Clutter.none()
+    for _ in range(60):
+        quiet = quiet.after(np.empty((0, 2)), np.empty(0), 0.5)
+    assert_allclose(quiet.density(z, CONFIG), 0.02 * 5.0 / 65.0)
+    assert quiet.a_ping() == 0.0
+
+
+@pytest.mark.parametrize(
+    'near, far, left, right, where',
+    [
+        (1.0, 100.0, -22.5, 22.5, 'all over'),
+        (55.0, 59.0, -22.5, 22.5, 'at 57 m'),
+        (1.0, 100.0, 10.0, 16.0, 'to starboard 13 deg'),
+        (1.0, 100.0, -16.0, -10.0, 'to port 13 deg'),
+    ],
+)
+def test_users_are_told_where_false_echoes_are(near, far, left, right, where):
+    rng = np.random.default_rng(1)
+    ping = np.repeat(np.arange(60), 12)
+    z = np.column_stack(
+        [rng.uniform(near, far, len(ping)), np.radians(rng.uniform(left, right, len(ping)))]
+    )
+    (sentence,) = after_pings(z, ping, 1.0).warnings(CONFIG)
+    assert sentence == f'12 false detections a ping, most of them {where}: learnt'
+    assert not after_pings(z, ping, 0.3).warnings(CONFIG)
+    assert not after_pings(z, ping, 1.0).warnings(evolve(CONFIG, clutter_density=0.1))
+
+
+# -- existence ---------------------------------------------------------------------------------
+
+
+def test_existence_by_class():
+    p = detection(np.array([10.0, 60.0]), evolve(CONFIG, detection_profile=(20.0, 1.0, 40.0, 0.5)))
+    assert_allclose(p, [[0.9, 0.5, 0.2], [0.45, 0.25, 0.1]])
+    q = Existence.of(np.array([[0.1, 0.2, 0.6], 0.9999999 * PRIOR]), 2)
+    assert_allclose(q.probability(), [0.9, 0.9999999])
+    assert_allclose(q.detectability(CONFIG)[0], (0.09 + 0.1 + 0.12) / 0.9)
+    later = q.later(100.0)
+    assert_allclose(later.probability(), q.probability())
+    assert_allclose(
+        later.classes[0], np.array([0.1, 0.2, 0.6]) / np.e + 0.9 * (1.0 - 1.0 / np.e) * PRIOR
+    )
+    mu, V, p = np.array([[0.4, 0.6]] * 2), np.array([[0.9, 0.2]] * 2), np.full((2, 3), 0.5)
+    bounded = q.with_ping(q.classes, np.array([0.5, 1.0]), mu, V, p)
+    assert bounded.probability()[1] == pytest.approx(SUREST)
+    assert bounded.hits.tolist() == [1.5, 2.0]
+
+
+def test_misses_count_component_by_component_since_the_last_echo():
+    """Of a component that the beam always held, and one that has left it since the last echo."""
+    mu, p = np.array([[0.5, 0.5]]), np.array([[0.9, 0.5, 0.2]])
+    held, left = np.array([[0.9, 0.8]]), np.array([[0.9, 0.01]])
+    q = Existence.of(PRIOR[None], 2).with_ping(PRIOR[None], np.ones(1), mu, held, p)
+    assert_allclose(q.silence[0, :, 0], [0.9 / 0.85, 0.8 / 0.85])
+    for n in range(1, 4):
+        visible = q.visible(mu, left)
+        weight = np.array([[0.45], [0.4]]) / 0.85
+        weight = weight * (1.0 - p * left.T) ** (n - 1)
+        assert_allclose(visible[0], (weight * left.T).sum(axis=0) / weight.sum(axis=0))
+        q = q.with_ping(PRIOR[None], np.zeros(1), mu, left, p)
+
+
+def test_tracks_are_confirmed_for_good_by_existence_and_hits_and_end():
+    q = np.array([0.96, 0.96, 0.9, 0.04, 0.04, 0.0005])[:, None] * PRIOR
+    existence = Existence.of(q, 1)._replace(hits=np.array([2.6, 2.4, 9.0, 9.0, 2.0, 1.0]))
+    before, hit = np.array([0, 0, 0, 1, 0, 0], np.uint8), np.array([1, 1, 1, 0, 0, 0], bool)
+    assert existence.status(before, hit, CONFIG).tolist() == [1, 0, 0, 2, 0, 0]
+    assert existence.ended(before > 0).tolist() == [False, False, False, True, False, True]
+
+
+def test_of_two_tracks_in_one_place_the_younger_ends():
+    mean = np.array([[50.0, 0.1], [50.4, 0.1], [50.4, 0.13], [90.0, 0.1]])
+    covariance = np.tile(np.diag([0.1, 1e-5]), (4, 1, 1))
+    ids, confirmed = np.array([7, 9, 12, 13]), np.ones(4, bool)
+    hit = np.array([True, False, False, False])
+    near = older_nearby(mean, covariance, ids, confirmed, hit)
+    assert near.tolist() == [0, 7, 0, 0]
+    existence = Existence.of(np.tile(PRIOR, (4, 1)), 1)
+    for _ in range(MERGED):
+        assert not existence.ended(confirmed).any()
+        existence = existence.near(near)
+    assert existence.ended(confirmed).tolist() == [False, True, False, False]
+    both = np.array([True, True, False, False])
+    assert not older_nearby(mean, covariance, ids, confirmed, both).any()
+
+
+# -- seeds -------------------------------------------------------------------------------------
+
+SONAR = Sonar(geometry.Pose(np.array([3.0, -2.0, 20.0]), geometry.rotation(0.0, 0.0, 0.7)))
+
+
+def ping_of(z, stamp_ns=SECOND, dt=0.5):
+    z = np.reshape(np.asarray(z, float), (-1, 2))
+    detections = Detections(stamp_ns=stamp_ns, range=z[:, 0], bearing=-z[:, 1])
+    ping = Ping(stamp_ns, SONAR, Echoes.of(detections, CONFIG), GroundMap())
+    ping.dt = dt
+    return ping
+
+
+def test_a_seed_is_as_probable_as_births_beside_clutter():
+    (seeds,) = sown((), ping_of([[60.0, 0.1], [30.0, 0.0]]), np.array([1.0, 0.25]), 0.02, CONFIG)
+    born = 0.02 * 0.5 / (100.0 * np.radians(45.0))
+    assert_allclose(seeds.classes.sum(axis=1), [1.0, 0.25] * np.array(born / (born + 0.02)))
+    assert_allclose(seeds.classes[0] / seeds.classes[0].sum(), PRIOR)
+    pd = np.array([0.9, 0.5, 0.2])
+    q = seeds.classes[0]
+    left = unmet(seeds, CONFIG).classes[0]
+    assert_allclose(left, q * (1.0 - pd) / (1.0 - q.sum() + (q * (1.0 - pd)).sum()))
+    late = ping_of([[60.0, 0.1]], stamp_ns=4 * SECOND)
+    assert len(sown((seeds,), late, np.ones(1), 0.02, CONFIG)) == 1  # after 2.5 s it goes
+    soon = ping_of([[60.0, 0.1]], stamp_ns=3 * SECOND)
+    assert len(sown((seeds,), soon, np.ones(1), 0.02, CONFIG)) == 2
+
+
+def test_a_seed_is_met_as_the_closed_mixture_around_its_place_says():
+    (seeds,) = sown((), ping_of([[60.0, 0.1]]), np.ones(1), 0.02, CONFIG)
+    assert isinstance(seeds, Seeds)
+    dt, d = 1.0, 60.0
+    z = np.array([[60.9, 0.105], [95.0, -0.2]])
+    expected = np.array([0.5, 0.02])
+    found = met(seeds, ping_of(z, SECOND + round(dt * SECOND)), expected, CONFIG)
+    # In the axes of the seed: the sonar has not moved.
+    off = [60.9 * np.cos(0.005) - d, 60.9 * np.sin(0.005)]
+    R_r, R_b = CONFIG.range_std**2, np.radians(CONFIG.bearing_std_deg) ** 2
+    along = 2.0 * R_r + 0.05**2
+    across = 2.0 * R_b * d * d + (0.004 * d) ** 2 + (0.03 * dt) ** 2
+    swung = 2.0 * 0.5**2 * (1.0 - np.exp(-dt / 20.0))
+    L = sum(
+        share * multivariate_normal.pdf(off, cov=np.diag([along + more, across + more]))
+        for share, more in zip(BEHAVIOURS, (0.0, swung, (0.75 * dt) ** 2))
+    )
+    pd = seeds.classes[0] @ [0.9, 0.5, 0.2]
+    assert_allclose(found, pd * L * d / 0.5, rtol=1e-9)
+
+
+# -- scales ------------------------------------------------------------------------------------
+
+
+def learned(error, config=CONFIG, tracks=1):
+    """Scales after normalised innovations (N, 2) as the stated variances make them."""
+    scales, last = Scales.none(), np.full((1, 2), np.nan)
+    for e in error:
+        used = e[None] / np.sqrt(scales.factor(config))  # the sonar's own error is all there is
+        scales = scales.after(used, last, np.ones((1, 2), bool), config)
+        last = used
+    return scales
+
+
+def test_the_scale_of_stated_variances_is_found():
+    rng = np.random.default_rng(2)
+    white = rng.normal(size=(600, 2))
+    assert_allclose(learned(white).factor(CONFIG), 1.0, atol=0.2)
+    assert not learned(white).warnings(CONFIG)
+    wide = learned(white * [3.0, 1.0 / 3.0])
+    assert 7.0 < wide.factor(CONFIG)[0] < 10.0 and 0.1 <= wide.factor(CONFIG)[1] < 0.25
+    ranges, bearings = wide.warnings(CONFIG)
+    assert ranges.startswith('ranges scatter') and ranges.endswith(
+        'times more than stated: allowed for'
+    )
+    assert 'bearings scatter' in bearings and 'less than stated' in bearings
+    as_stated = evolve(CONFIG, variance_scale_min=1.0, variance_scale_max=1.0)
+    assert learned(white * 3.0, as_stated).factor(as_stated).tolist() == [1.0, 1.0]
+
+
+def test_echoes_that_err_alike_are_not_narrowed():
+    rng = np.random.default_rng(3)
+    keep, e = np.exp(-0.1), np.zeros((600, 2))
+    for k in range(1, 600):
+        e[k] = keep * e[k - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=2)
+    assert (learned(e).factor(CONFIG) > 1.0).all()
+    assert (learned(e / 3.0).factor(CONFIG) > 0.5).all()
+
+
+# -- the tracker -------------------------------------------------------------------------------
+
+
+def seen(seed, **overrides):
+    """A scene of an approach, its estimates by stamp, and the tracker."""
+    scene = simulate(scenario('approach', {'sonar_lever': LEVER, **overrides}), seed)
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=LEVER))
+    return scene, run(tracker, [item.measurement for item in scene.measurements]), tracker
+
+
+def test_an_obstacle_among_thirty_false_echoes_is_the_only_one():
+    scene, final, tracker = seen(3, clutter=30.0, last_range=50.0)
+    truth, confirmed = scene.truth[0], [e.extras['track_state'] > 0 for e in final.values()]
+    assert sum(int(each.sum()) for each in confirmed[10:]) == len(confirmed[10:])
+    for ping in range(10, len(truth.stamp_ns)):
+        assert followed(final[int(truth.stamp_ns[ping])], truth, ping, near=2.0) is not None
+    assert 25.0 < tracker.health()['clutter_a_ping'] < 35.0
+    last = list(final.values())[-1].extras
+    assert last['existence'][last['track_state'] > 0] > 0.99
+    assert last['detection_probability'].max() < 0.95
+
+
+def test_an_obstacle_that_is_seldom_seen_is_confirmed_and_said_to_be():
+    scene, final, tracker = seen(1, detection_probability=0.2, last_range=40.0)
+    truth = scene.truth[0]
+    ping = len(truth.stamp_ns) - 1
+    row = followed(final[int(truth.stamp_ns[ping])], truth, ping)
+    assert final[int(truth.stamp_ns[ping])].extras['detection_probability'][row] < 0.4
+    (sentence,) = (each for each in tracker.warnings() if 'pings' in each)
+    assert sentence.startswith('obstacles are seen in ') and 's to confirm' in sentence
