@@ -117,7 +117,7 @@ class NavigationErrors(NamedTuple):
             across = np.array([0.0, speed, -course[1] / speed, course[0] / speed, 0.0])
             drift = self._significant(along)
             if abs(drift) > DRIFTS:
-                north, east = -drift * along[2:4]
+                north, east = np.round(-drift * along[2:4], 2) + 0.0  # no -0.00
                 sentences.append(
                     f'navigation drifts by {abs(drift):.2f} m/s against what {obstacles} '
                     f'{"obstacles show" if obstacles > 1 else "obstacle shows"} ({east:.2f} m/s '

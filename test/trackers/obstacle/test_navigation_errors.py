@@ -17,15 +17,20 @@ assumptions."""
 
 from pathlib import Path
 
+from attrs import evolve
+from helpers.obstacle_runs import run, SECOND
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from sonar_imm.trackers.obstacle import navigation_errors, unscented
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle import mixtures, navigation_errors, unscented
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Mixture
 from sonar_imm.trackers.obstacle.navigation_errors import NavigationErrors
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 from sonar_imm.trackers.obstacle.unscented import Motion, NAV, Step
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_in_clutter'
 ORDER = [0, 1, 2, 5, 6, 7, 8, 9, 3, 4]
@@ -191,3 +196,134 @@ def unscented_moments(mixture):
     mean = mu @ x
     off = x - mean
     return mean, np.einsum('k,kab->ab', mu, P + off[:, :, None] * off[:, None])
+
+
+@pytest.mark.parametrize('case', [0, 1, 2])
+def test_what_is_published_counts_both_assumptions(case):
+    """Behaviours, velocity and the band of the depth, of the vectors."""
+    data = vectors('ins_good')
+    own = {name.split('/')[1]: value for name, value in data.items() if f'{case}/' in name}
+    order = np.array(ORDER)
+    mixture, _ = navigation_errors.under_two_assumptions(
+        Mixture(own['x'][..., order], own['P'][..., order[:, None], order], own['w']),
+        np.ones(1, np.bool_),
+        float(own['t']),
+        ObstacleConfig(),
+    )
+    kind = np.tile(own['beh'], 2)
+    behaviour = [mixture.mu[0, kind == k].sum() for k in range(3)]
+    # The last component is the sea floor.
+    floor = mixture.mu[0, [27, 55]].sum()
+    behaviour[0] -= floor
+    assert_allclose([*behaviour, floor], own['behaviour'][0], rtol=1e-9, atol=1e-12)
+    std = np.sqrt(np.where(mixture.mu > 0.0, mixture.P[..., 2, 2], 1.0))
+    low, high, _ = mixtures.bands(mixture.x[..., 2], std, mixture.mu, 0.05)
+    assert_allclose([low[0], high[0]], [own['lo'][0], own['hi'][0]], atol=3e-4)
+    moves = kind == 2
+    velocity = mixture.mu[0, moves] @ mixture.x[0, moves, 8:]
+    assert_allclose(velocity, own['v'][0], rtol=1e-9, atol=1e-12)
+
+
+def test_nothing_is_split_where_nothing_is_in_doubt():
+    good = ObstacleConfig(drift_std=0.003, yaw_error_std_deg=0.1, navigation_delay_std=0.01)
+    own = {name[2:]: value for name, value in vectors('ins_good').items() if name.startswith('0/')}
+    order = np.array(ORDER)
+    mixture = Mixture(own['x'][..., order], own['P'][..., order[:, None], order], own['w'])
+    sure = np.ones(1, np.bool_)
+    for config in (good, ObstacleConfig(navigation_good_probability=0.0)):
+        same, probability = navigation_errors.under_two_assumptions(mixture, sure, 9.0, config)
+        assert same is mixture and np.isnan(probability).all()
+    certain = ObstacleConfig(navigation_good_probability=1.0)
+    found, probability = navigation_errors.under_two_assumptions(mixture, sure, 9.0, certain)
+    assert_allclose(probability, 1.0)
+    assert np.isfinite(found.x).all() and np.isfinite(found.mu).all()
+
+
+# -- the tracker ----------------------------------------------------------------------------------
+
+
+def dived(drift=(0.0, 0.0), yaw_deg=0.0, late=0.0, **values):
+    """The tracker and its last estimate after an approach with navigation that drifts (east, north
+    m/s), a sonar turned to starboard by `yaw_deg`, or poses that come late."""
+    scene = simulate(scenario('approach', {'detection_probability': 0.95}), 3)
+    given, start = [], scene.measurements[0].measurement.stamp_ns
+    for item in scene.measurements:
+        each = item.measurement
+        if isinstance(each, Navigation):
+            off = (each.stamp_ns - start) / SECOND * np.array([*drift, 0.0])
+            stamp_ns = each.stamp_ns + round(late * SECOND)
+            each = evolve(each, position=each.position + off, stamp_ns=stamp_ns)
+        if isinstance(each, Detections):
+            each = evolve(each, bearing=each.bearing + np.radians(yaw_deg))
+        given.append(each)
+    tracker = ObstacleTracker(ObstacleConfig(**values))
+    final = run(tracker, sorted(given, key=lambda each: each.stamp_ns))
+    return tracker, list(final.values())[-1]
+
+
+def fixed(estimate):
+    row = int(np.argmax(estimate.extras['track_state']))
+    return float(estimate.extras['prob_fixed'][row])
+
+
+def test_good_navigation_is_believed_and_nothing_is_said():
+    tracker, estimate = dived()
+    assert tracker.health()['navigation_good'] > 0.7
+    assert tracker.warnings() == []
+    assert fixed(estimate) > 0.95
+
+
+def test_a_drift_is_no_motion_of_the_obstacle_and_is_said():
+    course = np.radians(30.0)
+    drift = 0.06 * np.array([np.sin(course), np.cos(course)])
+    tracker, estimate = dived(drift=drift)
+    health = tracker.health()
+    assert fixed(estimate) > 0.9
+    assert health['navigation_good'] < 0.05
+    assert np.hypot(health['nav_drift_x'] - drift[0], health['nav_drift_y'] - drift[1]) < 0.03
+    (sentence,) = tracker.warnings()
+    assert 'navigation drifts by 0.0' in sentence and 'what 1 obstacle shows' in sentence
+    off = dived(drift=drift, drift_std=0.0, yaw_error_std_deg=0.0, navigation_delay_std=0.0)
+    assert off[0].health()['nav_drift_x'] == 0.0
+    assert fixed(off[1]) < 0.1
+
+
+@pytest.mark.parametrize('side, yaw_deg', [('starboard', 2.5), ('port', -2.5)])
+def test_a_sonar_that_is_turned_is_said_with_its_side(side, yaw_deg):
+    """What it sees ahead lies to the other side of where it says."""
+    tracker, estimate = dived(yaw_deg=yaw_deg)
+    assert fixed(estimate) > 0.9
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('the sonar seems to be turned by 2.')
+    assert f'deg to {side} against sonar_mount_rpy_deg' in sentence
+
+
+@pytest.mark.parametrize('late, word', [(0.4, 'late'), (-0.4, 'early')])
+def test_poses_that_are_late_are_said(late, word):
+    tracker, _ = dived(late=late)
+    assert tracker.health()['nav_delay'] == pytest.approx(late, abs=0.15)
+    (sentence,) = tracker.warnings()
+    assert sentence.startswith('poses arrive 0.') and f's {word}: allowed for' in sentence
+
+
+def test_an_error_is_said_where_it_is_sure_and_matters():
+    """Along the course and across it, east and north, with their signs."""
+    small = np.diag([1e-3, 1e-3, 3e-3, 3e-3, 0.01]) ** 2
+    north = np.array([1.0, 0.0, 0.0])
+    drifts = NavigationErrors(np.array([0.0, 0.0, -0.05, 0.0, 0.0]), small)
+    assert drifts.warnings(north, 3) == [
+        'navigation drifts by 0.05 m/s against what 3 obstacles show (0.00 m/s east, 0.05 m/s '
+        'north): allowed for; check the log or the current'
+    ]
+    unsure = drifts._replace(covariance=100.0 * small)
+    assert unsure.warnings(north, 3) == []
+    assert drifts._replace(mean=0.5 * drifts.mean).warnings(north, 3) == []
+    aside = NavigationErrors(np.array([0.0, 0.02, 0.0, 0.01, 0.0]), small)
+    assert aside.warnings(north, 1) == [
+        'the sonar seems to be turned by 1.7 deg to port against sonar_mount_rpy_deg, or '
+        'navigation drifts sideways by 0.03 m/s'
+    ]
+    # Drift to port that hides a turn is neither.
+    assert aside._replace(mean=np.array([0.0, 0.02, 0.0, -0.02, 0.0])).warnings(north, 1) == []
+    still = np.zeros(3)
+    assert aside.warnings(still, 1) == aside.warnings(np.full(3, np.nan), 1) == []

@@ -17,6 +17,7 @@
 from attrs import evolve
 from helpers.obstacle_runs import (
     approach,
+    EXACT,
     FAITHFUL,
     FIXED,
     follow,
@@ -258,7 +259,7 @@ def test_answers_are_those_of_an_independent_filter(name, number):
     each leaves the errors of a steady obstacle alone and shows here. That filter knows how far
     obstacles sway and ours does not: while one begins to move they differ more."""
     data = encounter(name, number)
-    estimates = track(data)
+    estimates = track(data, **EXACT)
     assert tracks_of(estimates) == {1}
     pings = np.arange(SETTLED, len(estimates))
     offset = column(estimates, 'vertical_offset', pings)
@@ -282,7 +283,7 @@ def test_a_new_obstacle_is_believed_to_be_where_the_study_believes_it(number):
     """The slices end at the sea floor, and the sea floor is a slice: while little is known, the
     offset is 0.7 to 1 m another and the sea floor 0.2 less probable without."""
     data = encounter('seabed_and_fixed', number)
-    estimates = track(data)
+    estimates = track(data, **EXACT)
     pings = np.arange(4, SETTLED)
     offset = column(estimates, 'vertical_offset', pings)
     assert_allclose(offset, data['ref_offset'][pings], atol=0.35)
