@@ -41,7 +41,7 @@ from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 SECOND = 1e9
 SWEEP = 9.0
-BELIEFS: dict[str, dict[str, float]] = {
+BELIEFS: dict[str, dict[str, Any]] = {
     'default': {},
     'exact': {'drift_std': 0.0, 'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0},
     'good': {'drift_std': 0.003, 'yaw_error_std_deg': 0.1, 'navigation_delay_std': 0.01},
