@@ -25,10 +25,13 @@ from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
 from . import births, clutter, depth, offsets
 from .config import DiverConfig
-from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known, row_outputs
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
+from .scales import delay_probabilities, estimated_scales, weight_without_small_scales
+
+SURELY_LATE = 0.95
+"""Probability of a delay of a sensor that triggers a warning."""
 
 
 def estimate_of(
@@ -40,6 +43,8 @@ def estimate_of(
     mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
         covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
+    if known.memory['fixes'].errors_last(config.fix_bias_std > 0.0):
+        covariance = with_fix_covariance(known['reported'], covariance)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -87,6 +92,17 @@ def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatAr
     return mean, covariance
 
 
+def with_fix_covariance(reported: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Add the covariance of one fix, `reported` (T, 3), to that of the positions (T, q, q).
+
+    Filtering does not reduce an error that lasts. `reported`: see `fixes.FEATURES`.
+    """
+    xx, xy, yy = np.nan_to_num(reported).T
+    covariance = covariance.copy()
+    covariance[:, :2, :2] += np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
+    return covariance
+
+
 def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     """Return the extra columns of families."""
     if models.families is None:
@@ -95,7 +111,7 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = estimated_scales(known.rows)
+    out['covariance_scale'] = estimated_scales(known.rows, known.memory['reporting'])
     return out
 
 
@@ -111,8 +127,8 @@ def health(known: Known, waiting: int) -> dict[str, float]:
         'broken_tracks': known.counts.get('broken', 0),
         'covariance_repairs': known.counts.get('repairs', 0),
         'not_started': known.counts.get('not_started', 0),
-        'fixes_mean_nis': known.memory['fixes'].mean_nis,
-        'fixes_lag_1': known.memory['fixes'].lag_1,
+        'fixes_mean_nis': known.memory['fixes'].together.mean_nis,
+        'fixes_lag_1': known.memory['fixes'].together.lag_1,
         'arrivals_mean_nis': known.memory['arrivals'].mean,
         'waiting_for_vessel': waiting,
     }
@@ -127,13 +143,36 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         unset.insert(0, 'target_z (or dimensions: 3)')
     if unset:
         advice += ', or set instrument errors: ' + ', '.join(unset)
+    assumed = []
+    if known.memory['fixes'].assumed:
+        assumed = [
+            f'no message states a covariance: fix_std {config.fix_std:g} m is assumed, and no '
+            'ellipse is better than that. Set fix_std'
+        ]
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
-    exceeds = memory['excess'] >= ENOUGH
+    exceeds, largest = memory['excess'] >= ENOUGH, max(config.covariance_scales)
     return [
-        *memory['fixes'].warnings(config.fix_bias_std > 0.0),
+        *(assumed if config.has_usual_fix_std else []),
+        *memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names),
+        *late_warnings(known),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]
+
+
+def late_warnings(known: Known) -> list[str]:
+    """Return a warning for each sensor whose stamps are late."""
+    found, firm = [], known.life.status != TENTATIVE
+    for number, name in enumerate(known.memory['sensors'].names):
+        delay, weight = delay_probabilities(known.rows, number)
+        if not (firm & (weight > SURELY_LATE)).any():
+            continue
+        track = int(np.where(firm, weight, 0.0).argmax())
+        found.append(
+            f'the stamps of sensor {name or "without a name"} are {delay[track]:.2g} s late '
+            f'({weight[track]:.2g}): the estimate corrects them'
+        )
+    return found

@@ -39,6 +39,7 @@ from collections.abc import Callable, Sequence
 import math
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
 from ...estimation import bank, jipda
@@ -52,7 +53,6 @@ from ...estimation.rows import (
     log_sum,
     reduce_targets,
     restore_rows,
-    ROW_AGAIN,
     ROW_LOST,
     Rows,
 )
@@ -62,25 +62,35 @@ from .known import Feature, Known, repair_covariances, row_outputs
 from .models import ModelSet
 from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
+from .scales import (
+    can_restore,
+    estimated_scales,
+    protected_rows,
+    weight_without_small_scales,
+)
 from .scan import Group
+from .sensors import MOST_SENSORS
 
 FEATURES = {
     'nis': Feature(math.nan),
     'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (2,)),
+    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
+    'reported': Feature(math.nan, (3,)),
 }
 """nis, nis_dof: of this scan, NaN and 0 without a hit.
 
 score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
-white: whitened innovation of the last fix.
+white: whitened innovation of the last fix of each sensor.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
 evidence: sum of the detection probabilities of the track.
+
+reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
 """
 
 FAR = 80.0
@@ -101,14 +111,6 @@ divided by it."""
 CONFIRM_EXISTENCE = 0.9
 """Existence above which a track can be confirmed."""
 
-REDISTRIBUTED_FRACTION = 5e-4
-"""Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
-quality is detected."""
-
-MIN_PUBLISHED_SCALE = 1.0
-"""Smallest scale whose rows contribute to the published covariance. Smaller scales also fit
-time-correlated errors, so they contribute to the mean only."""
-
 
 # -- comparison ----------------------------------------------------------------------------------
 
@@ -118,8 +120,14 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
 
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
-    among = Assumptions.from_rows(known.rows, known.borrowed)
+    among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
     blocks, parts = known.rows.blocks, models.parts
+    if among.delay.any():
+        every = np.concatenate([np.arange(len(known.rows)), among.lent])
+        blocks = tuple(
+            bank.move_along(block.select(every), part.outputs[2:4], -among.delay)
+            for block, part in zip(blocks, parts)
+        )
     expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
     by_nis = models.families is None
     each = [
@@ -168,16 +176,20 @@ def _compare_part(
     :param min_probability: of a model whose NIS counts; None if no NIS is needed.
     """
     rows, z, R = known.rows, group.z, group.R
-    among = Assumptions._make(column[part] for column in among)
+    among = among.select(part)
     track = among.target - (among.target[0] if len(among.target) else 0)
     off = _box_distance(expected, among, z, R)
+    if len(z) > 1 and group.target_id is None:
+        # Of a whole scan, an improbable large scale would reach every fix.
+        off[~among.has_row & (among.logw < math.log(ROW_LOST))] = np.inf
     # A fix near one row is compared with all rows of the track, or a row could stay behind.
     near = reduce_targets(np.logical_or, off <= 1.0, track)
     if group.target_id is not None:
         near = known['target_id'][np.unique(among.target), None] == group.target_id
     assumption, fix = np.nonzero(near[track])
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
-    compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
+    seen = among.seen[assumption]
+    compared = tuple(bank.compare(*each, seen, z[fix], scaled) for each in expected)
     log = _mixture_log_density(rows.mu[row], compared)
     table = np.square(np.maximum(off, 1.0, out=off), out=off)
     table *= -0.5 * FAR
@@ -204,9 +216,12 @@ def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> Flo
         )
 
 
-def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
-    """Return the log density of a fix z (2,), R (2, 2) under the rows of one track."""
-    every, scale = np.arange(len(rows)), rows.key['scale']
+def track_log_density(
+    rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet, sensor: int
+) -> float:
+    """Return the log density of a fix z (2,), R (2, 2) of a sensor under the rows of one new
+    track."""
+    every, scale = np.arange(len(rows)), rows.key['scale'][:, sensor]
     many = np.tile(z, (len(rows), 1)), R * scale[:, None, None]
     compared = [
         bank.weigh(block, every, *many, part.measured)
@@ -231,9 +246,9 @@ def _box_distance(
     widest = np.array([R[:, 0, 0].max(), R[:, 1, 1].max()])
     low, high = np.full((len(among.row), 2), np.inf), np.full((len(among.row), 2), -np.inf)
     for h, S in expected:
-        spread = S[among.row][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
+        spread = S[among.seen][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
         reach = np.sqrt(FAR * np.maximum(spread, 0.0))
-        place = h[among.row]
+        place = h[among.seen]
         low = np.minimum(low, (place - reach).min(axis=2))
         high = np.maximum(high, (place + reach).max(axis=2))
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-300)
@@ -247,11 +262,11 @@ def _box_distance(
     return off
 
 
-def gate_log_density(group: Group) -> float:
-    """Return the gate threshold: the log density at which a detection and a miss with a false fix
-    are equally probable."""
+def gate_log_density(group: Group) -> FloatArray:
+    """Return the gate threshold (D,): the log density at which a detection and a miss with a
+    false fix are equally probable."""
     p = group.config.detection_probability
-    return math.log(group.clutter) + math.log1p(-p) - math.log(p)
+    return np.asarray(np.log(group.clutter) + (math.log1p(-p) - math.log(p)))
 
 
 def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
@@ -300,11 +315,12 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     seen, p = group.detection, group.config.detection_probability
     ratio = 0.0 if seen is None else seen.log_ratio
     fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
-    fix = assign_fits(fit, known.life.status == TENTATIVE, p, group.clutter)
+    clutter = group.config.usual_clutter
+    fix = assign_fits(fit, known.life.status == TENTATIVE, p, clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
     score = known['score'] + missed
-    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(group.clutter)
+    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
     return Association(*_hard_association(fix, D), fix, free, None, score)
@@ -339,7 +355,8 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
     claimed = beta.sum(axis=0)
-    birth = group.birth_density / (group.birth_density + group.clutter) * (1.0 - claimed)
+    new = group.birth_density
+    birth = new / (new + group.clutter) * (1.0 - claimed)
     score = jipda.log_odds(after)
     return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
 
@@ -353,9 +370,12 @@ def update_stage(
     """Return the stage that updates rows, models and existence. estimated: masks of the components
     that an update may change, one per block."""
 
+    has_scales = len(models.scales) > 1
+
     def update(known: Known, group: Group) -> Known:
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
+        rejected = _rejected_fixes(known, group, association, pairs) if has_scales else None
         known = _record_innovations(known, group, association, models)
         columns = {'score': association.score}
         if association.is_joint:
@@ -364,9 +384,9 @@ def update_stage(
             columns['existence'] = np.where(named, known['existence'], association.exists)
             columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
         known = known.with_columns(**columns)
-        if not (association.beta > 0.0).any():
+        if rejected is None and not (association.beta > 0.0).any():
             return known
-        return update_tracks(known, group, pairs, association, models, estimated(known))
+        return update_tracks(known, group, pairs, association, models, estimated(known), rejected)
 
     return update
 
@@ -378,8 +398,12 @@ def update_tracks(
     association: Association,
     models: ModelSet,
     estimated: tuple[BoolArray | None, ...],
+    rejected: tuple[IntArray, FloatArray] | None,
 ) -> Known:
-    """Update the tracks by the fixes, with the probabilities of the association."""
+    """Update the tracks by the fixes, with the probabilities of the association.
+
+    rejected: see `_rejected_fixes`.
+    """
     among = pairs.among
     exists = np.where(association.exists > 0.0, association.exists, 1.0)
     missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
@@ -389,8 +413,13 @@ def update_tracks(
     assumption, weight = pairs.assumption[used], weight[used]
     whole = pairs.track_log[track[used], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    rows, borrowed = _update_weights(known, among, missed[among.target] + gain)
-    rows, borrowed, left = drop_weightless_rows(rows, borrowed, 'scale', _protected_rows(rows))
+    factor: FloatArray = np.add(missed[among.target], gain)
+    weighed = np.asarray(association.beta.any(axis=1))
+    if rejected is not None:
+        factor *= _rejected_factor(pairs, *rejected)
+        weighed = weighed | (rejected[1] > 0.0)
+    rows, borrowed = _update_weights(known, among, factor)
+    rows, borrowed, left = drop_weightless_rows(rows, borrowed, protected_rows(rows))
     # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
@@ -399,18 +428,61 @@ def update_tracks(
     row, weight, whole = row[own], weight[own, None], whole[own, None]
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
-    blocks, factors = [], []
+    blocks, factors, late = [], [], rows.key['delay'][:, group.number]
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
-        innovations = bank.compare(*expected, among.row[assumption], z, R)
+        innovations = bank.compare(*expected, among.seen[assumption], z, R)
+        block = bank.move_along(block, part.outputs[2:4], -late)
         ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
         block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
-        blocks.append(block)
+        blocks.append(bank.move_along(block, part.outputs[2:4], late))
         factors.append(factor)
     sound, repairs = repair_covariances(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    rows, borrowed = restore_rows(rows, borrowed, 'scale', _can_restore(rows, borrowed))
+    again = can_restore(rows, borrowed) & weighed[borrowed.target]
+    rows, borrowed = restore_rows(rows, borrowed, again)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
+
+
+def _rejected_fixes(
+    known: Known, group: Group, association: Association, pairs: Pairs
+) -> tuple[IntArray, FloatArray] | None:
+    """Return the nearest fix (T,) of each track that got none, -1 for none, and the probability
+    (T,) that the fix is of the track.
+
+    A fix has one track: the nearest, or the one with its ID. Return None if there is no such fix.
+    """
+    whole = pairs.track_log + (0.0 if group.detection is None else group.detection.log_ratio)
+    without = np.asarray(~(association.beta > 0.0).any(axis=1))
+    possible = without[:, None] & np.asarray(association.claimed < 0.5)
+    if group.target_id is not None:
+        possible &= known['target_id'][:, None] == group.target_id
+    whole = np.where(possible & np.isfinite(pairs.track_log), whole, -np.inf)
+    if not np.isfinite(whole).any():
+        return None
+    nearest = whole.argmax(axis=1)
+    best = whole[np.arange(len(whole)), nearest]
+    own = np.isfinite(best) & (whole[:, nearest].max(axis=0) == best)
+    odds = np.minimum(best - gate_log_density(group)[nearest], 0.0)
+    return np.where(own, nearest, -1), np.where(own, np.exp(odds) / (1.0 + np.exp(odds)), 0.0)
+
+
+def _rejected_factor(pairs: Pairs, nearest: IntArray, share: FloatArray) -> FloatArray:
+    """Return the factors (A,) of the weights of all assumptions by rejected fixes.
+
+    A rejected fix is a false fix, or the covariances are much too small. Without this factor, no
+    fix could show that.
+
+    :param nearest: (T,) rejected fix of each track; -1 for none.
+    :param share: (T,) probability that the fix is of the track.
+    """
+    among = pairs.among
+    track = among.target[pairs.assumption]
+    own = np.flatnonzero((nearest[track] == pairs.fix) & (pairs.log > -np.inf))
+    assumption, track = pairs.assumption[own], track[own]
+    fit = np.exp(pairs.log[own] - pairs.track_log[track, pairs.fix[own]])
+    gain = np.bincount(assumption, share[track] * fit, len(among.row))
+    return np.asarray(1.0 - share[among.target] + gain, np.float64)
 
 
 def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
@@ -425,111 +497,62 @@ def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tup
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
-    return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list)
-
-
-def _protected_rows(rows: Rows) -> BoolArray:
-    """Return which rows (N,) are kept at any total weight.
-
-    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
-    scales of at least `MIN_PUBLISHED_SCALE`.
-    """
-    first, scale = rows.first, rows.key['scale']
-    # A start depth is a state: all rows of such a track are kept, also the first.
-    protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
-    protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
-    is_published = scale >= MIN_PUBLISHED_SCALE
-    return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
-
-
-def _can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
-    """Return which assumptions (B,) have sufficient weight for a row.
-
-    For scales of at least `MIN_PUBLISHED_SCALE`, the weight among these scales is sufficient.
-    """
-    is_published = rows.key['scale'] >= MIN_PUBLISHED_SCALE
-    total = np.add.reduceat(np.where(is_published, np.exp(rows.logw), 0.0), rows.first)
-    total = total[borrowed.target]
-    is_published = borrowed.key >= MIN_PUBLISHED_SCALE
-    least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
-    return np.asarray(np.exp(borrowed.logw) > least)
-
-
-def weight_without_small_scales(rows: Rows) -> FloatArray:
-    """Return row weights (N,) normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
-    return rows.weights_among(rows.key['scale'] >= MIN_PUBLISHED_SCALE)
-
-
-def estimated_scales(rows: Rows) -> FloatArray:
-    """Return the estimated covariance scale (T,) of each track, from scales of at least
-    `MIN_PUBLISHED_SCALE`."""
-    if not len(rows):
-        return np.empty(0)
-    return np.asarray(
-        np.add.reduceat(weight_without_small_scales(rows) * rows.key['scale'], rows.first)
-    )
-
-
-def redistribute_weights(known: Known) -> Known:
-    """Redistribute a small fraction of the scale weights.
-
-    The fraction is spread over the scales from 1, over the smaller scales, and over these two
-    groups. So the relative weights of the scales from 1 do not depend on the smaller scales.
-    """
-    rows, borrowed = known.rows, known.borrowed
-    target = np.concatenate([rows.target, borrowed.target])
-    scale = np.concatenate([rows.key['scale'], borrowed.key])
-    weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
-    group = 2 * target + (scale >= MIN_PUBLISHED_SCALE)
-    total = np.bincount(group, weight, minlength=2 * len(known))
-    size = np.bincount(group, minlength=2 * len(known))
-    groups = (size.reshape(-1, 2) > 0).sum(axis=1)[target]
-    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + REDISTRIBUTED_FRACTION / groups
-    logw = np.log(
-        after
-        * (
-            (1.0 - REDISTRIBUTED_FRACTION) * weight / total[group]
-            + REDISTRIBUTED_FRACTION / size[group]
-        )
-    )
-    N = len(rows)
-    return known.replace(
-        rows=rows.replace(logw=logw[:N]),
-        borrowed=Borrowed(borrowed.target, borrowed.key, logw[N:]),
-    )
+    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list)
 
 
 def _record_innovations(
     known: Known, group: Group, association: Association, models: ModelSet
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
+    if len(group.z):
+        known = _with_consistency(
+            known,
+            group,
+            known.memory['fixes']
+            .of(group.number)
+            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
+        )
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
     fix = association.fix[tracks]
     seen = tuple(part.fix_matrix for part in models.parts)
-    mean, covariance = known.rows.combine(
-        *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)
+    rows, late = known.rows, known.rows.key['delay'][:, group.number]
+    each = zip(rows.blocks, models.parts)
+    moved = tuple(bank.move_along(block, part.outputs[2:4], -late) for block, part in each)
+    mean, covariance = rows.combine(
+        *row_outputs(rows.replace(blocks=moved), seen), weight_without_small_scales(rows)
     )
     scale = (
-        estimated_scales(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
+        estimated_scales(known.rows, group.number)[tracks]
+        if len(models.scales) > 1
+        else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes']
+    before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
         covariance[tracks],
         group.z[fix],
         R,
-        known['white'][tracks],
+        known['white'][tracks, group.number],
         tentative,
         before,
     )
     after = after.with_scale(scale, tentative)
-    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof')}
-    columns['white'][tracks] = white
+    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
+    columns['white'][tracks, group.number] = white
+    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.
-    return known.with_columns(**columns).with_memory(fixes=after, recent=RecentPairs())
+    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
+        recent=RecentPairs()
+    )
+
+
+def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
+    """Return the state with the consistency of the sensor of a group."""
+    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
+    return known.with_memory(fixes=fixes)

@@ -62,6 +62,7 @@ from ...estimation.motion import Motion, white_acceleration
 from ...estimation.rows import Rows
 from ..own_models import diver_models
 from .config import DiverConfig
+from .sensors import MOST_SENSORS, of_sensor
 
 __all__ = ['build_models', 'ModelSet', 'Part']
 
@@ -84,6 +85,9 @@ LIVELY, QUIET = (0.05, 0.6), (0.03,)
 
 LIVELY_STAY = 0.85
 """Probability of keeping a lively model over a reference step."""
+
+USUAL_SCALES = 0.1, 10.0
+"""Limits of the covariance scales that have a row in a new track."""
 
 SPEED_MEMORY = 60.0
 """Time constant of the speed memory of a hovering target, s. Without decay, a target that stands
@@ -168,7 +172,7 @@ class ModelSet:
     families: Families | None = None
     """Data of unequal models; None if all models have all components."""
     scales: tuple[float, ...] = (1.0,)
-    """(K,) covariance scales of K rows."""
+    """Covariance scales."""
     parts: tuple[Part, ...] = field(init=False)
     bank: Bank = field(init=False)
     _cache: OrderedDict[float, tuple[Moves, ...]] = field(factory=OrderedDict, init=False)
@@ -182,9 +186,15 @@ class ModelSet:
         return int(self.E.shape[2])
 
     @property
+    def row_scales(self) -> tuple[float, ...]:
+        """(K,) covariance scales of the K rows of a new track: the usual ones, if any."""
+        least, most = USUAL_SCALES
+        return tuple(s for s in self.scales if least <= s <= most) or self.scales
+
+    @property
     def rows_per_track(self) -> int:
         """Number of rows of a new track."""
-        return max(len(self.starts), len(self.scales))
+        return max(len(self.starts), len(self.row_scales))
 
     @property
     def fix_matrix(self) -> FloatArray:
@@ -235,8 +245,8 @@ class ModelSet:
         x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
         x[..., :2], x[..., 2:] = position[:, None, None], self.start_mean
         P[..., :2, :2] = covariance[:, None, None]
-        if from_fix and measured and len(self.scales) > 1:
-            P[..., :2, :2] *= np.array(self.scales)[:, None, None, None]
+        if from_fix and measured and len(self.row_scales) > 1:
+            P[..., :2, :2] *= np.array(self.row_scales)[:, None, None, None]
         diagonal = P.reshape(*shape, n * n)[..., :: n + 1]
         diagonal[..., 2:] = self.start_variance
         if self.height >= 0:
@@ -249,11 +259,16 @@ class ModelSet:
             P[..., :2, there] = P[..., there, :2] = -shared
         return x, P, np.broadcast_to(self.initial, shape).copy()
 
-    def make_rows(self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray) -> Rows:
+    def make_rows(
+        self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray, sensor: int = 0
+    ) -> Rows:
         """Return the rows of T tracks with K rows each: x (T, K, M, n), P (T, K, M, n, n), mu (T,
-        K, M), logw (T, K)."""
+        K, M), logw (T, K).
+
+        sensor: number of the sensor that started the tracks.
+        """
         T, K, M, size = x.shape
-        scale = np.resize(np.array(self.scales), K)
+        scale = np.resize(np.array(self.row_scales), K)
         start = np.resize(np.arange(len(self.starts)), K)
         return Rows(
             self.to_blocks(x.reshape(T * K, M, size), P.reshape(T * K, M, size, size)),
@@ -261,7 +276,11 @@ class ModelSet:
             logw.reshape(T * K),
             np.repeat(np.arange(T), K),
             np.full(T * K, -1),
-            {'scale': np.tile(scale, T), 'start': np.tile(start, T)},
+            {
+                'scale': of_sensor(np.tile(scale, T), sensor),
+                'delay': np.zeros((T * K, MOST_SENSORS)),
+                'start': np.tile(start, T),
+            },
         )
 
     def to_blocks(self, x: FloatArray, P: FloatArray) -> tuple[Gaussians, ...]:
@@ -488,7 +507,7 @@ def _build_families(config: DiverConfig) -> ModelSet:
         motion,
         families=Families(family, kind, units, *speed, sector),
         # With depth as a state, rows are depth hypotheses instead of scaled filters.
-        scales=(1.0,) if config.dimensions == 3 else config.covariance_scales,
+        scales=(1.0,) if config.dimensions == 3 else tuple(sorted({*config.covariance_scales})),
     )
 
 

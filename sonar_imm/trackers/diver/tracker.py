@@ -61,15 +61,17 @@ from . import (
     offsets,
     pruning,
     restart,
+    scales,
 )
 from .config import DiverConfig
 from .coverage_map import configured_coverage
 from .georeferencing import Georeferencer
-from .innovations import FixConsistency
+from .innovations import SensorConsistency
 from .instruments import Instruments, Layout
 from .known import Feature, Known, predict_over
 from .models import build_models, ModelSet
 from .scan import Group, Scan
+from .sensors import Sensors
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
 
@@ -125,6 +127,8 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            clutter.estimate_densities,
+            len(models.scales) > 1 and scales.hearing_stage(models),
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
             self._associate,
@@ -161,7 +165,7 @@ class DiverTracker:
     def _empty_state(self, life: Tracks) -> Known:
         nobody = Known.empty(life, self.models, self.models.n, self.features)
         return nobody.with_memory(
-            fixes=FixConsistency(),
+            fixes=SensorConsistency(),
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
@@ -170,6 +174,8 @@ class DiverTracker:
             instruments=Instruments(),
             clutter=clutter.Clutters(),
             last_named=names.LastNamed(),
+            sensors=Sensors(),
+            reporting=0,
         )
 
     def restored(self) -> None:
@@ -225,7 +231,8 @@ class DiverTracker:
 
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, previous.memory['clutter'].densities())
+        scan = Scan.from_items(items, self.config)
+        previous = previous.with_memory(sensors=scan.number_sensors(previous.memory['sensors']))
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:
@@ -240,7 +247,11 @@ class DiverTracker:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
         has_scales = len(previous) and len(self.models.scales) > 1
-        start = fixes.redistribute_weights(previous) if has_scales else previous
+        start = previous
+        for number in sorted(scan.numbers) if has_scales else ():
+            start = scales.redistribute_weights(
+                start, self.models.scales, self.config.sensor_delays, number
+            )
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )
@@ -268,7 +279,9 @@ class DiverTracker:
         )
         layout = self._layouts(known)
         known = births.restart_track(known, ping, free, self.models, layout, self.config)
-        scan.births += births.births_from_ping(ping, free, self.config)
+        number = known.memory['sensors'].number('')
+        for birth in births.births_from_ping(ping, free, self.config):
+            scan.births.append(birth._replace(number=number))
         return known
 
     def _update_transitions(self, known: Known, scan: Scan) -> Known:

@@ -26,9 +26,10 @@ import pytest
 from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
-from sonar_imm.trackers.diver import fixes
 from sonar_imm.trackers.diver.estimate import published_state
 from sonar_imm.trackers.diver.known import repair_covariances
+from sonar_imm.trackers.diver.scales import redistribute_weights
+from sonar_imm.trackers.diver.sensors import of_sensor
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SETS = [
@@ -87,9 +88,14 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
         np.testing.assert_allclose(total, 1.0, rtol=1e-9)
         np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
         for track in range(len(known)):
-            own = rows.key['scale'][known.row_indices(track)]
-            own = np.append(own, borrowed.key[borrowed.target == track])
-            assert np.array_equal(np.sort(own), scales)
+            these = known.row_indices(track)
+            own = rows.key['scale'][these]
+            own = np.append(own, borrowed.key['scale'][borrowed.target == track], axis=0)
+            assert not own[:, 1:].any()
+            # The improbable scales of a new or restarted track follow with its second scan.
+            begun = (rows.parent[these] < 0).all()
+            due = tracker.models.row_scales if begun else scales
+            assert np.array_equal(np.sort(own[:, 0]), due)
         old = rows.parent >= 0
         parents = before.life.track_id[before.rows.target[rows.parent[old]]]
         assert np.array_equal(parents, ids[rows.target[old]])
@@ -101,7 +107,7 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
 @pytest.mark.parametrize('settings', SETS)
 def test_tracks_in_one_table_are_trackers_of_one(settings):
     """Divers too far apart to share a fix."""
-    config = DiverConfig(max_tracks=9, clutter_density=1e-5, **settings)
+    config = DiverConfig(max_tracks=9, clutter_density=1e-5, birth_density=1e-5, **settings)
     made = list(swims(3, 30, 4))
     together = run(
         DiverTracker(config),
@@ -189,13 +195,13 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
     one = rows.select(rows.first)
     stated = np.ones(len(one))
     single = known.replace(
-        rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': stated})
+        rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': of_sensor(stated, 0)})
     )
     for ours, due in zip(
         published_state(agreeing, tracker.models), published_state(single, tracker.models)
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
-    spread = fixes.redistribute_weights(agreeing)
+    spread = redistribute_weights(agreeing, tracker.models.scales)
     for ours, due in zip(
         published_state(spread, tracker.models), published_state(single, tracker.models)
     ):
@@ -241,6 +247,7 @@ import sys
 import numpy as np
 from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.sensors import of_sensor
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 for tracker in (DiverTracker(DiverConfig()), SmoothingDiverTracker(DiverConfig(dimensions=3))):
