@@ -198,7 +198,12 @@ class Landmark:
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
         """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
         level, depth = (part * dt for part in self._noise)

@@ -117,7 +117,7 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = 
         false_ones(5.0, 1.0, 100.0),
     ),
     'P_D .17': ([('approach', {'detection_probability': 0.17})], None),
-    'no ping for 20 s': ([('approach', {})], silent(15.0, 35.0)),
+    'no ping for 20 s': ([('approach', {})], silent(8.0, 28.0)),
     'R told x 9': ([('approach', {})], told(9.0)),
     'field of 14': (KINDS_OF_14, None),
     'field of 14, 30 false': (KINDS_OF_14, ALL_OVER),

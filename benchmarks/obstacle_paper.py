@@ -75,7 +75,7 @@ from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.angles import wrap_angle
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -231,7 +231,12 @@ class Seafloor(DepthSlices):
         return self._clamped(super().begin(z, R, sonar, height), sonar)
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
         return super().advance(self._clamped(mixture, before), before, after, dt)
 

@@ -53,7 +53,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, replace_rows, take
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
@@ -199,10 +199,15 @@ class DepthSlices:
         return fresh
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
-        to be repaired."""
+        to be repaired; silent (T,): those that go on with what they do."""
         return self.predict_unchanged(mixture, before, after, dt)
 
     def advance_each(
@@ -211,11 +216,13 @@ class DepthSlices:
         before: Sequence[Sonar],
         after: Sequence[Sonar],
         dt: FloatArray,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
         """`advance` of each target by itself, from one sonar of its own to another."""
         if not len(before):
             return mixture, 0
-        steps = zip(before, after, dt.tolist())
+        quiet = np.zeros(len(dt), np.bool_) if silent is None else silent
+        steps = zip(before, after, dt.tolist(), quiet[:, None])
         done = [self.advance(take(mixture, np.array([t])), *step) for t, step in enumerate(steps)]
         return joined([each for each, _ in done]), sum(repairs for _, repairs in done)
 
@@ -407,10 +414,19 @@ class BehaviourSlices(DepthSlices):
         return self._unshift(Mixture(x, P, mu), z, sonar)
 
     def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+        self,
+        mixture: Mixture,
+        before: Sonar,
+        after: Sonar,
+        dt: float,
+        silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
-        mixed = mixtures.mix(*mixture, self._prior, self.slices, self._transition(dt), DROPPED)
-        return self.predict_unchanged(Mixture(*mixed), before, after, dt)
+        rows = np.arange(len(mixture.mu)) if silent is None else np.flatnonzero(~silent)
+        if len(rows):
+            chain = self._transition(dt)
+            mixed = mixtures.mix(*take(mixture, rows), self._prior, self.slices, chain, DROPPED)
+            mixture = replace_rows(mixture, rows, Mixture(*mixed))
+        return self.predict_unchanged(mixture, before, after, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         parts = mu.reshape(len(mu), mu.shape[1] // self.K, self.K)

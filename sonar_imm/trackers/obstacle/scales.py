@@ -70,6 +70,11 @@ class Scales(NamedTuple):
         """Return what is known before the first hit."""
         return Scales(*np.zeros((6, 2)))
 
+    @property
+    def are_learnt(self) -> bool:
+        """Whether there were hits enough to tell."""
+        return bool((self.number >= HITS).all())
+
     def factor(self, config: ObstacleConfig) -> FloatArray:
         """Return the scales (2,) of the variances of range and bearing."""
         scale = (PRIOR + 0.5 * self.square) / (PRIOR + 0.5 * self.number)
@@ -109,7 +114,7 @@ class Scales(NamedTuple):
         parameters = 'range_std', 'bearing_std_deg'
         for i, factor in enumerate(np.sqrt(self.factor(config)).tolist()):
             sigmas = abs(2.0 * math.log(factor)) * math.sqrt(PRIOR + 0.5 * self.number[i])
-            if self.number[i] < HITS or sigmas < 3.0 or 1.0 / MATTERS < factor < MATTERS:
+            if not self.are_learnt or sigmas < 3.0 or 1.0 / MATTERS < factor < MATTERS:
                 continue
             times, word = (factor, 'more') if factor > 1.0 else (1.0 / factor, 'less')
             own = f'; check {parameters[i]}' if self.own[i] > 0.5 * self.number[i] else ''

@@ -83,6 +83,8 @@ STATES = ('range', 'bearing', 'vertical_offset')
 MODELS = ('above', 'below')
 BEYOND = 1.3
 """Share of the reach of the sonar beyond which a track ends."""
+SILENT = 5.0
+"""Seconds of pings without an echo, after which a track does not change what it does."""
 SELDOM = 0.4
 """Share of the pings that shows an obstacle, below which users are told how long it takes."""
 _SIDE = np.array([1.0, -1.0, 1.0])
@@ -202,7 +204,7 @@ class ObstacleTracker:
         known, config = self._stream.state.known, self.config
         advice = 'check range_std, bearing_std_deg and the variances of the detections'
         found = known.scales.warnings(config) + known.clutter.warnings(config)
-        if known.innovations.verdict > 0:
+        if known.innovations.verdict > 0 or not known.scales.are_learnt:
             found += known.innovations.warnings('detections', advice)
         seen = known.obstacles.existence.detectability(config)[known.confirmed]
         if len(seen) and np.count_nonzero(seen < SELDOM) > 0.5 * len(seen):
@@ -278,15 +280,19 @@ class ObstacleTracker:
         finite end."""
         ping.before = known.sonar
         ping.dt = (ping.stamp_ns - known.stamp_ns) * 1e-9 if known.stamp_ns else 0.0
+        # What is out of sight goes on with what it does, as a landmark: else more and more of it
+        # would move, and meet false echoes all around.
+        silent = known.stamp_ns - known.life.last_hit_ns > nanoseconds(SILENT)
         mixture = known.obstacles.mixture
         if ping.sweep is None:
-            mixture, repairs = self.filter.advance(mixture, ping.before, ping.sonar, ping.dt)
+            steps = ping.before, ping.sonar, ping.dt
+            mixture, repairs = self.filter.advance(mixture, *steps, silent)
         else:
             where = self.filter.whereabouts(mixture, ping.before)
             met = ping.sweep.met(*where, ping.dt)
             before = [ping.before] * len(met.ago)
             mixture, repairs = self.filter.advance_each(
-                mixture, before, met.sonars, ping.dt - met.ago
+                mixture, before, met.sonars, ping.dt - met.ago, silent
             )
             ping.met = met.rows(mixture.is_finite())
         is_finite = mixture.is_finite()
