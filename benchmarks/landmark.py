@@ -254,7 +254,9 @@ class Landmark:
             seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
         )
 
-    def visible(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, BoolArray]:
+    def visible(
+        self, mixture: Mixture, sonar: Sonar, widest: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[FloatArray, BoolArray]:
         m = geometry.to_body(sonar.pose, mixture.x[..., :3])
         away = np.linalg.norm(m, axis=-1)
         P = np.zeros((*mixture.mu.shape, 3, 3))

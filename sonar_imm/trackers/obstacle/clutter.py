@@ -47,6 +47,9 @@ SHRINK = 0.3
 FIRST, PRIOR_PINGS = 0.02, 5.0
 MANY = 5.0
 """False detections a ping of which users are told."""
+OUTSIDE, MARGIN = 5, 0.1
+"""Number of detections farther out than the sonar is said to look, by that share, of which users
+are told."""
 TOGETHER = 0.15
 """Share of range or sector that holds most false detections where they are in one place."""
 
@@ -109,14 +112,37 @@ class Clutter(NamedTuple):
         number = self.false[which].sum(axis=1)
         return np.asarray((number + SHRINK) / (area + SHRINK / everywhere))
 
+    def widest(self, z: FloatArray) -> tuple[float, float]:
+        """Return the largest azimuth, rad to either side, and the largest range, m, of these
+        detections z (D, 2) and the last ones: the sonar looks there, whatever it is said to."""
+        every = np.abs(np.concatenate([self.z, z]))
+        return float(every[:, 1].max(initial=0.0)), float(every[:, 0].max(initial=0.0))
+
     def warnings(self, config: ObstacleConfig) -> list[str]:
-        """Return a sentence for the user where there are many false detections."""
-        if config.clutter_density > 0.0 or self.pings < PINGS or self.a_ping() <= MANY:
-            return []
-        return [
-            f'{self.a_ping():.0f} false detections a ping, most of them {self._where(config)}: '
-            'learnt'
-        ]
+        """Return sentences for the user: of many false detections, and of detections from where
+        the sonar is said not to look."""
+        found = []
+        if config.clutter_density == 0.0 and self.pings >= PINGS and self.a_ping() > MANY:
+            found.append(
+                f'{self.a_ping():.0f} false detections a ping, most of them '
+                f'{self._where(config)}: learnt'
+            )
+        for parameter, unit, told, column in (
+            (
+                'horizontal_fov_deg',
+                'deg',
+                config.horizontal_fov_deg,
+                2.0 * np.degrees(self.z[:, 1]),
+            ),
+            ('max_range', 'm', config.max_range, self.z[:, 0]),
+        ):
+            beyond = np.sort(np.abs(column))[-OUTSIDE:]
+            if len(beyond) == OUTSIDE and beyond[0] > told * (1.0 + MARGIN):
+                found.append(
+                    f'detections come from beyond {parameter} ({told:g} {unit}): set it to '
+                    f'{beyond[-1]:.0f} {unit} or more'
+                )
+        return found
 
     def _where(self, config: ObstacleConfig) -> str:
         low, middle, high = (self._quantile(p) for p in (0.2, 0.5, 0.8))

@@ -51,14 +51,19 @@ from .state import Known, Obstacles
 
 
 def compare(
-    table: Obstacles, ping: Ping, filter_: DepthSlices, met: Met | None
+    table: Obstacles,
+    ping: Ping,
+    filter_: DepthSlices,
+    met: Met | None,
+    widest: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Compared, int]:
     """Return each obstacle beside the echoes in its gate, and how many covariances had to be
-    repaired; met: in a ping that takes time, where it met these obstacles."""
+    repaired; met: in a ping that takes time, where it met these obstacles; widest: see
+    `DepthSlices.visible`."""
     mixture, echoes, config = table.mixture, ping.echoes, filter_.config
     h, C = filter_.expected(mixture, ping.sonar, met and met.sonars)
     pose = ping.sonar.pose if met is None else met.poses
-    V, ahead = filter_.visible(mixture, pose)
+    V, ahead = filter_.visible(mixture, pose, widest)
     threshold = gate_threshold(config.gate_probability, 2)
     near = mixtures.gate(h, C, mixture.mu, echoes.z, echoes.R, threshold)
     t, i = np.nonzero(near)

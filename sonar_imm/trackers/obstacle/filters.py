@@ -320,12 +320,18 @@ class DepthSlices:
         """Probability of each behaviour, (T, B)."""
         return np.ones((len(mu), 1))
 
-    def visible(self, mixture: Mixture, pose: Pose) -> tuple[FloatArray, BoolArray]:
+    def visible(
+        self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[FloatArray, BoolArray]:
         """Probability (T, K) that the beam holds each component, and which targets (T,) lie
-        ahead; pose: of the sonar, or of one for each target, see `unscented.points`."""
+        ahead; pose: of the sonar, or of one for each target, see `unscented.points`. widest:
+        azimuth and range from which there were echoes, where these are more than the parameters
+        say."""
         x, P, mu = mixture
         m = unscented.points(x, *pose, self.cone)
-        return mixtures.visible(m, P, mu, *self._beam)
+        vertical, horizontal, reach = self._beam
+        edges = max(horizontal, widest[0]), max(reach, widest[1])
+        return mixtures.visible(m, P, mu, vertical, *edges)
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo

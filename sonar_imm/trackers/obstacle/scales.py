@@ -44,7 +44,7 @@ USUAL, MOST = 0.1, 0.85
 """Of the correlation of innovations: what a filter leaves, and the largest that is believed."""
 ENOUGH = 12.0
 """Hits from which the correlation counts."""
-MATTERS, HITS = 1.5, 30.0
+MATTERS, HITS = 1.6, 30.0
 """Of a standard deviation: the factor from which, and the number of hits after which, users are
 told."""
 NAMES = ('ranges', 'bearings')

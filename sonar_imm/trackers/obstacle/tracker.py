@@ -323,7 +323,8 @@ class ObstacleTracker:
         """Weigh all joint events of the obstacles and echoes, with tracks of those seeds that the
         ping may meet."""
         filter_, config, T = self.filter, self.config, len(known.life)
-        compared, repairs = compare(known.obstacles, ping, filter_, ping.met)
+        widest = known.clutter.widest(ping.echoes.z)
+        compared, repairs = compare(known.obstacles, ping, filter_, ping.met, widest)
         density = known.clutter.density(ping.echoes.z, config)
         expected = density * (1.0 + claims(known.obstacles, compared, density, filter_))
         brood = reconsidered(known.brood, known.clutter, config)
@@ -332,7 +333,7 @@ class ObstacleTracker:
         for mixture, bodies, existence, met, repaired in banks:
             new = begun(mixture, bodies, existence)
             known = known.joined(known.life.born(len(new.nis), ping.stamp_ns, RULES), new)
-            theirs, more = compare(new, ping, filter_, met)
+            theirs, more = compare(new, ping, filter_, met, widest)
             compared = compared.joined(theirs, len(compared.ahead))
             repairs += repaired + more
             ping.met = joined(ping.met, met)

@@ -98,6 +98,19 @@ def test_users_are_told_where_false_echoes_are(near, far, left, right, where):
     assert not after_pings(z, ping, 1.0).warnings(evolve(CONFIG, clutter_density=0.1))
 
 
+def test_detections_from_where_the_sonar_is_said_not_to_look_are_said():
+    z = np.column_stack([np.full(60, 40.0), np.radians(30.0) * np.ones(60)])
+    clutter = after_pings(z, np.arange(60), 0.0)
+    (sentence,) = clutter.warnings(CONFIG)
+    assert sentence == (
+        'detections come from beyond horizontal_fov_deg (45 deg): set it to 60 deg or more'
+    )
+    assert clutter.widest(np.array([[70.0, -0.6]])) == (0.6, 70.0)
+    assert not clutter.warnings(evolve(CONFIG, horizontal_fov_deg=60.0))
+    (sentence,) = clutter.warnings(evolve(CONFIG, horizontal_fov_deg=60.0, max_range=30.0))
+    assert 'beyond max_range (30 m): set it to 40 m or more' in sentence
+
+
 # -- existence ---------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@
 """What the obstacle tracker does with input and parameters that are wrong, odd or missing."""
 
 from attrs import evolve
-from helpers.obstacle_runs import approach, navigation, rows, run, SECOND
+from helpers.obstacle_runs import approach, AS_STATED, navigation, rows, run, SECOND
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -99,7 +99,8 @@ def test_no_more_obstacles_than_allowed_are_followed():
 @pytest.mark.parametrize('side', [1, -1])
 def test_range_and_bearing_are_correlated_as_the_place_is(side):
     """The vehicle passes by: what it knew of the range before becomes knowledge of the bearing."""
-    tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1, range_scale_std=0.0))
+    config = ObstacleConfig(confirm_hits=1, range_scale_std=0.0, **AS_STATED)
+    tracker = ObstacleTracker(config)
     for second in range(1, 13):
         tracker.process(still(second, x=1.5 * second))
         east, north = 80.0 - 1.5 * second, 40.0 * side
