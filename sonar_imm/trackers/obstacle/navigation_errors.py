@@ -90,7 +90,10 @@ class NavigationErrors(NamedTuple):
         return NavigationErrors(mean, covariance, self.first_ns)
 
     def given_to(self, mixture: Mixture) -> Mixture:
-        """Return obstacles that know this of the navigation and nothing else."""
+        """Return obstacles that know this of the navigation and nothing else; those of a filter
+        without these states as they are."""
+        if mixture.x.shape[-1] < NAV.stop:
+            return mixture
         x, P = mixture.x.copy(), mixture.P.copy()
         x[..., NAV] = self.mean
         P[..., NAV, :] = P[..., NAV] = 0.0

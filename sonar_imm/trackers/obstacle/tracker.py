@@ -115,16 +115,16 @@ class ObstacleTracker:
         self.config = config
         self.filter = build_filter(config)
         evidence, remembers = config.misses == 'evidence', config.max_landmarks > 0
-        several = bool(config.navigation_errors()[0].any())
+        shared = bool(config.navigation_errors()[0][1:].any())
         self._published = attrgetter('misses.shown' if evidence else 'mixture')
         self.stages = wanted(
             self._predict,
             self._predict_misses if evidence else None,
             self._recall,
             self._associate,
-            self._heed if several else None,
+            self._heed if shared else None,
             self._update,
-            self._tell if several else None,
+            self._tell if shared else None,
             self._carry,
             self._weigh_misses if evidence else None,
             self._judge,
