@@ -282,6 +282,7 @@ class LandmarkTracker(ObstacleTracker):
     navigation it knows no error but the scale."""
 
     def _apply_config(self, config: ObstacleConfig) -> None:
-        exact = {'drift_std': 0.0, 'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0}
-        super()._apply_config(evolve(config, **exact))
+        super()._apply_config(
+            evolve(config, drift_std=0.0, yaw_error_std_deg=0.0, navigation_delay_std=0.0)
+        )
         self.filter = Landmark(config)  # type: ignore[assignment]
