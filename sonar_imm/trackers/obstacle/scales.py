@@ -119,6 +119,6 @@ class Scales(NamedTuple):
             times, word = (factor, 'more') if factor > 1.0 else (1.0 / factor, 'less')
             own = f'; check {parameters[i]}' if self.own[i] > 0.5 * self.number[i] else ''
             found.append(
-                f'{NAMES[i]} scatter {times:.1f} times {word} than stated: allowed for{own}'
+                f'{NAMES[i]} scatter {times:.0f} times {word} than stated: allowed for{own}'
             )
         return found
