@@ -25,12 +25,14 @@ Reference: Julier, Uhlmann, *Unscented Filtering and Nonlinear Estimation*, Proc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation import kalman
 from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
@@ -214,7 +216,9 @@ class Landmark:
         )
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
-    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+    def expected(
+        self, mixture: Mixture, sonar: Sonar, met: Sequence[Sonar] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         seen = unscented_transform(
             lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
         )
@@ -255,9 +259,9 @@ class Landmark:
         )
 
     def visible(
-        self, mixture: Mixture, sonar: Sonar, widest: tuple[float, float] = (0.0, 0.0)
+        self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, BoolArray]:
-        m = geometry.to_body(sonar.pose, mixture.x[..., :3])
+        m = geometry.to_body(pose, mixture.x[..., :3])
         away = np.linalg.norm(m, axis=-1)
         P = np.zeros((*mixture.mu.shape, 3, 3))
         # Range, azimuth and depth, as of the sonar.
@@ -274,8 +278,11 @@ class Landmark:
 
 
 class LandmarkTracker(ObstacleTracker):
-    """The obstacle tracker with `Landmark` as its filter; its behaviours are not used."""
+    """The obstacle tracker with `Landmark` as its filter; its behaviours are not used, and of the
+    navigation it knows no error but the scale."""
 
     def _apply_config(self, config: ObstacleConfig) -> None:
-        super()._apply_config(config)
+        super()._apply_config(
+            evolve(config, drift_std=0.0, yaw_error_std_deg=0.0, navigation_delay_std=0.0)
+        )
         self.filter = Landmark(config)  # type: ignore[assignment]

@@ -126,10 +126,11 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Change | None]] = 
 KINDS = {'approach': 'fixed', 'swaying': 'swaying', 'mover': 'moving'}
 
 
-def encounter(name: str, seed: int) -> tuple[list[Measurement], list[tuple[str, TrueObstacle]]]:
+def encounter(
+    parts: Sequence[tuple[str, dict[str, Any]]], change: Change | None, seed: int
+) -> tuple[list[Measurement], list[tuple[str, TrueObstacle]]]:
     """The measurements of an encounter, and the obstacles with what they do. Scenes of one seed
     have the same vehicle."""
-    parts, change = SCENES[name]
     scenes = []
     for kind, values in parts:
         seen = {'detection_probability': 0.95, **values}
@@ -277,7 +278,7 @@ def scene(name: str, runs: int, first: int = 0) -> dict[str, float]:
     """One row of the table."""
     sums = Sums()
     for seed in range(first, first + runs):
-        measurements, obstacles = encounter(name, seed)
+        measurements, obstacles = encounter(*SCENES[name], seed)
         config = ObstacleConfig(sonar_lever=LEVER['sonar_lever'])
         sums.add(final_estimates(ObstacleTracker(config), measurements), obstacles)
     return {'runs': runs, **sums.row()}

@@ -18,8 +18,8 @@ Our own message is a table with one row per echo and one message per ping. A pin
 was seen is a table without rows, because a miss is evidence too. Columns: ``x y z`` f4 [m, for
 display]; ``range`` [m], ``bearing`` [rad, REP-103: positive to port]; optional ``var_range``,
 ``var_bearing``, ``intensity``, ``extent_range``, ``extent_bearing``, ``elevation`` [rad, positive
-up], ``var_elevation``. A table without range and bearing is read from x, y, z, of which z says no
-elevation: flat sonars send 0.
+up], ``var_elevation``, ``time_offset`` [s after the stamp]. A table without range and bearing is
+read from x, y, z, of which z says no elevation: flat sonars send 0.
 
 The other messages use different axes; the rules are these. In the messages of
 marine_acoustic_msgs receive angles count to starboard, and beams point along z with x up and y to
@@ -41,7 +41,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import BEAM_AXES, Detections, OPTIONAL_COLUMNS, Rejection
+from sonar_imm.measurements import (
+    BEAM_AXES,
+    Detections,
+    LONGEST_SCAN,
+    nanoseconds,
+    OPTIONAL_COLUMNS,
+    Rejection,
+)
 
 from .headers import head_of, Make, places_of
 from .table import decode_table, require_columns, scalar_column, table_of
@@ -52,6 +59,8 @@ SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
 NEAREST, FARTHEST = 0.01, 1e4
 """Metres: no echo comes from nearer or farther."""
+UNTIMED = 0.3
+"""Seconds from which it matters that the rays of a scan have no times."""
 BEARING_SIDES = ('port', 'starboard')
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
 """A stated variance outside is a field that was not filled in."""
@@ -71,7 +80,9 @@ def read_detections(message: Any, *, bearing_positive: str = 'port', **_: Any) -
         distance, bearing = _polar(*(scalar_column(columns, name) for name in 'xyz'))
     else:
         distance = bearing = np.empty(0)
-    optional = {name: scalar_column(columns, name) for name in OPTIONAL_COLUMNS if name in columns}
+    optional: dict[str, Any] = {
+        name: scalar_column(columns, name) for name in OPTIONAL_COLUMNS if name in columns
+    }
     for name in ('var_range', 'var_bearing', 'var_elevation'):
         if name in optional:
             optional[name] = _variances(optional[name])
@@ -100,7 +111,7 @@ def read_point_cloud(message: Any, *, bearing_positive: str = 'port', **_: Any) 
         if str(channel.name).lower().startswith('intensit')
         and len(channel.values) == len(message.points)
     ]
-    extra = {'intensity': found[0]} if found else {}
+    extra: dict[str, Any] = {'intensity': found[0]} if found else {}
     return _detections(message, *_polar(*places.T), bearing_positive, **extra)
 
 
@@ -117,9 +128,9 @@ def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any
         centre = detection.bbox.center.position
         if best is not None and not (centre.x or centre.y or centre.z):
             centre = best.pose.pose.position
-        stated = np.zeros(36) if best is None else np.asarray(best.pose.covariance, np.float64)
+        own = np.zeros(36) if best is None else np.asarray(best.pose.covariance, np.float64)
         places.append(centre)
-        covariances.append(stated.reshape(6, 6)[:3, :3])
+        covariances.append(own.reshape(6, 6)[:3, :3])
         scores.append(np.nan if best is None else float(best.hypothesis.score))
     m, C = places_of(places), np.array(covariances).reshape(-1, 3, 3)
     distance, bearing = _polar(*m.T)
@@ -130,7 +141,7 @@ def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any
         aside = np.column_stack([-np.sin(bearing), np.cos(bearing), np.zeros(len(m))])
         variances = [_along(axis, C) for axis in (along, aside, np.cross(along, aside))]
         scales: list[FloatArray] = [np.ones(len(m)), level**2, distance**2]
-        stated_variances = [_variances(v / scale) for v, scale in zip(variances, scales)]
+        stated: list[Any] = [_variances(v / scale) for v, scale in zip(variances, scales)]
     return _detections(
         message,
         distance,
@@ -138,12 +149,14 @@ def read_detections_3d(message: Any, *, bearing_positive: str = 'port', **_: Any
         bearing_positive,
         elevation=elevation,
         intensity=np.array(scores, np.float64),
-        **dict(zip(('var_range', 'var_bearing', 'var_elevation'), stated_variances)),
+        **dict(zip(('var_range', 'var_bearing', 'var_elevation'), stated)),
     )
 
 
 def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
-    """Read a LaserScan: an echo for each range inside its limits; angles count to port."""
+    """Read a LaserScan: an echo for each range inside its limits; angles count to port. Its stamp
+    is that of the first ray; where it states a `time_increment`, each ray has its own time, and
+    the stamp becomes that of the last one."""
     distance: FloatArray = np.array(message.ranges, np.float64)
     with np.errstate(invalid='ignore'):  # a step that is not finite leaves no bearing
         steps = np.arange(len(distance), dtype=np.float64)
@@ -153,7 +166,21 @@ def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -
     if len(intensity) != len(distance):
         intensity = np.full(len(distance), np.nan)
     distance = np.where(inside, distance, np.nan)
-    return _detections(message, distance, bearing, bearing_positive, intensity=intensity)
+    step, period = float(message.time_increment), float(message.scan_time)
+    takes = step * max(len(distance) - 1, 0)
+    if not (np.isfinite(takes) and takes > 0.0):
+        untimed = period if UNTIMED < period <= LONGEST_SCAN else 0.0
+        return _detections(
+            message, distance, bearing, bearing_positive, intensity=intensity, untimed=untimed
+        )
+    if takes > LONGEST_SCAN:
+        raise Rejection(
+            'out_of_range', f'a scan of {takes:g} s; at most {LONGEST_SCAN:g} s are read'
+        )
+    late = step * steps - takes
+    return _detections(
+        message, distance, bearing, bearing_positive, takes, intensity=intensity, time_offset=late
+    )
 
 
 def read_sonar_ranges(
@@ -233,9 +260,13 @@ def _detections(
     distance: FloatArray,
     bearing: FloatArray,
     bearing_positive: str,
+    takes: float = 0.0,
+    *,
+    untimed: float = 0.0,
     **optional: Any,
 ) -> Detections:
-    """Put columns (n,) together, without the rows that are no echo."""
+    """Put columns (n,) together, without the rows that are no echo; takes: s by which the scan
+    ends later than its message is stamped; untimed: see `Detections`."""
     if bearing_positive not in BEARING_SIDES:
         raise ValueError(
             f"bearing_positive must be one of {', '.join(BEARING_SIDES)}, got '{bearing_positive}'"
@@ -259,10 +290,13 @@ def _detections(
         )
     keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
     keep &= distance <= FARTHEST
+    head = head_of(message)
+    head['stamp_ns'] += nanoseconds(takes)
     return Detections(
-        **head_of(message),
+        **head,
         range=distance[keep],
         bearing=bearing[keep] if bearing_positive == 'port' else -bearing[keep],
+        untimed=untimed,
         **{name: column[keep] for name, column in optional.items()},
     )
 

@@ -27,7 +27,8 @@
 - ``marine_interfaces/SonarInfo`` (unh_marine_autonomy), latched beside images, in their frame:
   what a sample is, and the pulse.
 - ``sensors/SonoptixECHO`` (recordings of SOLAQUA), a Float32MultiArray of ranges by beams, and
-  sensor_msgs Image: samples alone; ranges and directions are parameters.
+  sensor_msgs Image: samples alone; ranges and directions are parameters. A sensor_msgs Image that
+  shows the fan as on a screen is read as ranges by beams (`fans`).
 
 Bearings of marine_acoustic_msgs raw images and of the Oculus count to starboard, those of the
 Ping360 to port, as its driver draws them.
@@ -44,6 +45,7 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import MAX_IMAGE_CELLS, Rejection, SonarImage, SonarInfo
 
 from .detections import beam_bearings, FARTHEST, SOUND_SPEEDS
+from .fans import unfolded
 from .headers import head_of, Make, make_header, places_of
 
 DTYPES = ('u1', 'i1', 'u2', 'i2', 'u4', 'i4', 'u8', 'i8', 'f4', 'f8')
@@ -123,7 +125,12 @@ def read_picture(message: Any, *, image_order: str = 'range_major', **geometry: 
         )
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)
     pixels = np.ascontiguousarray(rows[:, : width * dtype.itemsize]).view(dtype)
-    return on_a_grid(message, pixels if image_order == 'range_major' else pixels.T, **geometry)
+    if image_order == 'beam_major':
+        return on_a_grid(message, pixels.T, **geometry)
+    by_beams = unfolded(pixels, float(geometry.get('image_fov_deg', 0.0)))
+    if by_beams is not pixels:
+        geometry['image_first_range'] = 'near'
+    return on_a_grid(message, by_beams, **geometry)
 
 
 def on_a_grid(

@@ -77,6 +77,7 @@ GONE: dict[str, str] = {
         f'parameter origin_{part}': 'was removed: give origin [latitude, longitude, height]'
         for part in ('latitude', 'longitude', 'height')
     },
+    'parameter sweep_speed': 'was removed: each direction counts at its own time',
     'parameter publish_revisions': 'was removed: max_revisions 0 leaves revisions out',
     'parameter diagnostics_period': _CONSTANT,
     'parameter state_interval': _CONSTANT,

@@ -23,9 +23,21 @@ from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
+from numpy.testing import assert_allclose
 import pytest
+import yaml
 
+from msg_adapters.estimates import write_estimate
+from msg_adapters.headers import swap_axes
+from msg_adapters.inputs import inputs_of
+from msg_adapters.table import encode_table
+from sonar_imm.acoustics.geometry import rotation
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'launch'
@@ -89,3 +101,67 @@ def test_every_argument_and_file_that_is_used_is_there(path):
         assert {arg.get('name') for arg in include.findall('arg')} <= known
     for name in re.findall(re.escape(SHARE) + r'([\w./]+)(?=["\'])', text):
         assert (ROOT / name).is_file(), name
+
+
+# -- the launch file and the costmap of the tutorial ----------------------------------------------
+
+TUTORIAL = ROOT / 'docs/tutorials/ros_avoidance.md'
+
+
+def block(kind: str) -> str:
+    """The only block of that kind on the page."""
+    (text,) = re.findall(rf'^```{kind}\n(.*?)^```$', TUTORIAL.read_text(), re.M | re.S)
+    return text
+
+
+def test_the_launch_file_of_the_tutorial_uses_what_is_there():
+    root = ElementTree.fromstring(block('xml'))
+    (include,) = root.iter('include')
+    assert include.get('file') == f'{SHARE}launch/obstacle.launch.xml'
+    assert {arg.get('name') for arg in include.findall('arg')} <= declared(tree('node'))
+    names = {topic.name for topic in inputs_of('obstacle')}
+    assert {remap.get('from') for remap in root.iter('set_remap')} <= names
+
+
+def test_the_static_transforms_of_the_tutorial_turn_axes_as_the_adapters_do():
+    """A place in odom_ned, by the transform, is where the adapter of navigation puts it."""
+    nodes = ElementTree.fromstring(block('xml')).findall('node')
+    given = {node.get('name'): node.get('args').split() for node in nodes}
+    words = {key: dict(zip(args[::2], args[1::2])) for key, args in given.items()}
+    assert (words['ned']['--frame-id'], words['ned']['--child-frame-id']) == ('odom', 'odom_ned')
+    angles = [float(words['ned'].get(f'--{name}', 0.0)) for name in ('roll', 'pitch', 'yaw')]
+    place = np.array([3.0, -4.0, 20.0])
+    assert_allclose(rotation(*angles) @ place, swap_axes(place), atol=1e-6)
+    assert words['fls']['--child-frame-id'] == 'fls_link'
+
+
+def test_the_costmap_of_the_tutorial_takes_what_is_sent():
+    """What the obstacle layer of nav2 reads of a cloud: float32 x, y and z by name, heights
+    between its limits, in a frame that the tree has."""
+    settings = yaml.safe_load(block('yaml'))['local_costmap']['local_costmap']['ros__parameters']
+    layer = settings['obstacle_layer']
+    source = layer[layer['observation_sources']]
+    assert source['data_type'] == 'PointCloud2' and source['topic'] == '/avoid/points'
+    place = {name: np.array([value], 'f4') for name, value in zip('xyz', (3.0, 4.0, -20.0))}
+    clouds = [
+        encode_table(place, stamp_ns=1, frame_id='odom', make=ros_message),
+        write_estimate(one_estimate(), ros_message),
+    ]
+    for cloud in clouds:
+        fields = {field.name: field for field in cloud.fields}
+        assert [fields[name].datatype for name in 'xyz'] == [7, 7, 7]  # FLOAT32
+        z = np.frombuffer(bytes(cloud.data), '<f4', 1, fields['z'].offset)[0]
+        assert source['min_obstacle_height'] < z < source['max_obstacle_height']
+        assert cloud.header.frame_id == settings['global_frame']
+    assert settings['plugins'] == ['obstacle_layer', 'inflation_layer']
+
+
+def one_estimate() -> Estimate:
+    """The last estimate of a short approach."""
+    tracker = ObstacleTracker(ObstacleConfig())
+    scene = simulate(scenario('approach', {'last_range': 60.0}), 1)
+    found = [
+        estimate for item in scene.measurements for estimate in tracker.process(item.measurement)
+    ]
+    assert len(found[-1])
+    return found[-1]

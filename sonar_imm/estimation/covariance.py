@@ -190,11 +190,13 @@ def _triangular(A: FloatArray) -> FloatArray:
 # -- many small covariances at once, (n, n, ...): numpy runs along the last axes ------------------
 
 
-def semidefinite_roots(S: FloatArray) -> FloatArray:
+def semidefinite_roots(S: FloatArray, columns: int | None = None) -> FloatArray:
     """Return lower roots (n, n, ...), ``S = L L'``, of covariances S (n, n, ...) that may be
-    singular: a column without variance is zero. Only lower triangles are read."""
-    L = np.zeros(S.shape)
-    for b in range(len(S)):
+    singular: a column without variance is zero; of these the first so many `columns`. Only lower
+    triangles are read."""
+    count = len(S) if columns is None else columns
+    L = np.zeros((len(S), count, *S.shape[2:]))
+    for b in range(count):
         pivot = S[b, b] - (L[b, :b] * L[b, :b]).sum(axis=0)
         known = (pivot <= LIMIT * S[b, b]) | ~(pivot > 0.0)
         root = np.sqrt(np.where(known, 0.0, pivot))

@@ -28,6 +28,7 @@ from .checks import (
     column,
     content_key,
     floats,
+    nanoseconds,
     point,
     points,
     quaternion,
@@ -41,6 +42,8 @@ IMAGE_ORDERS = ('range_major', 'beam_major')
 """How the samples of an image may lie: all beams of a range together, or all ranges of a beam."""
 MAX_IMAGE_CELLS = 4_000_000
 """No sonar makes larger images."""
+LONGEST_SCAN = 120.0
+"""Seconds; no sonar takes longer for a turn."""
 
 
 OPTIONAL_COLUMNS = (
@@ -51,6 +54,7 @@ OPTIONAL_COLUMNS = (
     'extent_bearing',
     'elevation',
     'var_elevation',
+    'time_offset',
 )
 """What a detection may say besides range and bearing."""
 
@@ -69,7 +73,12 @@ class Detections:
     intensity: (n,), NaN where unknown, not used by the tracker; extent_range: (n,) m and
     extent_bearing: (n,) rad, spread (standard deviation) of the echo, NaN where unknown;
     elevation: (n,) rad, positive up, NaN where the sonar does not measure it, var_elevation: (n,)
-    rad^2. Columns left out are unknown. A row without a finite range and bearing is no echo.
+    rad^2; time_offset: (n,) s after the stamp at which the row was heard, of a sonar that does not
+    take all at once, NaN where unknown. Columns left out are unknown. A row without a finite range
+    and bearing is no echo.
+
+    A scan whose rows have times is dated by its end: where a row is later than the stamp, the
+    stamp moves there. untimed: s that the ping took, where it says so and its rows have no times.
     """
 
     FRAME: ClassVar[str] = 'own'
@@ -85,6 +94,8 @@ class Detections:
     extent_bearing: FloatArray = field(factory=_unknown)
     elevation: FloatArray = field(factory=_unknown)
     var_elevation: FloatArray = field(factory=_unknown)
+    time_offset: FloatArray = field(factory=_unknown)
+    untimed: float = 0.0
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -98,15 +109,41 @@ class Detections:
                 raise Rejection(
                     'bad_shape', f'detections: {name} has {rows} rows, range has {len(self)}'
                 )
+        self._date_by_the_end()
+
+    def _date_by_the_end(self) -> None:
+        """Move the stamp to the last row, and count times from there."""
+        late = self.time_offset[np.isfinite(self.time_offset)]
+        if not len(late):
+            return
+        if np.abs(late).max() > LONGEST_SCAN:
+            raise Rejection(
+                'out_of_range',
+                f'detections: a time_offset of {late[np.abs(late).argmax()]:g} s; at most '
+                f'{LONGEST_SCAN:g} s before or after the stamp are read',
+            )
+        end = max(float(late.max()), 0.0)
+        if end > 0.0:
+            object.__setattr__(self, 'stamp_ns', self.stamp_ns + nanoseconds(end))
+            check_stamp(self.stamp_ns)
+            object.__setattr__(self, 'time_offset', column(self.time_offset - end))
 
     def __len__(self) -> int:
         return len(self.range)
+
+    @property
+    def takes(self) -> float:
+        """How long the rows took, s; 0 where all are of one instant."""
+        known = np.isfinite(self.time_offset)
+        return -float(self.time_offset[known].min()) if known.any() else 0.0
 
     def key(self) -> bytes:
         """See `content_key`."""
         columns = [self.range, self.bearing, self.var_range, self.var_bearing]
         if np.isfinite(self.elevation).any():
             columns += [self.elevation, self.var_elevation]
+        if self.takes:
+            columns.append(self.time_offset)
         return content_key('detections', *columns)
 
 

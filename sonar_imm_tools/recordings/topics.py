@@ -36,11 +36,12 @@ def fitting_topics(
 
     A topic fits when its type can be read and its name ends in the input's name, or has a word
     that stands for it; where several inputs fit, the later one counts. Topics below ``/truth``
-    never fit, and companions alone are not enough. Where an input is missing, a topic fits of
-    which a node before the tracker makes it (images of a sonar for detections). `topics` maps
-    topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``; what belongs beside those,
-    and has its name, comes along. Raises `BagError` when nothing fits, with a list of what is
-    there, and when several instruments fit; `instruments` tells them apart.
+    never fit, and companions alone are not enough. An input that is needed beside what fits is
+    found by its type too, where one topic alone has such a type. Where an input is missing, a
+    topic fits of which a node before the tracker makes it (images of a sonar for detections).
+    `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``; what belongs
+    beside those, and has its name, comes along. Raises `BagError` when nothing fits, with a list
+    of what is there, and when several instruments fit; `instruments` tells them apart.
     """
     found = instruments(bag, system, topics)
     if len(found) > 1:
@@ -214,10 +215,34 @@ def _matching(
     fitting |= {
         name: entry for name, entry in made_topics(bag, system).items() if entry.makes not in there
     }
+    fitting |= _only_ones(bag, system, fitting)
     fitting = _of_use(bag, fitting | _sure_instead(bag, system, fitting))
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
     return fitting
+
+
+def _only_ones(
+    bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
+) -> dict[str, InputTopic]:
+    """The topics without the name of an input that can be nothing but one that is missing: the
+    only ones of its types."""
+    there = fed(fitting.values())
+    if not there:
+        return {}
+    missing = set(needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]) - there
+    found = {}
+    for entry in inputs_of(system):
+        could = [
+            topic.name
+            for topic in bag.topics
+            if entry.may_be(topic.name, topic.type_name)
+            and 'truth' not in topic.name.split('/')
+            and not any(each.is_named(topic.name) for each in inputs_of(system))
+        ]
+        if entry.name in missing and len(could) == 1 and could[0] not in fitting:
+            found[could[0]] = entry
+    return found
 
 
 def _sure_instead(

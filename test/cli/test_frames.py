@@ -82,3 +82,31 @@ def test_both_conventions_give_the_same_places(ned_bag, tmp_path):
 def test_a_ned_frame_that_nobody_told_of_is_refused(ned_bag, tmp_path, capsys):
     assert main(['track', str(ned_bag), str(tmp_path / 'run')]) == 0
     assert 'north-east-down but east-north-up is expected' in capsys.readouterr().out
+
+
+def test_the_only_odometry_beside_detections_is_found_by_its_type(tmp_path):
+    with BagReader(BAG) as bag, BagWriter(tmp_path / 'odom') as out:
+        for name, message, stamp_ns in records(bag):
+            out.write('/odom' if name == '/nav' else name, message, stamp_ns)
+    with BagReader(tmp_path / 'odom') as bag:
+        names = {name: entry.name for name, entry in fitting_topics(bag, 'obstacle').items()}
+    assert names['/odom'] == 'nav' and names['/detections'] == 'detections'
+
+
+def test_one_of_two_odometries_is_not_guessed(tmp_path):
+    with BagReader(BAG) as bag, BagWriter(tmp_path / 'odom') as out:
+        for name, message, stamp_ns in records(bag):
+            for topic in ('/odom', '/odom_raw') if name == '/nav' else (name,):
+                out.write(topic, message, stamp_ns)
+    with BagReader(tmp_path / 'odom') as bag:
+        assert 'nav' not in {entry.name for entry in fitting_topics(bag, 'obstacle').values()}
+
+
+def records(bag):
+    """The first messages of the detections and the navigation of a bag, as they are."""
+    write = {entry.measurement: entry.write for entry in inputs_of('obstacle')}
+    topics = {name: entry.name for name, entry in fitting_topics(bag, 'obstacle').items()}
+    for received, _ in zip(measurements_of(bag, 'obstacle', topics), range(40)):
+        name = '/' + topics[received.topic]
+        message = write[type(received.measurement)](received.measurement, ros_message)
+        yield name, message, received.measurement.stamp_ns

@@ -29,7 +29,9 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 SECOND = 10**9
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
-FIXED = {'behaviours': ('fixed',)}
+EXACT = {'drift_std': 0.0, 'yaw_error_std_deg': 0.0, 'navigation_delay_std': 0.0}
+"""Navigation without errors that last."""
+FIXED = {'behaviours': ('fixed',), **EXACT}
 AS_STATED = {'variance_scale_min': 1.0, 'variance_scale_max': 1.0}
 """Variances as detections state them: what is wrong shows in the innovations."""
 FAITHFUL = {

@@ -21,6 +21,7 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
+from numpy.testing import assert_array_equal
 import pytest
 
 from msg_adapters.detections import (
@@ -175,6 +176,45 @@ def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():
     assert ping.intensity.tolist() == [1.0, 5.0]
     assert len(read_laser_scan(scan([]))) == 0
     assert np.isnan(read_laser_scan(scan([2.0], [1.0, 2.0])).intensity).all()
+
+
+def test_the_rays_of_a_laser_scan_have_times_and_its_stamp_is_the_last_one():
+    once = read_laser_scan(scan([10.0] * 4))
+    timed = read_laser_scan(scan([10.0, 20.0, np.inf, np.nan], time_increment=0.5))
+    assert timed.stamp_ns == once.stamp_ns + 1_500_000_000
+    assert timed.time_offset.tolist() == [-1.5, -1.0]
+    assert once.takes == 0.0 and timed.takes == 1.5
+    assert read_laser_scan(scan([np.inf] * 3, time_increment=0.5)).stamp_ns > once.stamp_ns
+
+
+@pytest.mark.parametrize('step', [0.0, -1.0, np.nan, np.inf])
+def test_a_laser_scan_without_times_of_its_rays_says_how_long_it_takes(step):
+    fields = {'time_increment': step, 'scan_time': 2.0}
+    assert read_laser_scan(scan([10.0, 20.0], **fields)).untimed == 2.0
+    assert np.isnan(read_laser_scan(scan([10.0, 20.0], **fields)).time_offset).all()
+    assert read_laser_scan(scan([10.0], time_increment=step, scan_time=0.2)).untimed == 0.0
+
+
+def test_a_scan_of_an_hour_is_refused():
+    with pytest.raises(Rejection, match='scan of 3600 s'):
+        read_laser_scan(scan([10.0] * 2, time_increment=3600.0))
+
+
+def test_times_of_a_table_move_its_stamp_to_the_last_row():
+    ping = Detections(
+        stamp_ns=10**9, range=[5.0] * 3, bearing=[0.0] * 3, time_offset=[0.5, np.nan, 0.25]
+    )
+    assert ping.stamp_ns == 1_500_000_000
+    assert_array_equal(ping.time_offset, [0.0, np.nan, -0.25])
+    again = read_detections(write_detections(ping, ros_message))
+    assert again.stamp_ns == ping.stamp_ns
+    assert_array_equal(again.time_offset, ping.time_offset)
+    assert again.key() == ping.key()
+
+
+def test_a_time_of_a_row_that_is_no_time_of_a_scan_is_refused():
+    with pytest.raises(Rejection, match='time_offset of 1e\\+09 s'):
+        Detections(stamp_ns=1, range=[5.0], bearing=[0.0], time_offset=[1e9])
 
 
 def test_a_laser_scan_may_count_from_port():

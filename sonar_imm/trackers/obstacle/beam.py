@@ -64,7 +64,7 @@ from ...estimation.arrays import BoolArray, FloatArray, replace_rows, take
 from .config import ObstacleConfig
 from .filters import DepthSlices, Mixture, Sonar
 from .mixtures import weights
-from .unscented import points
+from .unscented import points, upright
 
 REACH = 4.0
 """Standard deviations of an elevation over which a new obstacle has its slices."""
@@ -114,7 +114,7 @@ def expected_elevations(mixture: Mixture, pose: Pose, cone: bool) -> tuple[Float
     """
     x = mixture.x
     d, cosine, sine = x[..., 0], np.cos(x[..., 1]), np.sin(x[..., 1])
-    a, b, c = pose.R[2]
+    a, b, c = upright(*pose)[1]
     m = points(x, *pose, cone)
     level = np.sqrt(m[..., 0] * m[..., 0] + m[..., 1] * m[..., 1])
     H = np.empty((*d.shape, 3))

@@ -46,7 +46,8 @@ from .clutter import Clutter, sector_area
 from .config import ObstacleConfig
 from .existence import detection, Existence, PRIOR
 from .filters import DepthSlices, Mixture, Sonar
-from .pings import default_variance, Echoes, Ping
+from .navigation_errors import NavigationErrors
+from .pings import default_variance, Echoes, Met, Ping
 
 WAITS = 2.5
 """Seconds without an echo, after which a seed goes."""
@@ -92,6 +93,8 @@ class Seeds(NamedTuple):
 
 Brood = tuple[Seeds, ...]
 """Those of the last pings, the oldest first."""
+Bank = tuple[Mixture, Bodies, Existence, Met | None, int]
+"""See `bank`."""
 
 
 def level(z: FloatArray, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
@@ -119,30 +122,33 @@ def sown(
     dt = min(ping.dt, LONGEST) if ping.dt > 0.0 else FIRST
     born = config.birth_rate * dt / sector_area(config)
     r = np.clip(false, 0.0, 1.0) * born / (born + density)
-    oldest = ping.stamp_ns - max(nanoseconds(WAITS), nanoseconds(ping.dt))
+    takes = 0.0 if ping.echoes.late is None else -float(ping.echoes.late.min(initial=0.0))
+    oldest = ping.stamp_ns - nanoseconds(max(WAITS, ping.dt) + takes)
     kept = [seeds for seeds in brood if seeds.stamp_ns >= oldest and len(seeds.classes)]
-    kept.append(
-        Seeds(
-            ping.stamp_ns,
-            ping.sonar,
-            ping.echoes,
-            r[:, None] * PRIOR,
-            density,
-            *level(ping.echoes.z, ping.sonar),
-        )
-    )
+    classes, echoes = r[:, None] * PRIOR, ping.echoes
+    if echoes.late is None:
+        places = level(echoes.z, ping.sonar)
+        kept.append(Seeds(ping.stamp_ns, ping.sonar, echoes, classes, density, *places))
+    else:
+        for i, (late, sonar) in enumerate(zip(echoes.late.tolist(), ping.places())):
+            one, stamp_ns = slice(i, i + 1), ping.stamp_ns + nanoseconds(late)
+            places = level(echoes.z[one], sonar)
+            own = echoes.rows(np.array([i]))
+            kept.append(Seeds(stamp_ns, sonar, own, classes[one], density[one], *places))
     while sum(len(seeds.classes) for seeds in kept) > MOST and len(kept) > 1:
         kept.pop(0)
     return tuple(kept)
 
 
-def met(seeds: Seeds, ping: Ping, expected: FloatArray, config: ObstacleConfig) -> FloatArray:
+def met(
+    seeds: Seeds, ping: Ping, place: FloatArray, expected: FloatArray, config: ObstacleConfig
+) -> FloatArray:
     """Return q P_D L / lambda (S,) of the echo that fits each seed best.
 
+    :param place: (D, 2) of the echoes, seen level.
     :param expected: (D,) density of false echoes and of those that tracks expect.
     """
     best = np.zeros(len(seeds.classes))
-    place, _ = level(ping.echoes.z, ping.sonar)
     if not len(best) or not len(place):
         return best
     dt = (ping.stamp_ns - seeds.stamp_ns) * 1e-9
@@ -192,13 +198,21 @@ def grown(
     brood: Brood,
     ping: Ping,
     expected: FloatArray,
+    errors: NavigationErrors,
     filter_: DepthSlices,
     room: int,
-) -> tuple[Brood, list[tuple[Mixture, Bodies, Existence, int]]]:
+) -> tuple[Brood, list[Bank]]:
     """Return the seeds that are left after a ping, and the banks of those that it may meet, as
-    they are now: at most `room` of them, the likeliest first."""
-    config = filter_.config
-    worth = np.concatenate([np.empty(0), *(met(seeds, ping, expected, config) for seeds in brood)])
+    they are when it does: at most `room` of them, the likeliest first; errors: of the
+    navigation."""
+    config, z = filter_.config, ping.echoes.z
+    if ping.sweep is None:
+        place, _ = level(z, ping.sonar)
+    else:
+        seen = [level(z[i : i + 1], sonar)[0] for i, sonar in enumerate(ping.places())]
+        place = np.concatenate(seen)
+    found = (met(seeds, ping, place, expected, config) for seeds in brood)
+    worth = np.concatenate([np.empty(0), *found])
     best = np.argsort(-worth, kind='stable')[: max(room, 0)]
     grows = np.zeros(len(worth), np.bool_)
     grows[best] = worth[best] > WORTH
@@ -207,22 +221,28 @@ def grown(
         chosen, grows = grows[: len(seeds.classes)], grows[len(seeds.classes) :]
         left.append(unmet(seeds.rows(~chosen), config))
         if chosen.any():
-            banks.append(bank(seeds.rows(chosen), ping, filter_))
+            banks.append(bank(seeds.rows(chosen), ping, errors, filter_))
     return tuple(left), banks
 
 
-def bank(seeds: Seeds, ping: Ping, filter_: DepthSlices) -> tuple[Mixture, Bodies, Existence, int]:
-    """Return the components of seeds, made at their instant and carried to a ping; and how many
-    covariances had to be repaired."""
+def bank(seeds: Seeds, ping: Ping, errors: NavigationErrors, filter_: DepthSlices) -> Bank:
+    """Return the components of seeds, made at their instant and carried to a ping, where that met
+    them, and how many covariances had to be repaired."""
     echoes, config, then = seeds.echoes, filter_.config, seeds.sonar
     bodies, R = Bodies.unknown(len(echoes)).with_echoes(
         echoes.extended, echoes.z, echoes.R, default_variance(config)
     )
     mixture = filter_.begin(echoes.z, R, then, echoes.height_prior(then, ping.ground, config))
-    mixture, _ = echoes.update_height(mixture, then.pose, config)
-    dt = (ping.stamp_ns - seeds.stamp_ns) * 1e-9
-    mixture, repairs = filter_.advance(mixture, then, ping.sonar, dt)
+    mixture, _ = echoes.update_height(errors.given_to(mixture), then.pose, config)
+    dt, found = (ping.stamp_ns - seeds.stamp_ns) * 1e-9, None
+    if ping.sweep is None:
+        mixture, repairs = filter_.advance(mixture, then, ping.sonar, dt)
+    else:
+        found = ping.sweep.met(*filter_.whereabouts(mixture, then), dt)
+        before = [then] * len(echoes)
+        mixture, repairs = filter_.advance_each(mixture, before, found.sonars, dt - found.ago)
     finite = mixture.is_finite()
     if not finite.all():
         mixture, bodies, seeds = take(mixture, finite), take(bodies, finite), seeds.rows(finite)
-    return mixture, bodies, Existence.of(seeds.classes, filter_.K), repairs
+        found = found and found.rows(finite)
+    return mixture, bodies, Existence.of(seeds.classes, filter_.K), found, repairs

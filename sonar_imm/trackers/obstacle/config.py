@@ -43,6 +43,9 @@ GRADES = {
 }
 """Random walks of the errors of navigation: horizontal position m/sqrt(s), yaw deg/sqrt(s), depth
 m/sqrt(s). Of a compass what wanders within a minute."""
+WALKS = np.array([0.0, 0.004, 0.025, 0.025, 0.02])
+"""Random walks of scale, yaw, drift (twice) and lateness of the navigation, over sqrt(s), as
+shares of their standard deviations."""
 LEAST_DETECTION = 1e-3
 """An echo is never quite impossible."""
 
@@ -161,6 +164,19 @@ class ObstacleConfig(
     scale_std: float = constant(0.003, '',
         'standard deviation of the scale error of the horizontal distances of nav against sonar '
         'ranges', range=(0.0, 0.2))
+    drift_std: float = parameter(0.02, 'm/s',
+        'standard deviation of the velocity by which nav drifts, on each axis; 0: it does not; of '
+        'a good inertial system 0.003', range=(0.0, 10.0))
+    yaw_error_std_deg: float = parameter(0.5, 'deg',
+        'standard deviation of the angle between heading of nav and sonar, beside '
+        'sonar_mount_rpy_deg; 0: none; of a good inertial system 0.1', range=(0.0, 45.0))
+    navigation_delay_std: float = parameter(0.15, 's',
+        'standard deviation of the time by which the poses of nav are late or early; 0: they are '
+        'not; of a good inertial system 0.01', range=(0.0, 10.0))
+    navigation_good_probability: float = live(0.5, '',
+        'probability that nav is as good as an inertial system, and not as doubtful as drift_std, '
+        'yaw_error_std_deg and navigation_delay_std say; what is published weighs both by what '
+        'the obstacles show; 0: it is in doubt', range=(0.0, 1.0))
     range_scale_std: float = live(0.001, '',
         'standard deviation of the scale error of ranges, from the sound speed that the sonar '
         'assumes; part of the covariance of range, offset and position', range=(0.0, 0.2))
@@ -248,6 +264,14 @@ class ObstacleConfig(
         """Return the random walks of horizontal position, yaw (rad) and depth, over sqrt(s)."""
         position, yaw_deg, depth = self.navigation_noise or GRADES[self.navigation_grade]
         return position, math.radians(yaw_deg), depth
+
+    def navigation_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Return standard deviations and random walks, over sqrt(s), of the five errors of the
+        navigation that all obstacles share (`navigation_errors`)."""
+        yaw = math.radians(self.yaw_error_std_deg)
+        drift, delay = self.drift_std, self.navigation_delay_std
+        std = np.array([self.scale_std, yaw, drift, drift, delay])
+        return std, std * WALKS
 
     def detection_at(self, distance: FloatArray) -> FloatArray:
         """Probability that a ping shows obstacles at ranges (T,) in the beam."""

@@ -120,9 +120,6 @@ class DetectorConfig(Config):
         'others are not', range=(1.0, 360.0))
     sweep_max_gap: float = parameter(2.0, 's',
         'scanning sonar: time without a beam that ends a sweep', range=(0.01, 600.0))
-    sweep_speed: float = parameter(1.5, 'm/s',
-        'scanning sonar: speed by which ranges may change during a sweep; a direction taken '
-        'earlier or later than the middle has an error of this for each second', range=(0.0, 50.0))
     # fmt: on
 
     def rules(self) -> EchoRules:
@@ -223,11 +220,11 @@ def _turn(first: SonarImage, second: SonarImage) -> float:
 
 
 def _whole(sweep: list[SonarImage]) -> SonarImage:
-    """One image of the directions of a sweep, stamped in its middle."""
-    middle = sweep[len(sweep) // 2]
-    delay = np.array([(beam.stamp_ns - middle.stamp_ns) * 1e-9 for beam in sweep])
+    """One image of the directions of a sweep, stamped at its end."""
+    last = sweep[-1]
+    delay = np.array([(beam.stamp_ns - last.stamp_ns) * 1e-9 for beam in sweep])
     return evolve(
-        middle,
+        last,
         bearing=np.array([beam.bearing[0] for beam in sweep]),
         amplitude=np.column_stack([beam.amplitude for beam in sweep]),
         scanning=False,
@@ -244,31 +241,34 @@ def detect(image: SonarImage, config: DetectorConfig) -> Detections:
         with np.errstate(over='ignore'):
             amplitude = 10.0 ** (amplitude * (config.decibel_step / 20.0))
     found = find_echoes(amplitude, distance, bearing, config.rules())
-    late = np.interp(found.bearing, bearing, delay) if len(bearing) else found.bearing
+    late = np.full(len(found.bearing), np.nan)
+    if delay is not None and len(bearing):
+        late = np.interp(found.bearing, bearing, delay)
     n = slice(None, config.max_detections)
     return Detections(
         stamp_ns=image.stamp_ns,
         range=found.range[n],
         bearing=found.bearing[n],
-        var_range=(found.var_range + np.square(config.sweep_speed * late))[n],
+        var_range=found.var_range[n],
         var_bearing=found.var_bearing[n],
         intensity=found.amplitude[n],
         extent_range=found.extent_range[n],
         extent_bearing=found.extent_bearing[n],
         frame_id=image.frame_id,
+        time_offset=late[n],
     )
 
 
-def _in_order(image: SonarImage) -> tuple[np.ndarray, ...]:
+def _in_order(image: SonarImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """Amplitudes (R, B), ranges, bearings and delays of what has a place, with ranges and bearings
     ascending."""
     rows, beams = _ascending(image.range), _ascending(image.bearing)
     bearing = image.bearing[beams]
     if len(bearing) and np.ptp(bearing) > 2.0 * np.pi:
         raise Rejection('out_of_range', 'the beams of the image span more than a turn')
-    delay = np.zeros(len(image.bearing)) if image.delay is None else image.delay
+    delay = None if image.delay is None else image.delay[beams]
     amplitude = np.asarray(image.amplitude, np.float64)[rows][:, beams]
-    return amplitude, image.range[rows], bearing, delay[beams]
+    return amplitude, image.range[rows], bearing, delay
 
 
 def _ascending(axis: FloatArray) -> np.ndarray | slice:

@@ -45,19 +45,25 @@ from .config import ObstacleConfig
 from .existence import detection
 from .filters import DepthSlices, Mixture
 from .matches import Compared, Match
-from .pings import default_variance, Ping
+from .pings import default_variance, Met, Ping
 from .scales import Scales, SURE
 from .state import Known, Obstacles
 
 
 def compare(
-    table: Obstacles, ping: Ping, filter_: DepthSlices, widest: tuple[float, float] = (0.0, 0.0)
+    table: Obstacles,
+    ping: Ping,
+    filter_: DepthSlices,
+    met: Met | None,
+    widest: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Compared, int]:
     """Return each obstacle beside the echoes in its gate, and how many covariances had to be
-    repaired; widest: see `DepthSlices.visible`."""
+    repaired; met: in a ping that takes time, where it met these obstacles; widest: see
+    `DepthSlices.visible`."""
     mixture, echoes, config = table.mixture, ping.echoes, filter_.config
-    h, C = filter_.expected(mixture, ping.sonar)
-    V, ahead = filter_.visible(mixture, ping.sonar, widest)
+    h, C = filter_.expected(mixture, ping.sonar, met and met.sonars)
+    pose = ping.sonar.pose if met is None else met.poses
+    V, ahead = filter_.visible(mixture, pose, widest)
     threshold = gate_threshold(config.gate_probability, 2)
     near = mixtures.gate(h, C, mixture.mu, echoes.z, echoes.R, threshold)
     t, i = np.nonzero(near)
@@ -68,7 +74,7 @@ def compare(
     r, S = mine.z[:, None] - h[t], C[t] + R[:, None]
     mean, whole, nis = mixtures.innovations(before.mu, r, S)
     given, log, repairs = filter_.update(before, h[t], mine.z, R, ping.sonar)
-    given, more = mine.update_height(given, ping.sonar.pose, config)
+    given, more = mine.update_height(given, pose if met is None else met.rows(t).poses, config)
     compared = Compared(
         t,
         i,

@@ -19,8 +19,9 @@ obstacle above and one below the sonar swing to opposite sides; and on the appro
 closes more slowly the further off the course in the vertical it lies, whether above or below. Both
 are so weak at first, and the second so ambiguous, that no single Gaussian holds what is known. So
 the vertical reach of the beam is cut into slices, each an unscented Kalman filter over (d, delta,
-z, s), and their likelihoods say in which of them the obstacle is. What stays constant is the
-obstacle's own depth z; its offset follows from it and the vehicle's depth.
+z) and the errors of the navigation (`navigation_errors`), and their likelihoods say in which of
+them the obstacle is. What stays constant is the obstacle's own depth z; its offset follows from it
+and the vehicle's depth.
 
 **Behaviour.** Inside each slice runs an interacting multiple model filter over what the obstacle
 does; two more states e say how:
@@ -44,6 +45,7 @@ Source: docs/obstacle.md, sections Methods and Behaviours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Annotated, NamedTuple
 
@@ -55,7 +57,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, replace_rows
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
-from .unscented import COMMON, Motion, RELATIVE, STATES, Step
+from .unscented import COMMON, Motion, NAV, RELATIVE, STATES, Step
 
 BAND = 0.9
 """Probability of the interval `low` to `high`."""
@@ -93,7 +95,8 @@ class Sonar(NamedTuple):
     """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
     when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
     reference: how far below the navigation reference, whose altitude it is, the sonar lies, m.
-    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown."""
+    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown. velocity: (3,)
+    m/s of the sonar now, NED; turn: (3,) rad/s, rate at which it turns, in its own axes."""
 
     pose: Pose
     altitude: float = np.nan
@@ -101,6 +104,8 @@ class Sonar(NamedTuple):
     late_by: float = 0.0
     reference: float = 0.0
     course: Annotated[FloatArray, '3'] = NOWHERE
+    velocity: Annotated[FloatArray, '3'] = np.zeros(3)
+    turn: Annotated[FloatArray, '3'] = np.zeros(3)
 
     def seabed_below(self) -> float:
         """Depth of the sea floor below the sonar, m, NaN when unknown."""
@@ -130,6 +135,11 @@ class Mixture(NamedTuple):
         return np.asarray(means.all(axis=(1, 2)) & covariances.all(axis=(1, 2, 3)))
 
 
+def joined(mixtures: Sequence[Mixture]) -> Mixture:
+    """Return the targets of several mixtures as one."""
+    return Mixture(*(np.concatenate(parts) for parts in zip(*mixtures)))
+
+
 class View(NamedTuple):
     """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
     covariance; the interval of the offset; probability that the obstacle is above; its place in
@@ -151,9 +161,9 @@ class View(NamedTuple):
 
 
 class DepthSlices:
-    """A Gaussian sum over depth slices, states (d, delta, z, s)."""
+    """A Gaussian sum over depth slices, states (d, delta, z, s, psi, b_N, b_E, tau)."""
 
-    n = 4
+    n = COMMON
     behaviours: tuple[str, ...] = ('fixed',)
 
     def __init__(self, config: ObstacleConfig):
@@ -164,16 +174,18 @@ class DepthSlices:
         self.cone = config.azimuth_model == 'cone'
         self._beam = beam_of(config)
         self._noise = tuple(walk**2 for walk in config.drift())
+        std, walk = config.navigation_errors()
+        self._errors, self._walk = np.diag(np.square(std)), np.square(walk)
 
     def begin(
         self, z: FloatArray, R: FloatArray, sonar: Sonar, height: HeightPrior | None = None
     ) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
         B, K = len(z), self.K
-        x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
+        x, P = np.zeros((B, K, self.n)), np.zeros((B, K, self.n, self.n))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.config.scale_std**2
+        P[..., NAV, NAV] = self._errors
         span = depth_span(z, sonar, self.config, height)
         centre, sigma = depth_slices(*span, K)
         x[..., 2] = sonar.pose.position[2] + centre
@@ -196,13 +208,41 @@ class DepthSlices:
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired; silent (T,): those that go on with what they do."""
-        return self.predict_unchanged(mixture, before.pose, after.pose, dt)
+        return self.predict_unchanged(mixture, before, after, dt)
+
+    def advance_each(
+        self,
+        mixture: Mixture,
+        before: Sequence[Sonar],
+        after: Sequence[Sonar],
+        dt: FloatArray,
+        silent: BoolArray | None = None,
+    ) -> tuple[Mixture, int]:
+        """`advance` of each target by itself, from one sonar of its own to another."""
+        if not len(before):
+            return mixture, 0
+        quiet = np.zeros(len(dt), np.bool_) if silent is None else silent
+        steps = zip(before, after, dt.tolist(), quiet[:, None])
+        done = [self.advance(take(mixture, np.array([t])), *step) for t, step in enumerate(steps)]
+        return joined([each for each, _ in done]), sum(repairs for _, repairs in done)
+
+    def whereabouts(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        """Mean place (T, 3) in the world and velocity (T, 3) of the targets, NED."""
+        m = unscented.points(mixture.x, *sonar.pose, self.cone)
+        place = geometry.to_world(sonar.pose, np.einsum('tk,tka->ta', mixture.mu, m))
+        velocity = np.zeros(place.shape)
+        if self.moves.any():
+            weight = np.where(self.moves, mixture.mu, 0.0)
+            velocity[:, :2] = np.einsum('tk,tka->ta', weight, mixture.x[..., COMMON:])
+        return place, velocity
 
     def predict_unchanged(
-        self, mixture: Mixture, before: Pose, after: Pose, dt: float
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """`advance` of targets that go on with what they do."""
-        step = Step(*before, *after, np.array(self._noise) * dt, self.cone)
+        poses = (*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
+        rates = (before.velocity, before.turn, after.velocity, after.turn, self._walk * dt, dt)
+        step = Step(*poses, *rates)
         x, P, repaired = unscented.advance(*mixture, self._motion(dt), step)
         return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
@@ -210,10 +250,17 @@ class DepthSlices:
         """What the components do in `dt` seconds."""
         return self._still
 
-    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+    def expected(
+        self, mixture: Mixture, sonar: Sonar, met: Sequence[Sonar] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
-        without the sonar's own error."""
-        return self._echo(mixture, sonar), np.ascontiguousarray(mixture.P[..., :2, :2])
+        without the sonar's own error; met: sonars that see one target each."""
+        if met and sonar.late is not None:
+            seen = [self._echo(take(mixture, np.array([t])), own) for t, own in enumerate(met)]
+            h = np.concatenate(seen)
+        else:
+            h = self._echo(mixture, sonar)
+        return h, np.ascontiguousarray(mixture.P[..., :2, :2])
 
     def update(
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
@@ -254,7 +301,8 @@ class DepthSlices:
         state, own = mixtures.moment_match(x, P, mu, 3)
         state[:, 2] -= depth
         band = mixtures.bands(x[:, :, 2] - depth, np.sqrt(P[:, :, 2, 2]), mu, 0.5 * (1.0 - BAND))
-        near = unscented.relative(x, P, mu, self.moves, *sonar.pose, self.cone)
+        moves = np.tile(self.moves, mu.shape[1] // self.K)
+        near = unscented.relative(x, P, mu, moves, *sonar.pose, self.cone)
         together, both = mixtures.moment_match(*near, mu, RELATIVE)
         return View(
             state,
@@ -273,13 +321,14 @@ class DepthSlices:
         return np.ones((len(mu), 1))
 
     def visible(
-        self, mixture: Mixture, sonar: Sonar, widest: tuple[float, float] = (0.0, 0.0)
+        self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, BoolArray]:
         """Probability (T, K) that the beam holds each component, and which targets (T,) lie
-        ahead. widest: azimuth and range from which there were echoes, where these are more than
-        the parameters say."""
+        ahead; pose: of the sonar, or of one for each target, see `unscented.points`. widest:
+        azimuth and range from which there were echoes, where these are more than the parameters
+        say."""
         x, P, mu = mixture
-        m = unscented.points(x, *sonar.pose, self.cone)
+        m = unscented.points(x, *pose, self.cone)
         vertical, horizontal, reach = self._beam
         edges = max(horizontal, widest[0]), max(reach, widest[1])
         return mixtures.visible(m, P, mu, vertical, *edges)
@@ -294,7 +343,8 @@ class DepthSlices:
 
 
 class BehaviourSlices(DepthSlices):
-    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
+    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, psi, b_N, b_E, tau,
+    e_N, e_E)."""
 
     n = STATES
 
@@ -348,7 +398,7 @@ class BehaviourSlices(DepthSlices):
         x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
-        P[..., 3, 3] = self.config.scale_std**2
+        P[..., NAV, NAV] = self._errors
         x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
         P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
         mu = np.zeros((B, self.K))
@@ -382,10 +432,11 @@ class BehaviourSlices(DepthSlices):
             chain = self._transition(dt)
             mixed = mixtures.mix(*take(mixture, rows), self._prior, self.slices, chain, DROPPED)
             mixture = replace_rows(mixture, rows, Mixture(*mixed))
-        return self.predict_unchanged(mixture, before.pose, after.pose, dt)
+        return self.predict_unchanged(mixture, before, after, dt)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
-        return np.asarray(mu @ self._of)
+        parts = mu.reshape(len(mu), mu.shape[1] // self.K, self.K)
+        return np.asarray(parts.sum(axis=1) @ self._of)
 
     def _transition(self, dt: float) -> FloatArray:
         """P[i, j], (M, M): probability that an obstacle of which i holds is one of j `dt` seconds

@@ -29,6 +29,7 @@ from typing import Annotated, Any, NamedTuple
 from attrs import frozen
 import numpy as np
 
+from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import append, BoolArray, FloatArray, take
 from ...estimation.association import TENTATIVE, TrackRules, Tracks
@@ -41,7 +42,8 @@ from .config import ObstacleConfig
 from .existence import Existence, PRIOR, SUREST
 from .filters import DepthSlices, Mixture, Sonar
 from .memory import in_view, kept, Landmark, LEAST_WEIGHT, Memory
-from .pings import Inbox, Mount
+from .navigation_errors import NavigationErrors
+from .pings import Inbox, joined, Mount, Ping
 from .scales import Scales
 
 RULES = TrackRules(confirm_hits=2, confirm_window=2, delete_misses=1, max_coast_ns=0)
@@ -68,7 +70,8 @@ class Known(NamedTuple):
     far because their numbers were not finite; alike: whether most obstacles move alike
     (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
     confirmed obstacles; brood: echoes that may become tracks; clutter: false echoes so far;
-    scales: of the variances of the echoes."""
+    scales: of the variances of the echoes; untimed: s that the pings took that are the most wrong
+    for it, and m by which they are, where their echoes have no times; navigation: its errors."""
 
     stamp_ns: int
     sonar: Sonar
@@ -83,6 +86,8 @@ class Known(NamedTuple):
     brood: Brood = ()
     clutter: Clutter = Clutter.none()
     scales: Scales = Scales.none()
+    untimed: tuple[float, float] = (0.0, 0.0)
+    navigation: NavigationErrors = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
 
     @classmethod
     def nothing(cls, filter_: DepthSlices) -> Known:
@@ -92,7 +97,8 @@ class Known(NamedTuple):
         sonar = Sonar(Pose(np.zeros(3), np.eye(3)))
         existence = Existence.of(np.empty((0, len(PRIOR))), K)
         none = begun(mixture, Bodies.unknown(0), existence)
-        return cls(0, sonar, Tracks.none(RULES), none)
+        errors = NavigationErrors.of(filter_.config)
+        return cls(0, sonar, Tracks.none(RULES), none, navigation=errors)
 
     @property
     def confirmed(self) -> BoolArray:
@@ -182,7 +188,7 @@ def remember(
     return known._replace(memory=kept((*known.memory, *fresh), known.stamp_ns, config))
 
 
-def recall(known: Known, filter_: DepthSlices, config: ObstacleConfig) -> Known:
+def recall(known: Known, ping: Ping, filter_: DepthSlices, config: ObstacleConfig) -> Known:
     """Return the same with tracks again of the landmarks that come into view, as long as there is
     room."""
     memory = known.memory
@@ -196,12 +202,20 @@ def recall(known: Known, filter_: DepthSlices, config: ObstacleConfig) -> Known:
     for each in (memory[i] for i in sorted(back)):
         if each.track_id in known.life.track_id:
             continue  # numbers began anew, and this one lives
-        dt = (known.stamp_ns - each.stamp_ns) * 1e-9
+        dt, sonar, met = (known.stamp_ns - each.stamp_ns) * 1e-9, known.sonar, None
+        if ping.sweep is not None:
+            place = geometry.flip_world(each.place[None])
+            met = ping.sweep.met(place, np.zeros((1, 3)), dt)
+            sonar, dt = met.sonars[0], dt - float(met.ago[0])
+        # Its place drifted as `navigation_grade` says, which holds for any time.
+        exact = NavigationErrors(np.zeros(5), np.zeros((5, 5)))
         mixture, repairs = filter_.predict_unchanged(
-            each.mixture(filter_.K), each.sonar, known.sonar.pose, dt
+            exact.given_to(each.mixture(filter_.K)), Sonar(each.sonar), sonar, dt
         )
+        mixture = known.navigation.given_to(mixture)
         if not mixture.is_finite()[0]:
             continue
+        ping.met = joined(ping.met, met)
         number, std = each.body
         chance = each.existence(known.stamp_ns, config.landmark_time)
         classes = each.classes * (min(chance, SUREST) / each.classes.sum())

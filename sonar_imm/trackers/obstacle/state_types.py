@@ -30,6 +30,7 @@ from .existence import Existence
 from .filters import Mixture, Sonar
 from .ground import Cells, GroundMap
 from .memory import Landmark
+from .navigation_errors import NavigationErrors
 from .pings import Echoes, Inbox
 from .scales import Scales
 from .state import Known, Obstacles, ObstacleState
@@ -38,6 +39,6 @@ STATE_TYPES = (
     *STREAM_TYPES,
     *(Altitude, Detections, Ground, Navigation, NavigationBuffer, geometry.Pose),
     *(ObstacleState, Inbox, Known, Obstacles, Tracks, NisMemory, Mixture, Sonar, Bodies),
-    *(MissEvidence, Existence, Landmark, GroundMap, Cells),
+    *(MissEvidence, Existence, Landmark, GroundMap, Cells, NavigationErrors),
     *(Clutter, Echoes, Elevations, Scales, Seeds),
 )

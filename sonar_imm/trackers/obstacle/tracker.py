@@ -19,7 +19,11 @@ how an echo of a fixed obstacle must move, and that depends on how far above or 
 lies. The tracker follows each obstacle in sonar coordinates and learns its vertical offset on the
 way (`filters`). Navigation and pings arrive in any order (`pings`). A ping goes through
 
-    predict -> recall -> associate -> update -> judge -> remember -> end -> begin -> watch
+    predict -> recall -> associate -> heed -> update -> tell -> carry -> judge -> remember -> end
+    -> begin -> watch
+
+A ping of a sonar that turns takes time: each obstacle is predicted to the instant at which the
+beam meets it, and carried on to the end of the ping after its update.
 
 An echo that may be nobody's begins as a seed (`births`); `associate` makes tracks of those that
 the ping may meet again, and weighs all joint events of tracks and echoes (`events`).
@@ -34,12 +38,13 @@ Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daura
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 
 from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate, places
+from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import (
@@ -56,10 +61,18 @@ from .bodies import with_common_errors
 from .config import ObstacleConfig
 from .events import associate, claims, compare, learnt, updated
 from .existence import older_nearby
-from .filters import behaviour_columns, build_filter, moving_alike
+from .filters import behaviour_columns, build_filter, Mixture, moving_alike
 from .memory import Memory
 from .mixtures import moment_match
-from .pings import Mount, Ping
+from .navigation_errors import (
+    marginals,
+    messages,
+    NavigationErrors,
+    SURE,
+    told,
+    under_two_assumptions,
+)
+from .pings import joined, Mount, Ping
 from .state import begun, Known, ObstacleState, recall, remember, RULES
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
@@ -71,7 +84,7 @@ MODELS = ('above', 'below')
 BEYOND = 1.3
 """Share of the reach of the sonar beyond which a track ends."""
 SILENT = 5.0
-"""Seconds without an echo, after which a track does not change what it does."""
+"""Seconds of pings without an echo, after which a track does not change what it does."""
 SELDOM = 0.4
 """Share of the pings that shows an obstacle, below which users are told how long it takes."""
 _SIDE = np.array([1.0, -1.0, 1.0])
@@ -102,13 +115,17 @@ class ObstacleTracker:
         self.config = config
         self.filter = build_filter(config)
         evidence, remembers = config.misses == 'evidence', config.max_landmarks > 0
+        shared = bool(config.navigation_errors()[0][1:].any())
         self._published = attrgetter('misses.shown' if evidence else 'mixture')
         self.stages = wanted(
             self._predict,
             self._predict_misses if evidence else None,
             self._recall,
             self._associate,
+            self._heed if shared else None,
             self._update,
+            self._tell if shared else None,
+            self._carry,
             self._weigh_misses if evidence else None,
             self._judge,
             self._remember if remembers else None,
@@ -159,6 +176,7 @@ class ObstacleTracker:
         state = self._stream.state
         known, inbox = state.known, state.inbox
         nis = known.obstacles.nis[np.isfinite(known.obstacles.nis)]
+        good = self._both(known)[1][known.confirmed]
         return {
             'tracks': len(known.life),
             'confirmed': int(known.confirmed.sum()),
@@ -177,6 +195,8 @@ class ObstacleTracker:
             **dict(
                 zip(('scale_range', 'scale_bearing'), known.scales.factor(self.config).tolist())
             ),
+            'navigation_good': float(good.mean()) if len(good) else float('nan'),
+            **known.navigation.health(),
         }
 
     def warnings(self) -> list[str]:
@@ -192,6 +212,14 @@ class ObstacleTracker:
             found.append(
                 f'obstacles are seen in {share:.0%} of the pings: they take '
                 f'{config.confirm_hits / share * known.clutter.interval:.0f} s to confirm'
+            )
+        shown = int(np.count_nonzero(known.confirmed))
+        found += known.navigation.warnings(known.sonar.course, shown)
+        takes, wrong = known.untimed
+        if takes:
+            found.append(
+                f'a scan takes {takes:.1f} s and its detections have no times: one instant is '
+                f'taken for all, wrong by up to {wrong:.1f} m'
             )
         return found
 
@@ -234,7 +262,15 @@ class ObstacleTracker:
             known = remember(known, everybody, self.filter, self.mount, self.config)
         none = known.only(~everybody)
         return ObstacleState(
-            Known(0, none.sonar, none.life, none.obstacles, none.memory, none.repairs)
+            Known(
+                0,
+                none.sonar,
+                none.life,
+                none.obstacles,
+                none.memory,
+                none.repairs,
+                navigation=NavigationErrors.of(self.config),
+            )
         )
 
     # -- the stages -------------------------------------------------------------------------------
@@ -246,17 +282,28 @@ class ObstacleTracker:
         ping.dt = (ping.stamp_ns - known.stamp_ns) * 1e-9 if known.stamp_ns else 0.0
         # What is out of sight goes on with what it does, as a landmark: else more and more of it
         # would move, and meet false echoes all around.
-        silent = ping.stamp_ns - known.life.last_hit_ns > nanoseconds(SILENT)
-        mixture, repairs = self.filter.advance(
-            known.obstacles.mixture, ping.before, ping.sonar, ping.dt, silent
-        )
+        silent = known.stamp_ns - known.life.last_hit_ns > nanoseconds(SILENT)
+        mixture = known.obstacles.mixture
+        if ping.sweep is None:
+            steps = ping.before, ping.sonar, ping.dt
+            mixture, repairs = self.filter.advance(mixture, *steps, silent)
+        else:
+            where = self.filter.whereabouts(mixture, ping.before)
+            met = ping.sweep.met(*where, ping.dt)
+            before = [ping.before] * len(met.ago)
+            mixture, repairs = self.filter.advance_each(
+                mixture, before, met.sonars, ping.dt - met.ago, silent
+            )
+            ping.met = met.rows(mixture.is_finite())
         is_finite = mixture.is_finite()
         broken = len(is_finite) - int(np.count_nonzero(is_finite))
         existence = known.obstacles.existence.later(ping.dt)
         known = known.with_columns(mixture=mixture, existence=existence).only(is_finite)
+        errors = known.navigation.predicted(ping.stamp_ns, ping.dt, self.config)
         return known._replace(
             stamp_ns=ping.stamp_ns,
             sonar=ping.sonar,
+            navigation=errors,
             repairs=known.repairs + repairs,
             broken=known.broken + broken,
         )
@@ -270,24 +317,26 @@ class ObstacleTracker:
 
     def _recall(self, known: Known, ping: Ping) -> Known:
         """Begin the tracks again of landmarks that come into view."""
-        return recall(known, self.filter, self.config)
+        return recall(known, ping, self.filter, self.config)
 
     def _associate(self, known: Known, ping: Ping) -> Known:
         """Weigh all joint events of the obstacles and echoes, with tracks of those seeds that the
         ping may meet."""
         filter_, config, T = self.filter, self.config, len(known.life)
         widest = known.clutter.widest(ping.echoes.z)
-        compared, repairs = compare(known.obstacles, ping, filter_, widest)
+        compared, repairs = compare(known.obstacles, ping, filter_, ping.met, widest)
         density = known.clutter.density(ping.echoes.z, config)
         expected = density * (1.0 + claims(known.obstacles, compared, density, filter_))
         brood = reconsidered(known.brood, known.clutter, config)
-        brood, banks = grown(brood, ping, expected, filter_, config.max_tracks - T)
-        for mixture, bodies, existence, repaired in banks:
+        room = config.max_tracks - T
+        brood, banks = grown(brood, ping, expected, known.navigation, filter_, room)
+        for mixture, bodies, existence, met, repaired in banks:
             new = begun(mixture, bodies, existence)
             known = known.joined(known.life.born(len(new.nis), ping.stamp_ns, RULES), new)
-            theirs, more = compare(new, ping, filter_, widest)
+            theirs, more = compare(new, ping, filter_, met, widest)
             compared = compared.joined(theirs, len(compared.ahead))
             repairs += repaired + more
+            ping.met = joined(ping.met, met)
         ping.match = associate(known.obstacles, compared, density, filter_)
         return known._replace(brood=brood, repairs=known.repairs + repairs)
 
@@ -303,6 +352,34 @@ class ObstacleTracker:
             clutter=known.clutter.after(ping.echoes.z, false, ping.dt),
             scales=scales,
         )
+
+    def _heed(self, known: Known, ping: Ping) -> Known:
+        """Note what is known of the errors of the navigation before the update."""
+        ping.heard = marginals(known.obstacles.mixture)
+        return known
+
+    def _tell(self, known: Known, ping: Ping) -> Known:
+        """Tell all other obstacles what the update of each said of these errors."""
+        mixture = known.obstacles.mixture
+        chance = known.obstacles.existence.probability()
+        trust = np.where(known.confirmed & (chance > SURE), chance, 0.0)
+        L, eta = messages(ping.heard, marginals(mixture), trust)
+        if not L.any():
+            return known
+        if len(L) > 1:
+            mixture = told(mixture, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
+        known = known._replace(navigation=known.navigation.told(L, eta))
+        return known.with_columns(mixture=mixture)
+
+    def _carry(self, known: Known, ping: Ping) -> Known:
+        """Carry the obstacles of a ping that takes time on to its end."""
+        if ping.met is None:
+            return known
+        met = ping.met
+        mixture, repairs = self.filter.advance_each(
+            known.obstacles.mixture, met.sonars, [ping.sonar] * len(met.ago), met.ago
+        )
+        return known.with_columns(mixture=mixture)._replace(repairs=known.repairs + repairs)
 
     def _weigh_misses(self, known: Known, ping: Ping) -> Known:
         """Take in what it says of the height that some gave no echo."""
@@ -354,12 +431,19 @@ class ObstacleTracker:
             alike=alike,
             pings_alike=known.pings_alike + alike,
             innovations=known.innovations.after(nis[sure], 2),
+            untimed=max(known.untimed, ping.skew(), key=itemgetter(1)),
         )
 
     # -- what is published ------------------------------------------------------------------------
 
+    def _both(self, known: Known) -> tuple[Mixture, FloatArray]:
+        """See `under_two_assumptions`."""
+        age = (known.stamp_ns - known.navigation.first_ns) * 1e-9
+        mixture = self._published(known.obstacles)
+        return under_two_assumptions(mixture, known.confirmed, age, self.config)
+
     def _estimate(self, ping: Known) -> Estimate:
-        mixture = self._published(ping.obstacles)
+        mixture, _ = self._both(ping)
         view = self.filter.view(mixture, ping.sonar)
         view = with_common_errors(
             view, ping.sonar, ping.obstacles.bodies, self.config.range_scale_std

@@ -14,17 +14,18 @@
 
 """The unscented transform of all components at once.
 
-A target is K components of four states (d, delta, z, s): range m, azimuth rad positive to
-starboard, depth m of the obstacle, scale of the navigation's horizontal distances; with behaviours
-of six, (d, delta, z, s, e_N, e_E), see `behaviours`. Components with some weight are gathered into
-one list of L, and every step is an operation on arrays of states (n, L), covariances (n, n, L) and
-sigma points (2 n + 1, L).
+A target is K components of eight states (d, delta, z, s, psi, b_N, b_E, tau): range m, azimuth
+rad positive to starboard, depth m of the obstacle, and the errors of the navigation
+(`navigation_errors`); with behaviours of ten, e_N and e_E behind them (`filters`). Components with
+some weight are gathered into one list of L, and every step is an operation on arrays of states (n,
+L), covariances (n, n, L) and sigma points (2 k + 1, L).
 
-Sigma points lie on the columns of the lower Cholesky root, with kappa = 1, so that no weight is
-negative. The root is triangular: points on the columns of states behind the first three leave the
+Sigma points lie on the columns of the lower Cholesky root of the obstacle's own states, with kappa
+= 1, so that no weight is negative. The root is triangular: points on the columns of e leave the
 obstacle in its place, so that there are seven different places. A state that a function leaves as
 it is needs no sigma points of its own: its covariance stays, and its covariance with an image is a
-sum over the columns (`cross_covariance`).
+sum over the columns (`cross_covariance`). The errors of the navigation are small: they take part
+by the derivatives of range and azimuth at the mean.
 
 Everything is in NED and FRD. Where no point exists, as can happen at a sigma point, the nearest
 existing one is taken.
@@ -39,12 +40,17 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.covariance import are_sound, semidefinite_roots, with_jitter
 
-STATES, COMMON = 6, 4
-"""States with behaviours, and those that all components have: d, delta, z, s."""
+STATES, COMMON = 10, 8
+"""States with behaviours, and those that all components have."""
+NAV = slice(3, 8)
+"""Of these the errors of the navigation, see `navigation_errors`."""
 
 KAPPA = 1.0
 PLACED = 3
 """The first so many states say where an obstacle is."""
+
+DELAY_STEP = 0.05
+"""Seconds by which poses are shifted to see what their lateness changes."""
 
 NEGLIGIBLE = 1e-12
 """A component that weighs less plays no part in a quantile or a place."""
@@ -69,7 +75,9 @@ class Motion(NamedTuple):
 
 class Step(NamedTuple):
     """Sonar poses before and after, position (3,) and rotation (3, 3); noise (3,): variances the
-    time adds to horizontal position, azimuth and depth; cone: which azimuth."""
+    time adds to horizontal position, azimuth and depth; cone: which azimuth. v0, v1 (3,): velocity
+    of the sonar in the world, m/s; w0, w1 (3,): rate at which it turns, in its own axes, rad/s;
+    walk (5,): variances the time `dt` s adds to the errors of the navigation."""
 
     p0: FloatArray
     R0: FloatArray
@@ -77,20 +85,36 @@ class Step(NamedTuple):
     R1: FloatArray
     noise: FloatArray
     cone: bool
+    v0: FloatArray = np.zeros(3)
+    w0: FloatArray = np.zeros(3)
+    v1: FloatArray = np.zeros(3)
+    w1: FloatArray = np.zeros(3)
+    walk: FloatArray = np.zeros(5)
+    dt: float = 0.0
 
 
 def points(x: FloatArray, p: FloatArray, R: FloatArray, cone: bool) -> FloatArray:
-    """Return where means (..., 4) lie, seen from the sonar at (p, R): (..., 3)."""
+    """Return where means (T, K, 4) lie, seen from the sonar at (p, R), or from one of each target,
+    p (T, 3) and R (T, 3, 3): (T, K, 3)."""
     placed = np.moveaxis(x[..., :PLACED], -1, 0)
-    return np.moveaxis(place(placed, p[2], R, cone), 0, -1)
+    return np.moveaxis(place(placed, *upright(p, R), cone), 0, -1)
 
 
-def place(x: FloatArray, depth: float, R: FloatArray, cone: bool) -> FloatArray:
+def upright(p: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return depth and vertical (3,) of the sonar at (p, R), or depths (T, 1) and verticals (3, T,
+    1) of those of T targets."""
+    if p.ndim == 1:
+        return p[2], R[2]
+    return p[:, 2, None], R[:, 2].T[..., None]
+
+
+def place(x: FloatArray, depth: FloatArray, down: FloatArray, cone: bool) -> FloatArray:
     """Return the points (3, ...) of ranges, azimuths and depths x (3, ...), seen from a sonar at
-    that depth, turned by R: `geometry.reconstruct`, where no point exists the nearest one."""
+    that depth, from which the vertical is `down` (3, ...): `geometry.reconstruct`, where no point
+    exists the nearest one."""
     d, drop = x[0], x[2] - depth
     cosine, sine = np.cos(x[1]), np.sin(x[1])
-    a, b, c = R[2]
+    a, b, c = down
     if cone:
         r, across, k = d * cosine, d * sine, a
         drop = drop - b * across
@@ -153,7 +177,7 @@ def advance(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Predict what the sonar will see.
 
-    :param x: (T, C, 4) of obstacles that are all fixed, or (T, C, 6).
+    :param x: (T, C, 8) of obstacles that are all fixed, or (T, C, 10).
     :param P: (T, C, n, n).
     :param mu: (T, C) weights; components of weight 0 take no part.
     :returns: x, P, and where P (T, C) was repaired (`estimation.covariance`). Dropped components
@@ -178,48 +202,111 @@ def _predicted(
     y: FloatArray, S: FloatArray, motion: Motion, step: Step, component: IndexArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return states (n, L) and covariances (n, n, L) after a step of the components (L,)."""
-    size, lanes = y.shape
+    size = len(y)
+    private = np.array([*range(PLACED), *range(COMMON, size)])
     own = motion.prior[component] > 0.0
-    n = np.where(own, size, COMMON)
+    n = np.where(own, len(private), PLACED)
     centre, apart = KAPPA / (n + KAPPA), 0.5 / (n + KAPPA)
-    weight = apart * ((np.arange(size)[:, None] < COMMON) | own)
-    F = semidefinite_roots(S) * np.sqrt(n + KAPPA)
-    seen = _moved(y, F, motion, step, component)
-    image = np.stack(_echoes(seen, step.cone))
-    mean, image = image_moments(image, centre, weight)
+    weight = apart * ((private[:, None] < PLACED) | own)
+    order = np.concatenate([private, np.arange(size)[NAV]])
+    F = np.empty((size, len(private), y.shape[1]))
+    F[order] = semidefinite_roots(S[order[:, None], order], len(private)) * np.sqrt(n + KAPPA)
+    seen = _moved(y, F[private], motion, step, component)
+    echo = np.stack(_echoes(seen, step.cone))
+    early, late, echo = echo[:, -2], echo[:, -1], echo[:, :-2]
+    J = _slopes(seen[:, 0], step)
+    D = _error_slopes(y, J, step)
+    D[:, -1] = (late - early) / (2.0 * DELAY_STEP)
+    mean, image = image_moments(echo, centre, weight)
+    both = cross_covariance(image, F, apart)
+    errors = both[:, NAV]
+    twice = (errors[:, None] * D[None]).sum(axis=2)
+    through = (D[:, :, None] * S[None, NAV]).sum(axis=1)
     out = S.copy()
-    out[:2, :2] = covariances(image, centre, weight)
-    out[:2, 2:] = cross_covariance(image, F[2:], apart)
+    out[:2, :2] = covariances(image, centre, weight) + twice + np.swapaxes(twice, 0, 1)
+    linear = (through[:, None, NAV] * D[None]).sum(axis=2)
+    out[:2, :2] += 0.5 * (linear + np.swapaxes(linear, 0, 1))
+    out[:2, 2:] = both[:, 2:] + through[:, 2:]
     out[2:, :2] = np.swapaxes(out[:2, 2:], 0, 1)
     position, azimuth, depth = step.noise
     out[0, 0] += position
     out[1, 1] += position / (mean[0] * mean[0]) + azimuth
     out[2, 2] += depth
+    for a, variance in enumerate(step.walk, NAV.start):
+        out[a, a] += variance
     y1 = np.concatenate([mean, y[2:]])
     if size > COMMON:
-        _add_behaviour(y1, out, seen[:, 0], motion, step, component)
+        _add_behaviour(y1, out, J, motion, component)
     return y1, out
 
 
 def _moved(
     y: FloatArray, F: FloatArray, motion: Motion, step: Step, component: IndexArray
 ) -> FloatArray:
-    """Return where the sigma points lie, seen by the sonar after the step, (3, 1 + 2 n, L)."""
-    size = len(y)
+    """Return where the sigma points of the obstacle's own states lie, seen by the sonar after the
+    step, (3, 1 + 2 k + 2, L), F (k, k, L); the last two: the centre, with poses `DELAY_STEP`
+    earlier and later."""
+    k = len(F)
+    s, psi, north, east, tau = y[NAV]
     placed = sigma_points(y[:PLACED], F[:PLACED, :PLACED])
-    m = place(placed, step.p0[2], step.R0, step.cone)
     # Points on other columns lie at the centre.
-    side = [*range(1, PLACED + 1), *[0] * (size - PLACED)]
-    back = [*range(PLACED + 1, 2 * PLACED + 1), *[0] * (size - PLACED)]
-    m = np.tensordot(step.R1.T @ step.R0, m[:, [0, *side, *back]], axes=1)
-    across = step.R1[:2].T @ (step.p0 - step.p1)[:2]
-    down = step.R1[2] * (step.p0 - step.p1)[2]
-    scale = sigma_points(y[3:4], F[3:4])[0]
-    m += across[:, None, None] * (1.0 + scale) + down[:, None, None]
-    if size > COMMON:
-        gone = sigma_points(y[COMMON:], F[COMMON:]) * motion.step[component]
-        m += np.tensordot(step.R1[:2].T, gone, axes=1)
-    return m
+    side = [*range(1, PLACED + 1), *[0] * (k - PLACED)]
+    back = [*range(PLACED + 1, 2 * PLACED + 1), *[0] * (k - PLACED)]
+    shift = np.zeros((2 * PLACED + 3, 1))
+    shift[-2:] = [[-DELAY_STEP], [DELAY_STEP]]
+    delay = tau + shift
+    down = step.R0[2, :, None, None] + delay * np.cross(step.R0[2], step.w0)[:, None, None]
+    placed = np.concatenate([placed, placed[:, :1], placed[:, :1]], axis=1)
+    m = place(placed, step.p0[2] + delay * step.v0[2], down, step.cone)
+    m += delay * np.tensordot(_cross_matrix(step.w0), m, axes=1)
+    last = len(shift) - 2
+    points = [0, *side, *back, last, last + 1]
+    m = np.tensordot(step.R1.T @ step.R0, m[:, points], axes=1)
+    delay = delay[points]
+    gone = (step.p1 - step.p0)[:, None, None]
+    gone = gone + delay * (step.v1 - step.v0)[:, None, None]
+    stretch = 1.0 + s
+    world = np.empty((3, *delay.shape))
+    world[0] = -stretch * (gone[0] - psi * gone[1]) - north * step.dt
+    world[1] = -stretch * (gone[1] + psi * gone[0]) - east * step.dt
+    world[2] = -gone[2]
+    if len(y) > COMMON:
+        e = sigma_points(y[COMMON:], F[PLACED:]) * motion.step[component]
+        world[:2, : 2 * k + 1] += e
+        world[:2, 2 * k + 1 :] += e[:, :1]
+    m += np.tensordot(step.R1.T, world, axes=1)
+    return m - delay * np.tensordot(_cross_matrix(step.w1), m, axes=1)
+
+
+def _cross_matrix(w: FloatArray) -> FloatArray:
+    """Return the matrix (3, 3) of ``w x``."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def _slopes(m: FloatArray, step: Step) -> FloatArray:
+    """Return how range and azimuth change with the obstacle's north and east, (2, 2, L); m (3, L):
+    where it is seen."""
+    X, Y, Z = m
+    d = np.sqrt(X * X + Y * Y + Z * Z)
+    axes = step.R1[:2]
+    along = axes @ m / d
+    if step.cone:
+        turn = (axes[:, 1:2] - Y / d * along) / np.sqrt(d * d - Y * Y)
+    else:
+        turn = (axes[:, 1:2] * X - axes[:, 0:1] * Y) / (X * X + Y * Y)
+    return np.stack([along, turn])
+
+
+def _error_slopes(y: FloatArray, J: FloatArray, step: Step) -> FloatArray:
+    """Return how range and azimuth change with the errors of the navigation, (2, 5, L), but for
+    its lateness; J: `_slopes`."""
+    s, psi, _, _, tau = y[NAV]
+    gone = (step.p1 - step.p0)[:, None] + tau * (step.v1 - step.v0)[:, None]
+    D = np.empty((2, 5, y.shape[1]))
+    D[:, 0] = -J[:, 0] * (gone[0] - psi * gone[1]) - J[:, 1] * (gone[1] + psi * gone[0])
+    D[:, 1] = (1.0 + s) * (J[:, 0] * gone[1] - J[:, 1] * gone[0])
+    D[:, 2:4] = -step.dt * J
+    return D
 
 
 def _echoes(m: FloatArray, cone: bool) -> tuple[FloatArray, FloatArray]:
@@ -235,26 +322,11 @@ def _echoes(m: FloatArray, cone: bool) -> tuple[FloatArray, FloatArray]:
 
 
 def _add_behaviour(
-    y: FloatArray,
-    S: FloatArray,
-    m: FloatArray,
-    motion: Motion,
-    step: Step,
-    component: IndexArray,
+    y: FloatArray, S: FloatArray, J: FloatArray, motion: Motion, component: IndexArray
 ) -> None:
-    """Add what w brings, to e, to range and azimuth, and to both together, in place; m (3, L):
-    where the centres are seen."""
+    """Add what w brings, to e, to range and azimuth, and to both together, in place; J:
+    `_slopes`."""
     keep, push, noise = (part[component] for part in (motion.keep, motion.push, motion.noise))
-    # How range and azimuth change with the obstacle's north and east, (2, 2, L).
-    X, Y, Z = m
-    d = np.sqrt(X * X + Y * Y + Z * Z)
-    axes = step.R1[:2]
-    along = axes @ m / d
-    if step.cone:
-        turn = (axes[:, 1:2] - Y / d * along) / np.sqrt(d * d - Y * Y)
-    else:
-        turn = (axes[:, 1:2] * X - axes[:, 0:1] * Y) / (X * X + Y * Y)
-    J = np.stack([along, turn])
     y[COMMON:] *= keep
     S[COMMON:] *= keep
     S[:, COMMON:] *= keep
@@ -301,9 +373,9 @@ def relative(
     R: FloatArray,
     cone: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean (T, K, 5) and covariance (T, K, 5, 5) of g, of components whose states are (d,
-    delta, z, s) and, where `moves` (K,), the velocity; zeros where the weight mu (T, K) is
-    negligible."""
+    """Return mean (T, K, 5) and covariance (T, K, 5, 5) of g, of components whose first states are
+    (d, delta, z) and, where `moves` (K,), the last ones the velocity; zeros where the weight mu
+    (T, K) is negligible."""
     T, K, size = x.shape
     mean, covariance = np.zeros((T, K, RELATIVE)), np.zeros((T, K, RELATIVE, RELATIVE))
     live = np.nonzero(mu > NEGLIGIBLE)
@@ -313,12 +385,11 @@ def relative(
     still = ~moves[live[1]]
     y[COMMON:, still] = 0.0
     S[COMMON:, :, still] = S[:, COMMON:, still] = 0.0
-    F = semidefinite_roots(S)[:, :PLACED] * np.sqrt(COMMON + KAPPA)
+    F = semidefinite_roots(S, PLACED) * np.sqrt(PLACED + KAPPA)
     placed = sigma_points(y[:PLACED], F[:PLACED])
-    world = np.tensordot(R[:2], place(placed, p[2], R, cone), axes=1)
-    apart = np.full(y.shape[1], 0.5 / (COMMON + KAPPA))
-    # Points on the other columns lie at the centre.
-    centre = np.full(y.shape[1], (KAPPA + (COMMON - PLACED)) / (COMMON + KAPPA))
+    world = np.tensordot(R[:2], place(placed, p[2], R[2], cone), axes=1)
+    apart = np.full(y.shape[1], 0.5 / (PLACED + KAPPA))
+    centre = np.full(y.shape[1], KAPPA / (PLACED + KAPPA))
     level, world = image_moments(world, centre, np.tile(apart, (PLACED, 1)))
     others = [2, *range(COMMON, size)]
     filled = 3 + size - COMMON

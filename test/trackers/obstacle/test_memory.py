@@ -167,7 +167,7 @@ def test_what_was_passed_has_the_same_number_in_the_third_pass():
     rows = {row['track_id']: row for row in tracker.known()}
     (first,) = numbers[0, 0]
     assert {first, *numbers[1, 0]} <= set(rows)
-    assert rows[first]['existence'] > 0.8
+    assert rows[first]['existence'] > 0.75
     assert -24.0 < rows[first]['z_low'] < rows[first]['z_high'] < -19.5
     assert rows[first]['x'] == pytest.approx(pings[-1].place[0, 0], abs=1.0)
 
@@ -190,7 +190,7 @@ def test_places_of_landmarks_are_as_good_as_they_state():
             level.append(off[:2] @ np.linalg.solve(mark.covariance[:2, :2], off[:2]))
             height.append(off[2] ** 2 / mark.covariance[2, 2])
             inside.append(mark.low <= mark.place[2] - off[2] <= mark.high)
-    assert np.mean(same_number) >= 0.85
+    assert np.mean(same_number) >= 0.8
     assert 1.0 < np.mean(level) < 3.0
     assert 0.5 < np.mean(height) < 1.6
     assert 0.78 < np.mean(inside) < 0.98

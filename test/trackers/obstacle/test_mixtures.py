@@ -26,6 +26,8 @@ from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import BehaviourSlices, Sonar
 
 MODELS = {'plane': False, 'cone': True}
+PRIVATE = np.array([0, 1, 2, 8, 9])
+"""The states of the obstacle itself."""
 
 
 def poses(rng):
@@ -36,21 +38,23 @@ def poses(rng):
     return before, after
 
 
-def targets(rng, before, slices=2, T=2):
-    """Components fixed, swaying, swaying farther, moving of each slice, one more is fixed."""
+def targets(rng, before, slices=2, T=2, errors=0.0):
+    """Components fixed, swaying, swaying farther, moving of each slice, one more is fixed; errors:
+    how much is unknown of the navigation."""
     C = 4 * slices + 1
-    x = np.zeros((T, C, 6))
+    x = np.zeros((T, C, 10))
     x[..., 0] = rng.uniform(30.0, 90.0, (T, C))
     x[..., 1] = rng.uniform(-0.3, 0.3, (T, C))
     x[..., 2] = before.position[2] + rng.uniform(-6.0, 6.0, (T, C))
     x[..., 3] = rng.normal(0.0, 0.003, (T, C))
-    x[..., 4:] = rng.normal(0.0, 0.5, (T, C, 2))
-    scale = np.array([0.2, 0.004, 1.5, 0.003, 0.3, 0.3])
-    A = rng.normal(size=(T, C, 6, 6)) * scale[:, None]
+    x[..., 8:] = rng.normal(0.0, 0.5, (T, C, 2))
+    navigation = errors * np.array([0.003, 0.002, 0.01, 0.01, 0.05])
+    scale = np.array([0.2, 0.004, 1.5, *navigation, 0.3, 0.3])
+    A = rng.normal(size=(T, C, 10, 10)) * scale[:, None]
     P = A @ np.swapaxes(A, -1, -2)
     fixed = np.arange(C) % 4 == 0
-    x[:, fixed, 4:] = 0.0
-    P[:, fixed, 4:, :] = P[:, fixed, :, 4:] = 0.0
+    x[:, fixed, 8:] = 0.0
+    P[:, fixed, 8:, :] = P[:, fixed, :, 8:] = 0.0
     return x, P, rng.dirichlet(np.ones(C), T)
 
 
@@ -75,9 +79,9 @@ def numpy_mix(x, P, mu, prior, slices, chain):
                 means, covariances = x[t, own].copy(), P[t, own].copy()
                 for i in range(M):
                     if i != a:
-                        means[i, 4:] = 0.0
-                        covariances[i, 4:, :] = covariances[i, :, 4:] = 0.0
-                        covariances[i, 4:, 4:] = np.eye(2) * prior[k * M + a]
+                        means[i, 8:] = 0.0
+                        covariances[i, 8:, :] = covariances[i, :, 8:] = 0.0
+                        covariances[i, 8:, 8:] = np.eye(2) * prior[k * M + a]
                 mean = share @ means
                 off = means - mean
                 x1[t, k * M + a] = mean
@@ -90,7 +94,7 @@ def numpy_mix(x, P, mu, prior, slices, chain):
 def test_mixing_equals_numpy():
     rng = np.random.default_rng(1)
     before, _ = poses(rng)
-    x, P, mu = targets(rng, before)
+    x, P, mu = targets(rng, before, errors=1.0)
     prior = motion().prior
     got = mixtures.mix(x, P, mu, prior, 2, CHAIN, 0.0)
     for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, CHAIN)):
@@ -112,28 +116,28 @@ def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
 
 
 def numpy_advance(x, P, motion, j, before, after, noise, model):
-    n = 6 if motion.prior[j] else 4
-    centre, C = x[:n], P[:n, :n]
+    own = PRIVATE if motion.prior[j] else PRIVATE[:3]
+    n = len(own)
+    centre, C = x[own], P[np.ix_(own, own)]
     columns = (np.sqrt(n + 1.0) * np.linalg.cholesky(C)).T
     points = np.concatenate([centre[None], centre + columns, centre - columns])
     weights = np.array([1.0 / (n + 1.0)] + [0.5 / (n + 1.0)] * (2 * n))
-    d, delta, z, s = points[:, :4].T
+    d, delta, z = points[:, :3].T
+    s = np.full(len(d), x[3])
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
     stretch = np.stack([1.0 + s, 1.0 + s, np.ones_like(s)], axis=-1)
     moved = geometry.apply(before.R, m) + (before.position - after.position) * stretch
-    if n == 6:
-        moved[:, :2] += motion.step[j] * points[:, 4:]
+    if n == 5:
+        moved[:, :2] += motion.step[j] * points[:, 3:]
     seen = geometry.apply(after.R.T, moved)
-    images = np.column_stack(
-        [*geometry.project(seen, model), z, s, motion.keep[j] * points[:, 4:]]
-    )
+    images = np.column_stack([*geometry.project(seen, model), z, motion.keep[j] * points[:, 3:]])
     mean = weights @ images
     off = images - mean
     covariance = np.einsum('s,si,sj->ij', weights, off, off)
     covariance[0, 0] += noise[0]
     covariance[1, 1] += noise[0] / mean[0] ** 2 + noise[1]
     covariance[2, 2] += noise[2]
-    if n == 6:
+    if n == 5:
         J = np.zeros((2, 2))
         for i in range(2):
             step = np.zeros(3)
@@ -145,8 +149,8 @@ def numpy_advance(x, P, motion, j, before, after, noise, model):
                 for sign in (1.0, -1.0)
             )
             J[:, i] = (ahead - back) / 2e-5
-        G = np.zeros((6, 2))
-        G[:2], G[4:] = motion.push[j] * J, np.eye(2)
+        G = np.zeros((5, 2))
+        G[:2], G[3:] = motion.push[j] * J, np.eye(2)
         covariance += motion.noise[j] * G @ G.T
     return mean, covariance
 
@@ -163,23 +167,26 @@ def test_prediction_equals_numpy(model):
     for t in range(2):
         for j in range(9):
             mean, covariance = numpy_advance(x[t, j], P[t, j], how, j, before, after, noise, model)
-            n = len(mean)
-            assert_allclose(x1[t, j, :n], mean, rtol=1e-11, atol=1e-12)
-            assert_allclose(P1[t, j, :n, :n], covariance, rtol=1e-6, atol=1e-10)
-            assert np.all(x1[t, j, n:] == 0.0) and np.all(P1[t, j, n:] == 0.0)
+            own = PRIVATE[: len(mean)]
+            others = np.setdiff1d(np.arange(10), [*own, 3])
+            assert_allclose(x1[t, j, own], mean, rtol=1e-11, atol=1e-12)
+            found = P1[t, j][np.ix_(own, own)]
+            assert_allclose(found, covariance, rtol=1e-6, atol=1e-10)
+            assert x1[t, j, 3] == x[t, j, 3]
+            assert np.all(x1[t, j, others] == 0.0) and np.all(P1[t, j, others] == 0.0)
 
 
 def test_fixed_components_are_predicted_as_the_fixed_filter_does():
     """Bit for bit: what the behaviours cost a fixed obstacle is not in the arithmetic."""
     rng = np.random.default_rng(4)
     before, after = poses(rng)
-    x, P, mu = targets(rng, before)
+    x, P, mu = targets(rng, before, errors=1.0)
     noise = np.array([1e-3, 2e-7, 3e-4])
     x1, P1, _ = behave.advance(x, P, mu, motion(), behave.Step(*before, *after, noise, False))
-    four = np.ascontiguousarray(x[..., :4]), np.ascontiguousarray(P[..., :4, :4])
+    eight = np.ascontiguousarray(x[..., :8]), np.ascontiguousarray(P[..., :8, :8])
     none, step = behave.Motion.none(x.shape[1]), behave.Step(*before, *after, noise, False)
-    plain, plain_P, _ = behave.advance(*four, mu, none, step)
-    assert np.all(x1[:, 0, :4] == plain[:, 0]) and np.all(P1[:, 0, :4, :4] == plain_P[:, 0])
+    plain, plain_P, _ = behave.advance(*eight, mu, none, step)
+    assert np.all(x1[:, 0, :8] == plain[:, 0]) and np.all(P1[:, 0, :8, :8] == plain_P[:, 0])
 
 
 @pytest.mark.parametrize('kind', ['swaying', 'moving'])
@@ -197,9 +204,9 @@ def test_covariance_of_a_step_equals_sampling(kind):
     dt, draws = 5.0, 400_000
     how = filter_._motion(dt)
     # An obstacle whose place is known, level with the sonar.
-    x, P = np.zeros((1, 1, 6)), np.zeros((1, 1, 6, 6))
+    x, P = np.zeros((1, 1, 10)), np.zeros((1, 1, 10, 10))
     x[0, 0, :3] = 50.0, 0.2, 20.0
-    P[0, 0, 4:, 4:] = how.prior[0] * np.eye(2)
+    P[0, 0, 8:, 8:] = how.prior[0] * np.eye(2)
     step = behave.Step(*sonar.pose, *sonar.pose, np.zeros(3), False)
     x1, P1, _ = behave.advance(x, P, np.ones((1, 1)), how, step)
     e = rng.normal(0.0, np.sqrt(how.prior[0]), (draws, 2))
@@ -212,7 +219,7 @@ def test_covariance_of_a_step_equals_sampling(kind):
         w = rng.normal(0.0, 0.3 * np.sqrt(dt), (draws, 2))
         place, after = place + dt * e + 0.5 * dt * w, e + w
     sample = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0]), after])
-    pick = [0, 1, 4, 5]
+    pick = [0, 1, 8, 9]
     got = P1[0, 0][np.ix_(pick, pick)]
     scale = np.sqrt(np.outer(np.diag(got), np.diag(got)))
     assert_allclose(got / scale, np.cov(sample.T) / scale, atol=0.04)

@@ -337,7 +337,7 @@ def test_the_edges_of_the_beam_are_smeared():
     azimuth = np.radians([0.0, 21.3, 22.5, 23.7, 40.0])
     z = np.column_stack([np.full(5, 30.0), azimuth])
     mixture = filter_.begin(z, np.tile(np.diag([0.02, 1e-9]), (5, 1, 1)), sonar)
-    V, ahead = filter_.visible(mixture, sonar)
+    V, ahead = filter_.visible(mixture, sonar.pose)
     due = 0.01 + 0.99 * norm.cdf([99.0, 1.0, 0.0, -1.0, -99.0])
     assert_allclose(V[:, 0], due, atol=1e-4)
     assert ahead.all()

@@ -51,16 +51,20 @@ def targets(rng, before, T=3, K=4):
 
 
 def advanced(x, P, before, after, noise, cone=False):
-    """The prediction of obstacles that are all fixed."""
+    """The prediction of obstacles that are all fixed, of which no other error of the navigation
+    is known than its scale."""
     weights, step = np.ones(x.shape[:2]), Step(*before, *after, noise, cone)
-    return unscented.advance(x, P, weights, Motion.none(x.shape[1]), step)
+    whole, spread = np.zeros((*x.shape[:2], 8)), np.zeros((*x.shape[:2], 8, 8))
+    whole[..., :4], spread[..., :4, :4] = x, P
+    found = unscented.advance(whole, spread, weights, Motion.none(x.shape[1]), step)
+    return found[0][..., :4], found[1][..., :4, :4], found[2]
 
 
 def sigma_points(x, P):
-    """Nine points (..., 9, 4) and their weights, by numpy."""
-    columns = np.swapaxes(np.sqrt(5.0) * np.linalg.cholesky(P), -1, -2)
+    """Seven points (..., 7, 3) and their weights, by numpy."""
+    columns = np.swapaxes(2.0 * np.linalg.cholesky(P), -1, -2)
     centre = x[..., None, :]
-    weights = np.array([0.2] + [0.1] * 8)
+    weights = np.array([0.25] + [0.125] * 6)
     return np.concatenate([centre, centre + columns, centre - columns], axis=-2), weights
 
 
@@ -69,10 +73,12 @@ def test_prediction_equals_numpy(model):
     rng = np.random.default_rng(1)
     before, after = poses(rng)
     x, P, _ = targets(rng, before)
+    P[..., 3, :] = P[..., 3] = 0.0
     noise = np.array([1e-3, 2e-7, 3e-4])
     x1, P1, _ = advanced(x, P, before, after, noise, MODELS[model])
-    points, weights = sigma_points(x, P)
-    d, delta, z, s = np.moveaxis(points, -1, 0)
+    points, weights = sigma_points(x[..., :3], P[..., :3, :3])
+    d, delta, z = np.moveaxis(points, -1, 0)
+    s = np.broadcast_to(x[..., 3:], d.shape)
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
     stretch = np.stack([1.0 + s, 1.0 + s, np.ones_like(s)], axis=-1)
     moved = geometry.apply(before.R, m) + (before.position - after.position) * stretch
@@ -241,7 +247,7 @@ def test_places_equal_the_geometry(cone):
     rng = np.random.default_rng(1)
     y, F, points = spread_points(rng, 7, 0.01)
     R = geometry.rotation(0.1, -0.05, 2.0)
-    out = unscented.place(unscented.sigma_points(y[:3], F[:3, :3]), 1.0, R, cone)
+    out = unscented.place(unscented.sigma_points(y[:3], F[:3, :3]), 1.0, R[2], cone)
     model = 'cone' if cone else 'plane'
     order = [0, 1, 3, 5, 2, 4, 6]  # here ahead on all columns, then behind
     exact = geometry.reconstruct(points[0], points[1], points[2] - 1.0, R, model)[order]

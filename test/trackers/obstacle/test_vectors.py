@@ -17,6 +17,7 @@
 from attrs import evolve
 from helpers.obstacle_runs import (
     approach,
+    EXACT,
     FAITHFUL,
     FIXED,
     follow,
@@ -108,7 +109,7 @@ def test_nor_can_it_with_all_behaviours(kind):
     name = f'approach_level_mirror_{kind}'
     moving = track_approach(name, max_tracks=1, behaviours=('fixed', 'swaying', 'moving'))
     assert_allclose([item.probabilities[0, 0] for item in moving[1:]], 0.5, atol=0.005)
-    everything = track_approach(name, max_tracks=1)
+    everything = track_approach(name, max_tracks=1, **EXACT)
     assert_allclose([item.probabilities[0, 0] for item in everything[28:]], 0.5, atol=0.01)
     assert everything[-1].extras['vertical_offset_lo'][0] < -3.0
     assert everything[-1].extras['vertical_offset_hi'][0] > 3.0
@@ -258,7 +259,7 @@ def test_answers_are_those_of_an_independent_filter(name, number):
     each leaves the errors of a steady obstacle alone and shows here. That filter knows how far
     obstacles sway and ours does not: while one begins to move they differ more."""
     data = encounter(name, number)
-    estimates = track(data)
+    estimates = track(data, **EXACT)
     assert tracks_of(estimates) == {1}
     pings = np.arange(SETTLED, len(estimates))
     offset = column(estimates, 'vertical_offset', pings)
@@ -283,7 +284,7 @@ def test_a_new_obstacle_is_believed_to_be_where_the_study_believes_it(number):
     """The slices end at the sea floor, and the sea floor is a slice: while little is known, the
     offset is 0.7 to 1 m another and the sea floor 0.2 less probable without."""
     data = encounter('seabed_and_fixed', number)
-    estimates = track(data)
+    estimates = track(data, **EXACT)
     pings = np.arange(4, SETTLED)
     offset = column(estimates, 'vertical_offset', pings)
     assert_allclose(offset, data['ref_offset'][pings], atol=0.35)
