@@ -120,11 +120,13 @@ def look(
     jump: float = 0.005,
     fish_rate: float = 0.001,
     told: tuple[FloatArray, float] | None = None,
+    least: FloatArray | float = 0.0,
 ) -> Look:
     """Make the tables of the traces (T, n), samples `step` m apart. jump, fish_rate: see
-    `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell."""
+    `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell;
+    least: noise that there is at least."""
     ring = envelopes.transmit_samples(traces)
-    first = told[0] if told else envelopes.first_noise(traces)
+    first = told[0] if told else np.maximum(envelopes.first_noise(traces), least)
     loudest = float(np.quantile(np.nanmax(traces, axis=1), 0.9))
     whole, cells = first, seen_cells(first, loudest)
     traces, first = traces[:, :cells], first[:cells]
@@ -322,13 +324,12 @@ class Water:
         if early and stated is not None:
             gaussian = config.pulse == 'gaussian'
             told = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
-        found = look(self._traces, self.step, config.bottom_jump, config.fish_rate, told)
+        least = 0.0 if stated is None else stated
+        found = look(self._traces, self.step, config.bottom_jump, config.fish_rate, told, least)
         self._noise, self._loudest, self._ring, self._pulse = found[:4]
         self._lead, self._lead_std = found[4:6]
         if not self._pulse > 0.0:
             self._pulse = UNKNOWN_PULSE
-        if stated is not None:
-            self._noise = np.maximum(self._noise, stated)
         self._state = found.state
         self._scatter, self._seen = np.zeros(self.cells), 0.0
         scale = self._noise
