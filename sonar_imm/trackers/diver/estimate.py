@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import arrival_stamps, births, clutter, depth, offsets, polling
+from . import arrival_stamps, births, clutter, depth, offsets, polling, ranges, sides
 from .config import DiverConfig
 from .known import Known, row_outputs
 from .models import FAMILIES, HOVER, ModelSet
@@ -42,7 +42,10 @@ def estimate_of(
     known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
     mean, covariance = published_state(known, models)
     if known.memory['recent'].pairs:
-        covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
+        places = sides.likely_positions(known, models, mean)
+        covariance = offsets.with_assumed_errors(
+            known.memory['recent'], places, covariance, config
+        )
     if known.memory['fixes'].errors_last(config.fix_bias_std > 0.0):
         covariance = with_fix_covariance(known['reported'], covariance)
     xyz = np.full((len(mean), 3), config.target_z)
@@ -53,6 +56,7 @@ def estimate_of(
         'track_state': known.life.status,
         **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
         'target_id': known['target_id'].astype(np.int32),
+        **sides.side_columns(known, models),
         **family_extras(known, models),
     }
     if models.height >= 0 and models.rows_per_track > 1:
@@ -134,7 +138,7 @@ def health(known: Known, waiting: int) -> dict[str, float]:
     }
 
 
-def warnings(known: Known, config: DiverConfig) -> list[str]:
+def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
     """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
@@ -166,6 +170,8 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
+        *sides.warnings(known, models),
+        *ranges.warnings(known),
         *births.start_warnings(known, config),
     ]
 

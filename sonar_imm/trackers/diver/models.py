@@ -280,6 +280,7 @@ class ModelSet:
                 'scale': of_sensor(np.tile(scale, T), sensor),
                 'delay': np.zeros((T * K, MOST_SENSORS)),
                 'start': np.tile(start, T),
+                'side': np.zeros(T * K, np.int64),
             },
         )
 

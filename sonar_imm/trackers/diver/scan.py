@@ -104,6 +104,17 @@ class Heights(NamedTuple):
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
 
 
+class Fit(NamedTuple):
+    """Minima of single ranges (`ranges`): K states (x, y, vx, vy) at the last range."""
+
+    x: FloatArray
+    """(K, 4)."""
+    P: FloatArray
+    """(K, 4, 4)."""
+    weight: FloatArray
+    """(K,) probabilities."""
+
+
 class Birth(NamedTuple):
     """Position of a possible new track."""
 
@@ -127,6 +138,8 @@ class Birth(NamedTuple):
     """Name and position (2,) of a sensor with a bearing error; None for others."""
     number: int = 0
     """Number of the sensor (`sensors`)."""
+    fit: Fit | None = None
+    """Minima of single ranges; None for other births."""
 
 
 MOST_BIRTHS = 1.5

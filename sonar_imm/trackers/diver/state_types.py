@@ -44,6 +44,7 @@ from .known import Known
 from .names import LastNamed
 from .offsets import BiasTest, RecentPairs
 from .polling import SingleFixes
+from .ranges import Ranges
 from .sensors import Sensors
 
 STATE_TYPES = (
@@ -61,6 +62,6 @@ STATE_TYPES = (
         BiasTest,
         RecentPairs,
     ),
-    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
+    *(Clutter, Clutters, LastNamed, Ranges, Sensors, SingleFixes),
     *(ArrivalStamps, Resolution),
 )
