@@ -46,7 +46,7 @@ CAUTION = 1.15
 SCATTER_MEMORY = 0.9
 UNKNOWN_PULSE, LEAD = 2.0, 2.4
 """Samples of a pulse that is not known; pulses from the onset to the reflector, likewise."""
-LEAST_SAMPLES, DEAF = 20, 0.25
+LEAST_SAMPLES, DEAF, DEEPEST_TRANSMITTER = 20, 0.25, 10.0
 STILL_RECORDS, MOVED, MOVED_SAMPLES = 60, 0.5, 3.0
 """Traces in which a first return that never moves is doubted, and by how much, in m and samples,
 what is below moves then."""
@@ -120,11 +120,15 @@ def look(
     jump: float = 0.005,
     fish_rate: float = 0.001,
     told: tuple[FloatArray, float] | None = None,
+    least: FloatArray | float = 0.0,
+    top: float = 0.0,
 ) -> Look:
     """Make the tables of the traces (T, n), samples `step` m apart. jump, fish_rate: see
-    `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell."""
-    ring = envelopes.transmit_samples(traces)
-    first = told[0] if told else envelopes.first_noise(traces)
+    `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell;
+    least: noise that there is at least; top: depth of the first sample, m: a transmit pulse begins
+    near the surface."""
+    ring = envelopes.transmit_samples(traces) if top < DEEPEST_TRANSMITTER else 0
+    first = told[0] if told else np.maximum(envelopes.first_noise(traces), least)
     loudest = float(np.quantile(np.nanmax(traces, axis=1), 0.9))
     whole, cells = first, seen_cells(first, loudest)
     traces, first = traces[:, :cells], first[:cells]
@@ -322,13 +326,13 @@ class Water:
         if early and stated is not None:
             gaussian = config.pulse == 'gaussian'
             told = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
-        found = look(self._traces, self.step, config.bottom_jump, config.fish_rate, told)
+        least = 0.0 if stated is None else stated
+        chances = config.bottom_jump, config.fish_rate
+        found = look(self._traces, self.step, *chances, told, least, self.first)
         self._noise, self._loudest, self._ring, self._pulse = found[:4]
         self._lead, self._lead_std = found[4:6]
         if not self._pulse > 0.0:
             self._pulse = UNKNOWN_PULSE
-        if stated is not None:
-            self._noise = np.maximum(self._noise, stated)
         self._state = found.state
         self._scatter, self._seen = np.zeros(self.cells), 0.0
         scale = self._noise

@@ -351,7 +351,9 @@ def compared(
     distance = np.abs(depth_a.reshape(-1, 1) - depth_b.reshape(1, -1))
     rows, columns = linear_sum_assignment(np.minimum(distance, limit))
     pairs = [(a[i], b[j]) for i, j in zip(rows, columns) if distance[i, j] < limit]
-    floor_cut = any(h.cut and h.is_bottom > 0.5 for h in (*a, *b))
+    # What is uppermost and cut may be the floor, or lie below it.
+    uppermost = [min(line, key=lambda h: h.depth) for line in (a, b) if len(line)]
+    floor_cut = any(h.cut for h in uppermost)
     horizons = []
     for first, second in pairs:
         # Lines that are nearly parallel say nothing of the slope across them.
