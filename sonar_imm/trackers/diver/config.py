@@ -262,7 +262,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         range=(0.0, 1e4),
         description='number of false fixes expected in a scan, per square metre; 0: jipda '
-        'learns it from the fixes that belong to no track, gnn takes 1e-6')
+        'learns it, place by place, from the fixes that belong to no track; gnn takes 1e-6')
     association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
         'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
@@ -273,9 +273,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
-    birth_density: float = live(1.2e-5, '1/m^2',
-        'jipda: number of new divers expected in a scan, per square metre',
-        range=(1e-12, 1.0))
+    birth_density: float = live(2e-7, '1/(m^2 s)',
+        'jipda: number of new divers expected per square metre and second',
+        range=(1e-14, 1.0))
     survival_time: float = constant(500.0, 's',
         'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 

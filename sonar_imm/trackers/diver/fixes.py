@@ -262,11 +262,11 @@ def _box_distance(
     return off
 
 
-def gate_log_density(group: Group) -> float:
-    """Return the gate threshold: the log density at which a detection and a miss with a false fix
-    are equally probable."""
+def gate_log_density(group: Group) -> FloatArray:
+    """Return the gate threshold (D,): the log density at which a detection and a miss with a
+    false fix are equally probable."""
     p = group.config.detection_probability
-    return math.log(group.clutter) + math.log1p(-p) - math.log(p)
+    return np.asarray(np.log(group.clutter) + (math.log1p(-p) - math.log(p)))
 
 
 def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
@@ -315,11 +315,12 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     seen, p = group.detection, group.config.detection_probability
     ratio = 0.0 if seen is None else seen.log_ratio
     fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
-    fix = assign_fits(fit, known.life.status == TENTATIVE, p, group.clutter)
+    clutter = group.config.usual_clutter
+    fix = assign_fits(fit, known.life.status == TENTATIVE, p, clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
     score = known['score'] + missed
-    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(group.clutter)
+    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
     return Association(*_hard_association(fix, D), fix, free, None, score)
@@ -354,7 +355,8 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
     claimed = beta.sum(axis=0)
-    birth = group.birth_density / (group.birth_density + group.clutter) * (1.0 - claimed)
+    new = group.birth_density
+    birth = new / (new + group.clutter) * (1.0 - claimed)
     score = jipda.log_odds(after)
     return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
 
@@ -461,7 +463,7 @@ def _rejected_fixes(
     nearest = whole.argmax(axis=1)
     best = whole[np.arange(len(whole)), nearest]
     own = np.isfinite(best) & (whole[:, nearest].max(axis=0) == best)
-    odds = np.minimum(best - gate_log_density(group), 0.0)
+    odds = np.minimum(best - gate_log_density(group)[nearest], 0.0)
     return np.where(own, nearest, -1), np.where(own, np.exp(odds) / (1.0 + np.exp(odds)), 0.0)
 
 

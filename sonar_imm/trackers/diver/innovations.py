@@ -178,8 +178,8 @@ class FixConsistency(NamedTuple):
             more = 'a million' if largest == 1e6 else f'{largest:,.6g}'
             return (
                 f'fix covariances{whose} too small by a factor of more than {more}: errors are '
-                f'more than {math.sqrt(largest):,.4g} times as large as reported. Check the unit of the '
-                'covariances'
+                f'more than {math.sqrt(largest):,.4g} times as large as reported. Check the unit '
+                'of the covariances'
             )
         factor = _rounded(times)
         action = 'Correct its covariances' if whose else f'Multiply covariance_scale by {factor}'
@@ -212,14 +212,9 @@ class SensorConsistency(NamedTuple):
     @property
     def together(self) -> FixConsistency:
         """The sums over all sensors."""
-        if len(self.sensors) == 1:
-            return self.sensors[0]
-        number, nis, pairs, cross, square = (
-            (float(sum(column)) for column in zip(*(each[:5] for each in self.sensors)))
-            if self.sensors
-            else (0.0,) * 5
-        )
-        return FixConsistency(number, nis, pairs, cross, square)
+        if len(self.sensors) < 2:
+            return self.of(0)
+        return FixConsistency(*map(float, np.sum([each[:5] for each in self.sensors], axis=0)))
 
     @property
     def assumed(self) -> bool:

@@ -23,7 +23,7 @@ The message order of arrivals does not change the result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ import numpy as np
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, Start
-from .config import CLUTTER, DiverConfig
+from .config import DiverConfig
 from .coverage_map import DetectionProbability
 from .explanations import PingMeasurements
 from .instruments import Layout
@@ -132,13 +132,18 @@ class Birth(NamedTuple):
 MOST_BIRTHS = 1.5
 """Maximum ratio of birth density and estimated clutter density."""
 
+FIRST_LOOK = 10.0
+"""Time, s, over which targets have arrived before the first scan of a sensor, and the longest
+before a later one."""
+
 
 @define(eq=False)
 class Group:
     """D fixes of one stamp and sensor, with at most one per target.
 
-    The tracker sets `number`. Later stages use the slots `detection` (`coverage`), `pairs` and
-    `association` (`fixes`), and `births`. One stage writes each slot.
+    The tracker sets `number`. Later stages use the slots `learnt_clutter` and `elapsed`
+    (`clutter`), `detection` (`coverage`), `pairs` and `association` (`fixes`), and `births`. One
+    stage writes each slot.
     """
 
     z: FloatArray
@@ -159,10 +164,12 @@ class Group:
     """(2,) sensor position; None if unknown."""
     is_stated: bool = True
     """True if a fix states its covariance."""
-    learnt_clutter: float = CLUTTER
-    """Estimated clutter density, 1/m^2, if `clutter_density` is not set."""
     number: int = field(default=0, init=False)
     """Number of the sensor (`sensors`)."""
+    learnt_clutter: FloatArray | None = field(default=None, init=False)
+    """(D,) estimated clutter density at each fix, 1/m^2; None if none is estimated."""
+    elapsed: float = field(default=FIRST_LOOK, init=False)
+    """Time since the scan before of this sensor, s."""
     detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
     association: Association | None = field(default=None, init=False)
@@ -177,23 +184,27 @@ class Group:
         return self.sensor, self.seen_from
 
     @property
-    def clutter(self) -> float:
-        """Clutter density, 1/m^2."""
-        return self.config.clutter_density or self.learnt_clutter
+    def clutter(self) -> FloatArray:
+        """(D,) clutter density at each fix, 1/m^2."""
+        if self.learnt_clutter is None:
+            return np.full(len(self.z), self.config.usual_clutter)
+        return self.learnt_clutter
 
     @property
-    def birth_density(self) -> float:
-        """Density of new targets, 1/m^2.
+    def new_targets(self) -> float:
+        """Density of the targets that arrived since the scan before, 1/m^2."""
+        return self.config.birth_density * self.elapsed
+
+    @property
+    def birth_density(self) -> FloatArray:
+        """(D,) density of new targets at each fix, 1/m^2.
 
         If the clutter density is estimated, the ratio to it is limited. With almost no false
         fixes, an unlimited birth density would attribute the fixes of known targets to new ones.
         """
-        stated = self.config.birth_density
-        return (
-            stated
-            if self.config.clutter_density
-            else min(stated, MOST_BIRTHS * self.learnt_clutter)
-        )
+        if self.config.clutter_density:
+            return np.full(len(self.z), self.new_targets)
+        return np.minimum(self.new_targets, MOST_BIRTHS * self.clutter)
 
 
 @define(eq=False)
@@ -235,18 +246,9 @@ class Scan:
         return known
 
     @classmethod
-    def from_items(
-        cls,
-        items: Sequence[Measurement],
-        config: DiverConfig,
-        clutter: Mapping[str, float],
-    ) -> Scan:
-        """Build the scan of `items`. clutter: estimated clutter density of each sensor."""
+    def from_items(cls, items: Sequence[Measurement], config: DiverConfig) -> Scan:
+        """Build the scan of `items`."""
         fixes, names = position_groups(items, config), []
-        for group in fixes if config.pairing != 'gnn' else ():
-            density = clutter.get(group.sensor)
-            if group.target_id is None and density is not None:
-                group.learnt_clutter = density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()

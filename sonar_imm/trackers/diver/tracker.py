@@ -128,6 +128,7 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            clutter.estimate_densities,
             len(models.scales) > 1 and scales.hearing_stage(models),
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
@@ -231,7 +232,7 @@ class DiverTracker:
 
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, previous.memory['clutter'].densities())
+        scan = Scan.from_items(items, self.config)
         previous = previous.with_memory(sensors=scan.number_sensors(previous.memory['sensors']))
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:

@@ -399,7 +399,7 @@ def test_depth_hypotheses_neither_exchange_weight_nor_borrow():
         assert len(known.rows) == START_DEPTHS * len(known) and not len(known.borrowed)
     improbable = known.rows.replace(logw=np.log([1e-6, 0.5, 0.5 - 1e-6]))
     assert protected_rows(improbable).all()
-    scan = Scan.from_items([], tracker.config, {})
+    scan = Scan.from_items([], tracker.config)
     after = tracker._predict(known, scan, known.stamp_ns + 10**9)
     np.testing.assert_array_equal(after.rows.logw, known.rows.logw)
 

@@ -107,7 +107,7 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
 @pytest.mark.parametrize('settings', SETS)
 def test_tracks_in_one_table_are_trackers_of_one(settings):
     """Divers too far apart to share a fix."""
-    config = DiverConfig(max_tracks=9, clutter_density=1e-5, **settings)
+    config = DiverConfig(max_tracks=9, clutter_density=1e-5, birth_density=1e-5, **settings)
     made = list(swims(3, 30, 4))
     together = run(
         DiverTracker(config),

@@ -138,7 +138,7 @@ def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track(
     for item in items:
         tracker.process(item)
     far = fix(41, *(items[-1].position[:2] + [3.0, 0.0]), 0.01 * np.eye(2))
-    scan = Scan.from_items([far], config, {})
+    scan = Scan.from_items([far], config)
     known, (group,) = tracker._predict(tracker._stream.state, scan, far.stamp_ns), scan.fixes
     pairs = compare(known, group, tracker.models, 0.01)
     missed = (1.0 - config.detection_probability) * 1e-6
