@@ -31,7 +31,7 @@ Arrays are never changed in place, because tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -262,25 +262,13 @@ class Borrowed:
         """Return the row (B,) that each assumption borrows: the heaviest of its target.
 
         A scale changes the future of a filter. So the lender need not be near in scale: its state
-        must fit the target. A delay changes the state too. So an assumption with a delay of a
-        sensor borrows from the heaviest row that agrees about the other sensors, if there is one.
+        must fit the target.
         """
         if not len(self):
             return np.empty(0, np.intp)
         heaviest = np.maximum.reduceat(rows.logw, rows.first)[rows.target] == rows.logw
         lenders, first = np.unique(rows.target[heaviest], return_index=True)
-        lender = np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]]
-        if 'delay' not in self.key or not self.key['delay'].any():
-            return np.asarray(lender)
-        late = np.flatnonzero(self.key['delay'].any(axis=1))
-        own = self.key['delay'][late] == 0.0
-        agrees = self.target[late, None] == rows.target
-        for name, column in self.key.items():
-            differs = column[late, None] != rows.key[name]
-            agrees &= ~(differs & own[:, None]).any(axis=2)
-        best = np.where(agrees, rows.logw, -np.inf)
-        lender[late] = np.where(agrees.any(axis=1), best.argmax(axis=1), lender[late])
-        return np.asarray(lender)
+        return np.asarray(np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]])
 
 
 def drop_weightless_rows(
@@ -302,14 +290,21 @@ def drop_weightless_rows(
     )
 
 
-def restore_rows(rows: Rows, borrowed: Borrowed, again: BoolArray) -> tuple[Rows, Borrowed]:
+def restore_rows(
+    rows: Rows,
+    borrowed: Borrowed,
+    again: BoolArray,
+    lend: Callable[[Rows, Borrowed], Rows] | None = None,
+) -> tuple[Rows, Borrowed]:
     """Give the assumptions `again` (B,) a row, a copy of their lender.
 
-    Return the rows and the list.
+    :param lend: changes the copies where an assumption also changes the state.
+    :returns: the rows and the list.
     """
     if not again.any():
         return rows, borrowed
     back = borrowed.select(again)
     lender = back.find_lenders(rows)
     copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
+    copies = copies if lend is None else lend(copies, back)
     return rows.append(evolve(copies, key={**copies.key, **back.key})), borrowed.select(~again)

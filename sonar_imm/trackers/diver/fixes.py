@@ -65,6 +65,7 @@ from .pairs import Association, Assumptions, Pairs
 from .scales import (
     can_restore,
     estimated_scales,
+    lending,
     protected_rows,
     weight_without_small_scales,
 )
@@ -122,10 +123,10 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     """
     among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
     blocks, parts = known.rows.blocks, models.parts
-    if among.delay.any():
+    if among.moved.any():
         every = np.concatenate([np.arange(len(known.rows)), among.lent])
         blocks = tuple(
-            bank.move_along(block.select(every), part.outputs[2:4], -among.delay)
+            bank.move_along(block.select(every), part.outputs[2:4], among.moved)
             for block, part in zip(blocks, parts)
         )
     expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
@@ -440,7 +441,7 @@ def update_tracks(
     sound, repairs = repair_covariances(tuple(blocks))
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
     again = can_restore(rows, borrowed) & weighed[borrowed.target]
-    rows, borrowed = restore_rows(rows, borrowed, again)
+    rows, borrowed = restore_rows(rows, borrowed, again, lending(models))
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 

@@ -214,7 +214,9 @@ class SensorConsistency(NamedTuple):
         """The sums over all sensors."""
         if len(self.sensors) < 2:
             return self.of(0)
-        return FixConsistency(*map(float, np.sum([each[:5] for each in self.sensors], axis=0)))
+        sums = np.sum([each[:5] for each in self.sensors], axis=0)
+        number, nis, pairs, cross, square = sums.tolist()
+        return FixConsistency(number, nis, pairs, cross, square)
 
     @property
     def assumed(self) -> bool:

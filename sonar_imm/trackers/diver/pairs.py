@@ -22,7 +22,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, Rows
-from .sensors import scale_of
+from .sensors import lent_moves, scale_of
 
 
 class Assumptions(NamedTuple):
@@ -42,24 +42,26 @@ class Assumptions(NamedTuple):
     """(A,) True for assumptions with a row of their own, False for borrowed ones."""
     lent: IndexArray
     """(L,) row of each prediction beyond those of the rows, see `seen`."""
-    delay: FloatArray
-    """(N + L,) delay of the stamps of the sensor in each prediction, s."""
+    moved: FloatArray
+    """(N + L,) time over which each prediction moves along the velocity to the time of the fixes,
+    s."""
 
     @classmethod
     def from_rows(cls, rows: Rows, borrowed: Borrowed, sensor: int) -> Assumptions:
         """Return the assumptions of rows and of the borrowed list about a sensor."""
-        N, scale, delay = len(rows), scale_of(rows.key, sensor), rows.key['delay'][:, sensor]
+        N, scale, moved = len(rows), scale_of(rows.key, sensor), -rows.key['delay'][:, sensor]
         every, none = np.arange(N), np.empty(0, np.intp)
         if not len(borrowed):
             has_row = np.ones(N, np.bool_)
-            return cls(every, every, scale, rows.logw, rows.target, has_row, none, delay)
+            return cls(every, every, scale, rows.logw, rows.target, has_row, none, moved)
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
-        lender, its = borrowed.find_lenders(rows), borrowed.key['delay'][:, sensor]
-        seen, other = lender.copy(), np.flatnonzero(its != delay[lender])
+        lender = borrowed.find_lenders(rows)
+        its = lent_moves(rows.key, lender, borrowed.key) - borrowed.key['delay'][:, sensor]
+        seen, other = lender.copy(), np.flatnonzero(its != moved[lender])
         lent, late = lender[other], its[other]
         if len(other):
-            # One prediction for each row and delay.
+            # One prediction for each row and time.
             pairs, place = np.unique(np.column_stack([lent, late]), axis=0, return_inverse=True)
             seen[other] = N + place.ravel()
             lent, late = pairs[:, 0].astype(np.intp), pairs[:, 1]
@@ -71,7 +73,7 @@ class Assumptions(NamedTuple):
             target[order],
             order < N,
             lent,
-            np.concatenate([delay, late]),
+            np.concatenate([moved, late]),
         )
 
     def select(self, part: slice) -> Assumptions:
@@ -96,7 +98,7 @@ class Pairs(NamedTuple):
     """(p,) index of the fix."""
     expected: list[tuple[FloatArray, FloatArray]]
     """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows, then
-    of the L rows of `Assumptions.lent` with another delay."""
+    of the L rows of `Assumptions.lent` at another time."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray

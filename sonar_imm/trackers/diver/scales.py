@@ -35,12 +35,13 @@ from collections.abc import Callable, Sequence
 from attrs import evolve
 import numpy as np
 
+from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
 from .known import Known, track_positions
 from .models import ModelSet, USUAL_SCALES
 from .scan import Group
-from .sensors import scale_of
+from .sensors import lent_moves, scale_of
 
 REDISTRIBUTED_FRACTION = 5e-4
 """Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
@@ -313,6 +314,19 @@ def usual_assumptions(
             differs[:, sensor] = ~np.isin(table[:, sensor], usual)
         same &= ~differs.any(axis=1)
     return same
+
+
+def lending(models: ModelSet) -> Callable[[Rows, Borrowed], Rows]:
+    """Return the function that moves copies of lenders as `sensors.lent_moves` does."""
+
+    def lend(copies: Rows, borrowed: Borrowed) -> Rows:
+        moved = lent_moves(copies.key, np.arange(len(copies)), borrowed.key)
+        each = zip(copies.blocks, models.parts)
+        return copies.replace(
+            blocks=tuple(bank.move_along(b, part.outputs[2:4], moved) for b, part in each)
+        )
+
+    return lend
 
 
 def least_scale(key: dict[str, np.ndarray]) -> FloatArray:
