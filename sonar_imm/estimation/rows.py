@@ -67,6 +67,9 @@ class Rows:
     """(N,) row of the previous table; -1 for none."""
     key: dict[str, np.ndarray] = field(factory=dict)
     """Assumptions of each row by name, (N,) each."""
+    tail: int = 0
+    """Number of last components that belong to an assumption: they are nil in rows without it, and
+    they are absent where no row has it."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -100,6 +103,7 @@ class Rows:
             self.target[rows],
             np.asarray(rows, np.int64),
             {name: column[rows] for name, column in self.key.items()},
+            self.tail,
         )
 
     def select_targets(self, kept: BoolArray) -> Rows:
@@ -118,9 +122,10 @@ class Rows:
         """
         if set(new.key) != set(self.key):
             raise ValueError(f'rows with {sorted(new.key)} do not fit {sorted(self.key)}')
+        tail = max(self.tail, new.tail)
         blocks = tuple(
             Gaussians(*(np.concatenate(parts) for parts in zip(ours, theirs)))
-            for ours, theirs in zip(self.blocks, new.blocks)
+            for ours, theirs in zip(self.with_tail(tail).blocks, new.with_tail(tail).blocks)
         )
         both = Rows(
             blocks,
@@ -129,11 +134,26 @@ class Rows:
             np.concatenate([self.target, new.target]),
             np.concatenate([self.parent, new.parent]),
             {name: np.concatenate([self.key[name], new.key[name]]) for name in self.key},
+            tail,
         )
         if (np.diff(both.target) >= 0).all():
             return both
         order = np.argsort(both.target, kind='stable')
         return evolve(both.select(order), parent=both.parent[order])
+
+    def with_tail(self, tail: int) -> Rows:
+        """Return the rows with `tail` last components, none of them or new ones, which are nil."""
+        if tail == self.tail:
+            return self
+        blocks = []
+        for x, P in self.blocks:
+            kept = x.shape[1] - self.tail
+            x, P = x[:, :kept], P[:, :kept, :kept]
+            if tail:
+                x = np.pad(x, ((0, 0), (0, tail), (0, 0)))
+                P = np.pad(P, ((0, 0), (0, tail), (0, tail), (0, 0)))
+            blocks.append(Gaussians(x, P))
+        return evolve(self, blocks=tuple(blocks), tail=tail)
 
     def replace_target(self, target: int, new: Rows) -> Rows:
         """Replace all rows of one target by `new`, without parents."""
@@ -169,6 +189,10 @@ class Rows:
         d = mean - centre[self.target]
         spread = covariance + d[:, :, None] * d[:, None]
         return centre, np.add.reduceat(w[..., None] * spread, first)
+
+    def total(self, values: FloatArray, targets: int) -> FloatArray:
+        """Return the sum (T,) of `values` (N,) over the rows of each of `targets` targets."""
+        return np.bincount(self.target, values, minlength=targets).astype(np.float64)
 
     def model_probabilities(self) -> FloatArray:
         """Return the model probabilities (T, M) of each target over all its rows."""

@@ -35,7 +35,7 @@ Source: docs/diver.md, 'Association'.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import math
 from typing import Any
 
@@ -44,7 +44,6 @@ import numpy as np
 from ...estimation import bank, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
-from ...estimation.bank import Innovations
 from ...estimation.rows import (
     Borrowed,
     drop_weightless_rows,
@@ -57,8 +56,9 @@ from ...estimation.rows import (
     Rows,
 )
 from ...measurements import NOBODY
+from . import bursts
 from .innovations import FixConsistency, whiten_innovations
-from .known import Feature, Known, repair_covariances, row_outputs
+from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
@@ -119,8 +119,7 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
     among = Assumptions.from_rows(known.rows, known.borrowed)
-    blocks, parts = known.rows.blocks, models.parts
-    expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
+    expected = _predict_fixes(known, group, models)
     by_nis = models.families is None
     each = [
         _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
@@ -128,7 +127,8 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     ]
     if len(each) == 1:
         assumption, fix, log, whole, nis = each[0]
-        return Pairs(among, assumption, fix, expected, log, whole, nis)
+        pairs = Pairs(among, assumption, fix, expected, log, whole, nis)
+        return bursts.add_ways(known, group, pairs, models) if has_ways(group, models) else pairs
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
@@ -139,6 +139,28 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
         np.concatenate(whole),
         np.concatenate(nis) if by_nis else None,
     )
+
+
+def _predict_fixes(
+    known: Known, group: Group, models: ModelSet
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return `Pairs.expected`."""
+    rows = known.rows
+    factor = bursts.offset_factor(rows, known.memory['sensors'].number(group.sensor))
+    if factor is None:
+        return [bank.predict_fix(b, p.measured) for b, p in zip(rows.blocks, models.parts)]
+    both = [
+        [bank.predict_fix(b, p.measured, each) for each in (factor, np.zeros(len(rows)))]
+        for b, p in zip(rows.blocks, models.parts)
+    ]
+    return [(np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])) for a, b in both]
+
+
+def has_ways(group: Group, models: ModelSet) -> bool:
+    """Return whether fixes of the group may be off by an offset (`bursts`)."""
+    one = group.target_id is not None or group.config.max_tracks == 1
+    able = models.families is not None and models.height < 0
+    return one and able and group.config.burst_rate > 0.0
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -177,8 +199,9 @@ def _compare_part(
         near = known['target_id'][np.unique(among.target), None] == group.target_id
     assumption, fix = np.nonzero(near[track])
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
-    compared = tuple(bank.compare(*each, row, z[fix], scaled) for each in expected)
-    log = _mixture_log_density(rows.mu[row], compared)
+    seen = among.seen[assumption]
+    compared = tuple(bank.compare(*each, seen, z[fix], scaled) for each in expected)
+    log = bank.mixture_log_density(rows.mu[row], compared)
     table = np.square(np.maximum(off, 1.0, out=off), out=off)
     table *= -0.5 * FAR
     table[assumption, fix] = log
@@ -193,17 +216,6 @@ def _compare_part(
     return assumption + part.start, fix, log, whole, nis
 
 
-def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
-    """Return the log density (p,) of each pair over all models. mu: (p, M) model probabilities."""
-    with np.errstate(divide='ignore'):
-        of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
-        best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
-        safe = np.where(np.isfinite(best), best, 0.0)
-        return np.asarray(
-            (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
-        )
-
-
 def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
     """Return the log density of a fix z (2,), R (2, 2) under the rows of one track."""
     every, scale = np.arange(len(rows)), rows.key['scale']
@@ -212,7 +224,7 @@ def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet
         bank.weigh(block, every, *many, part.measured)
         for block, part in zip(rows.blocks, models.parts)
     ]
-    log = rows.logw + _mixture_log_density(rows.mu, compared)
+    log = rows.logw + bank.mixture_log_density(rows.mu, compared)
     return float(log_sum(log, np.zeros(len(rows), np.int64))[0])
 
 
@@ -231,9 +243,9 @@ def _box_distance(
     widest = np.array([R[:, 0, 0].max(), R[:, 1, 1].max()])
     low, high = np.full((len(among.row), 2), np.inf), np.full((len(among.row), 2), -np.inf)
     for h, S in expected:
-        spread = S[among.row][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
+        spread = S[among.seen][:, [0, 2]] + (among.scale[:, None] * widest)[..., None]
         reach = np.sqrt(FAR * np.maximum(spread, 0.0))
-        place = h[among.row]
+        place = h[among.seen]
         low = np.minimum(low, (place - reach).min(axis=2))
         high = np.maximum(high, (place + reach).max(axis=2))
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-300)
@@ -287,10 +299,20 @@ def associate_by_id(known: Known, group: Group, pairs: Pairs) -> Association:
     own = known['target_id'][:, None] == group.target_id
     good = own & np.isfinite(pairs.track_log)
     if pairs.nis is None:
-        good &= pairs.track_log > gate_log_density(group)
+        good &= (pairs.track_log > gate_log_density(group)) | (pairs.direct < 1.0)
     fix = np.where(good.any(axis=1), good.argmax(axis=1) if D else -1, -1)
     free = ~own.any(axis=0)
-    return Association(*_hard_association(fix, D), fix, free, None, known['score'])
+    hard = _hard_association(fix, D)
+    fix = _direct_hits(fix, pairs)
+    return Association(*hard, fix, free, None, known['score'], direct=pairs.direct)
+
+
+def _direct_hits(fix: IntArray, pairs: Pairs) -> IntArray:
+    """Return `fix` (T,) with -1 for fixes that are rather outliers or begin an offset."""
+    if pairs.ways is None or not pairs.ways.direct.shape[1]:
+        return fix
+    direct = pairs.ways.direct[np.arange(len(fix)), fix] > 0.5
+    return np.where(direct, fix, -1)
 
 
 def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
@@ -299,7 +321,8 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     T, D = pairs.track_log.shape
     seen, p = group.detection, group.config.detection_probability
     ratio = 0.0 if seen is None else seen.log_ratio
-    fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
+    may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
+    fit = np.where(may, pairs.track_log + ratio, -np.inf)
     fix = assign_fits(fit, known.life.status == TENTATIVE, p, group.clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
@@ -307,7 +330,9 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(group.clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
-    return Association(*_hard_association(fix, D), fix, free, None, score)
+    hard = _hard_association(fix, D)
+    fix = _direct_hits(fix, pairs)
+    return Association(*hard, fix, free, None, score, direct=pairs.direct)
 
 
 def _hard_association(fix: IntArray, D: int) -> tuple[FloatArray, FloatArray]:
@@ -322,7 +347,7 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     """Compute the probabilities of all joint events of tracks and fixes."""
     T, D = pairs.track_log.shape
     config, status, seen = group.config, known.life.status, group.detection
-    may = gate_pairs(group, pairs)
+    may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
     # With max_tracks confirmed tracks, no fix is attributed to a new target.
     full = int((status != TENTATIVE).sum()) >= config.max_tracks
     ratio = np.exp(pairs.track_log) / (group.clutter + (0.0 if full else group.birth_density))
@@ -336,12 +361,17 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
     before = np.where(np.isnan(before), guess, before)
     beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
+    if D == 1 and pairs.ways is not None and (whole := pairs.ways.direct[:, 0] < 1.0).any():
+        # The rows themselves weigh that the fix of a single target is an outlier.
+        beta[:, 0], missed = np.where(whole, before, 0.0), np.where(whole, 0.0, missed)
+        after = np.where(whole, before, after)
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
+    fix = _direct_hits(fix, pairs)
     claimed = beta.sum(axis=0)
     birth = group.birth_density / (group.birth_density + group.clutter) * (1.0 - claimed)
     score = jipda.log_odds(after)
-    return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
+    return Association(beta, missed, fix, claimed < 0.5, birth, score, True, pairs.direct)
 
 
 # -- update --------------------------------------------------------------------------------------
@@ -356,7 +386,7 @@ def update_stage(
     def update(known: Known, group: Group) -> Known:
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
-        known = _record_innovations(known, group, association, models)
+        known = _record_innovations(known, group, pairs, association, models)
         columns = {'score': association.score}
         if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
@@ -389,7 +419,12 @@ def update_tracks(
     assumption, weight = pairs.assumption[used], weight[used]
     whole = pairs.track_log[track[used], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    rows, borrowed = _update_weights(known, among, missed[among.target] + gain)
+    share = association.beta / exists[:, None]
+    sensor = known.memory['sensors'].number(group.sensor)
+    rows, borrowed, of_ways = _update_weights(known, pairs, missed[among.target] + gain, share)
+    began = None
+    if pairs.ways is not None:
+        began = bursts.begin_rows(known, group, pairs.ways, of_ways, models, estimated)
     rows, borrowed, left = drop_weightless_rows(rows, borrowed, 'scale', _protected_rows(rows))
     # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
@@ -400,32 +435,66 @@ def update_tracks(
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
     blocks, factors = [], []
+    offset = bursts.offset_factor(rows, sensor)
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
-        innovations = bank.compare(*expected, among.row[assumption], z, R)
+        innovations = bank.compare(*expected, among.seen[assumption], z, R)
         ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
-        block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
+        mask = bursts.with_tail_mask(mask, rows.tail)
+        block, of_models = bank.update(
+            block, innovations, row, ratio, none, part.measured, mask, offset
+        )
         blocks.append(block)
-        factors.append(factor)
-    sound, repairs = repair_covariances(tuple(blocks))
+        factors.append(of_models)
+    sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
     rows, borrowed = restore_rows(rows, borrowed, 'scale', _can_restore(rows, borrowed))
+    took = association.beta.sum(axis=1) > 0.5 * exists
+    rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
+    if began is not None or rows.tail:
+        rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
-def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
-    """Multiply the weights of all assumptions by `factor` (A,).
+def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows, Borrowed]:
+    """Add new rows of offsets, and remove rows of negligible weight.
 
     Return the rows and the borrowed list.
     """
+    rows = bursts.merge_rows(rows if began is None else rows.append(began))
+    rows, borrowed = bursts.drop_rows(rows, borrowed, _protected_rows(rows))
+    return bursts.without_unused_tail(rows), borrowed
+
+
+def _update_weights(
+    known: Known, pairs: Pairs, factor: FloatArray, beta: FloatArray
+) -> tuple[Rows, Borrowed, FloatArray]:
+    """Multiply the weights of all assumptions by `factor` (A,).
+
+    Return the rows, the borrowed list, and the log weights (E,) of the rows that ways lead to.
+
+    :param beta: (T, D) probability of each pair, if the target exists.
+    """
+    among, ways, of_ways = pairs.among, pairs.ways, np.empty(0)
     with np.errstate(divide='ignore'):
         logw = among.logw + np.log(factor)
-    logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
+        every, target = logw, among.target
+        if ways is not None:
+            track = known.rows.target[ways.row]
+            of_ways = known.rows.logw[ways.row] + ways.log - pairs.track_log[track, ways.fix]
+            of_ways = of_ways + np.log(beta[track, ways.fix])
+            target = np.concatenate([target, track])
+            order = np.argsort(target, kind='stable')
+            every, target = np.concatenate([every, of_ways])[order], target[order]
+    total = log_sum(every, target)
+    logw = np.maximum(logw - total[among.target], LEAST_LOG)
+    if ways is not None:
+        of_ways = of_ways - total[track]
     rows, borrowed = known.rows, known.borrowed
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
-    return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list)
+    return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list), of_ways
 
 
 def _protected_rows(rows: Rows) -> BoolArray:
@@ -480,11 +549,24 @@ def redistribute_weights(known: Known) -> Known:
     target = np.concatenate([rows.target, borrowed.target])
     scale = np.concatenate([rows.key['scale'], borrowed.key])
     weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
-    group = 2 * target + (scale >= MIN_PUBLISHED_SCALE)
-    total = np.bincount(group, weight, minlength=2 * len(known))
-    size = np.bincount(group, minlength=2 * len(known))
-    groups = (size.reshape(-1, 2) > 0).sum(axis=1)[target]
-    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + REDISTRIBUTED_FRACTION / groups
+    # Rows with the same offset share their weight.
+    since, aside = (
+        np.concatenate([rows.key[name], np.zeros(len(borrowed), rows.key[name].dtype)])
+        for name in ('since', 'aside')
+    )
+    assumed = np.stack([target, since, aside], axis=1)
+    table, place = np.unique(assumed, axis=0, return_inverse=True)
+    place = place.ravel()
+    group = 2 * place + (scale >= MIN_PUBLISHED_SCALE)
+    count = 2 * (int(place.max(initial=-1)) + 1)
+    total = np.bincount(group, weight, minlength=count)
+    size = np.bincount(group, minlength=count)
+    groups = (size.reshape(-1, 2) > 0).sum(axis=1)[place]
+    whole = np.bincount(place, weight)[place]
+    divided = np.bincount(table[:, 0], minlength=len(known)) > 1
+    whole = np.where(divided[target], whole, 1.0)
+    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group]
+    after = after + whole * REDISTRIBUTED_FRACTION / groups
     logw = np.log(
         after
         * (
@@ -500,17 +582,16 @@ def redistribute_weights(known: Known) -> Known:
 
 
 def _record_innovations(
-    known: Known, group: Group, association: Association, models: ModelSet
+    known: Known, group: Group, pairs: Pairs, association: Association, models: ModelSet
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
     fix = association.fix[tracks]
-    seen = tuple(part.fix_matrix for part in models.parts)
-    mean, covariance = known.rows.combine(
-        *row_outputs(known.rows, seen), weight_without_small_scales(known.rows)
-    )
+    count = len(known.rows)
+    seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
+    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
     scale = (
         estimated_scales(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
     )

@@ -90,6 +90,25 @@ SPEED_MEMORY = 60.0
 for minutes is estimated as slowly swimming, also when it moves on."""
 
 
+NO_OFFSET: dict[str, int | bool] = {
+    'offset': -1,
+    'since': 0,
+    'took': 0,
+    'taken': 1,
+    'fixes': 0,
+    'others': 0,
+    'aside': False,
+    'link': 0,
+}
+"""Assumptions of a new row about offsets (`bursts`).
+
+offset: number of the sensor whose fixes are off, -1 for none; since: stamp of the first of them;
+took: stamp of the last fix that the row used, 0 for none; taken: number of fixes before;
+fixes: number of fixes of the sensor since; others: of other sensors; aside: whether its last fix
+was an outlier; link: ID of the track that the row excludes, 0 for none.
+"""
+
+
 class Families(NamedTuple):
     """Properties of models with unequal states."""
 
@@ -261,7 +280,11 @@ class ModelSet:
             logw.reshape(T * K),
             np.repeat(np.arange(T), K),
             np.full(T * K, -1),
-            {'scale': np.tile(scale, T), 'start': np.tile(start, T)},
+            {
+                'scale': np.tile(scale, T),
+                'start': np.tile(start, T),
+                **{name: np.full(T * K, value) for name, value in NO_OFFSET.items()},
+            },
         )
 
     def to_blocks(self, x: FloatArray, P: FloatArray) -> tuple[Gaussians, ...]:

@@ -29,6 +29,8 @@ class Assumptions(NamedTuple):
 
     row: IndexArray
     """(A,) row whose states are used."""
+    seen: IndexArray
+    """(A,) index of its prediction in `Pairs.expected`."""
     scale: FloatArray
     """(A,) scale of the covariances."""
     logw: FloatArray
@@ -43,16 +45,43 @@ class Assumptions(NamedTuple):
         """Return the assumptions of rows and of the borrowed list."""
         N, scale = len(rows), rows.key['scale']
         if not len(borrowed):
-            return cls(np.arange(N), scale, rows.logw, rows.target, np.ones(N, np.bool_))
+            every = np.arange(N)
+            return cls(every, every, scale, rows.logw, rows.target, np.ones(N, np.bool_))
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
+        lender = borrowed.find_lenders(rows, 'scale')
+        # A borrowed scale has no offset.
+        nil = N if rows.tail else 0
         return cls(
-            np.concatenate([np.arange(N), borrowed.find_lenders(rows, 'scale')])[order],
+            np.concatenate([np.arange(N), lender])[order],
+            np.concatenate([np.arange(N), lender + nil])[order],
             np.concatenate([scale, borrowed.key])[order],
             np.concatenate([rows.logw, borrowed.logw])[order],
             target[order],
             order < N,
         )
+
+
+OPEN, NOBODYS, LEAVE = range(3)
+"""Ways of a fix: an offset begins, the fix is an outlier, an offset ends."""
+
+
+class Ways(NamedTuple):
+    """Further ways in which E pairs of a row and a fix are read, see `bursts`."""
+
+    row: IndexArray
+    """(E,) index of the row."""
+    fix: IndexArray
+    """(E,) index of the fix."""
+    way: IntArray
+    """(E,) `OPEN`, `NOBODYS` or `LEAVE`."""
+    variance: FloatArray
+    """(E,) variance of a new offset, m^2."""
+    log: FloatArray
+    """(E,) log density of the fix in this way, with the log prior of the way."""
+    direct: FloatArray
+    """(T, D) share of the density of a fix under a track that has the fix at the target, or at the
+    offset it had."""
 
 
 class Pairs(NamedTuple):
@@ -64,13 +93,22 @@ class Pairs(NamedTuple):
     fix: IndexArray
     """(p,) index of the fix."""
     expected: list[tuple[FloatArray, FloatArray]]
-    """Prediction of a fix by each row, for each block of models: see `bank.predict_fix`."""
+    """Prediction of a fix by each row, for each block of models: see `bank.predict_fix`. Where
+    rows have offsets, N predictions with the offset precede N predictions without."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray
     """(T, D) log density of each fix under each track."""
     nis: FloatArray | None
     """(T, D) smallest NIS of any model; None for density gating."""
+    ways: Ways | None = None
+    """Further ways of the fixes; None for none."""
+
+    @property
+    def direct(self) -> FloatArray | float:
+        """Return the share (T, D) of the density that has the fix at the target, or at the offset
+        it had."""
+        return 1.0 if self.ways is None else self.ways.direct
 
 
 class Association(NamedTuple):
@@ -90,6 +128,8 @@ class Association(NamedTuple):
     """(T,) new score of each track."""
     is_joint: bool = False
     """True if existence follows from the probabilities."""
+    direct: FloatArray | float = 1.0
+    """(T, D) see `Ways`."""
 
     @property
     def hit(self) -> BoolArray:
@@ -98,8 +138,13 @@ class Association(NamedTuple):
 
     @property
     def claimed(self) -> FloatArray:
-        """(D,) probability that the fix belongs to any track."""
-        return np.asarray(self.beta.sum(axis=0))
+        """(D,) probability that the fix is at any track, or at the offset it had."""
+        return np.asarray((self.beta * self.direct).sum(axis=0))
+
+    @property
+    def taken(self) -> BoolArray:
+        """(T,) True if the rows of a track have taken a fix in any way."""
+        return np.asarray(self.beta.sum(axis=1) > 0.5 * self.exists)
 
     @property
     def exists(self) -> FloatArray:

@@ -78,7 +78,7 @@ def restart_lost_tracks(
     assert association is not None and group.pairs is not None
     if not len(known):
         return known, False
-    hit, firm = association.hit, known.life.status != TENTATIVE
+    hit, firm = association.hit | association.taken, known.life.status != TENTATIVE
     left = association.beta[firm].sum(axis=0) < 0.5
     if association.is_joint and seen is not None:
         hit = hit | ~seen.is_outside

@@ -53,6 +53,7 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
     births,
+    bursts,
     clutter,
     coverage,
     depth,
@@ -71,6 +72,7 @@ from .instruments import Instruments, Layout
 from .known import Feature, Known, predict_over
 from .models import build_models, ModelSet
 from .scan import Group, Scan
+from .sensors import Sensors
 
 __all__ = ['DiverConfig', 'DiverTracker', 'Known']
 
@@ -126,12 +128,14 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            hear_sensor,
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
             self._associate,
             models.families
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
+            models.families and bursts.jump,
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
             covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
@@ -171,6 +175,7 @@ class DiverTracker:
             instruments=Instruments(),
             clutter=clutter.Clutters(),
             last_named=names.LastNamed(),
+            sensors=Sensors(),
         )
 
     def restored(self) -> None:
@@ -264,6 +269,7 @@ class DiverTracker:
         """Update the tracks by a ping, and store the births it shows."""
         from . import arrivals  # imported late: not needed for fixes
 
+        known = known.replace(rows=bursts.without_offsets(known.rows))
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
@@ -300,6 +306,12 @@ class DiverTracker:
 def select_stages(*stages: object) -> tuple:
     """Return the stages that are enabled, without False and None."""
     return tuple(stage for stage in stages if stage)
+
+
+def hear_sensor(known: Known, group: Group) -> Known:
+    """Number the sensor of the fixes. A stage of the tracker."""
+    sensors = known.memory['sensors'].with_sensor(group.sensor)
+    return known if sensors is known.memory['sensors'] else known.with_memory(sensors=sensors)
 
 
 def rotation_stage(

@@ -1,0 +1,39 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Sensors heard so far. Rows of a track name sensors by number (`Rows.key`)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+MOST_SENSORS = 20
+"""Maximum number of numbered sensors; all later ones share the last number."""
+
+
+class Sensors(NamedTuple):
+    """Names of the sensors of fixes, in order of appearance."""
+
+    names: tuple[str, ...] = ()
+
+    def with_sensor(self, name: str) -> Sensors:
+        """Return the sensors with `name` among them."""
+        if name in self.names or len(self.names) >= MOST_SENSORS:
+            return self
+        return Sensors((*self.names, name))
+
+    def number(self, name: str) -> int:
+        """Return the number of a sensor that was heard."""
+        return self.names.index(name) if name in self.names else MOST_SENSORS - 1
