@@ -48,6 +48,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.bank import Gaussians
 from ...estimation.rows import Borrowed, LEAST_LOG, log_sum, ROW_LOST, Rows
 from ...measurements import NOBODY
+from .config import DiverConfig
 from .known import Known, repair_covariances, row_outputs
 from .models import ModelSet, NO_OFFSET
 from .pairs import LEAVE, NOBODYS, OPEN, Pairs, Ways
@@ -192,11 +193,24 @@ def _reach(known: Known, group: Group, models: ModelSet, row: IndexArray) -> Flo
     config, rows = group.config, known.rows
     if len(known.memory['sensors'].names) > 1:
         return np.zeros(len(row))
-    velocity, _ = row_outputs(rows.select(row), tuple(part.outputs[2:4] for part in models.parts))
-    speed = config.speed_mean + 3.0 * config.speed_std + np.hypot(*velocity.T)
+    outputs = tuple(part.outputs[velocity_outputs(models)] for part in models.parts)
+    velocity, _ = row_outputs(rows.select(row), outputs)
+    speed = fastest_speed(velocity, config)
     took = np.maximum(rows.key['took'], 0)[row]
     took = np.where(took > 0, took, known.life.last_hit_ns[rows.target[row]])
     return np.asarray(speed * (known.stamp_ns - took) * 1e-9)
+
+
+def velocity_outputs(models: ModelSet) -> slice:
+    """Return the outputs that are the horizontal velocity."""
+    return slice(2, 4) if models.height < 0 else slice(3, 5)
+
+
+def fastest_speed(velocity: FloatArray, config: DiverConfig) -> FloatArray:
+    """Return the highest speed (...,), m/s, of a target with `velocity` (..., 2): it may turn
+    round."""
+    moving = np.hypot(velocity[..., 0], velocity[..., 1])
+    return np.asarray(config.speed_mean + 3.0 * config.speed_std + moving)
 
 
 def _is_far(

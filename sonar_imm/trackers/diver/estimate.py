@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, bursts, clutter, depth, offsets
+from . import births, burst_reports, bursts, clutter, depth, offsets
 from .config import DiverConfig
 from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known
@@ -141,6 +141,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     exceeds = memory['excess'] >= ENOUGH
     return [
         *memory['fixes'].warnings(config.fix_bias_std > 0.0),
+        *burst_reports.warnings(known, config),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),

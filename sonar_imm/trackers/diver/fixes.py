@@ -98,6 +98,9 @@ MIN_DETECTION_PROBABILITY = 1e-9
 """Lower bound of the detection probability of a track outside the coverage, because ratios are
 divided by it."""
 
+SURELY = 1e3
+"""Log density of a pair that is chosen."""
+
 CONFIRM_EXISTENCE = 0.9
 """Existence above which a track can be confirmed."""
 
@@ -159,8 +162,7 @@ def _predict_fixes(
 def has_ways(group: Group, models: ModelSet) -> bool:
     """Return whether fixes of the group may be off by an offset (`bursts`)."""
     one = group.target_id is not None or group.config.max_tracks == 1
-    able = models.families is not None and models.height < 0
-    return one and able and group.config.burst_rate > 0.0
+    return one and models.families is not None and group.config.burst_rate > 0.0
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -307,6 +309,14 @@ def associate_by_id(known: Known, group: Group, pairs: Pairs) -> Association:
     return Association(*hard, fix, free, None, known['score'], direct=pairs.direct)
 
 
+def _held(pairs: Pairs) -> BoolArray:
+    """Return which tracks (T,) hold the only fix: their rows weigh themselves that it is an
+    outlier."""
+    if pairs.ways is None:
+        return np.zeros(len(pairs.track_log), np.bool_)
+    return np.asarray(pairs.ways.direct[:, 0] < 1.0)
+
+
 def _direct_hits(fix: IntArray, pairs: Pairs) -> IntArray:
     """Return `fix` (T,) with -1 for fixes that are rather outliers or begin an offset."""
     if pairs.ways is None or not pairs.ways.direct.shape[1]:
@@ -323,7 +333,10 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     ratio = 0.0 if seen is None else seen.log_ratio
     may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
     fit = np.where(may, pairs.track_log + ratio, -np.inf)
-    fix = assign_fits(fit, known.life.status == TENTATIVE, p, group.clutter)
+    chosen = fit
+    if D == 1:
+        chosen = np.where(_held(pairs)[:, None], SURELY, fit)
+    fix = assign_fits(chosen, known.life.status == TENTATIVE, p, group.clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
     score = known['score'] + missed
@@ -361,10 +374,9 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
     before = np.where(np.isnan(before), guess, before)
     beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
-    if D == 1 and pairs.ways is not None and (whole := pairs.ways.direct[:, 0] < 1.0).any():
-        # The rows themselves weigh that the fix of a single target is an outlier.
-        beta[:, 0], missed = np.where(whole, before, 0.0), np.where(whole, 0.0, missed)
-        after = np.where(whole, before, after)
+    if D == 1 and (held := _held(pairs)).any():
+        beta[:, 0], missed = np.where(held, before, 0.0), np.where(held, 0.0, missed)
+        after = np.where(held, before, after)
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
     fix = _direct_hits(fix, pairs)
@@ -506,6 +518,7 @@ def _protected_rows(rows: Rows) -> BoolArray:
     first, scale = rows.first, rows.key['scale']
     # A start depth is a state: all rows of such a track are kept, also the first.
     protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published

@@ -53,6 +53,7 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
     births,
+    burst_reports,
     bursts,
     clutter,
     coverage,
@@ -124,6 +125,7 @@ class DiverTracker:
             **pruning.FEATURES,
             **coverage.FEATURES,
             **depth.FEATURES,
+            **burst_reports.FEATURES,
             'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
         turn = config.bearing_bias_std_deg > 0.0
@@ -144,6 +146,7 @@ class DiverTracker:
         )
         self._scan_stages: tuple[ScanStage, ...] = select_stages(
             self._update_transitions,
+            models.families and burst_reports.count_bursts,
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
@@ -176,6 +179,7 @@ class DiverTracker:
             clutter=clutter.Clutters(),
             last_named=names.LastNamed(),
             sensors=Sensors(),
+            bursts=burst_reports.BurstCounts(),
         )
 
     def restored(self) -> None:
