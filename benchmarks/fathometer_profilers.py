@@ -56,7 +56,8 @@ from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, sum
 from sonar_imm_tools.evaluation.fathometer.records import records_of
 from sonar_imm_tools.evaluation.fathometer.scoring import pair
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.convert.segy import arrival_edges, first_arrivals, read_segy
+from sonar_imm_tools.recordings.convert.segy import arrival_edges, first_arrivals
+from sonar_imm_tools.recordings.segy_lines import read_segy
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'

@@ -150,6 +150,7 @@ def pressure(folder: Path) -> dict[str, float]:
     config = FathometerConfig(
         phones=16,
         element_spacing=float(v['element_spacing']),
+        phone_correction='off',
         noise_depth_min=0.0,
         noise_depth_max=0.0,
         **settings,

@@ -41,7 +41,7 @@ from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geodesy import NEAR_ZERO, Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import (
@@ -423,10 +423,13 @@ def _read(message: Any, kind: type[GeodeticFix]) -> Any:
     if status is not None and int(status.status) < FIX:
         raise Rejection('no_fix', 'the receiver says that it has no fix')
     point = _point(message)
+    latitude, longitude = float(point.latitude), float(point.longitude)
+    if max(abs(latitude), abs(longitude)) < NEAR_ZERO:
+        raise Rejection('no_fix', 'latitude 0, longitude 0 is what receivers without a fix say')
     return kind(
         **head_of(message),
-        latitude=float(point.latitude),
-        longitude=float(point.longitude),
+        latitude=latitude,
+        longitude=longitude,
         height=float(point.altitude) if np.isfinite(point.altitude) else float('nan'),
         covariance=_on_earth(message),
     )
@@ -445,8 +448,11 @@ def _on_earth(message: Any) -> np.ndarray | None:
     covariance = square(values, n, 'covariance')[:3, :3]
     if kind == DIAGONAL:
         covariance = np.diag(np.diag(covariance))
-    if not covariance.any() or (np.diag(covariance) < 0.0).any():
+    usable = np.isfinite(covariance[:2, :2]).all() and (np.diag(covariance) >= 0.0)[:2].all()
+    if not usable or not covariance.any():
         return None
+    if not np.isfinite(covariance[2]).all() or covariance[2, 2] < 0.0:
+        covariance[2] = covariance[:, 2] = 0.0
     if not covariance[2].any():  # no height: say so, rather than that it is certain
         covariance = covariance + np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
     if (np.abs(covariance) <= MOST_VARIANCE).all():

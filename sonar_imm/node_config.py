@@ -57,6 +57,9 @@ class NodeConfig(Config):
         '`ros2 lifecycle set` does')
     stale_after: float = live(10.0, 's',
         'time after which diagnostics call an input stale', range=(0.01, 1e6))
+    max_age: float = live(0.0, 's',
+        'age of the newest estimate above which diagnostics warn; 0: one second, or three periods '
+        'of the estimates, whichever is longer', range=(0.0, 1e6))
     state_file: str = parameter('', '',
         'file that keeps the state of the tracker, so that a node started again continues its '
         'tracks; empty: none')

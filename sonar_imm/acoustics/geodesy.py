@@ -27,6 +27,9 @@ import numpy as np
 
 from ..estimation.arrays import FloatArray
 
+NEAR_ZERO = 1e-4
+"""Degrees; both of a position below it are the place of receivers without a fix."""
+
 
 @frozen
 class Origin:

@@ -82,7 +82,7 @@ def linked_marginals(
         weight = np.exp(np.array(log) - max(log))
         weight = weight / weight.sum()
         held[np.flatnonzero(label == first)] = 0.0
-        for share, (chosen, absent, its_pair, its_none) in zip(weight.tolist(), found):
+        for share, (chosen, _, its_pair, its_none) in zip(weight.tolist(), found):
             pair[chosen] += share * its_pair
             none[chosen] += share * its_none
             held[target[chosen]] += share

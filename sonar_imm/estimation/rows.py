@@ -22,15 +22,16 @@ Rows are added and removed at run time. `Rows.key` names the assumptions of each
 the row of the previous table that a row came from, for smoothing.
 
 *Borrowing.* A covariance scale changes the future of a filter, not its current state. So a row of
-an improbable scale is removed, and its weight is kept in a list (`Borrowed`) and updated from
-another row of the target. When the scale becomes probable again, it gets a copy of that row. Other
-assumptions cannot borrow: a start depth is the state itself.
+an improbable scale is removed, and its weight is kept in a list (`Borrowed`) and updated from the
+heaviest row of the target. When the scale becomes probable again, it gets a copy of that row.
+Other assumptions cannot borrow: a start depth is the state itself.
 
 Arrays are never changed in place, because tables of earlier scans share them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -42,6 +43,7 @@ from .bank import Gaussians
 
 __all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
 
+NOTHING: Mapping[str, Any] = {}
 LEAST_LOG = -345.0
 """Minimum logarithm of a row weight, 1e-150, so that a row can recover."""
 
@@ -246,70 +248,86 @@ class Borrowed:
 
     target: Annotated[IntArray, 'b']
     """(B,) target index."""
-    key: Annotated[FloatArray, 'b']
-    """(B,) value of the assumption."""
+    key: dict[str, np.ndarray]
+    """Assumptions by name, (B,) each: those of `Rows.key` that can borrow."""
     logw: Annotated[FloatArray, 'b']
     """(B,) logarithms of the weights."""
 
     @classmethod
-    def empty(cls) -> Borrowed:
-        """Return an empty list."""
-        return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    def from_rows(cls, rows: Rows, names: Iterable[str]) -> Borrowed:
+        """Return the assumptions `names` of rows."""
+        return cls(rows.target, {name: rows.key[name] for name in names}, rows.logw)
 
     def __len__(self) -> int:
         return len(self.target)
 
+    def select(self, chosen: IndexArray | BoolArray) -> Borrowed:
+        """Return the `chosen` assumptions."""
+        key = {name: column[chosen] for name, column in self.key.items()}
+        return Borrowed(self.target[chosen], key, self.logw[chosen])
+
+    def append(self, new: Borrowed) -> Borrowed:
+        """Append assumptions."""
+        return Borrowed(
+            np.concatenate([self.target, new.target]),
+            {name: np.concatenate([own, new.key[name]]) for name, own in self.key.items()},
+            np.concatenate([self.logw, new.logw]),
+        )
+
     def select_targets(self, kept: BoolArray) -> Borrowed:
         """Return the assumptions of the targets selected by `kept` (T,), renumbered."""
-        own = kept[self.target]
-        return Borrowed((np.cumsum(kept) - 1)[self.target[own]], self.key[own], self.logw[own])
+        left = self.select(kept[self.target])
+        return evolve(left, target=(np.cumsum(kept) - 1)[left.target])
 
     def without_target(self, target: int) -> Borrowed:
         """Return the assumptions of all other targets."""
-        other = self.target != target
-        return Borrowed(self.target[other], self.key[other], self.logw[other])
+        return self.select(self.target != target)
 
-    def find_lenders(self, rows: Rows, name: str) -> IndexArray:
-        """Return the row (B,) that each assumption borrows: the nearest by the logarithm of the
-        key `name`, the heavier of two."""
+    def find_lenders(self, rows: Rows) -> IndexArray:
+        """Return the row (B,) that each assumption borrows: the heaviest of its target.
+
+        A scale changes the future of a filter. So the lender need not be near in scale: its state
+        must fit the target.
+        """
         if not len(self):
             return np.empty(0, np.intp)
-        apart = np.abs(np.log(rows.key[name]) - np.log(self.key)[:, None])
-        apart = np.where(rows.target == self.target[:, None], apart - 1e-9 * rows.logw, np.inf)
-        return np.asarray(apart.argmin(axis=1))
+        heaviest = np.maximum.reduceat(rows.logw, rows.first)[rows.target] == rows.logw
+        lenders, first = np.unique(rows.target[heaviest], return_index=True)
+        return np.asarray(np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]])
 
 
 def drop_weightless_rows(
-    rows: Rows, borrowed: Borrowed, name: str, stays: BoolArray
+    rows: Rows, borrowed: Borrowed, stays: BoolArray
 ) -> tuple[Rows, Borrowed, IndexArray]:
     """Move rows of negligible weight to the borrowed list, except rows that `stays` (N,).
 
-    :param name: key that can borrow.
     :returns: the rows, the list, and the indices of the remaining rows.
     """
     lost = (rows.logw < np.log(ROW_LOST)) & ~stays
     left = np.flatnonzero(~lost)
     if len(left) == len(rows):
         return rows, borrowed, left
-    target = np.concatenate([borrowed.target, rows.target[lost]])
-    key = np.concatenate([borrowed.key, rows.key[name][lost]])
-    new = Borrowed(target, key, np.concatenate([borrowed.logw, rows.logw[lost]]))
-    return evolve(rows.select(left), parent=rows.parent[left]), new, left
+    gone = Borrowed.from_rows(rows.select(np.flatnonzero(lost)), borrowed.key)
+    return (
+        evolve(rows.select(left), parent=rows.parent[left]),
+        borrowed.append(gone),
+        left,
+    )
 
 
 def restore_rows(
-    rows: Rows, borrowed: Borrowed, name: str, again: BoolArray
+    rows: Rows, borrowed: Borrowed, again: BoolArray, without: Mapping[str, Any] = NOTHING
 ) -> tuple[Rows, Borrowed]:
     """Give the assumptions `again` (B,) a row, a copy of their lender.
 
-    Return the rows and the list.
+    The copy has no tail, and the values `without` of other assumptions. Return the rows and the
+    list.
     """
     if not again.any():
         return rows, borrowed
-    back, waiting = (
-        Borrowed(borrowed.target[own], borrowed.key[own], borrowed.logw[own])
-        for own in (again, ~again)
-    )
-    lender = back.find_lenders(rows, name)
+    back = borrowed.select(again)
+    lender = back.find_lenders(rows)
     copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
-    return rows.append(evolve(copies, key={**copies.key, name: back.key})), waiting
+    ended = {name: np.full(len(back), value) for name, value in without.items()}
+    copies = evolve(copies.with_tail(0), key={**copies.key, **ended, **back.key})
+    return rows.append(copies), borrowed.select(~again)

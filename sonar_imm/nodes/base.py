@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 import functools
+import math
 import sys
 import time
 import traceback
@@ -93,7 +94,7 @@ class BaseNode(ManagedNode):
         self._full_name = self.get_fully_qualified_name().lstrip('/')
         self._inputs: dict[str, tuple[InputTopic, str, Callable[[Any], Any]]] = {}
         self._topic_names: dict[str, str] = {}
-        self._published = 0
+        self._published = self._received_ns = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
@@ -182,6 +183,7 @@ class BaseNode(ManagedNode):
         self._meter.arrived(name, start)
         if stamp is not None:
             self._meter.stamped(name, start - (stamp.sec + 1e-9 * stamp.nanosec))
+        self._received_ns = info['received_timestamp']
         if self._waited_too_long(name, info):
             self._acknowledge(stamp)
             return
@@ -359,6 +361,7 @@ class BaseNode(ManagedNode):
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
                 stale_after=self._node_config.stale_after,
+                max_age=getattr(self._node_config, 'max_age', 0.0),
                 starting='' if self._hears else self._why_silent(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
@@ -510,7 +513,14 @@ class TrackerNode(BaseNode):
         for estimate in estimates[-wanted:]:
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
+        self._note_age(max(estimate.stamp_ns for estimate in estimates))
         self.show(estimates)
+
+    def _note_age(self, stamp_ns: int) -> None:
+        """Note how old the newest estimate is, and how long its message waited."""
+        wait = (time.time_ns() - self._received_ns) * 1e-9 if self._received_ns else math.nan
+        age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        self._meter.estimates.published(time.monotonic(), age, wait)
 
     def _doubt(self, name: str, reason: str) -> None:
         if reason not in self._meter.doubted:

@@ -36,6 +36,7 @@ from attrs import define
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
+from .ages import Ages
 from .qos import Endpoints, latched_qos, output_qos
 
 OK, WARN, ERROR, STALE = (
@@ -60,6 +61,7 @@ UNUSED_REASONS = frozenset(
     {
         'doubted',
         'full',
+        'heading_unmeasured',
         'navigation_gap',
         'navigation_missing',
         'no_origin',
@@ -94,6 +96,7 @@ class Meter:
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
         self.ages: dict[str, deque[float]] = {}
+        self.estimates = Ages()
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
     def arrived(self, topic: str, now: float) -> None:
@@ -317,6 +320,7 @@ class Reporter:
         *,
         enabled: bool,
         stale_after: float,
+        max_age: float = 0.0,
         starting: str = '',
         counts: Mapping[str, int],
         health: Mapping[str, float],
@@ -325,8 +329,9 @@ class Reporter:
         incompatible: Mapping[str, str],
         publishers: Callable[[str], int] = lambda topic: 1,
     ) -> DiagnosticArray:
-        """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; starting: why
-        no input is heard yet, or empty; publishers: how many there are of a topic."""
+        """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; max_age: see
+        `Ages.report`; starting: why no input is heard yet, or empty; publishers: how many there
+        are of a topic."""
         meter, before = self._meter, self._before
         totals = self._before = _Totals(
             now,
@@ -353,7 +358,7 @@ class Reporter:
         message.header.stamp = stamp
         message.status = [
             self._input_status(period, stale_after, lost, incompatible, publishers),
-            self._tracker_status(period, starting, counts, health, sentences),
+            self._tracker_status(period, starting, counts, health, sentences, max_age),
         ]
         return message
 
@@ -450,6 +455,7 @@ class Reporter:
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str],
+        max_age: float,
     ) -> DiagnosticStatus:
         stale, enabled, dropped = period.stale, period.enabled, period.dropped
         rate = (period.fresh + period.missing).total() / period.elapsed
@@ -457,10 +463,20 @@ class Reporter:
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
+        ages = self._meter.estimates.report(period.now, max_age)
+        values |= ages.values
         found = [Finding(_wording(warning), WARN, warning) for warning in warnings]
         if stale and enabled:
             sentence = starting or f'waiting for input: {stale[0]}'
             found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
+        if ages.slow:
+            lost = self._before.lost.total() + self._before.dropped
+            of = self._before.received.total() + self._before.lost.total()
+            share = f'; {lost:,} of {of:,} messages lost' if lost else ''
+            found.append(Finding('old', WARN, ages.slow + share, timed=True))
+        if ages.clock:
+            # OK: recordings are played, and only you can know which clock is right.
+            found.append(Finding('clock', OK, ages.clock, timed=True))
         if dropped:
             sentence = f'input comes faster than it can be processed: {dropped} messages dropped'
             found.append(Finding('dropped', WARN, sentence, at_once=True))

@@ -36,7 +36,7 @@ TRACK_FORMATS = ('gpx', 'kml', 'geojson', 'csv', 'parquet')
     epilog=example(
         'sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.tif --cell 0.5 --epsg 32632 --origin 500000,6000000',
-        'sonar-imm export out survey.xyz',
+        'sonar-imm export out survey.csv',
         'sonar-imm export out horizons.csv --epsg 32615',
         'sonar-imm export out picks.sgy --segy line.seg',
         'sonar-imm export out tracks.gpx',
@@ -82,14 +82,14 @@ def command(
     """Write the soundings, horizons or tracks of a RUN to OUT for charts and other programs.
 
     What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
-    its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
-    depth, uncertainty, label, count and what competes with the depth); they come from recordings
-    with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson (points along
-    the track), .sgy, .segy or .seg (the file given by --segy with picks in place of its samples).
-    Where the recording has no fixes by satellite, the places of horizons come from its navigation,
-    with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml, .geojson (lines and points
-    with uncertainty and model), .csv and .parquet; --crs and --origin say where they lie where the
-    run does not.
+    its standard deviation as text), .csv, .las and .laz (points with all columns), .tif (a grid
+    of depth, uncertainty, label, count and what competes with the depth); they come from
+    recordings with navigation. Horizons of the fathometer: .csv (picks by horizon), .geojson
+    (points along the track), .sgy, .segy or .seg (the file given by --segy with picks in place
+    of its samples). Where the recording has no fixes by satellite, the places of horizons come
+    from its navigation, with --crs and --origin. Tracks of divers and obstacles: .gpx, .kml,
+    .geojson (lines and points with uncertainty and model), .csv and .parquet; --crs and
+    --origin say where they lie where the run does not.
     """
     from ..offline.run_folder import RunFolder
     from ..recordings.sources import BagError
@@ -108,6 +108,8 @@ def command(
     asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
         result, text = _export_map(asked)
+    elif kind == 'csv' and asked.record['system'] == 'bathymetry':
+        result, text = _export_soundings(asked, cell)
     elif kind in TRACK_FORMATS and asked.record['system'] != 'fathometer':
         result, text = _export_tracks(asked)
     elif kind in HORIZON_FORMATS + TRACK_FORMATS:
@@ -135,7 +137,7 @@ Told = tuple[dict[str, Any], str]
 
 def _export_soundings(asked: _Asked, cell: float) -> Told:
     from ..offline.run_folder import SOUNDINGS
-    from ..recordings.export.points import read_points, write_las, write_xyz
+    from ..recordings.export.points import read_points, write_las, write_table, write_xyz
     from ..recordings.sources import BagError
     from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
     from ..survey.line import budget_of
@@ -156,6 +158,8 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
             shape = f' in {result["rows"]} by {result["columns"]} cells'
         elif asked.kind == 'xyz':
             write_xyz(unfinished, points)
+        elif asked.kind == 'csv':
+            write_table(unfinished, points)
         else:
             write_las(unfinished, points, asked.epsg)
     return result, f'{len(points)} soundings{shape}'

@@ -86,6 +86,13 @@ def _shard(
     show_default=True,
     help='Messages in the order of arrival, or sorted by their stamps.',
 )
+@click.option(
+    '--sound-speed',
+    type=click.Path(path_type=Path),
+    metavar='FILE',
+    help='Profile of sound speed (CARIS .svp, Kongsberg .asvp, Sea-Bird .cnv, CSV): rays of '
+    'bathymetry bend by it, other systems take its mean.',
+)
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
 @click.option(
     '--jobs',
@@ -124,7 +131,8 @@ def command(
 ) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
-    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
+    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`; the exit code is 1 if no
+    measurement was used. The same command writes the
     same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
     used, if there is one. --set changes single parameters.
 
@@ -153,6 +161,8 @@ def command(
         if len(runs) == 1 and scheduler is None:
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
             print_json(run) if as_json else _print(run, out_dir)
+            if not run['estimates'] and not run['counts'].get('used', 0):
+                raise click.exceptions.Exit(1)
             return
         failures: list[Outcome] = []
     else:
@@ -174,6 +184,20 @@ class Plan:
     overwrite: bool = False
     strict: bool = False
     parquet: bool = False
+    sound_speed: Path | None = None
+
+    def _overrides(self, system: System) -> dict[str, str]:
+        """Return the parameters that the options of the command set. Raises `BagError`."""
+        if self.sound_speed is None:
+            return self.overrides
+        from ..recordings.sound_speed import mean_speed, read_profile
+
+        profile = read_profile(self.sound_speed)
+        pairs = [f'{value:.3f}' for pair in zip(*profile) for value in pair]
+        water = {'sound_speed': f'{mean_speed(profile):.3f}'}
+        if any(spec.name == 'sound_speed_profile' for spec in system.config_type().specs()):
+            water = {'sound_speed_profile': f'[{", ".join(pairs)}]'}
+        return {**water, **self.overrides}
 
     def parameters_of(self, bag: Path) -> Path | OwnParameters | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
@@ -199,8 +223,9 @@ class Plan:
             for sentence in remarks_on_topics(reader, system.name, found):
                 note(sentence)
         params = self.parameters_of(bag)
-        config, node = load_config(system, params, self.overrides)
-        detector = load_detector(system, params, self.overrides)
+        overrides = self._overrides(system)
+        config, node = load_config(system, params, overrides)
+        detector = load_detector(system, params, overrides)
         several = len(found) > 1
         return [
             Job(
@@ -354,6 +379,8 @@ def _print(run: Mapping[str, Any], out_dir: Path) -> None:
         say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
     for problem in run['problems']:
         say(f'  problem: {problem}')
+    if not run['estimates'] and not run['counts'].get('used', 0):
+        say('  no measurement was used')
     if run['rows'] == 0:
         say('  no track was made; sonar-imm info may show why')
 

@@ -94,6 +94,8 @@ USUAL_NAMES = {
     'vessel_latitude_hemisphere': '',
     'vessel_longitude_hemisphere': '',
     'heading': 'hdg gyro true_heading heading_true steuerkurs cap cap_vrai',
+    'roll': 'roll_angle rollen roulis balanceo',
+    'pitch': 'pitch_angle stampfen tangage cabeceo',
     'vx': 'v_east ve vel_x velocity_x',
     'vy': 'v_north vn vel_y velocity_y',
     'id': (
@@ -187,7 +189,7 @@ _UNITS_OF = {
     'x y z depth height range std_x std_y std_z std std_range std_depth forward starboard '
     'vessel_x vessel_y near_range far_range': METRES,
     'var_x cov_xy var_y var_z cov_xz cov_yz var_depth': _squares(METRES),
-    'latitude longitude vessel_latitude vessel_longitude heading': _DEGREES,
+    'latitude longitude vessel_latitude vessel_longitude heading roll pitch': _DEGREES,
     'bearing elevation std_bearing std_elevation': RADIANS,
     'var_bearing var_elevation': _squares(RADIANS),
     'std_toa': SECONDS,

@@ -96,6 +96,11 @@ class ConversionReport:
         elif self.bad_rows == MOST_NAMED + 1:
             self.problems.append('further bad rows are counted but not listed')
 
+    def note_ignored(self, path: Path, arrays: Sequence[str]) -> None:
+        """Note which arrays of an archive were not used."""
+        if arrays:
+            self.notes[f'ignored arrays of {path.name}'] = ', '.join(arrays)
+
     def nothing(self, what: object) -> BagError:
         """The error of a file without a usable record, with its commonest problem."""
         words = f' ({self.problems[0]})' if self.problems else ''

@@ -73,6 +73,14 @@ class _WithTruth(_Places):
 
 
 @frozen(kw_only=True)
+class _Navigated(_Options):
+    nav: Path | str | None = option(None, '',
+        'CSV of where the instrument was: stamp, x and y [m] or latitude and longitude [deg], '
+        'heading [deg, clockwise from north], z or depth, roll, pitch [deg].', kind='file')
+    nav_options: CsvOptions = group(CsvOptions, 'nav', 'the navigation')
+
+
+@frozen(kw_only=True)
 class _OfSonar(_Options):
     frame_id: str = option('sonar', '', 'Frame of the sonar.')
 
@@ -233,12 +241,14 @@ class TruthOptions(_Places):
 
 
 @frozen(kw_only=True)
-class SnapshotsOptions(_OfSonar):
+class SnapshotsOptions(_Navigated):
     """Array snapshots in a numpy archive (npz) to /snapshot.
 
     Arrays: iq, complex, (bins, staves) or (pings, bins, staves), and range [m] or time [s];
     optional sound_speed, frequency, element_spacing or spacing_wavelengths, stamp, noise_variance,
-    signal_variance. Usual names are recognised.
+    signal_variance. With latitude and longitude, or x and y [m], and heading [deg] or yaw [rad],
+    one value per ping, /nav is written; z or sonar_depth, roll, pitch and altitude are optional.
+    Usual names are recognised; arrays that are not used are listed.
     """
 
     EXAMPLES: ClassVar = (
@@ -250,6 +260,7 @@ class SnapshotsOptions(_OfSonar):
         'Channels, from 0, of each stave; those joined by + are summed.', parse=_staves)
     ping_rate: float = option(10.0, '',
         'Pings per second, when there are no stamps.', kind='float', range=(0.001, 1000.0))
+    frame_id: str = option('sonar', '', 'Frame of the sonar.')
 
 
 @frozen(kw_only=True)
@@ -303,7 +314,7 @@ class InterferometerOptions(_Options):
 
 
 @frozen(kw_only=True)
-class HydrophonesOptions(_Options):
+class HydrophonesOptions(_Navigated):
     """Sound of a vertical array to /pressure. Needs soundfile.
 
     WAV or FLAC with a channel for each hydrophone, the deepest first; --channels says another
@@ -314,7 +325,8 @@ class HydrophonesOptions(_Options):
     EXAMPLES: ClassVar = (
         '20240531_100000.wav drift.bag', 'array.wav drift.bag --channels 3,2,1,0 --depth 120',
     )
-    start: str = option('', 'TIME', 'Time of the first sample, e.g. 2024-05-31T10:00:00Z.')
+    start: str = option('', 'TIME',
+        'Time of the first sample, e.g. 2024-05-31T10:00:00Z, now, or 0 if it does not matter.')
     time_zone: str = option('UTC', 'ZONE', 'Zone of a time that does not say it.')
     channels: Sequence[int] | None = option(None, 'CHANNELS',
         'Channels of the hydrophones, from 0, the deepest first; all in their order by default.',
@@ -329,15 +341,25 @@ class HydrophonesOptions(_Options):
 
 
 @frozen(kw_only=True)
-class SegyOptions(_Options):
-    """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
+class SegyOptions(_Navigated):
+    """Traces of a sub-bottom profiler in SEG-Y or SU to /trace. Needs segyio.
 
-    Stamps come from the trace headers; traces within one second are spread over it.
+    Stamps, recording delay, sample interval and places come from the headers of each trace; traces
+    within one second are spread over it.
     """
 
     EXAMPLES: ClassVar = (
         'line.seg line.bag', 'line.seg line.bag --sample-spacing 0.376 --first-sample 12',
+        'line.sgy line.bag --time-zone +02:00 --crs 32631',
     )
+    time_zone: str = option('', 'ZONE', 'Zone of times whose headers say they are local.')
+    start: str = option('', 'TIME',
+        'Time of the first trace, e.g. 2024-05-31T10:00:00Z, where the headers hold no date.')
+    rate: float = option(1.0, '',
+        'Traces per second, where the headers hold no times.', kind='float', range=(1e-6, 1e6))
+    crs: int | None = option(None, 'EPSG',
+        'Coordinate system of places in metres or feet. Needs rasterio.', kind='int',
+        range=(1, None))
     sample_spacing: float | None = option(None, 'METRES',
         'Depth from sample to sample; by default from the sample interval.', kind='float',
         above=0.0)
@@ -356,7 +378,7 @@ class SegyOptions(_Options):
 
 
 @frozen(kw_only=True)
-class TracesOptions(_Options):
+class TracesOptions(_Navigated):
     """Traces in a numpy archive (npz) or CSV to /trace.
 
     Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and
@@ -385,6 +407,11 @@ class XtfOptions(_Detecting):
     EXAMPLES: ClassVar = ('line.xtf line.bag', 'line.xtf line.bag --side port')
     side: str = option('starboard', '', 'Side whose echoes are found.',
         choices=('starboard', 'port'))
+    units: str = option('auto', '', 'Units of the places; auto: what the file says.',
+        choices=('auto', 'degrees', 'metres'))
+    frequency: float | None = option(None, 'HZ',
+        'Which channel of a side, of several frequencies; by default the first one.',
+        kind='float', above=0.0)
     port_samples: str = option('far', '',
         'Which sample of a port channel comes first: most programs write the farthest.',
         choices=('far', 'near'))

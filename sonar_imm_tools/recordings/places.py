@@ -23,7 +23,7 @@ import re
 import numpy as np
 
 from msg_adapters.arrivals import FARTHEST
-from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geodesy import NEAR_ZERO, Origin
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 from sonar_imm.estimation.arrays import FloatArray
 
@@ -31,9 +31,6 @@ from .columns import FROM_BOW, FROM_NORTH, plain, sign_of, unit_of
 from .csv_table import NUMBER, Row, Table
 from .sources import BagError
 from .times import BadRow
-
-NEAR_ZERO = 1e-4
-"""Degrees; both of a position below it are the place of receivers without a fix."""
 
 
 def check_place(latitude: float, longitude: float) -> None:

@@ -29,6 +29,7 @@ from .convert.arrivals import name_columns, names_tags
 from .convert.nmea import SENTENCE
 from .csv_table import CsvOptions, CsvTable
 from .reader import BagReader
+from .segy_lines import is_segy
 from .sources import BagError, is_recording, quoted, start_of, SUFFIXES
 from .topics import made_topics
 from .track_files import kind_of_text
@@ -65,12 +66,13 @@ def sniff(path: Path, columns: Mapping[str, str] | None = None) -> Guess:
     start = start_of(path)
     if not start:
         raise BagError(f'{path} is empty')
-    if start[:4] == b'RIFF' and start[8:12] == b'WAVE' or start[:4] in (b'fLaC', b'RF64'):
+    riff = start[:4] in (b'RIFF', b'RIFX') and start[8:12] == b'WAVE'
+    if riff or start[:4] in (b'fLaC', b'RF64'):
         return Guess('hydrophones', 'sound of hydrophones')
     if start[:2] == b'PK':
         return _of_archive(path)
-    if _is_segy(start):
-        return Guess('segy', 'traces in SEG-Y')
+    if is_segy(start) or path.suffix.lower() == '.su':
+        return Guess('segy', 'traces in SEG-Y or SU')
     if _is_raw(start):
         raise BagError(f'{path} {RAW_FILE}')
     if start[0] == 123 and b'\0' in start[1:200]:
@@ -148,15 +150,6 @@ def _of_archive(path: Path) -> Guess:
         'those are taken with the array iq (sonar-imm convert snapshots, --name iq=ARRAY for '
         'another name) or the arrays depth and amplitude (sonar-imm convert traces)'
     )
-
-
-def _is_segy(start: bytes) -> bool:
-    """A header of 3,200 characters, EBCDIC or ASCII, whose first line begins with C, and a format
-    code that exists."""
-    if len(start) < 3600 or start[:1] not in (b'\xc3', b'C'):
-        return False
-    code = int.from_bytes(start[3224:3226], 'big')
-    return 1 <= code <= 16 and any(start[3220:3222])
 
 
 def _is_raw(start: bytes) -> bool:

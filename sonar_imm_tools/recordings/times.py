@@ -22,6 +22,10 @@ import itertools
 import re
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
+import numpy as np
+
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+
 from .columns import plain
 from .sources import BagError
 
@@ -46,6 +50,24 @@ _DAYS_SINCE_1900 = (25000, 73000)
 SHORTEST_STEP = 2e-3
 """Seconds; no instrument gives positions more often."""
 _DIGITS = re.compile(r'(\d+)([.,]\d+)?$')
+
+
+LEAPS = (
+    362793600, 394329600, 425865600, 489024000, 567993600, 631152000, 662688000, 709948800,
+    741484800, 773020800, 820454400, 867715200, 915148800, 1136073600, 1230768000, 1341100800,
+    1435708800, 1483228800,
+)  # fmt: skip
+"""Seconds since 1970 at which a leap second was inserted since 1980; none is planned."""
+GPS_EPOCH = 315964800
+"""1980-01-06, in seconds since 1970."""
+
+
+def gps_minus_utc(seconds: FloatArray | IntArray) -> IntArray:
+    """Return GPS time minus UTC (n,), s, at seconds since 1970 (n,).
+
+    Source: IERS Bulletin C.
+    """
+    return np.searchsorted(np.array(LEAPS), seconds, side='right')
 
 
 class BadRow(ValueError):

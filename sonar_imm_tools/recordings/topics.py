@@ -127,6 +127,16 @@ def remarks_on_topics(
     return sentences
 
 
+WORDS = {
+    'diver': ('usbl', 'fix', 'diver', 'target', 'beacon', 'acoustic', 'gps', 'gnss', 'tag', 'ais'),
+    'obstacle': ('fls', 'sonar', 'detection', 'image', 'scan', 'echo', 'obstacle'),
+    'bathymetry': ('swath', 'side_scan', 'sidescan', 'snapshot', 'bathy', 'stave'),
+    'fathometer': ('hydrophone', 'pressure', 'profil', 'trace', 'fathometer'),
+}
+"""Words in names of topics and types that tell which tracker is meant, if none reads them."""
+TYPES_NAMED = 3
+
+
 def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> list[str]:
     """The trackers that find their inputs in `bag`, the one with the best evidence first.
 
@@ -147,7 +157,7 @@ def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> 
 def system_in_mind(bag: BagReader) -> str:
     """The tracker for which most inputs could be there, if topics were named to it."""
 
-    def could(system: str) -> tuple[bool, int]:
+    def could(system: str) -> tuple[bool, int, int]:
         entries = [
             entry
             for entry in (*inputs_of(system), *made_inputs(system))
@@ -158,7 +168,9 @@ def system_in_mind(bag: BagReader) -> str:
             )
         ]
         required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
-        return bool(entries) and fed(entries).issuperset(required), len(entries)
+        names = ' '.join(f'{topic.name} {topic.type_name}' for topic in bag.topics).lower()
+        words = sum(word in names for word in WORDS[system])
+        return bool(entries) and fed(entries).issuperset(required), len(entries), words
 
     return max(SYSTEMS, key=could)
 
@@ -323,8 +335,15 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
         for entry in inputs_of(system)
         if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
     ]
-    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
+    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else _types_heard(system)
     return (
         f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
         f'there are {there}{hint}'
     )
+
+
+def _types_heard(system: str) -> str:
+    """Return which types the first inputs of a tracker take."""
+    entries = [entry for entry in inputs_of(system) if not entry.companion][:TYPES_NAMED]
+    takes = [f'{entry.name} takes {", ".join(entry.readers)}' for entry in entries]
+    return f'. None is of a type that is heard: {"; ".join(takes)}'

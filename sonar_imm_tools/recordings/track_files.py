@@ -85,9 +85,12 @@ def kind_of_text(path: Path) -> str:
 
 
 def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
-    """Positions of a GPX or KML file; what has no time has an empty one. A file that
-    is damaged ends with a word about it."""
+    """Positions of a GPX or KML file; what has no time has an empty one. A line without times that
+    only draws a timed track again is left out. A file that is damaged ends with a word about
+    it."""
     names: list[str] = []
+    lines: list[list[dict[str, str]]] = []
+    timed: set[tuple[tuple[str, str], ...]] = set()
     marks: list[ElementTree.Element] = []
     if b'<!' in start_of(path).replace(b'<!--', b'').replace(b'<![CDATA[', b''):
         raise BagError(
@@ -106,7 +109,12 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
                 yield _gpx_point(element, names[-1] if names else '')
                 element.clear()
             elif tag == 'Placemark':
-                yield from _placemark(marks.pop(), names.pop())
+                points = list(_placemark(marks.pop(), names.pop()))
+                if len(points) > 1 and not any(point['stamp'] for point in points):
+                    lines.append(points)
+                else:
+                    timed.add(_places(points))
+                    yield from points
                 element.clear()
             elif tag in ('trk', 'rte'):
                 names.pop()
@@ -115,6 +123,14 @@ def _read_xml(path: Path, kind: str) -> Iterator[dict[str, str] | str]:
         for mark, name in zip(marks, names):
             yield from _placemark(mark, name, cut=True)
         yield f'is damaged {kind.upper()}: {error}'
+    for points in lines:
+        if _places(points) not in timed:
+            yield from points
+
+
+def _places(points: list[dict[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Return longitude and latitude of points, as written."""
+    return tuple((point['longitude'], point['latitude']) for point in points)
 
 
 def _text(element: ElementTree.Element, tag: str) -> str:

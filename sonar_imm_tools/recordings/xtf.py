@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
+from itertools import chain, islice
 import os
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,41 @@ FILE_HEAD, PACKET_HEAD, LARGEST_PACKET = 1024, 14, 64 << 20  # bytes
 MARK = b'\xce\xfa'
 SIDE_SCAN, SOUNDINGS, VERSION, MOST_CHANNELS = 0, 17, 0x7B, 6
 SIDES, UNITS = {1: 'port', 2: 'starboard'}, {3: 'degrees', 0: 'metres'}
+PLACES_READ, SLOWEST = 200, 0.01
+"""Places by which the unit of a file is judged, and the least median speed of a survey, m/s."""
+
+
+def pings_in(path: Path, report: ConversionReport, units: str) -> Iterator[dict[str, Any]]:
+    """Yield the pings of `pings_of`, with places in `units` where these are stated.
+
+    :param units: 'degrees', 'metres', or 'auto' for those of the file.
+    :raises BagError: the file says metres, and its places can only be degrees.
+    """
+    pings = pings_of(path, report)
+    first = list(islice(pings, PLACES_READ)) if units == 'auto' else []
+    where = [ping for ping in first if ping['units'] == 'metres' and ping['stamp_ns'] >= 0]
+    if len(where) > 1:
+        place = np.array([ping['place'] for ping in where], np.float64)
+        seconds = np.diff([ping['stamp_ns'] for ping in where]) * 1e-9
+        steps = np.hypot(*np.diff(place, axis=0).T)[seconds > 0.0] / seconds[seconds > 0.0]
+        on_earth = (np.abs(place) <= (180.0, 90.0)).all()
+        if on_earth and len(steps) and 0.0 < np.median(steps) < SLOWEST:
+            raise BagError(
+                f'{path}: the file says that its places are metres; they are such as '
+                f'{place[0, 0]:.7g}, {place[0, 1]:.7g} and move by {np.median(steps):.2g} a '
+                'second, as degrees do; say --units degrees or --units metres'
+            )
+    for ping in chain(first, pings):
+        stated = ping['units'] and units != 'auto'
+        yield {**ping, 'units': units} if stated else ping
 
 
 def pings_of(path: Path, report: ConversionReport) -> Iterator[dict[str, Any]]:
     """The pings of a file: where (its word), stamp_ns (-1 for none), channels (dicts of side,
     name, samples, slant_range m, delay s, frequency Hz), soundings (n, 3), metres east and north
     of the place and depth below the surface, None in a ping of side scan; sound_speed m/s, place
-    (x, y) in degrees or metres as units says, heading, pitch, roll in degrees, depth, altitude m.
+    (x, y) in degrees or metres as units says, layback m from there to the sonar, heading, pitch,
+    roll in degrees, depth, altitude m.
 
     The report is told what ended a file early, and what was not taken. Raises `BagError` without
     pyxtf."""
@@ -131,7 +160,7 @@ def _ping(head: Any, content: bytes, pyxtf: Any) -> dict[str, Any]:
     except (ValueError, OverflowError):
         stamp_ns = -1
     place = packet.SensorXcoordinate, packet.SensorYcoordinate
-    if not any(place):
+    if of_ship := not any(place):
         place = packet.ShipXcoordinate, packet.ShipYcoordinate
     return {
         'stamp_ns': stamp_ns,
@@ -142,6 +171,7 @@ def _ping(head: Any, content: bytes, pyxtf: Any) -> dict[str, Any]:
         # Who has no position leaves it at zero.
         'units': UNITS.get(head.NavUnits, '') if any(place) else '',
         'place': place,
+        'layback': float(packet.Layback) if of_ship else 0.0,
         'heading': packet.SensorHeading or packet.ShipGyro,
         'pitch': packet.SensorPitch,
         'roll': packet.SensorRoll,

@@ -52,14 +52,23 @@ def test_a_run_holds_the_soundings_of_both_sides(tracked):
 def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):
     laspy, rasterio = pytest.importorskip('laspy'), pytest.importorskip('rasterio')
     place = ('--epsg', '32632', '--origin', '500000,6000000,1.5')
-    for name in ('a.xyz', 'a.laz', 'a.tif'):
+    for name in ('a.xyz', 'a.laz', 'a.tif', 'a.csv'):
         assert run('export', tracked, tmp_path / name, *place) == 0
     points = read_points(tracked / 'soundings.csv')
     text = np.loadtxt(tmp_path / 'a.xyz')
     las = laspy.read(tmp_path / 'a.laz')
+    table = read_points(tmp_path / 'a.csv')
+    assert table['y'] == pytest.approx(points['y'] + 6_000_000.0, abs=1e-6)
+    assert table.columns.keys() == points.columns.keys()
     assert text[:, 0] == pytest.approx(points['x'] + 500_000.0, abs=1e-3)
     assert np.asarray(las.y) == pytest.approx(points['y'] + 6_000_000.0, abs=1e-3)
     assert np.asarray(las.z) == pytest.approx(text[:, 2], abs=1.1e-3)
+    assert las.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    # Since 2017 GPS is 18 s ahead; the epoch is 1980-01-06, less 10^9 s.
+    utc = np.asarray(las.gps_time) + 1e9 - 18.0 + 315_964_800.0
+    assert utc == pytest.approx(1e-9 * points.stamp_ns, abs=1e-3)
+    assert (np.asarray(las.return_number) == 1).all()
+    assert (np.asarray(las.number_of_returns) == 1).all()
     with rasterio.open(tmp_path / 'a.tif') as file:
         depth, uncertainty, _, count = file.read([1, 2, 3, 4])
         assert file.crs.to_epsg() == 32632 and np.nansum(count) >= 0.9 * len(points)

@@ -17,11 +17,13 @@
 import json
 import shlex
 
+from helpers import marine
 from helpers.dive_bags import write_dive
-from helpers.field_files import FORMATS, line
+from helpers.field_files import bag_of, FORMATS, line
 from helpers.source import ROOT
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from msg_adapters.fixes import write_geodetic
 from sonar_imm.measurements import GeodeticFix
@@ -156,6 +158,21 @@ def test_a_laser_scan_with_odometry_is_tracked_as_info_says(tmp_path, capsys):
     refusal = capsys.readouterr().err
     assert 'no topic for the obstacle tracker' in refusal
     assert '/odom as nav' in refusal and '/scan as detections' in refusal
+
+
+def test_a_type_that_nobody_hears_names_what_would_do(tmp_path, capsys):
+    types, kind = get_typestore(Stores.ROS2_JAZZY), 'usbl_msgs/msg/Target'
+    types.register(get_types_from_msg('std_msgs/Header header\nfloat64 range', kind))
+
+    def messages(each, stamp):
+        header = marine.header(sec=stamp // 10**9)
+        yield '/usbl/target', types.types[kind](header=header, range=40.0)
+
+    bag_of(tmp_path / 'dive', line(5), messages, types)
+    assert main(['track', str(tmp_path / 'dive'), str(tmp_path / 'run')]) == 2
+    sentence = capsys.readouterr().err
+    assert kind in sentence and 'PoseWithCovarianceStamped' in sentence
+    assert 'diver' in sentence and 'bathymetry' not in sentence
 
 
 def test_both_sides_of_a_side_scan(tmp_path, capsys):

@@ -296,6 +296,20 @@ def test_the_type_of_a_covariance_decides(kind, expected):
     assert expected == (None if covariance is None else covariance[0].tolist())
 
 
+@pytest.mark.parametrize('place', [(0.0, 0.0), (1e-7, -1e-7)])
+@pytest.mark.parametrize('read', [read_geodetic, read_vessel_fix])
+def test_latitude_0_longitude_0_is_no_fix(place, read):
+    message = navsat(latitude=place[0], longitude=place[1])
+    assert earth_reason(message, read) == 'no_fix'
+
+
+def test_a_covariance_of_nan_is_unknown():
+    assert read_geodetic(navsat(position_covariance=np.full(9, np.nan))).covariance is None
+    flat = np.diag([1.0, 2.0, np.nan]).ravel()
+    covariance = read_geodetic(navsat(position_covariance=flat)).covariance
+    assert np.diag(covariance)[:2].tolist() == [1.0, 2.0] and covariance[2, 2] > 1e5
+
+
 def test_a_covariance_that_was_not_filled_in_is_unknown_and_doubted():
     zero = navsat(position_covariance=np.zeros(9))
     assert read_geodetic(zero).covariance is None
@@ -312,7 +326,6 @@ def test_a_covariance_that_was_not_filled_in_is_unknown_and_doubted():
         ({'latitude': 91.0}, 'out_of_range'),
         ({'longitude': 361.0}, 'out_of_range'),
         ({'altitude': 1e9}, 'out_of_range'),
-        ({'position_covariance': np.full(9, np.nan)}, 'nan'),
         ({'position_covariance': np.diag([1.0, 1.0, 1e-20]).ravel()}, 'out_of_range'),
         ({'position_covariance': np.ones(9)}, 'out_of_range'),
         ({'position_covariance': np.ones(4)}, 'bad_shape'),

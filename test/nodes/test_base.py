@@ -203,6 +203,25 @@ def test_what_waited_too_long_is_answered_and_counted_but_not_used(make_bench, m
     assert rig.answer == (4, 0, 2)
 
 
+def test_the_age_of_estimates_is_that_of_their_publication(make_bench, monkeypatch):
+    """A message that waited 40 s in the queue, and whose stamp is 41 s old then."""
+    bench = make_bench()
+    received = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    rig = Rig(bench)
+
+    def time_ns():
+        return time.time_ns() + 40 * SECOND
+
+    clock = SimpleNamespace(time_ns=time_ns, monotonic=time.monotonic)
+    monkeypatch.setattr(base, 'time', clock)
+    now = rig.node.get_clock().now().nanoseconds * 1e-9
+    rig.send(*(a_fix(now - 41.0 + 0.1 * k) for k in range(6)))
+    bench.spin_until(lambda: any('40.0 s old' in item.status[1].message for item in received))
+    values = {pair.key: float(pair.value) for pair in received[-1].status[1].values}
+    assert values['age of estimates p50 [s]'] == pytest.approx(41.0, abs=1.0)
+    assert values['waited in the queue p50 [s]'] == pytest.approx(40.0, abs=1.0)
+
+
 def test_best_effort_publishers_are_heard(make_bench):
     rig = Rig(make_bench(), qos=qos_profile_sensor_data)
     rig.send(a_fix(1.0))

@@ -277,6 +277,60 @@ def test_dropped_messages_warn_while_they_are_dropped(desk):
     assert desk.values['fix dropped, waited too long'] == '3'
 
 
+def estimates(desk, count, age, wait, *, period=0.1, start=0.0):
+    for k in range(count):
+        now = start + k * period
+        desk.meter.arrived('fix', now)
+        desk.meter.estimates.published(now, age, wait)
+    desk.report(start + count * period, stale_after=60.0)
+
+
+def test_estimates_of_a_node_that_is_too_slow_are_called_old(desk):
+    desk.report(0.0)
+    desk.meter.dropped['fix'] += 30
+    estimates(desk, 100, 20.3, 20.2)
+    desk.report(10.1, lost={'fix': 70})
+    assert desk.tracker.level == DiagnosticStatus.WARN
+    assert 'estimates are 20.2 s old: input comes faster' in desk.tracker.message
+    assert '100 of 170 messages lost' in desk.tracker.message
+    assert desk.values['age of estimates p50 [s]'] == '20.3'
+    assert desk.values['waited in the queue p50 [s]'] == '20.2'
+
+
+@pytest.mark.parametrize(
+    ('age', 'wait', 'level', 'words'),
+    [
+        (0.4, 0.1, DiagnosticStatus.OK, 'tracking'),
+        (3.0, 0.1, DiagnosticStatus.WARN, 'because their messages arrive that late'),
+        (3.0, np.nan, DiagnosticStatus.WARN, 'because their messages arrive that late'),
+        (3600.0, 0.1, DiagnosticStatus.OK, '3600 s behind the clock of this computer'),
+        (-3600.0, 0.1, DiagnosticStatus.OK, '3600 s ahead of the clock of this computer'),
+        (4e7, 0.1, DiagnosticStatus.OK, 'tracking'),  # a recording
+        (4e7, 5.0, DiagnosticStatus.WARN, 'estimates are 5.0 s old'),
+    ],
+)
+def test_the_cause_of_old_estimates_is_told_apart(desk, age, wait, level, words):
+    estimates(desk, 50, age, wait)
+    assert desk.tracker.level == level and words in desk.tracker.message
+
+
+def test_the_age_of_a_slow_publisher_is_judged_by_its_period(desk):
+    estimates(desk, 12, 8.0, 0.01, period=5.0)
+    assert desk.tracker.level == DiagnosticStatus.OK
+    estimates(desk, 12, 16.0, 0.01, period=5.0, start=60.0)
+    assert 'arrive that late' in desk.tracker.message
+    # A limit that is set counts.
+    desk.report(120.5, max_age=20.0, stale_after=60.0)
+    assert desk.tracker.level == DiagnosticStatus.OK
+
+
+def test_silence_is_no_age(desk):
+    estimates(desk, 50, 20.0, 19.0)
+    assert desk.tracker.level == DiagnosticStatus.WARN
+    desk.report(20.0, stale_after=60.0)
+    assert 'old' not in desk.tracker.message
+
+
 def test_internal_errors_and_disabling_show(desk):
     desk.meter.arrived('fix', 0.0)
     desk.report(1.0, enabled=False)

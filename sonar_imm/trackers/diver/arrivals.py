@@ -49,11 +49,11 @@ from .explanations import (
     PingMeasurements,
     subset_ping,
 )
-from .fixes import MIN_PUBLISHED_SCALE
 from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
+from .scales import MIN_PUBLISHED_SCALE
 from .scan import MOST_MEASUREMENTS, Ping, ping_measurements, tag_id
 
 MOST_SUBSETS = 6
@@ -184,8 +184,8 @@ def _associate_ping(
         return known, free
     instruments = known.memory['instruments'].with_receivers(ping, config)
     layout = instruments.layout(config, models)
-    every = np.ones(len(known.borrowed), np.bool_)
-    table, borrowed = restore_rows(known.rows, known.borrowed, 'scale', every)
+    usual = np.isin(known.borrowed.key['scale'], models.row_scales)
+    table, borrowed = restore_rows(known.rows, known.borrowed, usual)
     known = known.replace(rows=layout.rows_with_new_constants(table, models), borrowed=borrowed)
     known = known.with_memory(instruments=instruments)
     seen = ping_measurements(ping, rows, config, models, layout)

@@ -201,7 +201,9 @@ def spawn_stage(
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
             columns['learnt'] = chain.initial_counts(len(births))
-            columns['existence'] = [birth.existence for birth in births]
+            existence = np.array([birth.existence for birth in births])
+            columns['existence'] = existence
+            columns['least_existence'] = np.fmin(columns['least_existence'], existence)
             columns['target_id'] = [birth.target_id for birth in births]
             life = known.life.born(len(births), known.stamp_ns, rules)
             rows = birth_rows(births, models, layout, config)

@@ -46,7 +46,7 @@ import numpy as np
 from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.bank import Gaussians
-from ...estimation.rows import Borrowed, LEAST_LOG, log_sum, ROW_LOST, Rows
+from ...estimation.rows import Borrowed, log_sum, ROW_LOST, Rows
 from ...measurements import NOBODY
 from .config import DiverConfig
 from .known import Known, repair_covariances, row_outputs
@@ -72,6 +72,9 @@ WIDER = 6.0
 
 REACH = 2.0
 """Standard deviations of the innovation within which no offset begins."""
+
+ENDED = {name: value for name, value in NO_OFFSET.items() if name not in ('took', 'taken')}
+"""Assumptions about offsets of a row without one."""
 
 JUMP_FLOOR = math.log(1e-3)
 """Log odds that an established track was wrong before, when a burst begins."""
@@ -430,18 +433,14 @@ def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, B
     left = np.flatnonzero(~lost)
     scale = rows.key['scale']
     have = set(zip(rows.target[left].tolist(), scale[left].tolist()))
-    weights: dict[tuple[int, float], float] = {}
+    gone: dict[tuple[int, float], int] = {}
     for row in np.flatnonzero(lost).tolist():
         pair = int(rows.target[row]), float(scale[row])
-        if pair not in have:
-            weights[pair] = float(np.logaddexp(weights.get(pair, -np.inf), rows.logw[row]))
-    if weights:
-        target, key = (np.array(part) for part in zip(*weights))
-        new = np.maximum(np.array(list(weights.values())), LEAST_LOG)
-        borrowed = Borrowed(
-            np.concatenate([borrowed.target, target.astype(np.int64)]),
-            np.concatenate([borrowed.key, key]),
-            np.concatenate([borrowed.logw, new]),
+        if pair not in have and rows.logw[row] >= rows.logw[gone.get(pair, row)]:
+            gone[pair] = row
+    if gone:
+        borrowed = borrowed.append(
+            Borrowed.from_rows(rows.select(np.array(sorted(gone.values()))), borrowed.key)
         )
     return evolve(rows.select(left), parent=rows.parent[left]), borrowed
 
@@ -522,9 +521,17 @@ def without_offsets(rows: Rows) -> Rows:
     """Return the rows with all offsets ended: pings do not have them."""
     if not rows.tail:
         return rows
-    nothing = {name: np.full(len(rows), value) for name, value in NO_OFFSET.items()}
-    kept = {name: rows.key[name] for name in ('took', 'taken')}
-    return merge_rows(rows.with_tail(0).replace(key={**rows.key, **nothing, **kept}))
+    ended = {name: np.full(len(rows), value) for name, value in ENDED.items()}
+    return merge_rows(rows.with_tail(0).replace(key={**rows.key, **ended}))
+
+
+def divided(rows: Rows, began: Rows | None) -> BoolArray:
+    """Return the rows (N,) of targets with several rows of a scale: `drop_rows` drops them."""
+    strange = (rows.key['offset'] >= 0) | rows.key['aside']
+    targets = rows.target[strange]
+    if began is not None:
+        targets = np.concatenate([targets, began.target])
+    return np.isin(rows.target, targets)
 
 
 def without_unused_tail(rows: Rows) -> Rows:

@@ -15,18 +15,24 @@
 """Estimation of the clutter density from unassociated fixes (`clutter_density: 0`).
 
 The density is the number of false fixes per scan and area. Each fix counts with its probability of
-belonging to no track. The first fix of a target also counts as false until its track is confirmed.
-The area is a rectangle, ``12 sqrt(det C)`` of the covariance C of the false fixes (a disc has ``4
-pi sqrt(det C)``). It needs no parameter and follows a moving sensor.
+belonging to no track. There are two estimates, and the larger one is used:
 
-The prior is `PRIOR_SCANS` scans over `PRIOR_AREA` with density `CLUTTER`. The lower limit is a
-tenth of `CLUTTER`.
+- One density of the sensor. The first fix of a target also counts as false until its track is
+  confirmed. The area is a rectangle, ``12 sqrt(det C)`` of the covariance C of the false fixes (a
+  disc has ``4 pi sqrt(det C)``). It needs no parameter and follows a moving sensor. The prior is
+  `PRIOR_SCANS` scans over `PRIOR_AREA` with density `CLUTTER`. The lower limit is a tenth of
+  `CLUTTER`.
+- The density at a fix, from the remembered false fixes in the narrowest disc around it that has
+  `IN_DISC` of them and is not narrower than the fix is uncertain. False fixes are rarely uniform:
+  a pier, a reef or a wreck returns them in clumps.
+
+A scan is compared with the false fixes of earlier scans only.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -35,7 +41,7 @@ from ...estimation.association import TENTATIVE
 from ...measurements import NOBODY
 from .config import CLUTTER, DiverConfig
 from .known import Known
-from .scan import Group, Scan
+from .scan import FIRST_LOOK, Group, Scan
 
 MOST = 1e-2
 """Upper limit of the density, 1/m^2: one false fix in every second scan inside a typical gate of a
@@ -59,6 +65,21 @@ MOST_SENSORS = 20
 MEMORY = 100.0
 """Scans after which the weight of a scan is 1/e."""
 
+RADII = 3.0 * 2.0 ** np.arange(7)
+"""Radii of the discs, m."""
+
+IN_DISC = 5.0
+"""Minimum weight of the false fixes in a disc."""
+
+MOST_REMEMBERED, LEAST_WEIGHT = 3000, 0.01
+"""Maximum number of remembered false fixes, and their minimum weight."""
+
+MAX_TABLE = 1 << 19
+"""Largest number of distances that are computed at once."""
+
+LOOKS = 10.0
+"""Scans over which the time between scans is averaged."""
+
 
 class Clutter(NamedTuple):
     """Exponentially weighted clutter statistics of one sensor."""
@@ -77,6 +98,10 @@ class Clutter(NamedTuple):
     """Scatter, m^2."""
     xy: float = 0.0
     yy: float = 0.0
+    points: Annotated[FloatArray, 'p2'] = np.empty((0, 2))
+    """Remembered false fixes, m."""
+    weight: Annotated[FloatArray, 'p'] = np.empty(0)
+    """Their weights: the probability of being false, times 1/e in `MEMORY` scans."""
 
     @property
     def area(self) -> float:
@@ -92,8 +117,14 @@ class Clutter(NamedTuple):
         found = number / ((PRIOR_SCANS + self.scans) * self.area)
         return min(max(found, LEAST), MOST)
 
-    def with_scan(self, z: FloatArray, false: FloatArray) -> Clutter:
-        """Add a scan of fixes z (D, 2), false with probability `false` (D,)."""
+    def with_scan(
+        self, z: FloatArray, false: FloatArray, new: FloatArray | float = 0.0
+    ) -> Clutter:
+        """Add a scan of fixes z (D, 2), of no track with probability `false` (D,).
+
+        new: (D,) probability that the fix is of a new target. Such a fix is remembered with the
+        rest of its probability. In the one density it counts until its track is confirmed.
+        """
         kept = math.exp(-1.0 / MEMORY)
         added, old = float(false.sum()), kept * self.placed
         total = old + added
@@ -102,6 +133,7 @@ class Clutter(NamedTuple):
         apart, gap = z - mean, mean - (self.x, self.y)
         own = apart.T @ (false[:, None] * apart)
         own = own + old * share * np.outer(gap, gap)
+        points, weight = self._remembered(z, false - new)
         return Clutter(
             kept * self.scans + 1.0,
             kept * self.false + added,
@@ -111,7 +143,44 @@ class Clutter(NamedTuple):
             kept * self.xx + float(own[0, 0]),
             kept * self.xy + float(own[0, 1]),
             kept * self.yy + float(own[1, 1]),
+            points,
+            weight,
         )
+
+    def _remembered(self, z: FloatArray, false: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the false fixes after a scan and their weights.
+
+        Of more than `MOST_REMEMBERED`, evenly spaced ones are kept, with the weight of all.
+        """
+        weight = np.concatenate([math.exp(-1.0 / MEMORY) * self.weight, false])
+        kept = np.flatnonzero(weight > LEAST_WEIGHT)
+        total = float(weight[kept].sum())
+        if (count := len(kept)) > MOST_REMEMBERED:
+            kept = kept[np.arange(MOST_REMEMBERED) * count // MOST_REMEMBERED]
+            weight = weight * (total / float(weight[kept].sum()))
+        return np.concatenate([self.points, z])[kept], weight[kept]
+
+    def density_at(self, z: FloatArray, R: FloatArray) -> FloatArray:
+        """Return the false fixes (D,) per m^2 and scan at fixes z (D, 2), R (D, 2, 2)."""
+        found = np.full(len(z), self.density)
+        # If fixes stand for several others, as many of them have to be in a disc.
+        least = IN_DISC * max(1.0, float(self.weight.max(initial=0.0)))
+        if self.weight.sum() < least:
+            return found
+        size = np.sqrt(np.sqrt(np.linalg.det(R)))
+        step = max(1, MAX_TABLE // len(self.weight))
+        for start in range(0, len(z), step):
+            near = np.arange(start, min(start + step, len(z)))
+            square = np.square(z[near, 0, None] - self.points[:, 0])
+            square += np.square(z[near, 1, None] - self.points[:, 1])
+            for radius in RADII:
+                inside = (square <= radius**2) @ self.weight
+                enough = (inside >= least) & (size[near] <= radius)
+                area = (PRIOR_SCANS + self.scans) * math.pi * radius**2
+                local = np.maximum(found[near[enough]], inside[enough] / area)
+                found[near[enough]] = np.minimum(local, MOST)
+                near, square = near[~enough], square[~enough]
+        return found
 
     @property
     def evident(self) -> bool:
@@ -124,14 +193,12 @@ class Clutters(NamedTuple):
     """Clutter statistics by sensor name, most recent sensor last."""
 
     by_sensor: tuple[tuple[str, Clutter], ...] = ()
+    looks: tuple[tuple[str, int, float], ...] = ()
+    """Of each sensor: name, stamp of the last scan, ns, and mean time between scans, s."""
 
     def get(self, sensor: str) -> Clutter | None:
         """Return the statistics of a sensor; None for none."""
         return dict(self.by_sensor).get(sensor)
-
-    def densities(self) -> dict[str, float]:
-        """Return the estimated clutter density of each sensor, 1/m^2."""
-        return {sensor: clutter.density for sensor, clutter in self.by_sensor}
 
     def with_sensor(self, sensor: str, clutter: Clutter) -> Clutters:
         """Replace the statistics of a sensor.
@@ -139,7 +206,39 @@ class Clutters(NamedTuple):
         The oldest sensor is dropped above `MOST_SENSORS`.
         """
         others = [item for item in self.by_sensor if item[0] != sensor]
-        return Clutters((*others, (sensor, clutter))[-MOST_SENSORS:])
+        return self._replace(by_sensor=(*others, (sensor, clutter))[-MOST_SENSORS:])
+
+    def with_look(self, sensor: str, stamp_ns: int) -> tuple[Clutters, float]:
+        """Add a scan of a sensor.
+
+        :returns: the new state, and the time in which targets have arrived since the scan before.
+            If several instruments share a name, their scans come in pairs: the mean time is the
+            least.
+        """
+        before = next((look for look in self.looks if look[0] == sensor), None)
+        elapsed = mean = FIRST_LOOK
+        if before is not None:
+            _, last_ns, mean = before
+            elapsed = min((stamp_ns - last_ns) * 1e-9, FIRST_LOOK)
+            if last_ns == stamp_ns:
+                return self, mean
+            mean = elapsed if mean == FIRST_LOOK else mean + (elapsed - mean) / LOOKS
+        others = [look for look in self.looks if look[0] != sensor]
+        looks = (*others, (sensor, stamp_ns, mean))[-MOST_SENSORS:]
+        return self._replace(looks=looks), max(elapsed, mean)
+
+
+def estimate_densities(known: Known, group: Group) -> Known:
+    """Store the clutter density at each fix, and the time since the last scan. A stage of the
+    tracker."""
+    if group.target_id is not None:
+        return known
+    clutters: Clutters = known.memory['clutter']
+    own = clutters.get(group.sensor)
+    if own is not None and group.config.pairing != 'gnn' and not group.config.clutter_density:
+        group.learnt_clutter = own.density_at(group.z, group.R)
+    clutters, group.elapsed = clutters.with_look(group.sensor, known.stamp_ns)
+    return known.with_memory(clutter=clutters)
 
 
 def count_clutter(known: Known, group: Group) -> Known:
@@ -148,8 +247,10 @@ def count_clutter(known: Known, group: Group) -> Known:
         return known
     clutters: Clutters = known.memory['clutter']
     before = clutters.get(group.sensor) or Clutter()
-    assert group.association is not None
-    after = before.with_scan(group.z, np.clip(1.0 - group.association.claimed, 0.0, 1.0))
+    association = group.association
+    assert association is not None
+    new = 0.0 if association.existence is None else association.existence
+    after = before.with_scan(group.z, np.clip(1.0 - association.claimed, 0.0, 1.0), new)
     return known.with_memory(clutter=clutters.with_sensor(group.sensor, after))
 
 

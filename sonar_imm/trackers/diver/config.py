@@ -147,11 +147,12 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
     family_switch_rate: float = constant(0.001, '1/s',
         'families: rate of going from one family of models to the others', range=(0.0, 10.0))
-    covariance_scales: tuple[float, ...] = parameter((0.15, 1.0, 3.0, 10.0), '',
+    covariance_scales: tuple[float, ...] = parameter(
+        (0.02, 0.15, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5, 1e6), '',
         'families: factors by which scaled filters multiply the covariances of all measurements; '
         'the published covariance is that of filters from 1 on; with dimensions 3: one filter, '
         'scale 1',
-        range=(0.01, 1e4), kind='float[]')
+        range=(0.01, 1e6), kind='float[]')
     adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
         choices=ADAPTATIONS)
@@ -267,7 +268,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.0,
         range=(0.0, 1e4),
         description='number of false fixes expected in a scan, per square metre; 0: jipda '
-        'learns it from the fixes that belong to no track, gnn takes 1e-6')
+        'learns it, place by place, from the fixes that belong to no track; gnn takes 1e-6')
     association: str = parameter('auto', '',
         'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits), '
         'jipda (all pairings weighed, tracks confirmed by existence) or auto (jipda with '
@@ -278,9 +279,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 3, constant=True)
     confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 5, constant=True)
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 5, constant=True)
-    birth_density: float = live(1.2e-5, '1/m^2',
-        'jipda: number of new divers expected in a scan, per square metre',
-        range=(1e-12, 1.0))
+    birth_density: float = live(2e-7, '1/(m^2 s)',
+        'jipda: number of new divers expected per square metre and second',
+        range=(1e-14, 1.0))
     survival_time: float = constant(500.0, 's',
         'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
 
@@ -494,6 +495,11 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         usual = fields(type(self)).velocity_std.default
         anything = self.model_set == 'families' and self.target == 'diver'
         return AFLOAT if anything and self.velocity_std == usual else self.velocity_std
+
+    @property
+    def has_usual_fix_std(self) -> bool:
+        """Whether `fix_std` is its default."""
+        return bool(self.fix_std == fields(type(self)).fix_std.default)
 
     @property
     def usual_clutter(self) -> float:

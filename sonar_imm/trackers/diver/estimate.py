@@ -25,10 +25,10 @@ from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
 from . import births, burst_reports, bursts, clutter, depth, offsets
 from .config import DiverConfig
-from .fixes import estimated_scales, weight_without_small_scales
 from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
+from .scales import estimated_scales, weight_without_small_scales
 
 
 def estimate_of(
@@ -40,6 +40,8 @@ def estimate_of(
     mean, covariance = published_state(known, models, config.burst_end)
     if known.memory['recent'].pairs:
         covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
+    if known.memory['fixes'].errors_last(config.fix_bias_std > 0.0):
+        covariance = with_fix_covariance(known['reported'], covariance)
     xyz = np.full((len(mean), 3), config.target_z)
     dimensions = 3 if models.height >= 0 else 2
     xyz[:, :dimensions] = mean[:, :dimensions]
@@ -86,6 +88,17 @@ def published_state(
         off = mean - own
         covariance = covariance + off[:, :, None] * off[:, None, :]
     return mean, covariance
+
+
+def with_fix_covariance(reported: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Add the covariance of one fix, `reported` (T, 3), to that of the positions (T, q, q).
+
+    Filtering does not reduce an error that lasts. `reported`: see `fixes.FEATURES`.
+    """
+    xx, xy, yy = np.nan_to_num(reported).T
+    covariance = covariance.copy()
+    covariance[:, :2, :2] += np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
+    return covariance
 
 
 def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
@@ -137,10 +150,17 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         unset.insert(0, 'target_z (or dimensions: 3)')
     if unset:
         advice += ', or set instrument errors: ' + ', '.join(unset)
+    assumed = []
+    if known.memory['fixes'].assumed and not known.memory['fixes'].stated:
+        assumed = [
+            f'no message states a covariance: fix_std {config.fix_std:g} m is assumed, and no '
+            'ellipse is better than that. Set fix_std'
+        ]
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
     exceeds = memory['excess'] >= ENOUGH
     return [
-        *memory['fixes'].warnings(config.fix_bias_std > 0.0),
+        *(assumed if config.has_usual_fix_std else []),
+        *memory['fixes'].warnings(config.fix_bias_std > 0.0, max(config.covariance_scales)),
         *burst_reports.warnings(known, config),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),

@@ -39,6 +39,7 @@ from collections.abc import Callable
 import math
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 
 from ...estimation import bank, jipda
@@ -51,7 +52,6 @@ from ...estimation.rows import (
     log_sum,
     reduce_targets,
     restore_rows,
-    ROW_AGAIN,
     ROW_LOST,
     Rows,
 )
@@ -62,6 +62,12 @@ from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
+from .scales import (
+    can_restore,
+    estimated_scales,
+    protected_rows,
+    weight_without_small_scales,
+)
 from .scan import Group
 
 FEATURES = {
@@ -71,6 +77,7 @@ FEATURES = {
     'white': Feature(math.nan, (2,)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
+    'reported': Feature(math.nan, (3,)),
 }
 """nis, nis_dof: of this scan, NaN and 0 without a hit.
 
@@ -81,6 +88,8 @@ white: whitened innovation of the last fix.
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
 evidence: sum of the detection probabilities of the track.
+
+reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
 """
 
 FAR = 80.0
@@ -103,14 +112,6 @@ SURELY = 1e3
 
 CONFIRM_EXISTENCE = 0.9
 """Existence above which a track can be confirmed."""
-
-REDISTRIBUTED_FRACTION = 5e-4
-"""Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
-quality is detected."""
-
-MIN_PUBLISHED_SCALE = 1.0
-"""Smallest scale whose rows contribute to the published covariance. Smaller scales also fit
-time-correlated errors, so they contribute to the mean only."""
 
 
 # -- comparison ----------------------------------------------------------------------------------
@@ -195,6 +196,9 @@ def _compare_part(
     among = Assumptions._make(column[part] for column in among)
     track = among.target - (among.target[0] if len(among.target) else 0)
     off = _box_distance(expected, among, z, R)
+    if len(z) > 1 and group.target_id is None:
+        # Of a whole scan, an improbable large scale would reach every fix.
+        off[~among.has_row & (among.logw < math.log(ROW_LOST))] = np.inf
     # A fix near one row is compared with all rows of the track, or a row could stay behind.
     near = reduce_targets(np.logical_or, off <= 1.0, track)
     if group.target_id is not None:
@@ -261,11 +265,11 @@ def _box_distance(
     return off
 
 
-def gate_log_density(group: Group) -> float:
-    """Return the gate threshold: the log density at which a detection and a miss with a false fix
-    are equally probable."""
+def gate_log_density(group: Group) -> FloatArray:
+    """Return the gate threshold (D,): the log density at which a detection and a miss with a
+    false fix are equally probable."""
     p = group.config.detection_probability
-    return math.log(group.clutter) + math.log1p(-p) - math.log(p)
+    return np.asarray(np.log(group.clutter) + (math.log1p(-p) - math.log(p)))
 
 
 def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
@@ -333,14 +337,14 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     ratio = 0.0 if seen is None else seen.log_ratio
     may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
     fit = np.where(may, pairs.track_log + ratio, -np.inf)
-    chosen = fit
+    clutter, chosen = group.config.usual_clutter, fit
     if D == 1:
         chosen = np.where(_held(pairs)[:, None], SURELY, fit)
-    fix = assign_fits(chosen, known.life.status == TENTATIVE, p, group.clutter)
+    fix = assign_fits(chosen, known.life.status == TENTATIVE, p, clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
     score = known['score'] + missed
-    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(group.clutter)
+    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
     hard = _hard_association(fix, D)
@@ -381,7 +385,8 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
     fix = _direct_hits(fix, pairs)
     claimed = beta.sum(axis=0)
-    birth = group.birth_density / (group.birth_density + group.clutter) * (1.0 - claimed)
+    new = group.birth_density
+    birth = new / (new + group.clutter) * (1.0 - claimed)
     score = jipda.log_odds(after)
     return Association(beta, missed, fix, claimed < 0.5, birth, score, True, pairs.direct)
 
@@ -395,9 +400,12 @@ def update_stage(
     """Return the stage that updates rows, models and existence. estimated: masks of the components
     that an update may change, one per block."""
 
+    has_scales = len(models.scales) > 1
+
     def update(known: Known, group: Group) -> Known:
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
+        rejected = _rejected_fixes(known, group, association, pairs) if has_scales else None
         known = _record_innovations(known, group, pairs, association, models)
         columns = {'score': association.score}
         if association.is_joint:
@@ -406,9 +414,9 @@ def update_stage(
             columns['existence'] = np.where(named, known['existence'], association.exists)
             columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
         known = known.with_columns(**columns)
-        if not (association.beta > 0.0).any():
+        if rejected is None and not (association.beta > 0.0).any():
             return known
-        return update_tracks(known, group, pairs, association, models, estimated(known))
+        return update_tracks(known, group, pairs, association, models, estimated(known), rejected)
 
     return update
 
@@ -420,8 +428,12 @@ def update_tracks(
     association: Association,
     models: ModelSet,
     estimated: tuple[BoolArray | None, ...],
+    rejected: tuple[IntArray, FloatArray] | None,
 ) -> Known:
-    """Update the tracks by the fixes, with the probabilities of the association."""
+    """Update the tracks by the fixes, with the probabilities of the association.
+
+    rejected: see `_rejected_fixes`.
+    """
     among = pairs.among
     exists = np.where(association.exists > 0.0, association.exists, 1.0)
     missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
@@ -431,13 +443,18 @@ def update_tracks(
     assumption, weight = pairs.assumption[used], weight[used]
     whole = pairs.track_log[track[used], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    share = association.beta / exists[:, None]
+    factor: FloatArray = np.add(missed[among.target], gain)
+    if rejected is not None:
+        factor *= _rejected_factor(pairs, *rejected)
     sensor = known.memory['sensors'].number(group.sensor)
-    rows, borrowed, of_ways = _update_weights(known, pairs, missed[among.target] + gain, share)
+    rows, borrowed, of_ways = _update_weights(
+        known, pairs, factor, association.beta / exists[:, None]
+    )
     began = None
     if pairs.ways is not None:
         began = bursts.begin_rows(known, group, pairs.ways, of_ways, models, estimated)
-    rows, borrowed, left = drop_weightless_rows(rows, borrowed, 'scale', _protected_rows(rows))
+    stays = protected_rows(rows) | bursts.divided(rows, began)
+    rows, borrowed, left = drop_weightless_rows(rows, borrowed, stays)
     # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
@@ -460,12 +477,53 @@ def update_tracks(
         factors.append(of_models)
     sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    rows, borrowed = restore_rows(rows, borrowed, 'scale', _can_restore(rows, borrowed))
+    rows, borrowed = restore_rows(rows, borrowed, can_restore(rows, borrowed), bursts.ENDED)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
     if began is not None or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
+
+
+def _rejected_fixes(
+    known: Known, group: Group, association: Association, pairs: Pairs
+) -> tuple[IntArray, FloatArray] | None:
+    """Return the nearest fix (T,) of each track that got none, -1 for none, and the probability
+    (T,) that the fix is of the track.
+
+    A fix has one track: the nearest, or the one with its ID. Return None if there is no such fix.
+    """
+    whole = pairs.track_log + (0.0 if group.detection is None else group.detection.log_ratio)
+    without = np.asarray(~(association.beta > 0.0).any(axis=1))
+    possible = without[:, None] & np.asarray(association.claimed < 0.5)
+    if group.target_id is not None:
+        possible &= known['target_id'][:, None] == group.target_id
+    whole = np.where(possible & np.isfinite(pairs.track_log), whole, -np.inf)
+    if not np.isfinite(whole).any():
+        return None
+    nearest = whole.argmax(axis=1)
+    best = whole[np.arange(len(whole)), nearest]
+    own = np.isfinite(best) & (whole[:, nearest].max(axis=0) == best)
+    odds = np.minimum(best - gate_log_density(group)[nearest], 0.0)
+    return np.where(own, nearest, -1), np.where(own, np.exp(odds) / (1.0 + np.exp(odds)), 0.0)
+
+
+def _rejected_factor(pairs: Pairs, nearest: IntArray, share: FloatArray) -> FloatArray:
+    """Return the factors (A,) of the weights of all assumptions by rejected fixes.
+
+    A rejected fix is a false fix, or the covariances are much too small. Without this factor, no
+    fix could show that.
+
+    :param nearest: (T,) rejected fix of each track; -1 for none.
+    :param share: (T,) probability that the fix is of the track.
+    """
+    among = pairs.among
+    track = among.target[pairs.assumption]
+    own = np.flatnonzero((nearest[track] == pairs.fix) & (pairs.log > -np.inf))
+    assumption, track = pairs.assumption[own], track[own]
+    fit = np.exp(pairs.log[own] - pairs.track_log[track, pairs.fix[own]])
+    gain = np.bincount(assumption, share[track] * fit, len(among.row))
+    return np.asarray(1.0 - share[among.target] + gain, np.float64)
 
 
 def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows, Borrowed]:
@@ -474,7 +532,7 @@ def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows
     Return the rows and the borrowed list.
     """
     rows = bursts.merge_rows(rows if began is None else rows.append(began))
-    rows, borrowed = bursts.drop_rows(rows, borrowed, _protected_rows(rows))
+    rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
     return bursts.without_unused_tail(rows), borrowed
 
 
@@ -506,98 +564,16 @@ def _update_weights(
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
-    return rows.replace(logw=of_rows), Borrowed(borrowed.target, borrowed.key, of_list), of_ways
-
-
-def _protected_rows(rows: Rows) -> BoolArray:
-    """Return which rows (N,) are kept at any total weight.
-
-    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
-    scales of at least `MIN_PUBLISHED_SCALE`.
-    """
-    first, scale = rows.first, rows.key['scale']
-    # A start depth is a state: all rows of such a track are kept, also the first.
-    protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
-    protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
-    protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
-    is_published = scale >= MIN_PUBLISHED_SCALE
-    return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
-
-
-def _can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
-    """Return which assumptions (B,) have sufficient weight for a row.
-
-    For scales of at least `MIN_PUBLISHED_SCALE`, the weight among these scales is sufficient.
-    """
-    is_published = rows.key['scale'] >= MIN_PUBLISHED_SCALE
-    total = np.add.reduceat(np.where(is_published, np.exp(rows.logw), 0.0), rows.first)
-    total = total[borrowed.target]
-    is_published = borrowed.key >= MIN_PUBLISHED_SCALE
-    least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
-    return np.asarray(np.exp(borrowed.logw) > least)
-
-
-def weight_without_small_scales(rows: Rows) -> FloatArray:
-    """Return row weights (N,) normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
-    return rows.weights_among(rows.key['scale'] >= MIN_PUBLISHED_SCALE)
-
-
-def estimated_scales(rows: Rows) -> FloatArray:
-    """Return the estimated covariance scale (T,) of each track, from scales of at least
-    `MIN_PUBLISHED_SCALE`."""
-    if not len(rows):
-        return np.empty(0)
-    return np.asarray(
-        np.add.reduceat(weight_without_small_scales(rows) * rows.key['scale'], rows.first)
-    )
-
-
-def redistribute_weights(known: Known) -> Known:
-    """Redistribute a small fraction of the scale weights.
-
-    The fraction is spread over the scales from 1, over the smaller scales, and over these two
-    groups. So the relative weights of the scales from 1 do not depend on the smaller scales.
-    """
-    rows, borrowed = known.rows, known.borrowed
-    target = np.concatenate([rows.target, borrowed.target])
-    scale = np.concatenate([rows.key['scale'], borrowed.key])
-    weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
-    # Rows with the same offset share their weight.
-    since, aside = (
-        np.concatenate([rows.key[name], np.zeros(len(borrowed), rows.key[name].dtype)])
-        for name in ('since', 'aside')
-    )
-    assumed = np.stack([target, since, aside], axis=1)
-    table, place = np.unique(assumed, axis=0, return_inverse=True)
-    place = place.ravel()
-    group = 2 * place + (scale >= MIN_PUBLISHED_SCALE)
-    count = 2 * (int(place.max(initial=-1)) + 1)
-    total = np.bincount(group, weight, minlength=count)
-    size = np.bincount(group, minlength=count)
-    groups = (size.reshape(-1, 2) > 0).sum(axis=1)[place]
-    whole = np.bincount(place, weight)[place]
-    divided = np.bincount(table[:, 0], minlength=len(known)) > 1
-    whole = np.where(divided[target], whole, 1.0)
-    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group]
-    after = after + whole * REDISTRIBUTED_FRACTION / groups
-    logw = np.log(
-        after
-        * (
-            (1.0 - REDISTRIBUTED_FRACTION) * weight / total[group]
-            + REDISTRIBUTED_FRACTION / size[group]
-        )
-    )
-    N = len(rows)
-    return known.replace(
-        rows=rows.replace(logw=logw[:N]),
-        borrowed=Borrowed(borrowed.target, borrowed.key, logw[N:]),
-    )
+    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list), of_ways
 
 
 def _record_innovations(
     known: Known, group: Group, pairs: Pairs, association: Association, models: ModelSet
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
+    if len(group.z):
+        covariances = group.is_stated, group.config.has_usual_fix_std
+        known = known.with_memory(fixes=known.memory['fixes'].with_covariances(*covariances))
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
@@ -621,8 +597,9 @@ def _record_innovations(
         before,
     )
     after = after.with_scale(scale, tentative)
-    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof')}
+    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
     columns['white'][tracks] = white
+    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.

@@ -68,6 +68,9 @@ KEPT_NS = 60_000_000_000
 """Poses are kept that long, and for the history of the tracker."""
 _LONGEST_PAUSE_NS = 3_600_000_000_000
 _RESTART_AFTER = 5
+UNMEASURED = 0.3
+"""Variance of an angle, rad^2, above which it is not measured: drivers write pi^2, 99 or 1e6. The
+composition of positions is an expansion that does not hold there."""
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -161,6 +164,17 @@ class Georeferencer:
             sentences.append(
                 f'{len(self._waiting)} relative fixes wait for the pose of the vessel: nav, or '
                 'nav_fix and heading, or the parameter vessel: fixed'
+            )
+        if count := self._counts['heading_unmeasured']:
+            sentences.append(
+                f'{count} relative fixes cannot be used: the vessel states that its heading is '
+                f'not measured (a variance above {UNMEASURED} rad^2). Give another heading, or '
+                'correct the covariance'
+            )
+        if self._counts['attitude_unmeasured']:
+            sentences.append(
+                'the vessel states that roll or pitch is not measured (a variance above '
+                f'{UNMEASURED} rad^2): {self.config.vessel_attitude_std_deg:g} degrees are assumed'
             )
         return sentences
 
@@ -287,8 +301,10 @@ class Georeferencer:
             elif self._on_earth() if self._by_places() else self._in_metres():
                 try:
                     done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
-                except Rejection:  # poses that leap within nanoseconds lead beyond the Earth
-                    self._counts['vessel_pose_gap'] += 1
+                except Rejection as error:
+                    # Poses that leap within nanoseconds lead beyond the Earth.
+                    unmeasured = error.reason == 'heading_unmeasured'
+                    self._counts[error.reason if unmeasured else 'vessel_pose_gap'] += 1
         self._waiting = waiting
         return sorted(done, key=attrgetter('stamp_ns'))
 
@@ -323,7 +339,7 @@ class Georeferencer:
         near = where.nearest(stamp_ns)
         stated = Uncertainty(
             _stated(near, slice(0, 3), assumed.position),
-            _stated(lies.nearest(stamp_ns), slice(3, 6), assumed.attitude),
+            self._stated_attitude(lies.nearest(stamp_ns), assumed.attitude),
         )
         if not places:
             return _Vessel(Pose(position, R), stated, near.frame_id, np.eye(3))
@@ -332,6 +348,18 @@ class Georeferencer:
         turn = axes @ self._true_north()
         stated = stated._replace(attitude=turn @ stated.attitude @ turn.T)
         return _Vessel(Pose(position, turn @ R), stated, near.frame_id, axes)
+
+    def _stated_attitude(self, sample: Navigation, assumed: FloatArray) -> FloatArray:
+        """Return the covariance (3, 3) of the attitude, with the assumed variance of roll or pitch
+        where it is not measured. An unmeasured heading keeps its variance."""
+        stated = _stated(sample, slice(3, 6), assumed)
+        level = np.diag(stated)[:2] > UNMEASURED
+        if level.any():
+            self._counts['attitude_unmeasured'] += 1
+            stated, axes = stated.copy(), np.flatnonzero(level)
+            stated[axes] = stated[:, axes] = 0.0
+            stated[axes, axes] = np.diag(assumed)[axes]
+        return stated
 
     def _true_north(self) -> FloatArray:
         """(3, 3) that turns vectors in magnetic axes into true east, north, up."""
@@ -345,6 +373,9 @@ class Georeferencer:
             config.transceiver_lever_std,
         )
         offset, covariance = fix.offset, fix.covariance
+        needs_heading = not fix.levelled or mounting.lever.any()
+        if needs_heading and vessel.uncertainty.attitude[2, 2] > UNMEASURED:
+            raise Rejection('heading_unmeasured', 'the heading of the vessel is not measured')
         if fix.levelled:
             turn = vessel.axes @ self._true_north()
             offset = turn @ offset

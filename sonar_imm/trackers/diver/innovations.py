@@ -35,12 +35,17 @@ first limit is at five sigma. Motion absorbs part of larger errors: the NIS stay
 excess.
 """
 
-TOO_SMALL, ENOUGH = 2.0, 12.0
-"""Scale above which covariances are too small, and the evidence that triggers a warning.
+TOO_SMALL, MOST, ENOUGH = 2.0, 10.0, 12.0
+"""Scale above which covariances are too small, the scale above which one fix counts no more, and
+the evidence that triggers a warning.
 
 The evidence is the accumulated log of the scale over `TOO_SMALL`: 8 groups of fixes at scale 10,
 17 at scale 4. With correct covariances it stayed below 4 in four hours of `simulate` scenarios.
 """
+
+
+LAST_SHARE = 0.5
+"""Scale, relative to the largest one, above which covariances are wrong by more than that."""
 
 
 class FixConsistency(NamedTuple):
@@ -68,6 +73,10 @@ class FixConsistency(NamedTuple):
     """Covariance scale estimated by the scaled filters."""
     evidence: float = 0.0
     """Evidence that the scale exceeds `TOO_SMALL`."""
+    stated: bool = False
+    """True after a fix that states a covariance."""
+    assumed: bool = False
+    """True after a fix without covariance, of a sensor whose `fix_std` is not set."""
 
     def with_fixes(self, white: FloatArray, before: FloatArray) -> FixConsistency:
         """Add whitened innovations (k, 2), and those `before` (k, 2) of the same tracks, NaN for
@@ -95,8 +104,18 @@ class FixConsistency(NamedTuple):
             return self
         # The smallest scale counts: other tracks may follow wrong fixes.
         least = float(scale[~tentative].min())
-        evidence = max(self.evidence + math.log(least / TOO_SMALL), 0.0)
+        evidence = max(self.evidence + math.log(min(least, MOST) / TOO_SMALL), 0.0)
         return self._replace(scale=least, evidence=evidence)
+
+    def with_covariances(self, stated: bool, usual: bool) -> FixConsistency:
+        """Add fixes of a sensor.
+
+        :param stated: whether a fix states a covariance.
+        :param usual: whether `fix_std` of the sensor is its default.
+        """
+        if self.stated or (self.assumed and not stated):
+            return self
+        return self._replace(stated=stated, assumed=self.assumed or (usual and not stated))
 
     @property
     def mean_nis(self) -> float:
@@ -108,16 +127,30 @@ class FixConsistency(NamedTuple):
         """Correlation of successive whitened innovations; NaN without a pair."""
         return self.cross / self.square if self.square else float('nan')
 
-    def warnings(self, bias_stated: bool) -> list[str]:
+    @property
+    def are_too_small(self) -> bool:
+        """True if the covariances are too small."""
+        return self.evidence >= ENOUGH
+
+    def errors_last(self, bias_stated: bool) -> bool:
+        """Return whether the errors of fixes may last, or covariances are too large.
+
+        bias_stated: whether `fix_bias_std` is set.
+        """
+        if bias_stated or self.are_too_small or self.number < 0.99 * MEMORY:
+            return False
+        small = self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED
+        return small and self.mean_nis <= OPTIMISTIC
+
+    def warnings(self, bias_stated: bool, largest: float) -> list[str]:
         """Return warnings about wrong covariances: for families when the evidence suffices,
-        otherwise after `MEMORY` fixes."""
-        if self.evidence >= ENOUGH:
-            times = self.scale * max(self.mean_nis, 1.0)
-            return [
-                f'fix covariances too small by a factor {times:.2g}: errors are '
-                f'{math.sqrt(times):.2g} times as large as reported. Multiply covariance_scale by '
-                f'{times:.2g}'
-            ]
+        otherwise after `MEMORY` fixes.
+
+        :param bias_stated: whether `fix_bias_std` is set.
+        :param largest: largest scale of `covariance_scales`.
+        """
+        if self.are_too_small:
+            return [self._too_small(largest)]
         if self.number < 0.99 * MEMORY:
             return []
         if self.mean_nis > OPTIMISTIC:
@@ -126,14 +159,36 @@ class FixConsistency(NamedTuple):
                 '(expected 1). Increase covariance_scale or the motion noise; model_set families '
                 'estimates the scale'
             ]
-        if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
+        if self.errors_last(bias_stated):
             return [
                 f'fix innovations are too small or correlated: NIS {self.mean_nis:.2g} per '
                 f'coordinate (expected 1), lag-1 correlation {self.lag_1:.2g} (expected 0). If '
                 'the source filters its output, set fix_bias_std; otherwise its covariances are '
-                'too large'
+                'too large. The published covariance includes that of a fix'
             ]
         return []
+
+    def _too_small(self, largest: float) -> str:
+        """Return the warning about covariances that are too small."""
+        times = self.scale * max(self.mean_nis, 1.0)
+        if self.scale > LAST_SHARE * largest and largest > MOST:
+            more = 'a million' if largest == 1e6 else f'{largest:,.6g}'
+            return (
+                f'fix covariances too small by a factor of more than {more}: errors are more than '
+                f'{math.sqrt(largest):,.4g} times as large as reported. Check the unit of the '
+                'covariances'
+            )
+        factor = _rounded(times)
+        return (
+            f'fix covariances too small by a factor {factor}: errors are '
+            f'{_rounded(math.sqrt(times))} times as large as reported. Multiply covariance_scale '
+            f'by {factor}'
+        )
+
+
+def _rounded(value: float) -> str:
+    """Return a number >= 1 with two significant digits and without an exponent."""
+    return f'{float(f"{value:.2g}"):.12g}'
 
 
 def whiten_innovations(

@@ -38,6 +38,9 @@ from ...estimation.covariance import are_sound, with_jitter
 from ...estimation.rows import Borrowed, Rows
 from .models import ModelSet
 
+BORROWING = ('scale',)
+"""Assumptions that can borrow (`estimation.rows`)."""
+
 MOST_STEPS = 300
 """Maximum number of prediction steps over a gap."""
 
@@ -86,7 +89,7 @@ class Known:
         columns: dict[str, np.ndarray] = {
             name: np.empty((0, *feature.shape), feature.kind) for name, feature in features.items()
         }
-        return cls(0, life, rows, Borrowed.empty(), columns, {}, {})
+        return cls(0, life, rows, Borrowed.from_rows(rows, BORROWING), columns, {}, {})
 
     def __len__(self) -> int:
         return len(self.life)

@@ -85,6 +85,9 @@ LIVELY, QUIET = (0.05, 0.6), (0.03,)
 LIVELY_STAY = 0.85
 """Probability of keeping a lively model over a reference step."""
 
+USUAL_SCALES = 0.1, 10.0
+"""Limits of the covariance scales that have a row in a new track."""
+
 SPEED_MEMORY = 60.0
 """Time constant of the speed memory of a hovering target, s. Without decay, a target that stands
 for minutes is estimated as slowly swimming, also when it moves on."""
@@ -187,7 +190,7 @@ class ModelSet:
     families: Families | None = None
     """Data of unequal models; None if all models have all components."""
     scales: tuple[float, ...] = (1.0,)
-    """(K,) covariance scales of K rows."""
+    """Covariance scales."""
     parts: tuple[Part, ...] = field(init=False)
     bank: Bank = field(init=False)
     _cache: OrderedDict[float, tuple[Moves, ...]] = field(factory=OrderedDict, init=False)
@@ -201,9 +204,15 @@ class ModelSet:
         return int(self.E.shape[2])
 
     @property
+    def row_scales(self) -> tuple[float, ...]:
+        """(K,) covariance scales of the K rows of a new track: the usual ones, if any."""
+        least, most = USUAL_SCALES
+        return tuple(s for s in self.scales if least <= s <= most) or self.scales
+
+    @property
     def rows_per_track(self) -> int:
         """Number of rows of a new track."""
-        return max(len(self.starts), len(self.scales))
+        return max(len(self.starts), len(self.row_scales))
 
     @property
     def fix_matrix(self) -> FloatArray:
@@ -254,8 +263,8 @@ class ModelSet:
         x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
         x[..., :2], x[..., 2:] = position[:, None, None], self.start_mean
         P[..., :2, :2] = covariance[:, None, None]
-        if from_fix and measured and len(self.scales) > 1:
-            P[..., :2, :2] *= np.array(self.scales)[:, None, None, None]
+        if from_fix and measured and len(self.row_scales) > 1:
+            P[..., :2, :2] *= np.array(self.row_scales)[:, None, None, None]
         diagonal = P.reshape(*shape, n * n)[..., :: n + 1]
         diagonal[..., 2:] = self.start_variance
         if self.height >= 0:
@@ -272,7 +281,7 @@ class ModelSet:
         """Return the rows of T tracks with K rows each: x (T, K, M, n), P (T, K, M, n, n), mu (T,
         K, M), logw (T, K)."""
         T, K, M, size = x.shape
-        scale = np.resize(np.array(self.scales), K)
+        scale = np.resize(np.array(self.row_scales), K)
         start = np.resize(np.arange(len(self.starts)), K)
         return Rows(
             self.to_blocks(x.reshape(T * K, M, size), P.reshape(T * K, M, size, size)),
@@ -511,7 +520,7 @@ def _build_families(config: DiverConfig) -> ModelSet:
         motion,
         families=Families(family, kind, units, *speed, sector),
         # With depth as a state, rows are depth hypotheses instead of scaled filters.
-        scales=(1.0,) if config.dimensions == 3 else config.covariance_scales,
+        scales=(1.0,) if config.dimensions == 3 else tuple(sorted({*config.covariance_scales})),
     )
 
 

@@ -49,13 +49,13 @@ class Assumptions(NamedTuple):
             return cls(every, every, scale, rows.logw, rows.target, np.ones(N, np.bool_))
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
-        lender = borrowed.find_lenders(rows, 'scale')
+        lender = borrowed.find_lenders(rows)
         # A borrowed scale has no offset.
         nil = N if rows.tail else 0
         return cls(
             np.concatenate([np.arange(N), lender])[order],
             np.concatenate([np.arange(N), lender + nil])[order],
-            np.concatenate([scale, borrowed.key])[order],
+            np.concatenate([scale, borrowed.key['scale']])[order],
             np.concatenate([rows.logw, borrowed.logw])[order],
             target[order],
             order < N,

@@ -39,17 +39,25 @@ from .known import Feature, Known, track_positions
 from .models import ModelSet
 from .scan import Group, Scan
 
-FEATURES = {'near_to': Feature(0, kind=np.int64), 'near_for': Feature(0, kind=np.int64)}
-"""near_to: ID of the older track nearby, 0 for none; near_for: number of scans near it."""
+END_EXISTENCE = 0.002
+"""Existence, or target probability, below which a track ends."""
+
+FEATURES = {
+    'near_to': Feature(0, kind=np.int64),
+    'near_for': Feature(0, kind=np.int64),
+    'least_existence': Feature(END_EXISTENCE),
+}
+"""near_to: ID of the older track nearby, 0 for none; near_for: number of scans near it.
+
+least_existence: existence below which the track ends: at most that at its start. Where false fixes
+are dense, or scans frequent, a target starts with less than `END_EXISTENCE`.
+"""
 
 CONFIRM_EVIDENCE = 2.5
 """Minimum sum of detection probabilities of a confirmed track."""
 
 PUBLISH_EXISTENCE = 0.5
 """Existence above which a track is published."""
-
-END_EXISTENCE = 0.002
-"""Existence, or target probability, below which a track ends."""
 
 NEAR_TENTATIVE, SCANS_TENTATIVE = 4.0, 2
 """Squared Mahalanobis distance to an older track, and number of consecutive scans, after which a
@@ -83,7 +91,7 @@ def pruning_stage(
         by_existence = np.isfinite(known['existence'])
         life, kept = known.life.scan(hit, known.stamp_ns, rules, looked=looked & ~by_existence)
         if models.families is not None and any(group.is_complete for group in scan.fixes):
-            doubted, over = confirmation_masks(known, config)
+            doubted, over = confirmation_masks(known, config, scan.fixes)
             status = np.where(doubted[kept], TENTATIVE, life.status).astype(np.uint8)
             life, alive = evolve(life, status=status), alive & ~over
         if by_existence.any():
@@ -129,16 +137,20 @@ def _limit_tracks(known: Known, kept: BoolArray, life: Tracks, config: DiverConf
     return known.select(kept, life)
 
 
-def confirmation_masks(known: Known, config: DiverConfig) -> tuple[BoolArray, BoolArray]:
+def confirmation_masks(
+    known: Known, config: DiverConfig, groups: Sequence[Group]
+) -> tuple[BoolArray, BoolArray]:
     """Return which tentative tracks (T,) must not be confirmed, and which end.
 
     Rows with large covariances accept distant fixes, so hits alone do not confirm a track. The
     score is compared with the odds of a new target against a false fix.
     """
-    odds = known['score'] + math.log(config.birth_density / config.usual_clutter)
+    new = max(group.new_targets for group in groups if group.is_complete)
+    start = math.log(new / config.usual_clutter)
+    odds, least = known['score'] + start, min(_log_odds(END_EXISTENCE), start)
     tentative = (known.life.status == TENTATIVE) & (known['target_id'] == NOBODY)
     asked = tentative & np.isnan(known['existence'])
-    return asked & (odds < _log_odds(CONFIRM_EXISTENCE)), asked & (odds < _log_odds(END_EXISTENCE))
+    return asked & (odds < _log_odds(CONFIRM_EXISTENCE)), asked & (odds < least)
 
 
 def _log_odds(probability: float) -> float:
@@ -168,7 +180,7 @@ def update_status(
     """
     was, existence = known.life.status != TENTATIVE, known['existence']
     confirmed = was | (existence > CONFIRM_EXISTENCE) & (known['evidence'] >= CONFIRM_EVIDENCE)
-    alive = ~(existence < END_EXISTENCE)
+    alive = ~(existence < known['least_existence'])
     status = track_status(known.life.status, confirmed, hit, looked)
     if not looked.any():
         return StatusUpdate(status, alive, known['near_to'], known['near_for'])

@@ -93,9 +93,7 @@ def restart_lost_tracks(
         if hidden or group.target_id is not None or group.config.max_tracks == 1:
             lost = lost and _can_reach(known, track, z, R, group, models)
         if np.isfinite(rejected[track, 0]) and lost:
-            new = restarted_track(
-                known, track, rejected[track], z, R, group, models, chain, layout
-            )
+            new = restarted_track(known, track, rejected[track], row, group, models, chain, layout)
         rejected = rejected.copy()
         if new is None:
             rejected[track] = known.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
@@ -157,8 +155,7 @@ def restarted_track(
     known: Known,
     track: int,
     rejected: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
+    row: int,
     group: Group,
     models: ModelSet,
     chain: AdaptiveChain,
@@ -166,8 +163,9 @@ def restarted_track(
 ) -> Rows | None:
     """Return the rows of a track started at its rejected fix (6,).
 
-    Return None if the fix z (2,), R (2, 2) does not agree, or if two false fixes are likely.
+    Return None if the fix `row` of the group does not agree, or if two false fixes are likely.
     """
+    z, R = group.z[row], group.R[row]
     stamp, px, py, xx, xy, yy = rejected.tolist()
     x, P, mu = models.initial_states(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
     with_velocities_at_fix(P, models, group.config)
@@ -177,11 +175,11 @@ def restarted_track(
     learnt = known['learnt'][track : track + 1]
     rows = predict_over(models, chain, rows, learnt, dt, group.config.longest_step)[-1].rows
     whole = fixes.track_log_density(rows, z, R, models)
-    if whole <= fixes.gate_log_density(group):
+    if whole <= fixes.gate_log_density(group)[row]:
         return None
     if group.target_id is None and group.config.max_tracks > 1:
         _, covariance = track_outputs(rows, tuple(part.fix_matrix for part in models.parts))
         area = math.pi * REACH * math.sqrt(np.linalg.det(covariance[0] + R))
-        if group.clutter * area > MISTAKEN:
+        if group.clutter[row] * area > MISTAKEN:
             return None
     return rows

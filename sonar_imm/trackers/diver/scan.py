@@ -23,7 +23,7 @@ The message order of arrivals does not change the result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ import numpy as np
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of, Start
-from .config import CLUTTER, DiverConfig
+from .config import DiverConfig
 from .coverage_map import DetectionProbability
 from .explanations import PingMeasurements
 from .instruments import Layout
@@ -129,13 +129,17 @@ class Birth(NamedTuple):
 MOST_BIRTHS = 1.5
 """Maximum ratio of birth density and estimated clutter density."""
 
+FIRST_LOOK = 10.0
+"""Time, s, over which targets have arrived before the first scan of a sensor, and the longest
+before a later one."""
+
 
 @define(eq=False)
 class Group:
     """D fixes of one stamp and sensor, with at most one per target.
 
-    Later stages use the slots `detection` (`coverage`), `pairs` and `association` (`fixes`), and
-    `births`. One stage writes each slot.
+    Later stages use the slots `learnt_clutter` and `elapsed` (`clutter`), `detection`
+    (`coverage`), `pairs` and `association` (`fixes`), and `births`. One stage writes each slot.
     """
 
     z: FloatArray
@@ -154,8 +158,12 @@ class Group:
     """Name of the sensor."""
     seen_from: FloatArray | None = None
     """(2,) sensor position; None if unknown."""
-    learnt_clutter: float = CLUTTER
-    """Estimated clutter density, 1/m^2, if `clutter_density` is not set."""
+    is_stated: bool = True
+    """True if a fix states its covariance."""
+    learnt_clutter: FloatArray | None = field(default=None, init=False)
+    """(D,) estimated clutter density at each fix, 1/m^2; None if none is estimated."""
+    elapsed: float = field(default=FIRST_LOOK, init=False)
+    """Time since the scan before of this sensor, s."""
     detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
     association: Association | None = field(default=None, init=False)
@@ -170,23 +178,27 @@ class Group:
         return self.sensor, self.seen_from
 
     @property
-    def clutter(self) -> float:
-        """Clutter density, 1/m^2."""
-        return self.config.clutter_density or self.learnt_clutter
+    def clutter(self) -> FloatArray:
+        """(D,) clutter density at each fix, 1/m^2."""
+        if self.learnt_clutter is None:
+            return np.full(len(self.z), self.config.usual_clutter)
+        return self.learnt_clutter
 
     @property
-    def birth_density(self) -> float:
-        """Density of new targets, 1/m^2.
+    def new_targets(self) -> float:
+        """Density of the targets that arrived since the scan before, 1/m^2."""
+        return self.config.birth_density * self.elapsed
+
+    @property
+    def birth_density(self) -> FloatArray:
+        """(D,) density of new targets at each fix, 1/m^2.
 
         If the clutter density is estimated, the ratio to it is limited. With almost no false
         fixes, an unlimited birth density would attribute the fixes of known targets to new ones.
         """
-        stated = self.config.birth_density
-        return (
-            stated
-            if self.config.clutter_density
-            else min(stated, MOST_BIRTHS * self.learnt_clutter)
-        )
+        if self.config.clutter_density:
+            return np.full(len(self.z), self.new_targets)
+        return np.minimum(self.new_targets, MOST_BIRTHS * self.clutter)
 
 
 @define(eq=False)
@@ -214,18 +226,9 @@ class Scan:
     """Births from pings."""
 
     @classmethod
-    def from_items(
-        cls,
-        items: Sequence[Measurement],
-        config: DiverConfig,
-        clutter: Mapping[str, float],
-    ) -> Scan:
-        """Build the scan of `items`. clutter: estimated clutter density of each sensor."""
+    def from_items(cls, items: Sequence[Measurement], config: DiverConfig) -> Scan:
+        """Build the scan of `items`."""
         fixes, names = position_groups(items, config), []
-        for group in fixes if config.pairing != 'gnn' else ():
-            density = clutter.get(group.sensor)
-            if group.target_id is None and density is not None:
-                group.learnt_clutter = density
         for group in fixes:
             if group.target_id is not None:
                 names += group.target_id.tolist()
@@ -303,8 +306,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     if scan.covariance is not None:
         covariance = scan.covariance[rows]
     R = np.ascontiguousarray(covariance[:, :2, :2])
-    if not (stated := np.isfinite(R)).all():
-        R[~stated.all(axis=(1, 2))] = np.eye(2) * config.fix_std**2
+    stated = np.isfinite(R).all(axis=(1, 2))
+    R[~stated] = np.eye(2) * config.fix_std**2
     heights = (
         Heights.from_fixes(position, covariance, config.covariance_scale)
         if config.dimensions == 3
@@ -313,7 +316,8 @@ def _make_group(scan: Fixes, rows: IndexArray, config: DiverConfig, *, named: bo
     target_id = np.asarray(scan.target_id)[rows] if named else None
     z = np.ascontiguousarray(position[:, :2])
     named_rows = target_id, not named, heights, scan.sensor, _sensor_position(config)
-    return Group(z, R * config.covariance_scale, config, *named_rows)
+    is_stated = bool(stated.any())
+    return Group(z, R * config.covariance_scale, config, *named_rows, is_stated=is_stated)
 
 
 def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
@@ -321,10 +325,14 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
     unknown = np.eye(2) * config.fix_std**2
     z = np.empty((len(fixes), 2))
     R = np.empty((len(fixes), 2, 2))
+    is_stated = False
     for row, fix in enumerate(fixes):
         z[row] = fix.position[:2]
         stated = None if fix.covariance is None else fix.covariance[:2, :2]
-        R[row] = unknown if stated is None or math.isnan(stated[0, 0]) else stated
+        if stated is None or math.isnan(stated[0, 0]):
+            R[row] = unknown
+        else:
+            R[row], is_stated = stated, True
     heights, factor = None, config.covariance_scale
     if config.dimensions == 3:
         nothing = np.full((3, 3), np.nan)
@@ -332,9 +340,9 @@ def _group_single_fixes(fixes: Sequence[Fix], config: DiverConfig) -> Group:
         heights = Heights.from_fixes(
             np.array([fix.position for fix in fixes]), np.array(whole), factor
         )
-    more = None, config.fixes_are_scans, heights, fixes[0].sensor
+    more = None, config.fixes_are_scans, heights, fixes[0].sensor, _sensor_position(config)
     return _with_sensor_position(
-        fixes[0], Group(z, R * factor, config, *more, _sensor_position(config))
+        fixes[0], Group(z, R * factor, config, *more, is_stated=is_stated)
     )
 
 

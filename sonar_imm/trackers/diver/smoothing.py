@@ -29,7 +29,7 @@ import numpy as np
 
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray, IndexArray
-from ...estimation.rows import Borrowed, Rows
+from ...estimation.rows import Rows
 from ...estimation.smoothing import imm_smooth, IMMPredicted
 from ...measurements import Measurement
 from .known import Known, predict_over, Prediction
@@ -307,7 +307,7 @@ class SmoothingDiverTracker(DiverTracker):
         key = {name: np.array([each[name] for each in keys]) for name in known.rows.key}
         blocks, nobody = self.models.to_blocks(x, P), np.full(len(target), -1)
         rows = Rows(blocks, mu, logw, target, nobody, key)
-        return known.replace(rows=rows, borrowed=Borrowed.empty())
+        return known.replace(rows=rows, borrowed=known.borrowed.select(np.arange(0)))
 
 
 def _track_index(known: Known, track_id: int) -> int:

@@ -64,6 +64,7 @@ from . import (
     offsets,
     pruning,
     restart,
+    scales,
 )
 from .config import DiverConfig
 from .coverage_map import configured_coverage
@@ -131,6 +132,7 @@ class DiverTracker:
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
             hear_sensor,
+            clutter.estimate_densities,
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
             self._associate,
@@ -235,7 +237,7 @@ class DiverTracker:
 
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
-        scan = Scan.from_items(items, self.config, previous.memory['clutter'].densities())
+        scan = Scan.from_items(items, self.config)
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:
@@ -250,7 +252,9 @@ class DiverTracker:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
         has_scales = len(previous) and len(self.models.scales) > 1
-        start = fixes.redistribute_weights(previous) if has_scales else previous
+        start = (
+            scales.redistribute_weights(previous, self.models.scales) if has_scales else previous
+        )
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )

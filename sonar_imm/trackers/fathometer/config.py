@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from attrs import evolve, frozen
+from attrs import evolve, fields, frozen
 
 from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
@@ -27,6 +27,7 @@ from ..shared_parameters import StampParameters
 PULSES = ('auto', 'band', 'processor', 'envelope', 'gaussian', 'file')
 POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
+PHONE_CORRECTIONS = ('off', 'gains', 'full')
 HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
 MAX_DECAYS = 8
@@ -81,6 +82,15 @@ class FathometerConfig(StampParameters):
         'time between previews, which are estimates from the sliding average that are not '
         'committed; 0: none', range=(0.0, 86400.0))
 
+    # -- hydrophones that differ ------------------------------------------------------------------
+    phone_correction: str = parameter('full', '',
+        'whether the cross-spectra are corrected for hydrophones that differ: off; gains; full '
+        '(turned and late ones, too, and those that hear something else are left out)',
+        choices=PHONE_CORRECTIONS)
+    phone_least_share: float = parameter(0.1, '',
+        'phone_correction full: least share of the sound of its neighbours that a hydrophone '
+        'has; with less it is left out', range=(0.0, 1.0))
+
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', '', 'beamformer that looks up and down', choices=PROCESSORS)
     output: str = parameter('coherence', '',
@@ -111,9 +121,9 @@ class FathometerConfig(StampParameters):
         'shortest half wavelength', range=(0.0, 100.0))
     noise_depth_min: float = live(180.0, 'm',
         'upper end of the depths where noise is measured, down to noise_depth_max; the whole '
-        'trace when it does not reach there. 0 together with noise_depth_max, and with automatic '
-        'snapshots that are too short for it: at the mirror image of the depths tracked, or in '
-        'what reflectors leave of a trace', range=(0.0, 12000.0))
+        'trace when it does not reach there. 0 together with noise_depth_max, and where they lie '
+        'beyond half a snapshot: at the mirror image of the depths tracked, or in what '
+        'reflectors leave of a trace', range=(0.0, 12000.0))
     noise_depth_max: float = live(300.0, 'm',
         'lower end of the depths where noise is measured, see noise_depth_min',
         range=(0.0, 12000.0))
@@ -290,6 +300,14 @@ class FathometerConfig(StampParameters):
     def noise_from_mirror(self) -> bool:
         """True when no depths of noise are given."""
         return not (self.noise_depth_min or self.noise_depth_max)
+
+    @property
+    def noise_told(self) -> bool:
+        """True when the depths of noise are not the default ones."""
+        names = 'noise_depth_min', 'noise_depth_max'
+        return any(
+            getattr(self, name) != getattr(fields(type(self)), name).default for name in names
+        )
 
     @property
     def negative_share(self) -> float:

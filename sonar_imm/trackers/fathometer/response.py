@@ -25,7 +25,6 @@ on the instrument; the rest is common (`envelope_parameters`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -34,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acoustics import fathometer
+from ...acoustics.hydrophones import correct_phones
 from ...acoustics.pulse import (
     band_pulse,
     envelope_pulse,
@@ -51,6 +51,7 @@ from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError, small_text
 from .config import FathometerConfig
+from .noise import LEAST_NOISE_SAMPLES, measured_sigma, mirror_sigma
 
 MAX_CELLS = 100_000
 MAX_MOVES = 8_000_000
@@ -59,7 +60,6 @@ tables of moves, 32 where reflectors of either sign are looked for."""
 MAX_SIGMAS = 1e6
 LOUDEST = 1e100
 """Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
-LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 DECAYS = (2.0, 4.0, 8.0, 16.0)
 """Depths, m, over which the scatter of an envelope may fall to 1/e: silt with gas to sand."""
@@ -101,7 +101,9 @@ class Response:
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
     traces; snapshot_seconds: of what was averaged, 0 for traces. pulse: of this record, None for
     the one that is configured. noise_unknown: sigma is that of the whole trace, reflectors
-    included.
+    included. phones (4, M): gain in dB, sign, delay in s and share of each hydrophone before it
+    was corrected, NaN where it was not looked at, see `acoustics.hydrophones`. noise_wraps: the
+    depths that are configured for noise reach beyond half a snapshot.
     """
 
     stamp_ns: int
@@ -114,6 +116,8 @@ class Response:
     snapshot_seconds: float = 0.0
     pulse: SampledPulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
+    noise_wraps: bool = False
+    phones: Annotated[FloatArray, '4,M'] = field(factory=lambda: np.empty((4, 0)), repr=False)
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
@@ -253,31 +257,22 @@ def residual_sigma(response: Response, fitted: FloatArray) -> Response:
     return evolve(response, sigma=np.full(len(response.depth), sigma))
 
 
-def measured_sigma(quiet: FloatArray) -> float:
-    sigma = fathometer.noise_sigma(quiet)
-    if not sigma > 0.0:
-        # Coarse steps of a converter leave no deviation of the median.
-        sigma = float(np.std(quiet))
-    if not (np.isfinite(sigma) and sigma > 0.0):
-        raise Rejection('no_noise', 'the record has no noise to compare its peaks with')
-    return sigma
-
-
 def array_response(
     record: CrossSpectra,
     lattice: Lattice,
     config: FathometerConfig,
     reference_depth: float,
-    *,
-    mirrored: bool = False,
 ) -> Response:
-    """Look up and down with the array and correlate. mirrored: noise is measured in the mirror
-    window even where depths are configured for it. Raises `Rejection` ('bad_band',
+    """Look up and down with the array and correlate. Raises `Rejection` ('bad_band',
     'bad_frequency', 'singular', 'no_noise')."""
     below = lattice.depth - reference_depth
     coherence = array_coherence(record, config, below)
     gamma, first, spacing, aperture = coherence[:4]
     seconds = config.snapshot_seconds or 1.0 / spacing
+    # Lags beyond half a snapshot are those of the other side, and what is heard of the array
+    # itself at lag zero.
+    half = 0.25 * config.sound_speed * min(seconds, 1.0 / spacing)
+    wraps = not config.noise_from_mirror and config.noise_depth_max - reference_depth > half
     pulse = None
     if config.pulse == 'processor' and config.processor == 'mvdr':
         coherent = coherence._replace(weight=coherence.weight * coherence.share)
@@ -315,8 +310,8 @@ def array_response(
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
-    if not config.noise_sigma and (mirrored or config.noise_from_mirror):
-        sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
+    if not config.noise_sigma and (wraps or config.noise_from_mirror):
+        sigma = mirror_sigma(at, below, lattice.step, reference_depth, aperture, half)
     elif not config.noise_sigma:
         span = config.noise_depth_max - config.noise_depth_min
         step = max(lattice.step, span / MAX_CELLS)
@@ -335,6 +330,8 @@ def array_response(
         aperture,
         seconds,
         pulse,
+        phones=coherence.phones,
+        noise_wraps=wraps and not config.noise_sigma,
     )
 
 
@@ -353,33 +350,13 @@ def processor_pulse(
     return SampledPulse(step * np.arange(count, dtype=np.float64), value / value[0])
 
 
-def mirror_sigma(
-    at: Callable[[float, float, int], FloatArray],
-    lattice: Lattice,
-    reference_depth: float,
-    aperture: float,
-) -> float:
-    """Noise of a response where it holds no echo: at the lags of the lattice, negative, that is at
-    the depths 2 reference_depth - z. It fades there as it does on the lattice. Left out: what is
-    nearer than the aperture. at(first, step, count): the response."""
-    # A short lattice is made longer.
-    count = max(lattice.cells, 4 * LEAST_NOISE_SAMPLES)
-    first = 2.0 * reference_depth - lattice.first - lattice.step * (count - 1)
-    depth = first + lattice.step * np.arange(count)
-    quiet = reference_depth - depth >= aperture
-    if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
-        raise Rejection('no_noise', 'nothing of the mirrored depths is free of the array itself')
-    noise = at(first, lattice.step, count)[quiet]
-    # The noise of a coherence has mean zero: no median of it is taken off.
-    return measured_sigma(np.append(noise, -noise))
-
-
 class ArrayCoherence(NamedTuple):
     """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
     spacing in Hz; aperture: length of the array, m; weight (F,): the spectrum of an echo, NaN as
     gamma, if all noise were the surface's and the matrices exact; share (F,): by what it is less
     than that; turns (K, F): what takes the phase of `fathometer.echo_phase` off echoes from 1 /
-    inverse (K,) m below the array; one, and one row of ones, where it is left."""
+    inverse (K,) m below the array; one, and one row of ones, where it is left; phones (4, M): see
+    `Response`."""
 
     gamma: NDArray[np.complexfloating]
     first: float
@@ -389,6 +366,7 @@ class ArrayCoherence(NamedTuple):
     share: FloatArray
     turns: NDArray[np.complexfloating]
     inverse: FloatArray
+    phones: FloatArray
 
 
 def array_coherence(
@@ -413,8 +391,9 @@ def array_coherence(
     if config.processor == 'mvdr' and config.loading < 1e-9 and rank_deficient(record):
         raise Rejection('singular', _SINGULAR)
     alive = np.flatnonzero(record.alive)
-    heights = config.element_spacing * alive
     csdm, scale = _near_one(record.csdm[rows[use]][:, alive[:, None], alive])
+    csdm, alive, phones = _equal_phones(csdm, record.frequency[rows[use]], alive, record, config)
+    heights = config.element_spacing * alive
     w = fathometer.steering(record.frequency[rows[use]], heights, config.sound_speed)
     try:
         found, power = _both_beams(csdm, scale, w, config)
@@ -458,7 +437,29 @@ def array_coherence(
         turns = np.ones((_PHASES, len(gamma)), np.complex128)
         turns[:, index[use][there]] = np.exp(-1j * phase)
     first = float(record.frequency[rows[0]])
-    return ArrayCoherence(gamma, first, spacing, aperture, weight, share, turns, inverse)
+    return ArrayCoherence(gamma, first, spacing, aperture, weight, share, turns, inverse, phones)
+
+
+def _equal_phones(
+    csdm: NDArray[np.complexfloating],
+    frequency: FloatArray,
+    alive: NDArray[np.int64],
+    record: CrossSpectra,
+    config: FathometerConfig,
+) -> tuple[NDArray[np.complexfloating], NDArray[np.int64], FloatArray]:
+    """The cross-spectra as of equal hydrophones, those of `alive` that are kept, and what was
+    found of all of the record, see `Response.phones`."""
+    phones = np.full((4, record.hydrophones), np.nan)
+    if config.phone_correction == 'off':
+        return csdm, alive, phones
+    full = config.phone_correction == 'full'
+    wave = config.sound_speed / config.element_spacing
+    csdm, keep, fit = correct_phones(
+        csdm, frequency, alive, wave, config.phone_least_share, full=full
+    )
+    gain_db = 10.0 * np.log10(np.median(fit.gain, axis=0))
+    phones[:, alive] = np.stack([gain_db, fit.sign, fit.delay, fit.share])
+    return csdm, alive[keep], phones
 
 
 def _near_one(

@@ -47,9 +47,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 import math
-from typing import Any, ClassVar
+from typing import Any
 
-from attrs import define, evolve, field, frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics.pulse import independent_samples
@@ -68,6 +68,8 @@ from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
+from .fit import Fit
+from .phones import PhoneFaults
 from .pressure import (
     Collected,
     CompanionDepths,
@@ -107,11 +109,9 @@ from .slopes import slopes_followed
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
-_RECORDS, _LEAST = 100, 10
 LONGEST_GAP = 5000
-_FULL, _UNEXPLAINED, _NEGATIVE = 0.5, 0.05, 1e-9
-_LEFT, _DEEP, _OF_STRONGEST = 0.5, 6.0, 0.25
-"""Share of records with a negative echo; how deep it is, in sigma and of the strongest one."""
+_DEEP, _OF_STRONGEST = 6.0, 0.25
+"""How deep a negative echo is, in sigma and of the strongest one."""
 
 
 @frozen(eq=False)
@@ -147,6 +147,7 @@ class FathometerTracker:
         '_taken',
         '_health',
         '_fit',
+        '_phones',
     )
 
     response: Response | None
@@ -165,6 +166,7 @@ class FathometerTracker:
     _taken: deque[Taken]
     _health: dict[str, float]
     _fit: Fit
+    _phones: PhoneFaults
 
     def __init__(self, config: FathometerConfig):
         self.config = config
@@ -197,6 +199,7 @@ class FathometerTracker:
         self._taken = deque(maxlen=self.config.smoothing_lag + 1)
         self._health = {}
         self._fit = Fit()
+        self._phones = PhoneFaults()
 
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
@@ -243,8 +246,10 @@ class FathometerTracker:
 
     def health(self) -> dict[str, float]:
         """Numbers of the last record: effective sample size, log evidence against an empty one,
-        noise, most probable number of reflectors; and hydrophones left out, snapshots waiting."""
-        return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
+        noise, most probable number of reflectors; and hydrophones left out, snapshots waiting,
+        what was corrected of hydrophones."""
+        waiting = {'snapshots_waiting': float(self._pressure.waiting)}
+        return {**self._health, **waiting, **self._phones.health()}
 
     def warnings(self) -> list[str]:
         """What of the input leads to estimates that are worse than they say, in sentences."""
@@ -259,7 +264,7 @@ class FathometerTracker:
                 f'in {heaving} records the array heaves by more than {MOST_HEAVE:g} m: their '
                 'echoes are weaker than they should be'
             )
-        return [*found, *self._fit.warnings(self.config)]
+        return [*found, *self._phones.warnings(), *self._fit.warnings(self.config)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -349,12 +354,7 @@ class FathometerTracker:
             lattice = lattice_of_array(depth, self.config)
             self._begin(evolve(lattice, hydrophones=self._hydrophones))
         assert self._padded is not None
-        # Lags beyond half a snapshot are those of the other side: automatic snapshots of pressure
-        # can be too short for the depths of noise.
-        way = 2.0 * (self.config.noise_depth_max - depth) / self.config.sound_speed
-        folded = span_ns > 0 and not self.config.snapshot_seconds
-        folded = folded and way > 0.5 * collected.seconds
-        return array_response(record, self._padded, self._settled, depth, mirrored=folded)
+        return array_response(record, self._padded, self._settled, depth)
 
     def _begin(self, lattice: Lattice) -> None:
         settled = self.config.settled(lattice.hydrophones)
@@ -467,6 +467,7 @@ class FathometerTracker:
         )
         positive = self._settled.polarity == 'positive'
         negative = positive and self._left_negative(reflectors, response)
+        self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self.config)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self._settled, records))
@@ -541,64 +542,3 @@ class FathometerTracker:
         pulse = response.pulse or self.pulse
         found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
         return found, pmf
-
-
-@define(eq=False)
-class Fit:
-    """Whether the last records go with what is configured.
-
-    A filter with another pulse, or a noise that is too low, does not fail: it fills the record
-    with reflectors up to its limit, or finds no set that explains the record. Kept are whether a
-    set explained each record, how probable the greatest number of reflectors was, and whether it
-    has negative samples, and negative echoes that nothing explains. STATE: see
-    `trackers.Tracker`."""
-
-    STATE: ClassVar = ('_explained', '_full', '_found', '_signed', '_negative')
-
-    _explained: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
-    _full: deque[float] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
-    _found: deque[int] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
-    _signed: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
-    _negative: deque[bool] = field(init=False, factory=lambda: deque(maxlen=_RECORDS))
-
-    def add(
-        self, ok: bool, reflectors: Reflectors, response: Response, full: float, negative: bool
-    ) -> None:
-        """One record; full: the probability of the greatest number of reflectors; negative: an
-        echo of that sign is left."""
-        self._explained.append(ok)
-        self._full.append(full)
-        self._found.append(len(reflectors.depth))
-        self._signed.append(bool(np.min(response.amplitude) < -_NEGATIVE))
-        self._negative.append(negative)
-
-    def warnings(self, config: FathometerConfig) -> list[str]:
-        """What is wrong, with the parameters that it may come from."""
-        if len(self._full) < _LEAST:
-            return []
-        envelope = not any(self._signed)
-        advice = 'noise_sigma, pulse and order_max may not fit'
-        if envelope and (config.pulse in ('auto', 'band') or not config.scatter_decay):
-            advice = 'the records are never negative: envelopes need pulse gaussian or file, '
-            advice += 'pulse_width and scatter_decay'
-        sentences = []
-        full = float(np.mean(self._full))
-        if config.orders > 1 and full > _FULL:
-            sentences.append(
-                f'{np.mean(self._found):.1f} reflectors a record against a limit of '
-                f'{config.order_max}, which is reached with probability {full:.2f}; {advice}'
-            )
-        unexplained = 1.0 - float(np.mean(self._explained))
-        if unexplained > _UNEXPLAINED:
-            sentences.append(
-                f'no set of reflectors explains {100.0 * unexplained:.0f} % of the records; '
-                f'{advice}'
-            )
-        negative = float(np.mean(self._negative))
-        if negative > _LEFT:
-            sentences.append(
-                f'{100.0 * negative:.0f} % of the records have negative echoes, of multiples or '
-                'of layers that are softer than what is above: polarity both follows them, for '
-                'an array with pulse processor'
-            )
-        return sentences

@@ -80,7 +80,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
 
         # Of a run whose first fix was the origin, only the run knows it.
         origin = Origin(**run['origin']) if run.get('origin') else config.stated_origin()
-        return sections(metrics, series, truth, raw, origin)
+        return sections(metrics, series, truth, raw, origin, run.get('target_names'))
 
     return Judgement(
         run=run,

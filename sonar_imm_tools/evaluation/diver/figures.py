@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -60,11 +61,12 @@ def sections(
     truth: Truth | None = None,
     fixes: Series | None = None,
     origin: Origin | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> Iterator[Section]:
     """The sections of one run. metrics: content of ``metrics.json``; origin: where the frame of
-    the tracks lies on Earth, None when nobody said."""
+    the tracks lies on Earth, None when nobody said; names: of targets by target ID."""
     series = series.confirmed()
-    in_metres = map_figure(series, truth, fixes)
+    in_metres = map_figure(series, truth, fixes, names)
     yield Section(
         'Map',
         'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: ellipses that should hold '
@@ -75,7 +77,8 @@ def sections(
     if track_id is None:
         return
     count = len(np.unique(series.track_id))
-    which = '' if count == 1 else f' Track {track_id}, the longest of {count}.'
+    name = series.name(track_id, names or {})
+    which = '' if count == 1 else f' Of {name}, the longest of {count}.'
     matching = None
     if truth is not None and 'position' in metrics:
         matching = match(series, truth, cutoff=metrics['cutoff_m'])
@@ -121,8 +124,16 @@ def true_course(matching: Matching | None, track_id: int) -> tuple[FloatArray, F
     return seconds(stamps, matching.series.scan_ns), course
 
 
-def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.Figure:
-    """Truth, fixes and tracks from above with equal axes; 95 % ellipses along each track."""
+def map_figure(
+    series: Series,
+    truth: Truth | None,
+    fixes: Series | None,
+    names: Mapping[str, str] | None = None,
+) -> go.Figure:
+    """Truth, fixes and tracks from above with equal axes; 95 % ellipses along each track.
+
+    names: of targets by target ID.
+    """
     figure = go.Figure()
     if fixes is not None and len(fixes):
         shown = thin(len(fixes), MOST_POINTS)
@@ -148,7 +159,9 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
             line=TRUTH,
         )
     for order, track_id in enumerate(_tracks_by_length(series)):
-        _add_track(figure, series.pick(series.track_id == track_id), order)
+        track = series.pick(series.track_id == track_id)
+        # Labels are HTML.
+        _add_track(figure, track, order, escape(series.name(track_id, names or {})))
     # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
     x_range, y_range = view_of(
         np.concatenate([series.state[:, :2], *(path.state[:, :2] for path in paths)])
@@ -157,9 +170,8 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
     return styled(figure, 640, {'title': 'x [m]', 'range': x_range}, y)
 
 
-def _add_track(figure: go.Figure, track: Series, order: int) -> None:
+def _add_track(figure: go.Figure, track: Series, order: int, name: str) -> None:
     colour = COLOURS[order % len(COLOURS)]
-    name = f'track {track.track_id[0]}'
     shown = thin(len(track), MOST_POINTS)
     outline = outlines(track.state[:, :2], track.covariance[:, :2, :2])
     figure.add_scatter(

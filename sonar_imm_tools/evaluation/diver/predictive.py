@@ -14,14 +14,15 @@
 
 """What the diver tracker predicts of each fix, for `evaluation.tuning`.
 
-A scan of m fixes, of which false ones and new divers come with density l = clutter_density +
-birth_density over the area A in which fixes lie at all, has
+A scan of m fixes, of which false ones and new divers come with density l = clutter_density + b
+over the area A in which fixes lie at all, with b birth_density times the time since the scan
+before, has
 
     log p = m log l - l A + sum_t log(1 - r p + r p f / l)
 
 over the tracks: r the probability that a track is a diver, p that he is seen, f the density of the
 fix that is his under the whole mixture, 0 where he has none. So a missed diver costs
-log(1 - r p), a refused fix log l, and losing a track never pays. r begins at birth_density / l
+log(1 - r p), a refused fix log l, and losing a track never pays. r begins at b / l
 and follows from the same terms. Where fixes come singly, r is 1 and nobody is missed.
 """
 
@@ -117,7 +118,7 @@ class Scored(DiverTracker):
         config, found, seen = group.config, group.association, group.detection
         assert found is not None and group.pairs is not None
         p, m = config.detection_probability, len(group.z)
-        density = group.clutter + config.birth_density
+        density = config.clutter_density + group.new_targets
         tracks = np.flatnonzero(found.hit)
         fix = found.fix[tracks]
         log_f = np.full(len(known), -np.inf)
@@ -136,7 +137,7 @@ class Scored(DiverTracker):
                 if hit:
                     score += math.log(1.0 - p + p * ratio)
                 continue
-            r = 1.0 if sure else self.existence.get(track_id, config.birth_density / density)
+            r = 1.0 if sure else self.existence.get(track_id, group.new_targets / density)
             p = p if seen is None else float(seen.tracks[track])
             total = 1.0 - r * p + r * p * ratio
             score += math.log(total)

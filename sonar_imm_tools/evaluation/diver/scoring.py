@@ -38,7 +38,7 @@ from scipy.optimize import minimize_scalar
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.association import gate_threshold
 from sonar_imm.estimation.consistency import gospa, switches_by_scan, switching_gospa
-from sonar_imm.measurements import Fix, Fixes, scan_of
+from sonar_imm.measurements import Fix, Fixes, NOBODY, scan_of
 
 from ... import SECOND
 from ..numbers import (
@@ -133,6 +133,7 @@ def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
         scan_ns=np.unique(stamps),
         stamp_ns=np.repeat(stamps, counts),
         track_id=np.zeros(n, np.int64),
+        target_id=np.full(n, NOBODY),
         track_state=np.ones(n, np.int64),
         state=state,
         covariance=covariance,

@@ -21,13 +21,14 @@ truth is unknown and nothing is scored.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from attrs import evolve, frozen
 import numpy as np
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.measurements import NOBODY
 
 from ... import SECOND
 from ..columns import column, covariance_of, read_rows, Rows
@@ -46,6 +47,7 @@ class Series(Rows):
 
     track_id: IntArray = column('track_id', dtype=np.int64, default=0)
     track_state: IntArray = column('track_state', dtype=np.int64, default=1)
+    target_id: IntArray = column('target_id', dtype=np.int64, default=NOBODY)
     state: FloatArray = column('px', 'py', 'vx?', 'vy?')
     covariance: FloatArray = covariance_of(*STATES)
     place: FloatArray = column('px', 'py', 'pz?')
@@ -63,6 +65,13 @@ class Series(Rows):
     def hits(self) -> Series:
         """The rows that were updated by a measurement."""
         return self.pick(np.isfinite(self.nis) & (self.nis_dof > 0))
+
+    def name(self, track_id: int, names: Mapping[str, str]) -> str:
+        """Return what a track is called: by the name of its target, if it has one. names: of
+        targets by target ID."""
+        own = self.target_id[self.track_id == track_id]
+        found = [names[key] for key in map(str, own[::-1].tolist()) if key in names]
+        return f'{found[0]} (track {track_id})' if found else f'track {track_id}'
 
     def longest_track(self) -> int | None:
         """Id of the track with most rows (the lowest such id), None without rows."""

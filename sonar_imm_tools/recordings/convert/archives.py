@@ -46,6 +46,7 @@ from ..mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from ..messages import ros_message
 from ..sources import BagError
 from ..truth import records_of
+from .navigation import ARRAYS, navigation_of_arrays, navigation_of_table
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
@@ -64,6 +65,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     'patch': ('patch',),
     'sonar_height': ('sonar_height', 'H'),
     'tilt': ('tilt',),
+    **ARRAYS,
 }
 """Usual names of each array; the first one that the archive has is taken. Stamps in seconds,
 spacings in metres or wavelengths, snr linear and at one stave, tilt in radians."""
@@ -86,7 +88,9 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
     stamps = _stamps(content.path, content.get('stamp'), len(samples), how.ping_rate, 'pings')
     constants = {name: content.number(name) for name in _CONSTANTS}
     constants['element_spacing'] = _element_spacing(content, constants, report)
-    records: list[Record] = []
+    poses = {name: array for name in ARRAYS if (array := content.get(name)) is not None}
+    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=False)
+    records += [] if how.nav else navigation_of_arrays(poses, stamps, path, report)
     for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
         report.rows += 1
         try:
@@ -97,6 +101,7 @@ def convert_snapshots(path: Path, how: SnapshotsOptions, report: ConversionRepor
         records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
         if (profile := _true_floor(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
+    report.note_ignored(path, content.unused)
     write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
 
@@ -117,6 +122,8 @@ class _Archive:
             elif what in names:
                 raise BagError(f"{path} has no array '{names[what]}'; it has {', '.join(there)}")
         self.listed = ', '.join(there)
+        taken = {name for candidates in wanted.values() for name in candidates}
+        self.unused = [name for name in there if name not in taken]
 
     def get(self, what: str) -> NDArray | None:
         return self._arrays.get(what)
@@ -249,10 +256,11 @@ def convert_traces(path: Path, how: TracesOptions, report: ConversionReport) -> 
     array; as truth a reflector is present while its amplitude exceeds 0.4 of its largest value.
     Any other file is a CSV, one row per sample, trace after trace.
     """
+    records = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
     if path.suffix.lower() == '.npz':
-        records = _from_archive(report, path, how.rate, how.frame_id)
+        records += _from_archive(report, path, how.rate, how.frame_id)
     else:
-        records = _from_table(report, CsvTable(path, how.options), how.frame_id)
+        records += _from_table(report, CsvTable(path, how.options), how.frame_id)
     write_bag(report.path, records, report, source=path.name, storage=how.storage)
 
 
@@ -260,6 +268,7 @@ def _from_archive(
     report: ConversionReport, path: Path, rate: float, frame_id: str
 ) -> list[Record]:
     arrays = read_npz(path)
+    report.note_ignored(path, [name for name in arrays if name not in {*TRACE_NAMES, 'stamp'}])
     for name in arrays.keys() & TRACE_NAMES:
         numbers_of(path, name, arrays[name])
     for name in ('depth', 'amplitude'):

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import re
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +37,7 @@ from ..messages import ros_message
 from ..sources import BagError
 from ..times import BadRow, moment_ns
 from ..writer import BagWriter
+from .navigation import navigation_of_table
 
 if TYPE_CHECKING:
     import soundfile
@@ -52,6 +54,7 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
 
     The bag gets ``parameters.yaml`` with the number of hydrophones.
     """
+    places = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
     with _opened(path) as audio:
         channels = _channels(audio, how.channels)
         start_ns = _start_ns(path, how)
@@ -76,6 +79,9 @@ def convert_hydrophones(path: Path, how: HydrophonesOptions, report: ConversionR
             _write_blocks(audio, bag, report, how, channels, start_ns, rows)
             if not bag.count:
                 raise report.nothing(path)
+            for stamp_ns, topic, message in places:
+                bag.write(topic, message, stamp_ns)
+                report.messages[topic] += 1
 
 
 def _write_blocks(
@@ -145,9 +151,12 @@ def _start_ns(path: Path, how: HydrophonesOptions) -> int:
         found = _NAMED.search(path.stem)
         if found is None:
             raise BagError(
-                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z'
+                f'{path.name} does not say when it begins; say --start 2024-05-31T10:00:00Z, or '
+                '--start 0 where the time of day is of no use'
             )
         text = '20{}-{}-{} {}:{}:{}'.format(*found.groups())
+    if text in ('0', 'now'):
+        return SECOND if text == '0' else time.time_ns()
     try:
         start_ns = moment_ns(text, lambda: how.time_zone)
     except BadRow as error:

@@ -106,10 +106,10 @@ def convert_nmea(path: Path, how: NmeaOptions, report: ConversionReport) -> None
         report.notes['own'] = 'the positions of the receiver itself are the fixes'
     else:
         beside += [(fix.stamp_ns, '/nav_fix', write_geodetic(fix, ros_message)) for fix in log.own]
-        beside += [
-            (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
-            for heading in log.headings
-        ]
+    beside += [
+        (heading.stamp_ns, '/heading', write_heading(heading, ros_message))
+        for heading in log.headings
+    ]
     leaps = Leaps()
     leaps.saw_all(log.own)
     leaps.tell(path, report)

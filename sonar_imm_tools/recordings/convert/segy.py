@@ -14,10 +14,9 @@
 
 """Traces of a sub-bottom profiler from SEG-Y, the format of seismic instruments.
 
-Of the trace headers the date, the sample interval, the recording delay, the place and the depth of
-the water are used. The interval that small profilers state is often wrong: where it does not go
-with the depth of the water that the headers state, that is said, and the sample spacing has to be
-given. Headers count whole seconds, so the traces of one second are spread over it evenly.
+`segy_lines` reads the file. The interval that small profilers state is often wrong: where it does
+not go with the depth of the water that the headers state, that is said, and the sample spacing has
+to be given. Where delay or interval change along the line, so do the depths of the traces.
 
 Traces that are never negative are envelopes. For them the pulse and the noise are measured
 and written beside the bag, where the tracker finds them: the water above the floor is quiet, so
@@ -26,20 +25,15 @@ floor is level and little scatters below it. Steep floors, gas and roughness onl
 its widths at half height, where the arrivals beside it begin within a sample of it, the tenth part
 from below is taken. What is above the first arrival is noise; of coarse steps of a converter it is
 at least half a step. Where a gain that grows with time raises the noise with the depth, each trace
-states it by depth (`noise_by_depth`). Places in seconds of arc or degrees become the topic
-``/position``.
+states it by depth (`noise_by_depth`). Places become the topic ``/position``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from itertools import groupby
+import json
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple
 
-from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,15 +46,13 @@ from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
+from ..segy_lines import read_segy, SegyLine
 from ..sources import BagError
+from .navigation import navigation_of_table
 
-if TYPE_CHECKING:
-    import segyio
-
-SECOND = 10**9
-HEADERS, TRACE_HEADER = 3600, 240
-SAMPLE_BYTES = {3: 2, 8: 1, 6: 8, 7: 3, 9: 8, 11: 2, 12: 8, 15: 3, 16: 1}
-"""Of each sample by the code of its format, where they are not 4."""
+READ_OPTIONS = ('time_zone', 'start', 'rate', 'crs')
+"""Options that `read_segy` has, too."""
+GRID_OPTIONS = ('sound_speed', 'sample_spacing', 'depth_offset')
 _RUN, _REACH, _LOUD = 3, 4, 8.0
 _LEAST_ARRIVALS, _LEAST_QUIET, _AROUND = 10, 20, 3
 _NARROW = 0.1
@@ -77,27 +69,32 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
     """
     how = SegyOptions(**values)
     report = ConversionReport(Path(out))
-    line = read_segy(path, report.problems)
-    spacing = how.sample_spacing or 0.5 * how.sound_speed * line.interval
-    if not spacing > 0.0:
-        raise BagError(f'{path} states no sample interval; give the sample spacing')
-    start = 0.5 * how.sound_speed * line.delay
-    depth = how.depth_offset + start + spacing * np.arange(line.amplitude.shape[1])
-    part = slice(how.first_sample, None if how.samples is None else how.first_sample + how.samples)
-    depth, amplitude = depth[part], line.amplitude[:, part]
-    if amplitude.shape[1] < 2:
+    line = read_segy(path, **{name: getattr(how, name) for name in READ_OPTIONS})
+    report.problems += line.problems
+    report.questions += line.questions
+    windows = _windows(line, how)
+    usual = max(windows, key=lambda window: len(window.rows))
+    if not all(window.spacing > 0.0 for window in windows):
+        raise BagError(f'{path} states no sample interval; say --sample-spacing')
+    if line.amplitude[:, usual.samples].shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
-    report.notes['sample_spacing'] = f'{spacing:.9g} m'
-    report.notes['stack'] = str(how.stack)
-    report.notes['depth_of_sample_0'] = f'{how.depth_offset + start:.9g} m'
+    _note_windows(report, windows, how)
+    amplitude = line.amplitude[:, usual.samples]
     if not how.sample_spacing:
-        offset = start + spacing * how.first_sample
-        if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
+        offset = usual.depth(line)[0] - how.depth_offset
+        stated = line.water_depth[usual.rows]
+        if doubt := doubted_spacing(amplitude[usual.rows], usual.spacing, offset, stated):
             report.notes['sample_interval'] = doubt
-    own, sigma = _instrument(report, amplitude, spacing, how.stack)
-    traces = (line.stamps, depth, amplitude, sigma)
-    records = _records(report, Path(path), traces, how.stack, how.frame_id)
-    records += _positions(line) if records else []
+    own, sigma = _instrument(report, amplitude[usual.rows], usual.spacing, how.stack)
+    records: list[Record] = []
+    for window in windows:
+        noise = sigma
+        if sigma is not None and window is not usual:
+            noise = np.interp(window.depth(line), usual.depth(line), sigma)
+        records += _records(report, Path(path), line, window, noise, how)
+    if records:
+        beside = navigation_of_table(how.nav, how.nav_options, report, on_earth=True)
+        records += beside or _positions(line)
     return write_bag(
         out,
         records,
@@ -108,90 +105,55 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
     )
 
 
-@frozen(eq=False)
-class SegyLine:
-    """What of a SEG-Y file is used: stamps, ns, of its T traces; amplitude (T, n); interval from
-    sample to sample and delay of the first, s; longitude and latitude (T,) degrees, NaN where
-    unknown; water_depth (T,) m, 0 where not stated."""
+class Window(NamedTuple):
+    """Successive traces whose samples lie at the same depths."""
 
-    stamps: list[int]
-    amplitude: NDArray
-    interval: float
-    delay: float
-    longitude: NDArray
-    latitude: NDArray
-    water_depth: NDArray
+    rows: range
+    first: float
+    """Depth of the first sample of the file, m."""
+    spacing: float
+    """m from sample to sample."""
+    samples: slice
+    """The samples that are taken."""
 
-
-@contextmanager
-def _opened(path: Path, problems: list[str]) -> Iterator[segyio.SegyFile]:
-    """The file, or a copy of the whole traces of one that is cut off, which segyio refuses."""
-    import segyio
-
-    with path.open('rb') as source, TemporaryDirectory() as folder:
-        start = source.read(HEADERS)
-        samples, code = (int.from_bytes(start[k : k + 2], 'big') for k in (3220, 3224))
-        begin = HEADERS + 3200 * max(int.from_bytes(start[3504:3506], 'big', signed=True), 0)
-        each = TRACE_HEADER + samples * SAMPLE_BYTES.get(code, 4)
-        traces, rest = divmod(path.stat().st_size - begin, each)
-        if rest and traces > 0:
-            problems.append(
-                f'{path.name} is cut off in trace {traces + 1}; what came before it is kept'
-            )
-            path = Path(folder) / 'whole'
-            with path.open('wb') as copy:
-                source.seek(0)
-                left = begin + traces * each
-                while left and (part := source.read(min(left, 1 << 20))):
-                    left -= copy.write(part)
-        with segyio.open(str(path), 'r', ignore_geometry=True) as file:
-            yield file
+    def depth(self, line: SegyLine) -> FloatArray:
+        """Return the depth of the taken samples, m."""
+        whole = self.first + self.spacing * np.arange(line.amplitude.shape[1])
+        return np.asarray(whole[self.samples])
 
 
-def read_segy(path: str | Path, problems: list[str] | None = None) -> SegyLine:
-    """problems: gets a sentence where the file is cut off. Raises `BagError`, and
-    ModuleNotFoundError without segyio."""
-    import segyio
-
-    fields = segyio.TraceField
-    try:
-        with _opened(Path(path), [] if problems is None else problems) as file:
-            header = file.header[0]
-            depth = file.attributes(fields.SourceWaterDepth)[:]
-            return SegyLine(
-                _stamps(file, Path(path)),
-                np.asarray(file.trace.raw[:], np.float64),
-                # The field is unsigned, which segyio does not know.
-                (header[fields.TRACE_SAMPLE_INTERVAL] & 0xFFFF) * 1e-6,
-                header[fields.DelayRecordingTime] * 1e-3,
-                *_places(file),
-                np.maximum(_scaled(depth, file.attributes(fields.ElevationScalar)[:]), 0.0),
-            )
-    except (OSError, RuntimeError, ValueError) as error:
-        # segyio has no errors of its own.
-        reason = getattr(error, 'strerror', None) or f'it is damaged or not SEG-Y ({error})'
-        raise BagError(f'{path} cannot be read: {reason}') from None
+def _windows(line: SegyLine, how: SegyOptions) -> list[Window]:
+    """Return the windows of the line, in order."""
+    spacing = line.spacing(how.sound_speed, how.sample_spacing)
+    first = line.first_depth(how.sound_speed, how.depth_offset)
+    begins = np.flatnonzero((np.diff(spacing) != 0.0) | (np.diff(first) != 0.0)) + 1
+    end = None if how.samples is None else how.first_sample + how.samples
+    bounds = [0, *begins.tolist(), len(spacing)]
+    return [
+        Window(range(a, b), float(first[a]), float(spacing[a]), slice(how.first_sample, end))
+        for a, b in zip(bounds, bounds[1:])
+    ]
 
 
-def _scaled(value: NDArray, scalar: NDArray) -> NDArray:
-    """Header words (T,) with their scalar: a multiplier when positive, a divisor when negative."""
-    scalar = np.where(scalar == 0, 1, scalar).astype(np.float64)
-    return np.where(scalar > 0.0, value * scalar, value / np.abs(scalar))
-
-
-def _places(file: segyio.SegyFile) -> tuple[NDArray, NDArray]:
-    """Longitude and latitude (T,), degrees; NaN where the headers say none, or metres of a grid
-    that they do not name."""
-    import segyio
-
-    fields = segyio.TraceField
-    units = file.attributes(fields.CoordinateUnits)[:]
-    scalar = file.attributes(fields.SourceGroupScalar)[:]
-    per_degree = np.select([units == 2, units == 3], [3600.0, 1.0], np.nan)
-    x = _scaled(file.attributes(fields.SourceX)[:], scalar) / per_degree
-    y = _scaled(file.attributes(fields.SourceY)[:], scalar) / per_degree
-    good = (np.abs(x) <= 360.0) & (np.abs(y) <= 90.0) & ((x != 0.0) | (y != 0.0))
-    return np.where(good, x, np.nan), np.where(good, y, np.nan)
+def _note_windows(report: ConversionReport, windows: list[Window], how: SegyOptions) -> None:
+    """Note where the samples lie, for the reader and for the export of horizons."""
+    for name, values, unit in (
+        ('sample_spacing', {window.spacing for window in windows}, 'm'),
+        ('depth_of_sample_0', {window.first for window in windows}, 'm'),
+    ):
+        low, high = min(values), max(values)
+        changes = f'{low:.9g} to {high:.9g} {unit}, as the headers state trace by trace'
+        report.notes[name] = f'{low:.9g} {unit}' if low == high else changes
+    report.notes['stack'] = str(how.stack)
+    usual = SegyOptions()
+    own = {name: getattr(how, name) for name in (*READ_OPTIONS, *GRID_OPTIONS)}
+    report.notes['read_as'] = json.dumps(
+        {
+            name: value
+            for name, value in own.items()
+            if name == 'sound_speed' or value != getattr(usual, name)
+        }
+    )
 
 
 def _positions(line: SegyLine) -> list[Record]:
@@ -231,21 +193,23 @@ def _instrument(
 def _records(
     report: ConversionReport,
     path: Path,
-    traces: tuple[list[int], NDArray, NDArray, FloatArray | None],
-    stack: int,
-    frame_id: str,
+    line: SegyLine,
+    window: Window,
+    sigma: FloatArray | None,
+    how: SegyOptions,
 ) -> list[Record]:
-    stamps, depth, amplitude, sigma = traces
-    records: list[Record] = []
-    for first in range(0, len(stamps) - stack + 1, stack):
-        report.rows += stack
-        stamp = stamps[first + stack - 1]
+    """Return the traces of one window, each the mean of a stack."""
+    depth, records = window.depth(line), []
+    for first in range(window.rows.start, window.rows.stop - how.stack + 1, how.stack):
+        report.rows += how.stack
+        rows = slice(first, first + how.stack)
+        stamp = line.stamps[rows.stop - 1]
         try:
             trace = Trace(
                 stamp_ns=stamp,
-                frame_id=frame_id,
+                frame_id=how.frame_id,
                 depth=depth,
-                amplitude=amplitude[first : first + stack].mean(axis=0),
+                amplitude=line.amplitude[rows, window.samples].mean(axis=0),
                 sigma=sigma,
             )
         except Rejection as error:
@@ -253,26 +217,6 @@ def _records(
             continue
         records.append((stamp, '/trace', write_trace(trace, ros_message)))
     return records
-
-
-def _stamps(file: segyio.SegyFile, path: Path) -> list[int]:
-    """Nanoseconds since 1970 of every trace."""
-    import segyio
-
-    fields = segyio.TraceField
-    names = ('YearDataRecorded', 'DayOfYear', 'HourOfDay', 'MinuteOfHour', 'SecondOfMinute')
-    year, day, hour, minute, second = (
-        file.attributes(getattr(fields, name))[:].astype(np.int64) for name in names
-    )
-    if ((year < 1) | (year > 9999) | (day < 1)).any():
-        raise BagError(f'{path}: the trace headers hold no date')
-    start = (year - 1970).astype('datetime64[Y]').astype('datetime64[s]').astype(np.int64)
-    seconds = start + 86_400 * (day - 1) + 3600 * hour + 60 * minute + second
-    stamps: list[int] = []
-    for second, group in groupby(seconds.tolist()):
-        count = sum(1 for _ in group)
-        stamps += [second * SECOND + k * SECOND // count for k in range(count)]
-    return stamps
 
 
 def is_envelope(amplitude: FloatArray) -> bool:

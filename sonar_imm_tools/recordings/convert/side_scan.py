@@ -24,7 +24,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from attrs import evolve
+from attrs import define, evolve, Factory
 import numpy as np
 
 from msg_adapters.detections import write_detections
@@ -39,12 +39,14 @@ from ..messages import ros_message
 from ..places import Degrees
 from ..sources import BagError
 from ..times import BadRow
-from ..xtf import pings_of
+from ..xtf import pings_in
 from .bag_images import SYSTEM
 from .sonar_files import ground_message, Message, Record, speed_of, write_records
 
 LOOKS = {'starboard': -90.0, 'port': 90.0}
 """Where side scan looks, degrees to port of ahead."""
+MOST_CLIPPED = 0.01
+"""Of the samples, at full scale, before it is said."""
 ABEAM: dict[str, Any] = {'horizontal_fov_deg': 3.0, 'vertical_fov_deg': 80.0}
 """Parameters of the obstacle tracker for the narrow, high beam of a side scan."""
 
@@ -57,21 +59,23 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
     """
     config = DetectorConfig.from_mapping(how.parameters)
     mount = {**ABEAM, 'sonar_mount_rpy_deg': [0.0, 0.0, LOOKS[how.side]]}
-    phases = False
+    phases, seen = False, _Seen(how)
 
     def messages(ping: Record) -> Iterator[Message]:
         nonlocal phases
+        seen.ping(ping)
         if ping['soundings'] is not None:
             yield _ground(ping)
             return
         sides = _sides(ping, how.port_samples)
         if not sides:
             raise Rejection('no_side_scan', 'it has no channel of side scan')
-        if (image := _image(ping, sides.get(how.side, []), how.frame_id)) is not None:
+        if (image := _image(ping, sides.get(how.side, []), how)) is not None:
             mount['max_range'] = max(mount.get('max_range', 1.0), float(image.range[-1]))
             found = detect(image, config)
             # An image of one beam cannot show how wide it is.
             wide = np.full(len(found), np.radians(config.beam_width_deg) ** 2 / 12.0)
+            seen.image(image, sides[how.side], len(found))
             found = evolve(found, var_bearing=wide, extent_bearing=np.full(len(found), np.nan))
             yield Message('/detections', write_detections(found, ros_message))
         for side, channels in sides.items():
@@ -79,7 +83,9 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
                 phases = True
                 yield Message(f'/{side}/snapshot', write_snapshot(snapshot, ros_message))
 
-    write_records(path, pings_of(path, report), report, how, messages, {SYSTEM: mount})
+    pings = pings_in(path, report, how.units)
+    write_records(path, pings, report, how, messages, {SYSTEM: mount})
+    seen.tell(path, report)
     if set(report.messages) <= {'/nav', '/altitude', '/ground'}:
         return
     other = next(side for side in LOOKS if side != how.side)
@@ -87,6 +93,62 @@ def convert_xtf(path: Path, how: XtfOptions, report: ConversionReport) -> None:
     report.notes['samples'] = (
         'amplitudes and phases' if phases else 'magnitude only: no channel is called a phase'
     )
+
+
+@define
+class _Seen:
+    """What of a file of side scan has to be said at its end."""
+
+    how: XtfOptions
+    pings: int = 0
+    headings: int = 0
+    layback: float = 0.0
+    images: int = 0
+    echoes: int = 0
+    samples: int = 0
+    clipped: int = 0
+    frequencies: set[float] = Factory(set)
+
+    def ping(self, ping: Record) -> None:
+        self.pings += 1
+        self.headings += ping['heading'] != 0.0
+        self.layback = max(self.layback, ping['layback'])
+
+    def image(self, image: SonarImage, channels: list[Record], echoes: int) -> None:
+        """Count the echoes and samples of an image. channels: of its side."""
+        self.images += 1
+        self.echoes += echoes
+        magnitudes = [channel for channel in channels if not _is_phase(channel)]
+        self.frequencies |= {float(channel['frequency']) for channel in magnitudes}
+        samples = magnitudes[0]['samples']
+        if samples.dtype.kind in 'iu':
+            self.samples += len(samples)
+            self.clipped += int((samples == np.iinfo(samples.dtype).max).sum())
+
+    def tell(self, path: Path, report: ConversionReport) -> None:
+        if self.images and not self.echoes:
+            report.questions.append(
+                f'{path.name}: no echo was found in {self.images} pings of {self.how.side}; is '
+                'the other --side meant, or another threshold (--set false_alarm=0.001)?'
+            )
+        if self.pings and not self.headings and '/nav' in report.messages:
+            report.questions.append(
+                f'{path.name}: the heading is 0 in all {self.pings} pings; does the file hold '
+                'one? Echoes lie to the east and west of the line now'
+            )
+        if self.layback > 0.0:
+            report.questions.append(
+                f'{path.name}: the places are those of the ship, and the sonar is up to '
+                f'{self.layback:g} m behind them (layback), which is not taken off'
+            )
+        if self.clipped > MOST_CLIPPED * self.samples:
+            report.questions.append(
+                f'{path.name}: {self.clipped / self.samples:.1%} of the samples are at full '
+                'scale: was the gain too high?'
+            )
+        if len(self.frequencies) > 1:
+            listed = ', '.join(f'{frequency:g}' for frequency in sorted(self.frequencies))
+            report.notes['frequencies'] = f'{listed} Hz; --frequency HZ chooses one'
 
 
 @converter(PicturesOptions)
@@ -146,17 +208,19 @@ def _ranges(channel: Record, sound_speed: float) -> np.ndarray:
     return near + far * (np.arange(count) + 0.5) / count
 
 
-def _image(ping: Record, channels: list[Record], frame_id: str) -> SonarImage | None:
+def _image(ping: Record, channels: list[Record], how: XtfOptions) -> SonarImage | None:
     """The magnitudes of one side: an image of one beam, seen from the array."""
     magnitudes = [channel for channel in channels if not _is_phase(channel)]
     if not magnitudes:
         return None
+    if (wanted := how.frequency) is not None:
+        magnitudes.sort(key=lambda channel: abs(channel['frequency'] - wanted))
     return SonarImage(
         stamp_ns=ping['stamp_ns'],
         range=_ranges(magnitudes[0], speed_of(ping)),
         bearing=np.zeros(1),
         amplitude=np.abs(magnitudes[0]['samples'].astype(np.float64))[:, None],
-        frame_id=frame_id,
+        frame_id=how.frame_id,
     )
 
 

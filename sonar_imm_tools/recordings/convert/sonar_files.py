@@ -56,7 +56,7 @@ class Message(NamedTuple):
 
 
 @define
-class _Frame:
+class Frame:
     """Metres from the first position. missing: pings without a position."""
 
     frame_id: str = 'map'
@@ -89,11 +89,16 @@ class _Frame:
             frame_id=self.frame_id,
         )
 
-    def notes(self) -> dict[str, str]:
-        if self.origin is None:
-            return {}
-        place = self.origin
-        return {'origin': f'latitude {place.latitude!r}, longitude {place.longitude!r}'}
+    def tell(self, path: Path, report: ConversionReport) -> None:
+        """Report the origin, and what is missing or looks wrong."""
+        if self.missing:
+            report.problems.append(
+                f'{path.name}: {self.missing} pings have no position (0, 0 is none); they have no '
+                'navigation'
+            )
+        self.leaps.tell(path, report)
+        if place := self.origin:
+            report.notes['origin'] = f'latitude {place.latitude!r}, longitude {place.longitude!r}'
 
 
 def _orientation(heading: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
@@ -127,7 +132,7 @@ def write_records(
 ) -> None:
     """Write the messages of each record and where the ship was. Raises `BagError` when there is
     none."""
-    frame = _Frame()
+    frame = Frame()
     notes = provenance(path.name, report.notes)
     own = {} if parameters is None else parameters
     with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
@@ -156,13 +161,7 @@ def write_records(
             own['obstacle'] = {**own.get('obstacle', {}), **place}
         if not set(report.messages) - {'/nav', '/altitude'}:
             raise report.nothing(path)
-    if frame.missing:
-        report.problems.append(
-            f'{path.name}: {frame.missing} pings have no position (0, 0 is none); they have no '
-            'navigation'
-        )
-    frame.leaps.tell(path, report)
-    report.notes |= frame.notes()
+    frame.tell(path, report)
 
 
 def _write_altitude(record: Record, write: Any) -> None:

@@ -42,9 +42,10 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
-from ..convert.segy import read_segy
+from ..convert_options import SegyOptions
 from ..csv_writer import CsvWriter
 from ..positions import Positions
+from ..segy_lines import opened_for_change, read_segy, SegyLine
 from ..sources import BagError
 from .points import wkt_of
 
@@ -235,29 +236,41 @@ _LARGEST = {2: 2**31 - 1, 3: 2**15 - 1, 8: 2**7 - 1, 10: 2**32 - 1, 11: 2**16 - 
 """By the format of the samples; other formats are floats."""
 
 
+def _line_of(
+    original: Path, notes: Mapping[str, str]
+) -> tuple[SegyLine, FloatArray, FloatArray, int]:
+    """Return the line as it was converted, depth (T,) of the first sample and depth (T,) from
+    sample to sample, m, and the number of traces of a stack. notes: of the conversion."""
+    try:
+        how = SegyOptions(stack=int(notes['stack']), **json.loads(notes['read_as']))
+    except (KeyError, ValueError, TypeError):
+        raise BagError(
+            'the recording does not say how it was made of SEG-Y; convert it again with '
+            'sonar-imm convert segy'
+        ) from None
+    line = read_segy(
+        original, time_zone=how.time_zone, start=how.start, rate=how.rate, crs=how.crs
+    )
+    first = line.first_depth(how.sound_speed, how.depth_offset)
+    spacing = line.spacing(how.sound_speed, how.sample_spacing)
+    if not (spacing > 0.0).all() or how.stack < 1:
+        raise BagError('the recording states an impossible sample spacing or stack')
+    return line, first, spacing, how.stack
+
+
 def write_picks(out: Path, picks: Picks, original: Path, notes: Mapping[str, str]) -> int:
     """Write `out` from the SEG-Y file `original`; notes: what its conversion kept in the bag.
     Gives how many picks lie outside of the traces. Raises `BagError`, and ModuleNotFoundError
     without segyio."""
     import segyio
 
-    try:
-        spacing = float(notes['sample_spacing'].split()[0])
-        first, stack = float(notes['depth_of_sample_0'].split()[0]), int(notes['stack'])
-    except (KeyError, ValueError, IndexError):
-        raise BagError(
-            'the recording does not say how it was made of SEG-Y; convert it again with '
-            'sonar-imm convert segy'
-        ) from None
-    if not spacing > 0.0 or stack < 1:
-        raise BagError('the recording states an impossible sample spacing or stack')
-    line = read_segy(original)
+    line, first, spacing, stack = _line_of(original, notes)
     rows = {stamp: k for k, stamp in enumerate(line.stamps)}
     ends = np.array([rows.get(int(stamp), -1) for stamp in picks.stamp_ns])
     if (ends < 0).any():
         raise BagError(f'{original} is not the file that was tracked: its times are others')
     T, n = line.amplitude.shape
-    sample = (picks.depth - first) / spacing
+    sample = (picks.depth - first[ends]) / spacing[ends]
     nearest = np.round(sample).astype(np.int64)
     inside = (nearest >= 0) & (nearest < n)
     grid = np.zeros((T, n), np.float32)
@@ -271,7 +284,7 @@ def write_picks(out: Path, picks: Picks, original: Path, notes: Mapping[str, str
     shutil.copyfile(original, out)
     out.chmod(0o644)
     try:
-        with segyio.open(str(out), 'r+', ignore_geometry=True) as file:
+        with opened_for_change(out) as file:
             largest = _LARGEST.get(int(file.format), 2**24)
             if picks.horizon.max() > largest:
                 raise BagError(

@@ -35,6 +35,7 @@ from sonar_imm.soundings import COLUMNS, LATER
 from ..csv_writer import CsvWriter
 from ..reader import BagReader
 from ..sources import BagError, is_recording
+from ..times import GPS_EPOCH, gps_minus_utc
 
 TOPIC = 'soundings'
 """Name of the topic of soundings in a recording, behind its namespace."""
@@ -193,6 +194,7 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     and lazrs for ``.laz``.
     """
     import laspy
+    from laspy.header import GpsTimeType
 
     header = laspy.LasHeader(point_format=6, version='1.4')
     header.scales = np.full(3, SCALE)
@@ -210,7 +212,11 @@ def write_las(path: Path, points: Points, epsg: int | None) -> None:
     las.classification = np.full(len(points), 40, np.uint8)
     las.user_data = points['label'].astype(np.uint8)
     las.point_source_id = points['side'].astype(np.uint16)
-    las.gps_time = points.stamp_ns * 1e-9
+    seconds = points.stamp_ns.astype(np.float64) * 1e-9
+    # Adjusted standard GPS time, which the flag says.
+    las.gps_time = seconds + gps_minus_utc(seconds) - GPS_EPOCH - 1e9
+    header.global_encoding.gps_time_type = GpsTimeType.STANDARD
+    las.return_number = las.number_of_returns = np.ones(len(points), np.uint8)
     for name in _LAS_EXTRAS:
         las[name] = points[name].astype(np.float32)
     las.write(str(path))

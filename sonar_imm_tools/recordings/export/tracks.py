@@ -268,7 +268,8 @@ def _write_gpx(path: Path, tracks: Tracks, name: str) -> None:
 
 
 def _write_kml(path: Path, tracks: Tracks, name: str) -> None:
-    """A Placemark with a timed track for each track, in a colour of its own."""
+    """Two Placemarks for each track, in a colour of its own: a timed track, and its line, because
+    GIS programs know no timed tracks."""
     google = 'http://www.google.com/kml/ext/2.2'
     root = ElementTree.Element(
         'kml', {'xmlns': 'http://www.opengis.net/kml/2.2', 'xmlns:gx': google}
@@ -277,25 +278,37 @@ def _write_kml(path: Path, tracks: Tracks, name: str) -> None:
     ElementTree.SubElement(document, 'name').text = name
     for turn, (number, rows) in enumerate(tracks.each()):
         colour = COLOURS[turn % len(COLOURS)]
-        placemark = ElementTree.SubElement(document, 'Placemark')
-        ElementTree.SubElement(placemark, 'name').text = tracks.name(number, rows)
-        line = ElementTree.SubElement(ElementTree.SubElement(placemark, 'Style'), 'LineStyle')
-        # KML writes alpha, blue, green, red.
-        ElementTree.SubElement(line, 'color').text = f'ff{colour[5:7]}{colour[3:5]}{colour[1:3]}'
-        ElementTree.SubElement(line, 'width').text = '2'
-        track = ElementTree.SubElement(placemark, 'gx:Track')
+        track, line = (
+            ElementTree.SubElement(_placemark(document, tracks.name(number, rows), colour), shape)
+            for shape in ('gx:Track', 'LineString')
+        )
         points = [tracks.row(int(k)) for k in rows]
         for point in points:
             ElementTree.SubElement(track, 'when').text = point['time_utc']
-        for point in points:
-            text = f'{point["longitude"]:.8f} {point["latitude"]:.8f} {point["z"] or 0}'
-            ElementTree.SubElement(track, 'gx:coord').text = text
+        places = [
+            (f'{point["longitude"]:.8f}', f'{point["latitude"]:.8f}', str(point['z'] or 0))
+            for point in points
+        ]
+        for place in places:
+            ElementTree.SubElement(track, 'gx:coord').text = ' '.join(place)
+        ElementTree.SubElement(line, 'coordinates').text = ' '.join(map(','.join, places))
         data = ElementTree.SubElement(ElementTree.SubElement(track, 'ExtendedData'), 'SchemaData')
         for key in ('std_major', 'std_minor', 'major_azimuth_deg', 'speed', 'model'):
             column = ElementTree.SubElement(data, 'gx:SimpleArrayData', {'name': key})
             for point in points:
                 ElementTree.SubElement(column, 'gx:value').text = str(point[key])
     _write_xml(path, root)
+
+
+def _placemark(document: ElementTree.Element, name: str, colour: str) -> ElementTree.Element:
+    """Return a new Placemark. colour: '#rrggbb' of its line."""
+    placemark = ElementTree.SubElement(document, 'Placemark')
+    ElementTree.SubElement(placemark, 'name').text = name
+    line = ElementTree.SubElement(ElementTree.SubElement(placemark, 'Style'), 'LineStyle')
+    # KML writes alpha, blue, green, red.
+    ElementTree.SubElement(line, 'color').text = f'ff{colour[5:7]}{colour[3:5]}{colour[1:3]}'
+    ElementTree.SubElement(line, 'width').text = '2'
+    return placemark
 
 
 def _write_xml(path: Path, root: ElementTree.Element) -> None:

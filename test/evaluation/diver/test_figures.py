@@ -68,6 +68,17 @@ def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
     assert figure.layout.yaxis.scaleanchor == 'x'
 
 
+def test_tracks_have_the_names_of_their_targets():
+    estimates, _, _ = single_run(count=20)
+    series = series_of(estimates)
+    series.target_id[:] = 4
+    drawn = figures.map_figure(series, None, None, {'4': 'Schmidt <b>'})
+    (track,) = np.unique(series.track_id)
+    assert f'Schmidt &lt;b&gt; (track {track})' in {each.name for each in drawn.data}
+    section = next(iter(figures.sections({}, series, names={'4': 'Schmidt'})))
+    assert f'Schmidt (track {track})' in {each.name for each in section.figure.data}
+
+
 def test_no_points_leave_the_view_open():
     assert view_of(np.empty((0, 2))) == (None, None)
 

@@ -14,6 +14,7 @@
 
 """Numpy archives of snapshots and traces, traces as CSV and SEG-Y."""
 
+import math
 import sys
 import zipfile
 
@@ -22,6 +23,8 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.acoustics.geometry import rotation_of_quaternion
+from sonar_imm.measurements import Navigation
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.convert import (
     convert_segy,
@@ -103,6 +106,74 @@ def test_the_truth_of_a_test_vector(convert):
     assert extras['patch'].tolist() == [0] * 5 + [1] * 5 and extras['valid'].all()
     assert np.allclose(extras['angle'], np.arcsin((15.0 - h) / RANGE) - 0.5)
     assert np.allclose(truth.xyz[:, 2], h - 15.0)
+
+
+RANGES = np.linspace(10.0, 20.0, 30)
+POSES = {
+    'latitude': 59.43 + np.array([0.0, 1e-5, 2e-5]),
+    'longitude': np.full(3, 10.47),
+    'heading': np.full(3, 30.0),
+}
+EAST_NORTH = {'x': np.arange(3.0), 'y': np.full(3, 7.0), 'yaw': np.full(3, math.radians(60.0))}
+
+
+@pytest.mark.parametrize('poses', [POSES, EAST_NORTH])
+def test_places_and_attitude_of_each_ping_become_navigation(convert, poses):
+    more = {'z': -2.0, 'roll_deg': np.full(3, 5.0), 'pitch_rad': 0.1, 'altitude': 12.0}
+    report, received, _ = convert(
+        iq=samples(3, 30, 2), range=RANGES, stamp=np.arange(3.0) + 1e9, odd=np.ones(4), **poses,
+        **more,
+    )  # fmt: skip
+    assert report.messages == {'/nav': 3, '/altitude': 3, '/snapshot': 3}
+    assert report.notes['ignored arrays of pings.npz'] == 'odd'
+    poses_read = [item for item in received if isinstance(item, Navigation)]
+    step = (1e-5 * 111_414.0 if 'latitude' in poses else 0.0, 0.0 if 'latitude' in poses else 1.0)
+    for k, pose in enumerate(poses_read):
+        north, east = step
+        start = poses_read[0].position
+        assert pose.position - start == pytest.approx([k * east, k * north, 0.0], abs=1e-3)
+        assert pose.position[2] == -2.0
+        # Bow 60 degrees from east, up by .1 rad; starboard 5 degrees down.
+        bow = rotation_of_quaternion(pose.orientation) @ [1.0, 0.0, 0.0]
+        assert math.atan2(bow[1], bow[0]) == pytest.approx(math.radians(60.0))
+        assert bow[2] == pytest.approx(math.sin(0.1))
+        starboard = rotation_of_quaternion(pose.orientation) @ [0.0, -1.0, 0.0]
+        assert starboard[2] == pytest.approx(-math.sin(math.radians(5.0)) * math.cos(0.1))
+
+
+@pytest.mark.parametrize(
+    ('poses', 'words'),
+    [
+        ({**EAST_NORTH, 'yaw': np.full(3, 60.0)}, 'heading=yaw'),
+        ({'x': np.zeros(3), 'y': np.zeros(3)}, '--name heading=ARRAY'),
+        ({**POSES, 'roll': np.full(3, 0.1)}, '--name roll_rad=roll'),
+        ({**POSES, 'heading': np.zeros(4)}, 'heading has the shape'),
+    ],
+)
+def test_navigation_that_can_be_read_in_two_ways_is_asked(convert, poses, words):
+    with pytest.raises(BagError, match=words):
+        convert(iq=samples(3, 30, 2), range=RANGES, **poses)
+
+
+def test_navigation_in_a_table_beside_the_snapshots(convert, tmp_path):
+    (tmp_path / 'nav.csv').write_text(
+        'time,lat,lon,hdg,roll,depth\n'
+        + ''.join(f'{10**9 + k},{59.43 + 1e-5 * k},10.47,{30 + k},5,2\n' for k in range(4))
+        + '1000000005,bad,10.47,30,5,2\n'
+    )
+    report, received, _ = convert(
+        {'nav': tmp_path / 'nav.csv'},
+        iq=samples(3, 30, 2),
+        range=RANGES,
+        stamp=np.arange(3.0) + 1e9,
+    )
+    poses = [item for item in received if isinstance(item, Navigation)]
+    assert report.messages == {'/nav': 4, '/snapshot': 3} and report.bad_rows == 1
+    assert poses[2].position == pytest.approx([0.0, 2e-5 * 111_414.0, -2.0], abs=1e-3)
+    headless = tmp_path / 'headless.csv'
+    headless.write_text('time,lat,lon\n1000000000,59.43,10.47\n')
+    with pytest.raises(BagError, match='heading'):
+        convert({'nav': headless}, iq=samples(3, 30, 2), range=RANGES)
 
 
 def test_channels_are_added_up_to_staves(convert):

@@ -14,12 +14,15 @@
 
 """Sound of an array becomes blocks of pressure that are its samples."""
 
+import time
+
 import numpy as np
 import pytest
 
 from sonar_imm_tools.recordings.convert import convert_hydrophones
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sniffing import sniff
 from sonar_imm_tools.recordings.sources import BagError
 
 soundfile = pytest.importorskip('soundfile')
@@ -72,6 +75,24 @@ def test_the_name_of_the_file_says_when_it_begins(tmp_path, name):
     assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS
     report = convert_hydrophones(tmp_path / name, tmp_path / 'zone', time_zone='+02:00')
     assert blocks_of(report.path)[0].stamp_ns == BEGIN_NS - 7200 * 10**9
+
+
+@pytest.mark.parametrize('start', ['0', 'now'])
+def test_a_time_that_does_not_matter(tmp_path, start):
+    sound(tmp_path / 'a.wav')
+    before = time.time_ns() if start == 'now' else 10**9
+    report = convert_hydrophones(tmp_path / 'a.wav', tmp_path / 'out', start=start)
+    assert 0 <= blocks_of(report.path)[0].stamp_ns - before < 60 * 10**9
+
+
+def test_wave_files_of_the_other_byte_order(tmp_path):
+    samples = sound(tmp_path / 'a.wav')
+    soundfile.write(tmp_path / 'b.wav', samples, RATE, endian='BIG')
+    assert (tmp_path / 'b.wav').read_bytes()[:4] == b'RIFX'
+    assert sniff(tmp_path / 'b.wav').kind == 'hydrophones'
+    report = convert_hydrophones(tmp_path / 'b.wav', tmp_path / 'out', start='0')
+    found = np.concatenate([block.pressure for block in blocks_of(report.path)])
+    assert found == pytest.approx(samples, abs=1e-4)
 
 
 def test_what_cannot_be_used_is_one_sentence(tmp_path):

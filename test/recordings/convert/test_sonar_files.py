@@ -87,6 +87,61 @@ class TestXtf:
         (ping,) = read(tmp_path / 'bag', 'obstacle', Detections)
         assert ping.range == pytest.approx([(at + 0.5) * 0.1], abs=0.06)
 
+    def test_degrees_that_a_file_calls_metres_are_asked(self, tmp_path):
+        path = side_scan(tmp_path / 'a.xtf')
+        head = xtf_head(SIDES)
+        head.NavUnits = 0
+        path.write_bytes(head.to_bytes() + path.read_bytes()[1024:])
+        with pytest.raises(BagError, match='--units degrees'):
+            convert_xtf(path, tmp_path / 'bag')
+        convert_xtf(path, tmp_path / 'bag', units='degrees')
+        nav = read(tmp_path / 'bag', 'obstacle', Navigation)[-1]
+        assert nav.position == pytest.approx([5.9, 0.0, -5.0], abs=0.05)
+        convert_xtf(path, tmp_path / 'metres', units='metres')
+        nav = read(tmp_path / 'metres', 'obstacle', Navigation)[-1]
+        assert nav.position[:2] == pytest.approx([10.0, 54.0], abs=0.01)
+
+    def test_metres_near_the_origin_are_no_question(self, tmp_path):
+        head = xtf_head(SIDES)
+        head.NavUnits = 0
+        pings = [xtf_ping(0.2 * k, [echo(-1), echo(300)], (5.0, 0.1 * k)) for k in range(9)]
+        (tmp_path / 'a.xtf').write_bytes(b''.join([head.to_bytes(), *pings]))
+        assert not convert_xtf(tmp_path / 'a.xtf', tmp_path / 'bag').questions
+
+    def test_the_frequency_of_several_channels_is_chosen(self, tmp_path):
+        channels = [('low', 'starboard', 'uint16'), ('high', 'starboard', 'uint16')]
+        head = xtf_head(channels)
+        for info, frequency in zip(head.ChanInfo, (100.0, 500.0)):
+            info.Frequency = frequency
+        pings = [xtf_ping(0.2 * k, [echo(100), echo(300)]) for k in range(3)]
+        (tmp_path / 'a.xtf').write_bytes(b''.join([head.to_bytes(), *pings]))
+        for frequency, at in ((None, 100), (480e3, 300), (90e3, 100)):
+            out = tmp_path / f'{frequency}'
+            report = convert_xtf(tmp_path / 'a.xtf', out, frequency=frequency)
+            assert '100000, 500000 Hz' in report.notes['frequencies']
+            for ping in read(out, 'obstacle', Detections):
+                assert ping.range == pytest.approx([(at + 0.5) * 0.1], abs=0.06)
+
+    @pytest.mark.parametrize(
+        ('more', 'row', 'words'),
+        [
+            ({}, echo(300), ''),
+            ({'SensorHeading': 0.0}, echo(300), 'the heading is 0 in all 3 pings'),
+            ({}, echo(-1), 'no echo was found in 3 pings of starboard'),
+            ({}, np.maximum(echo(300), 65_535 * (np.arange(500) < 9)).astype('u2'), '1.8% of'),
+            (
+                {'SensorYcoordinate': 0.0, 'SensorXcoordinate': 0.0, 'ShipYcoordinate': 54.0,
+                 'ShipXcoordinate': 10.0, 'Layback': 25.0},
+                echo(300),
+                'up to 25 m behind',
+            ),
+        ],
+    )  # fmt: skip
+    def test_what_looks_wrong_is_asked(self, tmp_path, more, row, words):
+        pings = [xtf_ping(0.2 * k, [echo(-1), row], **more) for k in range(3)]
+        report = convert_xtf(xtf(tmp_path / 'a.xtf', pings), tmp_path / 'bag')
+        assert words in ' '.join(report.questions) and bool(report.questions) == bool(words)
+
     def test_a_channel_of_phases_makes_snapshots(self, tmp_path):
         channels = [('amplitude', 'starboard', 'uint16'), ('phase 1', 'starboard', 'float32')]
         turn = np.linspace(-3.0, 3.0, 500).astype('f4')

@@ -125,11 +125,23 @@ def test_other_formats_hold_the_same_rows(run, tmp_path, kind):
     assert times == [row['time_utc'] for row in rows]
 
 
-def test_exported_tracks_come_in_again(run, tmp_path):
-    """What `export` writes, `convert` reads."""
-    path = exported(run, tmp_path / 'a.gpx')
+@pytest.mark.parametrize('kind', ['gpx', 'kml', 'geojson'])
+def test_exported_tracks_come_in_again(run, tmp_path, kind, capsys):
+    """What `export` writes, `convert` reads, each point once."""
+    path = exported(run, tmp_path / f'a.{kind}')
+    count = len(places_of(path)[0])
     assert main(['convert', 'truth', str(path), str(tmp_path / 'truth')]) == 0
+    capsys.readouterr()
     assert main(['convert', str(path), str(tmp_path / 'again')]) == 0
+    assert f'{count} on /fix' in capsys.readouterr().out
+
+
+def test_gis_programs_see_the_lines_of_kml(run, tmp_path):
+    pyogrio = pytest.importorskip('pyogrio')
+    path = exported(run, tmp_path / 'a.kml')
+    _, _, geometry, _ = pyogrio.raw.read(path)
+    kinds = [int.from_bytes(each[1:5], 'little' if each[0] else 'big') for each in geometry]
+    assert 2 in [kind & 0xFF for kind in kinds]  # a line string in WKB
 
 
 def test_a_place_on_earth_can_be_told(run, tmp_path):

@@ -14,15 +14,27 @@
 
 """The density of false fixes, learnt from scans when nobody states it."""
 
+from pathlib import Path
+
 from helpers.diver_runs import SECOND
 from helpers.estimates import same
 import numpy as np
 import pytest
 
 from sonar_imm.measurements import Fixes
-from sonar_imm.trackers.diver.clutter import Clutter, LEAST, MOST
+from sonar_imm.trackers.diver.clutter import (
+    Clutter,
+    Clutters,
+    IN_DISC,
+    LEAST,
+    MOST,
+    MOST_REMEMBERED,
+    RADII,
+)
 from sonar_imm.trackers.diver.config import CLUTTER
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'diver_in_the_field'
 
 
 def scans(count, false, half, seed=11, divers=((0.0, 0.0), (0.0, 2.0)), aspect=1.0):
@@ -152,3 +164,95 @@ def test_gnn_says_that_there_is_clutter(false, half, settings, warns):
     assert bool(about) == warns
     # Its own false tracks take a part of them.
     assert not warns or 0.5 * false < float(about.split()[0]) < 1.2 * false
+
+
+def remembered(points, weight, scans, whole):
+    """Statistics that remember false fixes, with `whole` as the density of the sensor."""
+
+    class Known(Clutter):
+        density = whole
+
+    return Known(scans=scans, points=points, weight=weight)
+
+
+def test_the_density_at_a_fix_is_that_of_an_independent_program():
+    v = np.load(VECTORS / 'density.npz')
+    known = remembered(v['points'], v['weight'], float(v['scans']) - 5.0, float(v['whole']))
+    found = known.density_at(v['z'], v['R'])
+    assert found == pytest.approx(v['density'], rel=1e-12)
+    assert len(np.unique(found)) > 5
+    assert known.density_at(np.empty((0, 2)), np.empty((0, 2, 2))).shape == (0,)
+
+
+def test_a_disc_is_as_wide_as_a_fix_is_uncertain():
+    points = np.random.default_rng(3).normal(scale=1.0, size=(40, 2))
+    known = remembered(points, np.ones(40), 95.0, 1e-9)
+    for std in (1.0, 10.0, 100.0, 190.0, 500.0):
+        (found,) = known.density_at(np.zeros((1, 2)), std**2 * np.eye(2)[None])
+        (radius,) = RADII[RADII >= std][:1] if std <= RADII[-1] else [np.inf]
+        assert found == pytest.approx(max(min(40.0 / (100.0 * np.pi * radius**2), MOST), 1e-9))
+
+
+def test_what_is_remembered_is_bounded_and_keeps_its_weight():
+    rng, known, total = np.random.default_rng(7), Clutter(), 0.0
+    for _ in range(30):
+        z = rng.uniform(-500.0, 500.0, (700, 2))
+        known, total = known.with_scan(z, np.full(700, 0.9), 0.1), total * np.exp(-0.01) + 560.0
+    assert len(known.points) == len(known.weight) == MOST_REMEMBERED
+    assert known.weight.sum() == pytest.approx(total, rel=1e-9)
+    # Each stands for several, so a disc needs more than `IN_DISC` alone.
+    assert known.weight.max() > 1.5
+    places = rng.uniform(-300.0, 300.0, (200, 2))
+    found = known.density_at(places, np.tile(np.eye(2), (200, 1, 1)))
+    assert np.median(found) == pytest.approx(560e-6 * 30 / 35, rel=0.25)
+    for _ in range(1000):
+        known = known.with_scan(np.empty((0, 2)), np.empty(0))
+    assert not len(known.points)
+
+
+def test_false_fixes_in_a_clump_begin_no_track_for_long():
+    """A pier returns two fixes a scan; a diver passes by, and another is in the open."""
+    rng = np.random.default_rng(1)
+    tracker, shown = DiverTracker(DiverConfig()), []
+    for second in range(1, 121):
+        z = rng.normal(scale=3.0, size=(rng.poisson(0.8), 2))
+        divers = np.array([[0.6 * second - 36.0, 9.0], [0.6 * second - 36.0, 50.0]])
+        z = np.concatenate([z, divers + rng.normal(scale=0.5, size=(2, 2))])
+        position = np.column_stack([z, np.zeros(len(z))])
+        covariance = np.tile(0.25 * np.eye(2), (len(z), 1, 1))
+        item = Fixes(stamp_ns=second * SECOND, position=position, covariance=covariance)
+        (estimate,) = tracker.process(item)
+        firm = estimate.state[estimate.extras['track_state'] > 0, :2]
+        own = [np.hypot(*(firm - diver).T).min(initial=9.0) < 2.0 for diver in divers]
+        shown.append((*own, len(firm) - sum(own)))
+    first, second, false = np.mean(shown[30:], axis=0)
+    assert first > 0.95 and second > 0.95 and false < 0.1
+    ((_, known),) = tracker._stream.state.memory['clutter'].by_sensor
+    at = np.array([[0.0, 0.0], [0.0, 50.0], [40.0, -40.0]])
+    density = known.density_at(at, np.tile(0.25 * np.eye(2), (3, 1, 1)))
+    assert density[0] > 5.0 * density[1] == 5.0 * density[2] == 5.0 * known.density
+    assert known.points.shape[0] < 400 and known.weight.sum() > IN_DISC
+
+
+def test_new_targets_arrive_in_time():
+    """Twice the time between scans, twice the new targets; several instruments of one name, and
+    several messages of one stamp, take nothing from one another."""
+    steady, looks = Clutters(), []
+    for scan in range(1, 6):
+        steady, elapsed = steady.with_look('a', scan * SECOND // 2)
+        looks.append(elapsed)
+    assert looks == [10.0, *[0.5] * 4]
+    assert steady.with_look('a', 3 * SECOND)[1] == pytest.approx(0.5)
+    assert steady.with_look('a', 90 * SECOND)[1] == 10.0
+    assert steady.with_look('b', 90 * SECOND)[1] == 10.0
+    same_stamp, elapsed = steady.with_look('a', 5 * SECOND // 2)
+    assert elapsed == 0.5 and same_stamp == steady
+    pairs, looks = Clutters(), []
+    for scan in range(1, 60):
+        for late in (0, 1_000_000):
+            pairs, elapsed = pairs.with_look('a', scan * SECOND + late)
+            looks.append(elapsed)
+    assert min(looks[40:]) > 0.4 and 1.0 > looks[-2] > 0.99
+    for name in range(50):
+        pairs, _ = pairs.with_look(str(name), 70 * SECOND)
+    assert len(pairs.looks) == 20

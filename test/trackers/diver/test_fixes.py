@@ -52,7 +52,7 @@ def predicted(item):
     tracker = DiverTracker(CONFIG)
     for second in range(1, 6):
         tracker.process(scan(second, PLACES + 0.5 * second))
-    now = Scan.from_items([item], tracker.config, {})
+    now = Scan.from_items([item], tracker.config)
     known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
     return tracker, known, now.fixes[0]
 
@@ -87,7 +87,7 @@ def test_the_score_says_how_much_better_than_clutter_a_track_explains_its_fixes(
     pairs = compare(known, group, tracker.models, 1e-6)
     found = associate_gnn(known, group, pairs)
     p, gained = CONFIG.detection_probability, found.score - known['score']
-    density = pairs.track_log[0, 0] - math.log(group.clutter)
+    density = pairs.track_log[0, 0] - math.log(group.clutter[0])
     np.testing.assert_allclose(gained, [math.log(p) + density, *[math.log1p(-p)] * 2])
     x, P = (part[:1] for part in tracker.models.to_common(known.rows.blocks))
     v, H = group.z[None] - x[..., :2], tracker.models.fix_matrix[None]
@@ -139,7 +139,7 @@ def test_a_row_that_is_far_away_sees_the_fixes_of_its_track(pairing):
     for second in range(1, 6):
         tracker.process(scan(second, PLACES[:1] + 0.5 * second))
     item = scan(6, PLACES[:1] + 3.0)
-    now = Scan.from_items([item], tracker.config, {})
+    now = Scan.from_items([item], tracker.config)
     known = tracker._predict(tracker._stream.state, now, item.stamp_ns)
     blocks = []
     for x, P in known.rows.blocks:

@@ -29,10 +29,10 @@ from sonar_imm.trackers.diver.births import restart_track
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.depth import ambiguous_depths, respread_depths
 from sonar_imm.trackers.diver.estimate import published_state
-from sonar_imm.trackers.diver.fixes import _protected_rows
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.known import track_outputs
 from sonar_imm.trackers.diver.models import build_models, START_DEPTHS
+from sonar_imm.trackers.diver.scales import protected_rows
 from sonar_imm.trackers.diver.scan import ping_measurements, Scan
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
@@ -398,8 +398,8 @@ def test_depth_hypotheses_neither_exchange_weight_nor_borrow():
         known = tracker._stream.state
         assert len(known.rows) == START_DEPTHS * len(known) and not len(known.borrowed)
     improbable = known.rows.replace(logw=np.log([1e-6, 0.5, 0.5 - 1e-6]))
-    assert _protected_rows(improbable).all()
-    scan = Scan.from_items([], tracker.config, {})
+    assert protected_rows(improbable).all()
+    scan = Scan.from_items([], tracker.config)
     after = tracker._predict(known, scan, known.stamp_ns + 10**9)
     np.testing.assert_array_equal(after.rows.logw, known.rows.logw)
 

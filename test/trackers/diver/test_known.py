@@ -26,9 +26,9 @@ import pytest
 from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
-from sonar_imm.trackers.diver import fixes
 from sonar_imm.trackers.diver.estimate import published_state
 from sonar_imm.trackers.diver.known import repair_covariances
+from sonar_imm.trackers.diver.scales import redistribute_weights
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SETS = [
@@ -101,7 +101,7 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
 @pytest.mark.parametrize('settings', SETS)
 def test_tracks_in_one_table_are_trackers_of_one(settings):
     """Divers too far apart to share a fix."""
-    config = DiverConfig(max_tracks=9, clutter_density=1e-5, **settings)
+    config = DiverConfig(max_tracks=9, clutter_density=1e-5, birth_density=1e-5, **settings)
     made = list(swims(3, 30, 4))
     together = run(
         DiverTracker(config),
@@ -195,7 +195,7 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
         published_state(agreeing, tracker.models), published_state(single, tracker.models)
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
-    spread = fixes.redistribute_weights(agreeing)
+    spread = redistribute_weights(agreeing, tracker.models.scales)
     for ours, due in zip(
         published_state(spread, tracker.models), published_state(single, tracker.models)
     ):

@@ -187,6 +187,37 @@ def test_what_the_vessel_states_of_itself_counts_and_else_the_parameters():
     assert across < P[1, 1] < across * bent
 
 
+@pytest.mark.parametrize('variance', [np.pi**2 / 3, 99.0, 1e6, 1.8e308])
+def test_roll_and_pitch_that_are_not_measured_are_assumed(variance):
+    def placed(whole):
+        tracker = DiverTracker(DiverConfig())
+        poses = [pose(k, (0, 0, 0), 0.0, pose_covariance=whole) for k in (4, 6)]
+        (made,) = run(tracker, [*poses, relative(5, (100.0, 0.0, -20.0))])
+        return tracker, made
+
+    tracker, made = placed(np.diag([0.25] * 3 + [variance, variance, 1e-4]))
+    std = np.radians(tracker.config.vessel_attitude_std_deg)
+    _, expected = placed(np.diag([0.25] * 3 + [std**2, std**2, 1e-4]))
+    assert made.state == pytest.approx(expected.state)
+    assert made.covariance == pytest.approx(expected.covariance)
+    assert tracker.counts['attitude_unmeasured'] == 1
+    assert 'roll or pitch is not measured' in tracker.warnings()[0]
+
+
+@pytest.mark.parametrize('variance', [np.pi**2 / 3, 99.0, 1e6])
+def test_a_heading_that_is_not_measured_gives_no_position(variance):
+    whole = np.diag([0.25] * 3 + [1e-4, 1e-4, variance])
+    poses = [pose(k, (0, 0, 0), 0.0, pose_covariance=whole) for k in (4, 6)]
+    tracker = DiverTracker(DiverConfig())
+    assert not run(tracker, [*poses, relative(5, (100.0, 0.0, 0.0))])
+    assert tracker.counts['heading_unmeasured'] == 1
+    assert 'its heading is not measured' in tracker.warnings()[0]
+    # A transceiver with a compass of its own needs no heading of the vessel.
+    tracker = DiverTracker(DiverConfig())
+    assert run(tracker, [*poses, relative(5, (100.0, 0.0, 0.0), levelled=True)])
+    assert not tracker.counts['heading_unmeasured']
+
+
 def test_a_gap_in_the_poses_and_a_stamp_before_them_are_counted():
     tracker = DiverTracker(DiverConfig())
     made = run(

@@ -23,34 +23,39 @@ from sonar_imm.acoustics.fathometer import depth_response
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.response import Lattice, mirror_sigma
+from sonar_imm.trackers.fathometer.noise import mirror_sigma
+from sonar_imm.trackers.fathometer.response import array_response, Lattice
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 
 
 def test_the_mirror_lies_at_negative_lags():
     """What lies above the array would be seen in the mirror window; what lies below is not."""
-    lattice = Lattice(50.0, 0.05, 400)
+    below = 30.0 + 0.05 * np.arange(400)
     rng = np.random.default_rng(0)
     frequency = 100.0 + 2.0 * np.arange(1000)
     noise = 0.1 * (rng.standard_normal(1000) + 1j * rng.standard_normal(1000))
 
     def sigma(depth, strength):
         echo = strength * np.exp(-2j * np.pi * frequency * 2.0 * (depth - 20.0) / 1500.0)
-        return mirror_sigma(
+        found = mirror_sigma(
             lambda low, step, count: depth_response(
                 noise + echo, 100.0, 2.0, (low, step, count), 20.0, 1500.0
             ),
-            lattice,
+            below,
+            0.05,
             20.0,
             4.0,
         )
+        assert len(found) == 400
+        return found[0]
 
     quiet = sigma(60.0, 0.0)
     assert quiet == pytest.approx(0.1 / np.sqrt(1000.0), rel=0.2)
     assert sigma(60.0, 0.3) == pytest.approx(quiet, rel=0.2)
     with pytest.raises(Rejection, match='mirrored'):
-        mirror_sigma(lambda *a: np.ones(a[2]), Lattice(20.0, 1e-3, 100), 20.0, 4.0)
+        mirror_sigma(lambda *a: np.ones(a[2]), 1e-3 * np.arange(100), 1e-3, 20.0, 4.0)
 
 
 def test_the_noise_of_a_trace_is_what_its_reflectors_leave():
@@ -81,3 +86,55 @@ def test_only_both_depths_at_zero_ask_for_the_mirror():
     assert not FathometerConfig().noise_from_mirror
     with pytest.raises(ConfigError, match='noise_depth_max'):
         FathometerConfig(noise_depth_min=10.0, noise_depth_max=0.0)
+
+
+def test_noise_near_an_array_that_hears_itself_is_louder_there_and_nowhere_else():
+    below = 10.0 + 0.05 * np.arange(1200)
+    rng = np.random.default_rng(1)
+
+    def ringing(low, step, count):
+        away = 20.0 - (low + step * np.arange(count))
+        return rng.standard_normal(count) * (1.0 + 6.0 * np.exp(-away / 5.0))
+
+    sigma = mirror_sigma(ringing, below, 0.05, 20.0, 2.5)
+    assert sigma[0] > 1.6 and (np.diff(sigma) <= 0.0).all()
+    assert (sigma[400:] == sigma[-1]).all() and sigma[-1] == pytest.approx(1.0, rel=0.1)
+    flat = mirror_sigma(lambda *a: rng.standard_normal(a[2]), below, 0.05, 20.0, 2.5)
+    assert (flat == flat[0]).all()
+
+
+@pytest.mark.parametrize('half, expected', [(np.inf, 3.3), (40.0, 1.0), (9.0, 1.0)])
+def test_the_mirror_window_ends_at_half_a_snapshot(half, expected):
+    """Further away are the lags of the other side, here five times as loud: seen
+    without a limit, as the median of both."""
+    rng = np.random.default_rng(2)
+
+    def other_side(low, step, count):
+        away = 20.0 - (low + step * np.arange(count))
+        return rng.standard_normal(count) * np.where(away > 40.0, 5.0, 1.0)
+
+    sigma = mirror_sigma(other_side, 20.0 + 0.05 * np.arange(1600), 0.05, 20.0, 2.5, half)
+    assert np.median(sigma) == pytest.approx(expected, rel=0.3)
+
+
+def test_noise_depths_that_a_snapshot_cannot_hold_are_mirrored_and_said():
+    """With 0.2 s the lags of 180 m to 300 m are those of the array itself, and its depths."""
+    scene = simulate(scenario('small', {'records': 1, 'depth_companion': False}), 5)
+    spectra = scene.measurements[0].measurement
+    base = {**scenario('small').instruments(), 'particles': 200}
+    lattice = Lattice(125.0, 0.05, 500)
+    depth = spectra.reference_depth
+
+    def response(**options):
+        return array_response(spectra, lattice, FathometerConfig(**base, **options), depth)
+
+    wrapped, mirror = response(), response(**MIRROR)
+    assert wrapped.noise_wraps and not mirror.noise_wraps
+    assert wrapped.sigma.tobytes() == mirror.sigma.tobytes()
+    fits = response(noise_depth_min=85.0, noise_depth_max=125.0)
+    assert not fits.noise_wraps and fits.sigma[0] != mirror.sigma[0]
+    for told, sentences in (({}, 0), ({'noise_depth_max': 310.0}, 1)):
+        tracker, _ = run([spectra], **base, **told)
+        said = [each for each in tracker.warnings() if 'half a snapshot' in each]
+        assert len(said) == sentences
+    assert '75 m below the array with 0.2 s' in said[0]

@@ -1,0 +1,160 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Hydrophones that differ: against vectors, and each fault in a record of its own."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
+from sonar_imm.acoustics.hydrophones import apply_response, correct_phones, fit_phones
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
+M, SPACING, SPEED = 16, 0.25, 1500.0
+WAVE, PLACES = SPEED / SPACING, np.arange(M)
+FREQUENCY = np.arange(100.0, 2801.0, 10.0)
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    with np.load(VECTORS / 'phones.npz') as file:
+        return {name: file[name] for name in file}
+
+
+@pytest.fixture(scope='module')
+def clean():
+    R = surface_noise_csdm(FREQUENCY, M, SPACING, [22.0, 36.0], [0.35, 0.2], SPEED)
+    return sample_csdm(R + 0.01 * np.eye(M), 100, np.random.default_rng(0))
+
+
+def heard(csdm, response):
+    """With the responses (M,) or (F, M)."""
+    c = np.broadcast_to(response, (len(FREQUENCY), M)).astype(np.complex64)
+    return csdm * c[:, :, None] * c.conj()[:, None, :]
+
+
+def late(seconds, phone=9):
+    response = np.ones((len(FREQUENCY), M), np.complex128)
+    response[:, phone] = np.exp(-2j * np.pi * FREQUENCY * seconds)
+    return response
+
+
+def test_response_of_the_vectors(vectors):
+    wave = float(vectors['sound_speed'] / vectors['element_spacing'])
+    fit = fit_phones(vectors['csdm'], vectors['frequency'], PLACES, wave)
+    assert np.abs(fit.gain / vectors['gain'] - 1.0).max() < 1e-6
+    assert (fit.sign == vectors['sign']).all() and (fit.sign == vectors['true_sign']).all()
+    assert np.abs(fit.delay - vectors['delay']).max() < 1e-6
+    assert np.abs(fit.share - vectors['share']).max() < 0.02
+    corrected = apply_response(vectors['csdm'], vectors['frequency'], fit)
+    power = np.einsum('fmm->fm', vectors['csdm']).real.mean()
+    assert np.abs(corrected - vectors['corrected']).max() < 1e-3 * power
+
+
+def test_equal_hydrophones_are_left_as_they_are(clean):
+    corrected, keep, fit = correct_phones(clean, FREQUENCY, PLACES, WAVE, 0.1)
+    assert keep.all() and (fit.sign == 1).all()
+    assert np.abs(fit.delay).max() < 2e-6
+    assert np.abs(10.0 * np.log10(np.median(fit.gain, axis=0))).max() < 0.2
+    assert np.abs(corrected - clean).max() < 0.2 * np.abs(clean).max()
+
+
+@pytest.mark.parametrize('factor', [0.1, 0.5, 2.0])
+def test_gain(clean, factor):
+    response = np.ones(M)
+    response[5] = factor
+    corrected, keep, fit = correct_phones(heard(clean, response), FREQUENCY, PLACES, WAVE, 0.1)
+    assert keep.all()
+    assert np.median(fit.gain[:, 5]) == pytest.approx(factor**2, rel=0.05)
+    other, _, _ = correct_phones(clean, FREQUENCY, PLACES, WAVE, 0.1)
+    assert np.abs(corrected - other).max() < 0.05 * np.abs(other).max()
+
+
+@pytest.mark.parametrize('turned', [[4], [0, 15], [3, 4, 5], [1, 3, 5, 7, 9]])
+def test_signs(clean, turned):
+    response = np.ones(M)
+    response[turned] = -1.0
+    _, keep, fit = correct_phones(heard(clean, response), FREQUENCY, PLACES, WAVE, 0.1)
+    assert keep.all() and (fit.sign == response).all()
+    assert np.abs(fit.delay).max() < 2e-6
+
+
+@pytest.mark.parametrize('seconds', [50e-6, -120e-6])
+def test_a_delay(clean, seconds):
+    _, _, fit = correct_phones(heard(clean, late(seconds)), FREQUENCY, PLACES, WAVE, 0.1)
+    assert fit.delay[9] == pytest.approx(seconds, rel=0.12)
+    assert np.abs(np.delete(fit.delay, 9)).max() < 0.12 * abs(seconds)
+
+
+def test_delays_of_all_are_found_but_for_a_tilt(clean):
+    delay = 30e-6 * np.random.default_rng(3).standard_normal(M)
+    response = np.exp(-2j * np.pi * np.outer(FREQUENCY, delay))
+    _, _, fit = correct_phones(heard(clean, response), FREQUENCY, PLACES, WAVE, 0.1)
+    off = fit.delay - delay
+    bent = off - np.polyval(np.polyfit(PLACES, off, 1), PLACES)
+    assert np.abs(bent).max() < 8e-6
+    assert abs(np.polyfit(PLACES, off, 1)[0]) < 4e-6
+
+
+def test_a_tilt_stays(clean):
+    response = np.exp(-2j * np.pi * np.outer(FREQUENCY, 8e-6 * PLACES))
+    _, _, fit = correct_phones(heard(clean, response), FREQUENCY, PLACES, WAVE, 0.1)
+    assert np.abs(fit.delay).max() < 2e-6
+
+
+@pytest.mark.parametrize('place', [0, 7, 15])
+def test_a_hydrophone_that_hears_something_else_is_left_out(clean, place):
+    rng = np.random.default_rng(4)
+    alone = sample_csdm(np.repeat(np.eye(M)[None], len(FREQUENCY), axis=0), 100, rng)
+    foreign = clean.copy()
+    foreign[:, place], foreign[:, :, place] = alone[:, place], alone[:, :, place]
+    corrected, keep, fit = correct_phones(foreign, FREQUENCY, PLACES, WAVE, 0.1)
+    assert keep.sum() == M - 1 and not keep[place] and corrected.shape[1:] == (M - 1, M - 1)
+    assert abs(fit.share[place]) < 0.05 and np.delete(fit.share, place).min() > 0.95
+    assert np.abs(np.delete(fit.delay, place)).max() < 2e-6
+
+
+def test_dead_hydrophones_leave_gaps(clean):
+    alive = np.delete(PLACES, [2, 3, 10])
+    response = np.ones((len(FREQUENCY), M)) * late(50e-6)
+    response[:, 4] *= -1.0
+    csdm = heard(clean, response)[:, alive][:, :, alive]
+    _, keep, fit = correct_phones(csdm, FREQUENCY, alive, WAVE, 0.1)
+    assert keep.all() and fit.sign[alive == 4] == -1 and fit.sign.sum() == len(alive) - 2
+    assert fit.delay[alive == 9] == pytest.approx(50e-6, abs=6e-6)
+
+
+@pytest.mark.parametrize('phones, snapshots', [(8, 5), (16, 100)])
+def test_an_array_that_hears_nothing_in_common_is_levelled_only(phones, snapshots):
+    rng = np.random.default_rng(5)
+    csdm = sample_csdm(np.repeat(np.eye(phones)[None], len(FREQUENCY), axis=0), snapshots, rng)
+    _, keep, fit = correct_phones(csdm, FREQUENCY, np.arange(phones), WAVE, 0.1)
+    assert keep.all() and (fit.sign == 1).all() and not fit.delay.any()
+    assert np.isnan(fit.share).all()
+
+
+@pytest.mark.parametrize('phones', [3, 4])
+def test_few_hydrophones_are_levelled_only(clean, phones):
+    csdm = heard(clean, late(100e-6, 1))[:, :phones, :phones]
+    _, keep, fit = correct_phones(csdm, FREQUENCY, np.arange(phones), WAVE, 0.1)
+    assert keep.all() and not fit.delay.any() and np.isnan(fit.share).all()
+
+
+def test_gains_alone(clean):
+    _, keep, fit = correct_phones(
+        heard(clean, late(100e-6)), FREQUENCY, PLACES, WAVE, 0.1, full=False
+    )
+    assert keep.all() and not fit.delay.any() and np.isnan(fit.share).all()

@@ -1,0 +1,183 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Covariance scales: found over eight orders of magnitude, named truly, and cheap when absurd."""
+
+from helpers.diver_runs import fix
+import numpy as np
+import pytest
+
+from sonar_imm.estimation.rows import ROW_LOST
+from sonar_imm.measurements import Fix
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.fixes import compare, update_stage
+from sonar_imm.trackers.diver.scales import redistribute_weights, scale_priors
+from sonar_imm.trackers.diver.scan import Scan
+from sonar_imm.trackers.diver.tracker import DiverTracker
+
+WARNED = 'fix covariances too small by a factor'
+
+
+def swim(seed, count=110, std=1.0, stated=1.0, lasting=0.0, time=60.0):
+    """Fixes each second of a diver who turns now and then, and the positions (count, 2).
+
+    `stated` is the factor between what the fixes state and the variance `std`^2; `lasting` is the
+    standard deviation of a Gauss-Markov error of `time` seconds that they do not state.
+    """
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(np.where(rng.uniform(size=count) < 0.07, rng.normal(0.0, 1.2, count), 0))
+    truth = np.cumsum(0.75 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    bias, kept = lasting * rng.normal(size=2), np.exp(-1.0 / time)
+    items = []
+    for k, place in enumerate(truth, start=1):
+        bias = kept * bias + lasting * np.sqrt(1.0 - kept**2) * rng.normal(size=2)
+        z = place + bias + std * rng.normal(size=2)
+        items.append(fix(k, *z, std**2 * stated * np.eye(2)))
+    return items, truth
+
+
+def scored(items, truth, first=20, **values):
+    """RMSE, NEES and the tracker."""
+    tracker, error, squared = DiverTracker(DiverConfig(max_tracks=1, **values)), [], []
+    for k, item in enumerate(items):
+        last = tracker.process(item)[-1]
+        if k >= first:
+            error.append(last.state[0, :2] - truth[k])
+            squared.append(error[-1] @ np.linalg.solve(last.covariance[0, :2, :2], error[-1]))
+    return np.sqrt(np.mean(np.square(error).sum(axis=1))), np.mean(squared), tracker
+
+
+@pytest.mark.parametrize('excess', [1e2, 1e4])
+def test_covariances_that_are_far_too_small_cost_nothing_and_the_factor_is_named(excess):
+    items, truth = swim(3, stated=1.0 / excess)
+    rmse, nees, tracker = scored(items, truth)
+    due, _, _ = scored(items, truth, covariance_scale=excess)
+    assert rmse < 1.1 * due and 1.0 < nees < 3.0
+    (warned,) = tracker.warnings()
+    factor = float(warned.removeprefix(WARNED).partition(':')[0])
+    assert 0.6 < factor / excess < 1.7 and 'e+' not in warned
+    assert len(tracker._stream.state.rows) <= 4
+
+
+def test_beyond_the_last_scale_no_factor_is_named():
+    items, truth = swim(4, stated=1e-6)
+    rmse, _, tracker = scored(items, truth, first=40)
+    assert rmse < 1.0
+    assert f'{WARNED} of more than a million: errors' in tracker.warnings()[0]
+    items, _ = swim(4, count=50, stated=1.0 / 300.0)
+    *_, tracker = scored(items, truth[:50], covariance_scales=(1.0, 10.0, 100.0))
+    assert f'{WARNED} of more than 100: errors' in tracker.warnings()[0]
+
+
+def test_covariances_that_are_far_too_large_leave_the_mean_alone():
+    items, truth = swim(5, stated=50.0)
+    rmse, nees, tracker = scored(items, truth)
+    due, _, _ = scored(items, truth, covariance_scale=1.0 / 50.0)
+    assert rmse < 1.05 * due and nees < 0.5
+    assert 'covariances are too large' in tracker.warnings()[0]
+
+
+def test_true_covariances_are_not_warned_about():
+    items, truth = swim(6)
+    _, nees, tracker = scored(items, truth)
+    assert 1.0 < nees < 3.0 and not tracker.warnings()
+
+
+def test_a_new_track_has_no_rows_of_improbable_scales():
+    tracker = DiverTracker(DiverConfig())
+    items, _ = swim(7, count=3)
+    tracker.process(items[0])
+    assert sorted(tracker._stream.state.rows.key['scale']) == [0.15, 1.0, 3.0, 10.0]
+    tracker.process(items[1])
+    known = tracker._stream.state
+    held = np.concatenate([known.rows.key['scale'], known.borrowed.key['scale']])
+    assert sorted(held) == list(tracker.models.scales)
+    weight = np.exp(np.concatenate([known.rows.logw, known.borrowed.logw]))
+    assert weight.sum() == pytest.approx(1.0)
+    assert (weight[held > 10.0] < ROW_LOST).all()
+
+
+def test_the_priors_are_what_redistribution_tends_to():
+    """Inside the scales from 1 on and inside the smaller ones; half of the weight each."""
+    tracker = DiverTracker(DiverConfig())
+    items, _ = swim(8, count=30)
+    for item in items:
+        tracker.process(item)
+    known = tracker._stream.state
+    for _ in range(40000):
+        known = redistribute_weights(known, tracker.models.scales)
+    scale = np.concatenate([known.rows.key['scale'], known.borrowed.key['scale']])
+    weight = np.exp(np.concatenate([known.rows.logw, known.borrowed.logw]))
+    prior, large = scale_priors(scale), scale >= 1.0
+    due = 0.5 * np.where(large, prior / prior[large].sum(), prior / prior[~large].sum())
+    np.testing.assert_allclose(weight, due, rtol=1e-6)
+
+
+def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track():
+    """The two readings, enumerated: missed beside a false fix, or seen there under the scale."""
+    config = DiverConfig(max_tracks=1, clutter_density=1e-6)
+    tracker = DiverTracker(config)
+    items, _ = swim(9, count=40, std=0.1)
+    for item in items:
+        tracker.process(item)
+    far = fix(41, *(items[-1].position[:2] + [3.0, 0.0]), 0.01 * np.eye(2))
+    scan = Scan.from_items([far], config, {})
+    known, (group,) = tracker._predict(tracker._stream.state, scan, far.stamp_ns), scan.fixes
+    pairs = compare(known, group, tracker.models, 0.01)
+    missed = (1.0 - config.detection_probability) * 1e-6
+    due = np.exp(pairs.among.logw)
+    due *= missed + config.detection_probability * np.exp(pairs.log)
+    due = dict(zip(pairs.among.scale, due / due.sum()))
+    update = update_stage(tracker.models, lambda _: (None, None))
+    after = update(tracker._associate(known, group), group)
+    assert not group.association.beta.any()
+    held = np.concatenate([after.rows.key['scale'], after.borrowed.key['scale']])
+    weight = np.exp(np.concatenate([after.rows.logw, after.borrowed.logw]))
+    np.testing.assert_allclose(weight, [due[scale] for scale in held], rtol=1e-9)
+    assert due[1000.0] > 100.0 * np.exp(pairs.among.logw[pairs.among.scale == 1000.0][0])
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'values', 'said'),
+    [
+        ('', {}, True),
+        ('', {'fix_std': 2.0}, False),
+        ('radar', {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}, False),
+        ('lidar', {'sensors': ('radar',), 'own': (('radar.fix_std', 2.0),)}, True),
+    ],
+)
+def test_a_covariance_that_no_message_states_is_said_from_the_first_fix(sensor, values, said):
+    tracker = DiverTracker(DiverConfig(**values))
+    first = Fix(stamp_ns=10**9, position=[0.0, 0.0, 0.0], frame_id='map', sensor=sensor)
+    tracker.process(first)
+    due = 'no message states a covariance: fix_std 1 m is assumed, and no ellipse is better'
+    assert any(due in text for text in tracker.warnings()) == said
+    tracker.process(fix(2, 0.5, 0.0))
+    assert not any(due in text for text in tracker.warnings())
+
+
+def test_errors_that_last_widen_what_is_published():
+    """They are in no innovation: no filter that knows only the covariances has a true ellipse."""
+    found = []
+    for seed in range(2):
+        items, truth = swim(20 + seed, count=120, std=0.1, lasting=1.0, stated=100.0)
+        _, nees, tracker = scored(items, truth, first=60)
+        assert 'set fix_bias_std' in tracker.warnings()[0]
+        found.append(nees)
+        last = tracker._stream.state
+        calm = last.with_memory(fixes=last.memory['fixes']._replace(cross=0.0, nis=50.0))
+        R = tracker._estimate(last).covariance - tracker._estimate(calm).covariance
+        np.testing.assert_allclose(R[0, :2, :2], last['reported'][0, 0] * np.eye(2), atol=1e-9)
+        assert last['reported'][0, 0] >= 1.0 and not R[0, 2:].any()
+    assert np.mean(found) < 2.5
