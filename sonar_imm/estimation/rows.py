@@ -31,7 +31,7 @@ Arrays are never changed in place, because tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -43,6 +43,7 @@ from .bank import Gaussians
 
 __all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
 
+NOTHING: Mapping[str, Any] = {}
 LEAST_LOG = -345.0
 """Minimum logarithm of a row weight, 1e-150, so that a row can recover."""
 
@@ -68,6 +69,9 @@ class Rows:
     """(N,) row of the previous table; -1 for none."""
     key: dict[str, np.ndarray] = field(factory=dict)
     """Assumptions of each row by name, (N,) each."""
+    tail: int = 0
+    """Number of last components that belong to an assumption: they are nil in rows without it, and
+    they are absent where no row has it."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -101,6 +105,7 @@ class Rows:
             self.target[rows],
             np.asarray(rows, np.int64),
             {name: column[rows] for name, column in self.key.items()},
+            self.tail,
         )
 
     def select_targets(self, kept: BoolArray) -> Rows:
@@ -119,9 +124,10 @@ class Rows:
         """
         if set(new.key) != set(self.key):
             raise ValueError(f'rows with {sorted(new.key)} do not fit {sorted(self.key)}')
+        tail = max(self.tail, new.tail)
         blocks = tuple(
             Gaussians(*(np.concatenate(parts) for parts in zip(ours, theirs)))
-            for ours, theirs in zip(self.blocks, new.blocks)
+            for ours, theirs in zip(self.with_tail(tail).blocks, new.with_tail(tail).blocks)
         )
         both = Rows(
             blocks,
@@ -130,11 +136,26 @@ class Rows:
             np.concatenate([self.target, new.target]),
             np.concatenate([self.parent, new.parent]),
             {name: np.concatenate([self.key[name], new.key[name]]) for name in self.key},
+            tail,
         )
         if (np.diff(both.target) >= 0).all():
             return both
         order = np.argsort(both.target, kind='stable')
         return evolve(both.select(order), parent=both.parent[order])
+
+    def with_tail(self, tail: int) -> Rows:
+        """Return the rows with `tail` last components, none of them or new ones, which are nil."""
+        if tail == self.tail:
+            return self
+        blocks = []
+        for x, P in self.blocks:
+            kept = x.shape[1] - self.tail
+            x, P = x[:, :kept], P[:, :kept, :kept]
+            if tail:
+                x = np.pad(x, ((0, 0), (0, tail), (0, 0)))
+                P = np.pad(P, ((0, 0), (0, tail), (0, tail), (0, 0)))
+            blocks.append(Gaussians(x, P))
+        return evolve(self, blocks=tuple(blocks), tail=tail)
 
     def replace_target(self, target: int, new: Rows) -> Rows:
         """Replace all rows of one target by `new`, without parents."""
@@ -170,6 +191,10 @@ class Rows:
         d = mean - centre[self.target]
         spread = covariance + d[:, :, None] * d[:, None]
         return centre, np.add.reduceat(w[..., None] * spread, first)
+
+    def total(self, values: FloatArray, targets: int) -> FloatArray:
+        """Return the sum (T,) of `values` (N,) over the rows of each of `targets` targets."""
+        return np.bincount(self.target, values, minlength=targets).astype(np.float64)
 
     def model_probabilities(self) -> FloatArray:
         """Return the model probabilities (T, M) of each target over all its rows."""
@@ -294,10 +319,14 @@ def restore_rows(
     rows: Rows,
     borrowed: Borrowed,
     again: BoolArray,
+    without: Mapping[str, Any] = NOTHING,
     lend: Callable[[Rows, Borrowed], Rows] | None = None,
 ) -> tuple[Rows, Borrowed]:
     """Give the assumptions `again` (B,) a row, a copy of their lender.
 
+    The copy has no tail.
+
+    :param without: values of other assumptions.
     :param lend: changes the copies where an assumption also changes the state.
     :returns: the rows and the list.
     """
@@ -306,5 +335,8 @@ def restore_rows(
     back = borrowed.select(again)
     lender = back.find_lenders(rows)
     copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
+    copies = copies.with_tail(0)
     copies = copies if lend is None else lend(copies, back)
-    return rows.append(evolve(copies, key={**copies.key, **back.key})), borrowed.select(~again)
+    ended = {name: np.full(len(back), value) for name, value in without.items()}
+    copies = evolve(copies, key={**copies.key, **ended, **back.key})
+    return rows.append(copies), borrowed.select(~again)

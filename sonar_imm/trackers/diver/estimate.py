@@ -23,9 +23,9 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, clutter, depth, offsets
+from . import births, burst_reports, bursts, clutter, depth, offsets
 from .config import DiverConfig
-from .known import Known, row_outputs
+from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
 from .scales import delay_probabilities, estimated_scales, weight_without_small_scales
@@ -40,7 +40,7 @@ def estimate_of(
     """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
     # The existence is NaN for tracks confirmed by hits.
     known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
-    mean, covariance = published_state(known, models)
+    mean, covariance = published_state(known, models, config.burst_end)
     if known.memory['recent'].pairs:
         covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
     if known.memory['fixes'].errors_last(config.fix_bias_std > 0.0):
@@ -73,7 +73,9 @@ def estimate_of(
     )
 
 
-def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+def published_state(
+    known: Known, models: ModelSet, burst_end: float
+) -> tuple[FloatArray, FloatArray]:
     """Return mean (T, q) and covariance (T, q, q) of the published state.
 
     All rows contribute to the mean. Only rows with scale >= 1 contribute to the covariance,
@@ -82,8 +84,7 @@ def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatAr
     uncorrelated with all other estimates. The covariance of the mean is then its covariance plus
     the squared difference. If fixes are better, the result is conservative.
     """
-    maps = tuple(part.outputs for part in models.parts)
-    rows, each = known.rows, row_outputs(known.rows, maps)
+    rows, each = known.rows, bursts.row_readings(known.rows, models, burst_end)
     mean, covariance = rows.combine(*each, rows.weight)
     if len(models.scales) > 1:
         own, covariance = rows.combine(*each, weight_without_small_scales(rows))
@@ -111,7 +112,16 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = estimated_scales(known.rows, known.memory['reporting'])
+    rows, T = known.rows, len(known)
+    out['covariance_scale'] = estimated_scales(rows, known.memory['reporting'])
+    off = rows.key['offset'] >= 0
+    weight = np.where(off, rows.weight, 0.0)
+    out['burst'] = rows.total(weight, T)
+    likely = np.where(out['burst'] > 0.5, out['burst'], np.nan)
+    offset = bursts.row_offsets(rows) * weight[:, None]
+    for axis, name in enumerate(('offset_x', 'offset_y')):
+        out[name] = rows.total(offset[:, axis], T) / likely
+    out['rows'] = rows.total(np.ones(len(rows)), T)
     return out
 
 
@@ -155,6 +165,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *(assumed if config.has_usual_fix_std else []),
         *memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names),
         *late_warnings(known),
+        *burst_reports.warnings(known, config),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *memory['offsets'].warnings(config),

@@ -35,7 +35,7 @@ Source: docs/diver.md, 'Association'.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import math
 from typing import Any
 
@@ -45,7 +45,6 @@ import numpy as np
 from ...estimation import bank, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
-from ...estimation.bank import Innovations
 from ...estimation.rows import (
     Borrowed,
     drop_weightless_rows,
@@ -57,8 +56,9 @@ from ...estimation.rows import (
     Rows,
 )
 from ...measurements import NOBODY
+from . import bursts
 from .innovations import FixConsistency, whiten_innovations
-from .known import Feature, Known, repair_covariances, row_outputs
+from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
@@ -109,6 +109,9 @@ MIN_DETECTION_PROBABILITY = 1e-9
 """Lower bound of the detection probability of a track outside the coverage, because ratios are
 divided by it."""
 
+SURELY = 1e3
+"""Log density of a pair that is chosen."""
+
 CONFIRM_EXISTENCE = 0.9
 """Existence above which a track can be confirmed."""
 
@@ -122,14 +125,7 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     """
     among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
-    blocks, parts = known.rows.blocks, models.parts
-    if among.moved.any():
-        every = np.concatenate([np.arange(len(known.rows)), among.lent])
-        blocks = tuple(
-            bank.move_along(block.select(every), part.outputs[2:4], among.moved)
-            for block, part in zip(blocks, parts)
-        )
-    expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
+    expected = _predict_fixes(known, among, group.number, models)
     by_nis = models.families is None
     each = [
         _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
@@ -137,7 +133,8 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     ]
     if len(each) == 1:
         assumption, fix, log, whole, nis = each[0]
-        return Pairs(among, assumption, fix, expected, log, whole, nis)
+        pairs = Pairs(among, assumption, fix, expected, log, whole, nis)
+        return bursts.add_ways(known, group, pairs, models) if has_ways(group, models) else pairs
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
@@ -148,6 +145,33 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
         np.concatenate(whole),
         np.concatenate(nis) if by_nis else None,
     )
+
+
+def _predict_fixes(
+    known: Known, among: Assumptions, sensor: int, models: ModelSet
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return `Pairs.expected` of a sensor."""
+    rows, N = known.rows, len(known.rows)
+    factor, found = bursts.offset_factor(rows, sensor), []
+    for block, part in zip(rows.blocks, models.parts):
+        velocity, measured = part.outputs[2:4], part.measured
+        own = bank.move_along(block, velocity, among.moved[:N])
+        each = [bank.predict_fix(own, measured, factor)]
+        if factor is not None:
+            each.append(bank.predict_fix(own, measured, np.zeros(N)))
+        if len(among.lent):
+            lent = bank.move_along(block.select(among.lent), velocity, among.moved[N:])
+            none = None if factor is None else np.zeros(len(among.lent))
+            each.append(bank.predict_fix(lent, measured, none))
+        h, S = zip(*each)
+        found.append((np.concatenate(h), np.concatenate(S)) if len(each) > 1 else each[0])
+    return found
+
+
+def has_ways(group: Group, models: ModelSet) -> bool:
+    """Return whether fixes of the group may be off by an offset (`bursts`)."""
+    one = group.target_id is not None or group.config.max_tracks == 1
+    return one and models.families is not None and group.config.burst_rate > 0.0
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -191,7 +215,7 @@ def _compare_part(
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     seen = among.seen[assumption]
     compared = tuple(bank.compare(*each, seen, z[fix], scaled) for each in expected)
-    log = _mixture_log_density(rows.mu[row], compared)
+    log = bank.mixture_log_density(rows.mu[row], compared)
     table = np.square(np.maximum(off, 1.0, out=off), out=off)
     table *= -0.5 * FAR
     table[assumption, fix] = log
@@ -206,17 +230,6 @@ def _compare_part(
     return assumption + part.start, fix, log, whole, nis
 
 
-def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
-    """Return the log density (p,) of each pair over all models. mu: (p, M) model probabilities."""
-    with np.errstate(divide='ignore'):
-        of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
-        best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
-        safe = np.where(np.isfinite(best), best, 0.0)
-        return np.asarray(
-            (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
-        )
-
-
 def track_log_density(
     rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet, sensor: int
 ) -> float:
@@ -228,7 +241,7 @@ def track_log_density(
         bank.weigh(block, every, *many, part.measured)
         for block, part in zip(rows.blocks, models.parts)
     ]
-    log = rows.logw + _mixture_log_density(rows.mu, compared)
+    log = rows.logw + bank.mixture_log_density(rows.mu, compared)
     return float(log_sum(log, np.zeros(len(rows), np.int64))[0])
 
 
@@ -303,10 +316,28 @@ def associate_by_id(known: Known, group: Group, pairs: Pairs) -> Association:
     own = known['target_id'][:, None] == group.target_id
     good = own & np.isfinite(pairs.track_log)
     if pairs.nis is None:
-        good &= pairs.track_log > gate_log_density(group)
+        good &= (pairs.track_log > gate_log_density(group)) | (pairs.direct < 1.0)
     fix = np.where(good.any(axis=1), good.argmax(axis=1) if D else -1, -1)
     free = ~own.any(axis=0)
-    return Association(*_hard_association(fix, D), fix, free, None, known['score'])
+    hard = _hard_association(fix, D)
+    fix = _direct_hits(fix, pairs)
+    return Association(*hard, fix, free, None, known['score'], direct=pairs.direct)
+
+
+def _held(pairs: Pairs) -> BoolArray:
+    """Return which tracks (T,) hold the only fix: their rows weigh themselves that it is an
+    outlier."""
+    if pairs.ways is None:
+        return np.zeros(len(pairs.track_log), np.bool_)
+    return np.asarray(pairs.ways.direct[:, 0] < 1.0)
+
+
+def _direct_hits(fix: IntArray, pairs: Pairs) -> IntArray:
+    """Return `fix` (T,) with -1 for fixes that are rather outliers or begin an offset."""
+    if pairs.ways is None or not pairs.ways.direct.shape[1]:
+        return fix
+    direct = pairs.ways.direct[np.arange(len(fix)), fix] > 0.5
+    return np.where(direct, fix, -1)
 
 
 def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
@@ -315,16 +346,21 @@ def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
     T, D = pairs.track_log.shape
     seen, p = group.detection, group.config.detection_probability
     ratio = 0.0 if seen is None else seen.log_ratio
-    fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
-    clutter = group.config.usual_clutter
-    fix = assign_fits(fit, known.life.status == TENTATIVE, p, clutter)
+    may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
+    fit = np.where(may, pairs.track_log + ratio, -np.inf)
+    clutter, chosen = group.config.usual_clutter, fit
+    if D == 1:
+        chosen = np.where(_held(pairs)[:, None], SURELY, fit)
+    fix = assign_fits(chosen, known.life.status == TENTATIVE, p, clutter)
     hit = np.flatnonzero(fix >= 0)
     missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
     score = known['score'] + missed
     score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(clutter)
     free = np.ones(D, np.bool_)
     free[fix[hit]] = False
-    return Association(*_hard_association(fix, D), fix, free, None, score)
+    hard = _hard_association(fix, D)
+    fix = _direct_hits(fix, pairs)
+    return Association(*hard, fix, free, None, score, direct=pairs.direct)
 
 
 def _hard_association(fix: IntArray, D: int) -> tuple[FloatArray, FloatArray]:
@@ -339,7 +375,7 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     """Compute the probabilities of all joint events of tracks and fixes."""
     T, D = pairs.track_log.shape
     config, status, seen = group.config, known.life.status, group.detection
-    may = gate_pairs(group, pairs)
+    may = gate_pairs(group, pairs) | (pairs.direct < 1.0)
     # With max_tracks confirmed tracks, no fix is attributed to a new target.
     full = int((status != TENTATIVE).sum()) >= config.max_tracks
     ratio = np.exp(pairs.track_log) / (group.clutter + (0.0 if full else group.birth_density))
@@ -353,13 +389,17 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
     before = np.where(np.isnan(before), guess, before)
     beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
+    if D == 1 and (held := _held(pairs)).any():
+        beta[:, 0], missed = np.where(held, before, 0.0), np.where(held, 0.0, missed)
+        after = np.where(held, before, after)
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
+    fix = _direct_hits(fix, pairs)
     claimed = beta.sum(axis=0)
     new = group.birth_density
     birth = new / (new + group.clutter) * (1.0 - claimed)
     score = jipda.log_odds(after)
-    return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
+    return Association(beta, missed, fix, claimed < 0.5, birth, score, True, pairs.direct)
 
 
 # -- update --------------------------------------------------------------------------------------
@@ -377,7 +417,7 @@ def update_stage(
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
         rejected = _rejected_fixes(known, group, association, pairs) if has_scales else None
-        known = _record_innovations(known, group, association, models)
+        known = _record_innovations(known, group, pairs, association, models)
         columns = {'score': association.score}
         if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
@@ -419,8 +459,15 @@ def update_tracks(
     if rejected is not None:
         factor *= _rejected_factor(pairs, *rejected)
         weighed = weighed | (rejected[1] > 0.0)
-    rows, borrowed = _update_weights(known, among, factor)
-    rows, borrowed, left = drop_weightless_rows(rows, borrowed, protected_rows(rows))
+    sensor = group.number
+    rows, borrowed, of_ways = _update_weights(
+        known, pairs, factor, association.beta / exists[:, None]
+    )
+    began = None
+    if pairs.ways is not None:
+        began = bursts.begin_rows(known, group, pairs.ways, of_ways, models, estimated)
+    stays = protected_rows(rows) | bursts.divided(rows, began)
+    rows, borrowed, left = drop_weightless_rows(rows, borrowed, stays)
     # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
@@ -429,19 +476,27 @@ def update_tracks(
     row, weight, whole = row[own], weight[own, None], whole[own, None]
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
-    blocks, factors, late = [], [], rows.key['delay'][:, group.number]
+    blocks, factors = [], []
+    offset, late = bursts.offset_factor(rows, sensor), rows.key['delay'][:, sensor]
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
         innovations = bank.compare(*expected, among.seen[assumption], z, R)
         block = bank.move_along(block, part.outputs[2:4], -late)
         ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
-        block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
+        mask = bursts.with_tail_mask(mask, rows.tail)
+        block, of_models = bank.update(
+            block, innovations, row, ratio, none, part.measured, mask, offset
+        )
         blocks.append(bank.move_along(block, part.outputs[2:4], late))
-        factors.append(factor)
-    sound, repairs = repair_covariances(tuple(blocks))
+        factors.append(of_models)
+    sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
     again = can_restore(rows, borrowed) & weighed[borrowed.target]
-    rows, borrowed = restore_rows(rows, borrowed, again, lending(models))
+    rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lending(models))
+    took = association.beta.sum(axis=1) > 0.5 * exists
+    rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
+    if began is not None or rows.tail:
+        rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
@@ -486,23 +541,49 @@ def _rejected_factor(pairs: Pairs, nearest: IntArray, share: FloatArray) -> Floa
     return np.asarray(1.0 - share[among.target] + gain, np.float64)
 
 
-def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
-    """Multiply the weights of all assumptions by `factor` (A,).
+def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows, Borrowed]:
+    """Add new rows of offsets, and remove rows of negligible weight.
 
     Return the rows and the borrowed list.
     """
+    rows = bursts.merge_rows(rows if began is None else rows.append(began))
+    rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
+    return bursts.without_unused_tail(rows), borrowed
+
+
+def _update_weights(
+    known: Known, pairs: Pairs, factor: FloatArray, beta: FloatArray
+) -> tuple[Rows, Borrowed, FloatArray]:
+    """Multiply the weights of all assumptions by `factor` (A,).
+
+    Return the rows, the borrowed list, and the log weights (E,) of the rows that ways lead to.
+
+    :param beta: (T, D) probability of each pair, if the target exists.
+    """
+    among, ways, of_ways = pairs.among, pairs.ways, np.empty(0)
     with np.errstate(divide='ignore'):
         logw = among.logw + np.log(factor)
-    logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
+        every, target = logw, among.target
+        if ways is not None:
+            track = known.rows.target[ways.row]
+            of_ways = known.rows.logw[ways.row] + ways.log - pairs.track_log[track, ways.fix]
+            of_ways = of_ways + np.log(beta[track, ways.fix])
+            target = np.concatenate([target, track])
+            order = np.argsort(target, kind='stable')
+            every, target = np.concatenate([every, of_ways])[order], target[order]
+    total = log_sum(every, target)
+    logw = np.maximum(logw - total[among.target], LEAST_LOG)
+    if ways is not None:
+        of_ways = of_ways - total[track]
     rows, borrowed = known.rows, known.borrowed
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
-    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list)
+    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list), of_ways
 
 
 def _record_innovations(
-    known: Known, group: Group, association: Association, models: ModelSet
+    known: Known, group: Group, pairs: Pairs, association: Association, models: ModelSet
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
     if len(group.z):
@@ -517,13 +598,9 @@ def _record_innovations(
     if not len(tracks):
         return known
     fix = association.fix[tracks]
-    seen = tuple(part.fix_matrix for part in models.parts)
-    rows, late = known.rows, known.rows.key['delay'][:, group.number]
-    each = zip(rows.blocks, models.parts)
-    moved = tuple(bank.move_along(block, part.outputs[2:4], -late) for block, part in each)
-    mean, covariance = rows.combine(
-        *row_outputs(rows.replace(blocks=moved), seen), weight_without_small_scales(rows)
-    )
+    count = len(known.rows)
+    seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
+    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
     scale = (
         estimated_scales(known.rows, group.number)[tracks]
         if len(models.scales) > 1

@@ -94,6 +94,25 @@ SPEED_MEMORY = 60.0
 for minutes is estimated as slowly swimming, also when it moves on."""
 
 
+NO_OFFSET: dict[str, int | bool] = {
+    'offset': -1,
+    'since': 0,
+    'took': 0,
+    'taken': 1,
+    'fixes': 0,
+    'others': 0,
+    'aside': False,
+    'link': 0,
+}
+"""Assumptions of a new row about offsets (`bursts`).
+
+offset: number of the sensor whose fixes are off, -1 for none; since: stamp of the first of them;
+took: stamp of the last fix that the row used, 0 for none; taken: number of fixes before;
+fixes: number of fixes of the sensor since; others: of other sensors; aside: whether its last fix
+was an outlier; link: ID of the track that the row excludes, 0 for none.
+"""
+
+
 class Families(NamedTuple):
     """Properties of models with unequal states."""
 
@@ -280,6 +299,7 @@ class ModelSet:
                 'scale': of_sensor(np.tile(scale, T), sensor),
                 'delay': np.zeros((T * K, MOST_SENSORS)),
                 'start': np.tile(start, T),
+                **{name: np.full(T * K, value) for name, value in NO_OFFSET.items()},
             },
         )
 

@@ -58,12 +58,14 @@ class Assumptions(NamedTuple):
         order = np.argsort(target, kind='stable')
         lender = borrowed.find_lenders(rows)
         its = lent_moves(rows.key, lender, borrowed.key) - borrowed.key['delay'][:, sensor]
-        seen, other = lender.copy(), np.flatnonzero(its != moved[lender])
+        # A borrowed assumption has no offset.
+        nil = N if rows.tail else 0
+        seen, other = lender + nil, np.flatnonzero(its != moved[lender])
         lent, late = lender[other], its[other]
         if len(other):
             # One prediction for each row and time.
             pairs, place = np.unique(np.column_stack([lent, late]), axis=0, return_inverse=True)
-            seen[other] = N + place.ravel()
+            seen[other] = N + nil + place.ravel()
             lent, late = pairs[:, 0].astype(np.intp), pairs[:, 1]
         return cls(
             np.concatenate([every, lender])[order],
@@ -88,6 +90,28 @@ class Assumptions(NamedTuple):
         )
 
 
+OPEN, NOBODYS, LEAVE = range(3)
+"""Ways of a fix: an offset begins, the fix is an outlier, an offset ends."""
+
+
+class Ways(NamedTuple):
+    """Further ways in which E pairs of a row and a fix are read, see `bursts`."""
+
+    row: IndexArray
+    """(E,) index of the row."""
+    fix: IndexArray
+    """(E,) index of the fix."""
+    way: IntArray
+    """(E,) `OPEN`, `NOBODYS` or `LEAVE`."""
+    variance: FloatArray
+    """(E,) variance of a new offset, m^2."""
+    log: FloatArray
+    """(E,) log density of the fix in this way, with the log prior of the way."""
+    direct: FloatArray
+    """(T, D) share of the density of a fix under a track that has the fix at the target, or at the
+    offset it had."""
+
+
 class Pairs(NamedTuple):
     """Comparison of D fixes with assumptions, as p pairs in order of the assumptions."""
 
@@ -97,14 +121,23 @@ class Pairs(NamedTuple):
     fix: IndexArray
     """(p,) index of the fix."""
     expected: list[tuple[FloatArray, FloatArray]]
-    """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows, then
-    of the L rows of `Assumptions.lent` at another time."""
+    """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows; where
+    rows have offsets, of the N rows without them; and of the L rows of `Assumptions.lent`, at
+    another time and without an offset."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray
     """(T, D) log density of each fix under each track."""
     nis: FloatArray | None
     """(T, D) smallest NIS of any model; None for density gating."""
+    ways: Ways | None = None
+    """Further ways of the fixes; None for none."""
+
+    @property
+    def direct(self) -> FloatArray | float:
+        """Return the share (T, D) of the density that has the fix at the target, or at the offset
+        it had."""
+        return 1.0 if self.ways is None else self.ways.direct
 
 
 class Association(NamedTuple):
@@ -124,6 +157,8 @@ class Association(NamedTuple):
     """(T,) new score of each track."""
     is_joint: bool = False
     """True if existence follows from the probabilities."""
+    direct: FloatArray | float = 1.0
+    """(T, D) see `Ways`."""
 
     @property
     def hit(self) -> BoolArray:
@@ -132,8 +167,13 @@ class Association(NamedTuple):
 
     @property
     def claimed(self) -> FloatArray:
-        """(D,) probability that the fix belongs to any track."""
-        return np.asarray(self.beta.sum(axis=0))
+        """(D,) probability that the fix is at any track, or at the offset it had."""
+        return np.asarray((self.beta * self.direct).sum(axis=0))
+
+    @property
+    def taken(self) -> BoolArray:
+        """(T,) True if the rows of a track have taken a fix in any way."""
+        return np.asarray(self.beta.sum(axis=1) > 0.5 * self.exists)
 
     @property
     def exists(self) -> FloatArray:

@@ -83,6 +83,10 @@ def pruning_stage(
         rejected = known['rejected'][:, 0] == known.stamp_ns
         if covered:
             looked, rejected, known = _weigh_misses(known, hit, looked, rejected)
+        # Rows that take a fix as an outlier, or as the first of a burst, are not missed.
+        for group in scan.fixes:
+            if group.association is not None:
+                looked = looked & ~(group.association.taken & ~hit)
         looked = looked | rejected
         by_existence = np.isfinite(known['existence'])
         life, kept = known.life.scan(hit, known.stamp_ns, rules, looked=looked & ~by_existence)

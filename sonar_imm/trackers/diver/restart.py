@@ -29,10 +29,10 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.rows import Rows
-from . import fixes
+from . import bursts, fixes
 from .births import with_velocities_at_fix
 from .instruments import Layout
-from .known import Feature, Known, predict_over, track_outputs, track_positions
+from .known import Feature, Known, predict_over, track_outputs
 from .models import ModelSet
 from .scan import Group
 
@@ -78,7 +78,7 @@ def restart_lost_tracks(
     assert association is not None and group.pairs is not None
     if not len(known):
         return known, False
-    hit, firm = association.hit, known.life.status != TENTATIVE
+    hit, firm = association.hit | association.taken, known.life.status != TENTATIVE
     left = association.beta[firm].sum(axis=0) < 0.5
     if association.is_joint and seen is not None:
         hit = hit | ~seen.is_outside
@@ -89,11 +89,9 @@ def restart_lost_tracks(
     for track, row in _rejected_fixes(known, group, hit, left, group.pairs.track_log):
         z, R, new = group.z[row], group.R[row], None
         hidden = seen is not None and seen.is_outside[track]
-        lost = (
-            _can_reach(known, track, z, group, models)
-            if hidden
-            else _may_be_lost(known, track, group)
-        )
+        lost = hidden or _may_be_lost(known, track, group)
+        if hidden or group.target_id is not None or group.config.max_tracks == 1:
+            lost = lost and _can_reach(known, track, z, R, group, models)
         if np.isfinite(rejected[track, 0]) and lost:
             new = restarted_track(known, track, rejected[track], row, group, models, chain, layout)
         rejected = rejected.copy()
@@ -142,12 +140,15 @@ def _may_be_lost(known: Known, track: int, group: Group) -> bool:
     return bool(missed ** (before + 1) <= LOST)
 
 
-def _can_reach(known: Known, track: int, z: FloatArray, group: Group, models: ModelSet) -> bool:
-    """Return whether the target can have moved to z (2,) since its last hit."""
-    mean, _ = track_positions(known, models)
+def _can_reach(
+    known: Known, track: int, z: FloatArray, R: FloatArray, group: Group, models: ModelSet
+) -> bool:
+    """Return whether the target can have moved to z (2,), R (2, 2) since its last hit."""
+    outputs = tuple(part.outputs for part in models.parts)
+    mean, _ = track_outputs(known.track_rows(track), outputs)
     passed = (known.stamp_ns - int(known.life.last_hit_ns[track])) * 1e-9
-    fastest = group.config.speed_mean + 3.0 * group.config.speed_std
-    return bool(np.hypot(*(z - mean[track])) <= fastest * passed)
+    fastest = bursts.fastest_speed(mean[0, bursts.velocity_outputs(models)], group.config)
+    return bool(np.hypot(*(z - mean[0, :2])) <= fastest * passed + 3.0 * math.sqrt(np.trace(R)))
 
 
 def restarted_track(

@@ -91,8 +91,12 @@ class _Entries:
         """(E,) whether the track heard other sensors."""
         self.context = self.target
         """(E,) number of the target and of all assumptions except `name` of the sensor."""
-        if several.any():
-            parts = [self.target[:, None]]
+        # A borrowed assumption has no offset.
+        off = [np.append(rows.key[each], np.zeros(len(borrowed))) for each in ('since', 'aside')]
+        self.is_plain = (off[0] == 0) & (off[1] == 0)
+        """(E,) True for entries without an offset."""
+        if several.any() or not self.is_plain.all():
+            parts = [self.target[:, None], *(each[:, None] for each in off)]
             for each, table in self.key.items():
                 parts.append(np.delete(table, sensor, axis=1) if each == name else table)
             whole = np.concatenate(parts, axis=1)
@@ -184,7 +188,7 @@ def _redistribute(
     """Redistribute the weights of one assumption; arguments as in `_Entries.lacking`."""
     rows, borrowed = known.rows, known.borrowed
     entries = _Entries(rows, borrowed, name, sensor)
-    can = entries.heard
+    can = entries.heard & entries.is_plain
     if name == 'delay':
         others = np.delete(entries.key['delay'], sensor, axis=1)
         can = can & entries.has_others & ~others.any(axis=1)
@@ -279,6 +283,7 @@ def protected_rows(rows: Rows) -> BoolArray:
     first, scale = rows.first, least_scale(rows.key)
     # A start depth is a state: all rows of such a track are kept, also the first.
     protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published

@@ -150,7 +150,9 @@ class SmoothingDiverTracker(DiverTracker):
         scans: list[_Scan] = []
         for stamp in sorted(self._passed):
             known = self._passed[stamp]
-            known = known.replace(rows=layout.rows_with_new_constants(known.rows, self.models))
+            # Offsets are no part of the path of the target.
+            rows = layout.rows_with_new_constants(known.rows, self.models).with_tail(0)
+            known = known.replace(rows=rows)
             previous = scans[-1].known if scans else known
             dt = (known.stamp_ns - previous.stamp_ns) * 1e-9
             steps = predict_over(

@@ -53,6 +53,8 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
     births,
+    burst_reports,
+    bursts,
     clutter,
     coverage,
     depth,
@@ -124,6 +126,7 @@ class DiverTracker:
             **pruning.FEATURES,
             **coverage.FEATURES,
             **depth.FEATURES,
+            **burst_reports.FEATURES,
             'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
         turn = config.bearing_bias_std_deg > 0.0
@@ -136,6 +139,7 @@ class DiverTracker:
             models.families
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
+            models.families and bursts.jump,
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
             covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
@@ -144,6 +148,7 @@ class DiverTracker:
         )
         self._scan_stages: tuple[ScanStage, ...] = select_stages(
             self._update_transitions,
+            models.families and burst_reports.count_bursts,
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
@@ -177,6 +182,7 @@ class DiverTracker:
             last_named=names.LastNamed(),
             sensors=Sensors(),
             reporting=0,
+            bursts=burst_reports.BurstCounts(),
         )
 
     def restored(self) -> None:
@@ -275,6 +281,7 @@ class DiverTracker:
         """Update the tracks by a ping, and store the births it shows."""
         from . import arrivals  # imported late: not needed for fixes
 
+        known = known.replace(rows=bursts.without_offsets(known.rows))
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )

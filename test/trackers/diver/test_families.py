@@ -33,6 +33,7 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 VECTORS = Path(__file__).parents[2] / 'vectors/regret_free'
 COLUMNS = [f'family_{name}' for name in FAMILIES] + ['hover', 'covariance_scale']
+BURSTS = ['burst', 'offset_x', 'offset_y', 'rows']
 
 
 def config(**values):
@@ -210,8 +211,8 @@ def run(tracker, items):
 def test_columns_of_the_contract():
     estimate = run(DiverTracker(config()), path(20))[-1]
     columns = estimate.columns()
-    assert list(columns)[-6:] == COLUMNS
-    assert all(columns[name].dtype == np.float64 for name in COLUMNS)
+    assert list(columns)[-10:] == COLUMNS + BURSTS
+    assert all(columns[name].dtype == np.float64 for name in COLUMNS + BURSTS)
     assert sum(columns[f'family_{name}'][0] for name in FAMILIES) == pytest.approx(1.0)
     assert len(estimate.model_names) == 37 and estimate.probabilities.sum() == pytest.approx(1.0)
     other = DiverTracker(DiverConfig(model_set='heading_speed')).process(fix(1, 0.0, 0.0))[-1]

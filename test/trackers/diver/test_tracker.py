@@ -72,10 +72,10 @@ def test_the_estimate_is_the_contract():
         'prob_brisk_heading_000',
         'prob_quiet',
     ]
-    assert list(columns)[-12:] == [
+    assert list(columns)[-16:] == [
         *('track_id', 'track_state', 'nis', 'nis_dof', 'existence', 'target_id'),
         *('family_steady', 'family_brisk', 'family_lively', 'family_quiet'),
-        *('hover', 'covariance_scale'),
+        *('hover', 'covariance_scale', 'burst', 'offset_x', 'offset_y', 'rows'),
     ]
     assert columns['existence'] > 0.5 and columns['target_id'].tolist() == [-1]
     assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
