@@ -306,7 +306,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         kind='str[]')
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '
-        'counted; 0: use them', range=(0.0, 3600.0))
+        'counted, longer where a sensor holds its values; 0: use them', range=(0.0, 3600.0))
 
     # -- sensors ---------------------------------------------------------------------------------
     sensors: tuple[str, ...] = parameter((), '',

@@ -23,7 +23,16 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, burst_reports, bursts, clutter, depth, offsets
+from . import (
+    arrival_stamps,
+    births,
+    burst_reports,
+    bursts,
+    clutter,
+    depth,
+    offsets,
+    polling,
+)
 from .config import DiverConfig
 from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
@@ -161,16 +170,26 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         ]
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
     exceeds, largest = memory['excess'] >= ENOUGH, max(config.covariance_scales)
+    starving = polling.warnings(memory['single'], config)
+    # Of tracks that starve, nothing else is told by the fixes.
+    fixes = (
+        []
+        if starving
+        else memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
+    )
+    no_track = [] if starving else clutter.warnings(memory['clutter'], config, tracked)
     return [
-        *(assumed if config.has_usual_fix_std else []),
-        *memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names),
+        *starving,
+        *(assumed if config.has_usual_fix_std and not starving else []),
+        *fixes,
         *late_warnings(known),
         *burst_reports.warnings(known, config),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
+        *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
-        *clutter.warnings(memory['clutter'], config, tracked),
+        *no_track,
     ]
 
 

@@ -164,12 +164,12 @@ class Group:
     """(2,) sensor position; None if unknown."""
     is_stated: bool = True
     """True if a fix states its covariance."""
-    number: int = field(default=0, init=False)
-    """Number of the sensor (`sensors`)."""
     learnt_clutter: FloatArray | None = field(default=None, init=False)
     """(D,) estimated clutter density at each fix, 1/m^2; None if none is estimated."""
     elapsed: float = field(default=FIRST_LOOK, init=False)
     """Time since the scan before of this sensor, s."""
+    number: int = field(default=0, init=False)
+    """Number of the sensor (`sensors`)."""
     detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
     association: Association | None = field(default=None, init=False)

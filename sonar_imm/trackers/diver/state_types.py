@@ -35,6 +35,7 @@ from ...measurements import (
     VesselPose,
 )
 from ..navigation import NavigationBuffer
+from .arrival_stamps import ArrivalStamps, Resolution
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
 from .innovations import FixConsistency, SensorConsistency
@@ -42,6 +43,7 @@ from .instruments import Instruments
 from .known import Known
 from .names import LastNamed
 from .offsets import BiasTest, RecentPairs
+from .polling import SingleFixes
 from .sensors import Sensors
 
 STATE_TYPES = (
@@ -59,5 +61,6 @@ STATE_TYPES = (
         BiasTest,
         RecentPairs,
     ),
-    *(Clutter, Clutters, LastNamed, Sensors),
+    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
+    *(ArrivalStamps, Resolution),
 )

@@ -52,6 +52,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
+    arrival_stamps,
     births,
     burst_reports,
     bursts,
@@ -62,6 +63,7 @@ from . import (
     fixes,
     names,
     offsets,
+    polling,
     pruning,
     restart,
     scales,
@@ -131,6 +133,7 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
+            polling.remember_single_fixes,
             clutter.estimate_densities,
             len(models.scales) > 1 and scales.hearing_stage(models),
             turn and rotation_stage(models, layout),
@@ -179,6 +182,8 @@ class DiverTracker:
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=clutter.Clutters(),
+            single=polling.SingleFixes(),
+            stamps=arrival_stamps.ArrivalStamps(),
             last_named=names.LastNamed(),
             sensors=Sensors(),
             reporting=0,
@@ -281,6 +286,10 @@ class DiverTracker:
         """Update the tracks by a ping, and store the births it shows."""
         from . import arrivals  # imported late: not needed for fixes
 
+        known, usable = arrival_stamps.with_resolution(known, ping, self.config)
+        if usable is None:
+            return known
+        ping = usable
         known = known.replace(rows=bursts.without_offsets(known.rows))
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
