@@ -57,41 +57,27 @@ from ...estimation.rows import (
 )
 from ...measurements import NOBODY
 from . import bursts
-from .innovations import FixConsistency, whiten_innovations
+from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
-from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
 from .scales import (
     can_restore,
-    estimated_scales,
     lending,
     protected_rows,
-    weight_without_small_scales,
 )
 from .scan import Group
-from .sensors import MOST_SENSORS
 
 FEATURES = {
-    'nis': Feature(math.nan),
-    'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
-    'reported': Feature(math.nan, (3,)),
 }
-"""nis, nis_dof: of this scan, NaN and 0 without a hit.
-
-score: log-likelihood ratio of the track against clutter over about the last ten scans.
-
-white: whitened innovation of the last fix of each sensor.
+"""score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
 evidence: sum of the detection probabilities of the track.
-
-reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
 """
 
 FAR = 80.0
@@ -417,7 +403,7 @@ def update_stage(
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
         rejected = _rejected_fixes(known, group, association, pairs) if has_scales else None
-        known = _record_innovations(known, group, pairs, association, models)
+        known = record_innovations(known, group, models)
         columns = {'score': association.score}
         if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
@@ -466,6 +452,9 @@ def update_tracks(
     began = None
     if pairs.ways is not None:
         began = bursts.begin_rows(known, group, pairs.ways, of_ways, models, estimated)
+    if has_ways(group, models):
+        apart = begin_disagreement(known, group, models, estimated)
+        began = apart if began is None else began if apart is None else began.append(apart)
     stays = protected_rows(rows) | bursts.divided(rows, began)
     rows, borrowed, left = drop_weightless_rows(rows, borrowed, stays)
     # Pairs of the remaining rows, in row order.
@@ -580,57 +569,3 @@ def _update_weights(
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
     return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list), of_ways
-
-
-def _record_innovations(
-    known: Known, group: Group, pairs: Pairs, association: Association, models: ModelSet
-) -> Known:
-    """Store the whitened innovations of associated fixes, and update the covariance checks."""
-    if len(group.z):
-        known = _with_consistency(
-            known,
-            group,
-            known.memory['fixes']
-            .of(group.number)
-            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
-        )
-    tracks = np.flatnonzero(association.hit)
-    if not len(tracks):
-        return known
-    fix = association.fix[tracks]
-    count = len(known.rows)
-    seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
-    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
-    scale = (
-        estimated_scales(known.rows, group.number)[tracks]
-        if len(models.scales) > 1
-        else np.ones(len(tracks))
-    )
-    R = group.R[fix] * scale[:, None, None]
-    tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes'].of(group.number)
-    white, after = whiten_innovations(
-        mean[tracks],
-        covariance[tracks],
-        group.z[fix],
-        R,
-        known['white'][tracks, group.number],
-        tentative,
-        before,
-    )
-    after = after.with_scale(scale, tentative)
-    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
-    columns['white'][tracks, group.number] = white
-    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
-    columns['nis'][tracks] += np.square(white).sum(axis=1)
-    columns['nis_dof'][tracks] += np.uint16(2)
-    # With fixes, no instrument errors are assumed.
-    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
-        recent=RecentPairs()
-    )
-
-
-def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
-    """Return the state with the consistency of the sensor of a group."""
-    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
-    return known.with_memory(fixes=fixes)

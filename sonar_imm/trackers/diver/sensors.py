@@ -64,7 +64,8 @@ def lent_moves(
     under a borrowed assumption about delays.
 
     A lender that relies on a sensor is where that sensor shows the target: if the sensor is late,
-    the target has moved on. A lender that relies on another sensor does not move.
+    the target has moved on. A lender that relies on another sensor does not move. It relies on the
+    sensor with the least scale and without an offset.
 
     :param rows: `Rows.key`.
     :param borrowed: `Borrowed.key`.
@@ -76,8 +77,9 @@ def lent_moves(
         return moved
     scale = rows['scale'][lender[several]]
     scale = np.where(scale > 0.0, scale, np.inf)
+    every, off = np.arange(len(several)), rows['offset'][lender[several]]
+    scale[every[off >= 0], off[off >= 0]] = np.inf
     best = scale.argmin(axis=1)
-    every = np.arange(len(several))
     alone = (scale <= scale[every, best, None]).sum(axis=1) == 1
     moved[several] = np.where(alone, later[several, best], 0.0)
     return moved

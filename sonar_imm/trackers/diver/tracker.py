@@ -59,6 +59,7 @@ from . import (
     clutter,
     coverage,
     depth,
+    disagreement,
     estimate,
     fixes,
     names,
@@ -123,6 +124,7 @@ class DiverTracker:
         self._associate = fixes.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
+            **disagreement.FEATURES,
             **names.FEATURES,
             **restart.FEATURES,
             **pruning.FEATURES,
