@@ -174,7 +174,44 @@ def redistribute_weights(
     late = np.zeros(len(known), np.bool_)
     for table in (known.rows, known.borrowed):
         late[table.target[table.key['delay'][:, sensor] > 0.0]] = True
-    return _redistribute(known, 'delay', sensor, ladder, prior, ~late)
+    known = _redistribute(known, 'delay', sensor, ladder, prior, ~late)
+    return _with_delays_beside_offsets(known, ladder[1:], sensor)
+
+
+def _with_delays_beside_offsets(known: Known, delays: FloatArray, sensor: int) -> Known:
+    """Return the state in which a delay has at least its prior beside each row with an offset.
+
+    While a target keeps its course, an offset and a delay explain the same fixes. A turn decides,
+    maybe long after.
+    """
+    rows, borrowed = known.rows, known.borrowed
+    best = np.maximum.reduceat(rows.logw, rows.first)[rows.target]
+    off = (rows.key['offset'] >= 0) & ~rows.key['delay'].any(axis=1)
+    off &= (rows.key['scale'][:, sensor] > 0.0) & (rows.logw > best + np.log(NEAR_WEIGHT))
+    chosen = np.flatnonzero(off)
+    if not len(chosen):
+        return known
+    own = np.repeat(chosen, len(delays))
+    new = Borrowed.from_rows(rows.select(own), borrowed.key)
+    new.key['delay'][:, sensor] = np.tile(delays, len(chosen))
+    new = evolve(new, logw=rows.logw[own] + np.log(DELAYED / len(delays)))
+    place = {each: k for k, each in enumerate(_names(borrowed))}
+    held = {each for each, plain in zip(_names(rows), rows.key['offset'] < 0) if plain}
+    logw, fresh = borrowed.logw.copy(), np.ones(len(new), np.bool_)
+    for k, each in enumerate(_names(new)):
+        if each in place:
+            logw[place[each]] = max(logw[place[each]], new.logw[k])
+        fresh[k] = each not in place and each not in held
+        held.add(each)
+    lengthened = evolve(borrowed, logw=logw).append(new.select(fresh))
+    return known.replace(borrowed=_without_least(lengthened))
+
+
+def _names(table: Rows | Borrowed) -> list[bytes]:
+    """Return a name of the target and of the assumptions that can borrow, of each entry."""
+    key = table.key
+    each = np.column_stack([table.target, key['scale'], key['delay']]).astype(np.float64)
+    return [row.tobytes() for row in each]
 
 
 def _redistribute(
