@@ -124,6 +124,8 @@ class Birth(NamedTuple):
     """The z of the fix; None if the fix has no z."""
     seen_by: tuple[str, FloatArray] | None = None
     """Name and position (2,) of a sensor with a bearing error; None for others."""
+    mark: int = 0
+    """Number of the fix of the birth, for links to its track (`bursts`); 0 for none."""
 
 
 MOST_BIRTHS = 1.5
