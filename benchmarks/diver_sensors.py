@@ -70,6 +70,16 @@ class Scene(NamedTuple):
     """Standard deviation of sensor b relative to what it states."""
 
 
+KINDS: dict[str, dict[str, Any]] = {
+    'two sensors': {},
+    'b 10 m off': {'off': (6.0, 8.0), 'warning': 'm apart'},
+    'b 3 m off': {'off': (1.8, 2.4), 'warning': 'm apart'},
+    'b 2 s late': {'late': 2.0, 'warning': 'stamps of sensor b are'},
+    'b worse': {'times': 4.0, 'warning': 'of sensor b too small'},
+    'b better': {'times': 0.2, 'warning': 'of sensor b are too small or'},
+}
+"""What two sensors do."""
+
 SCENES: dict[str, dict[str, Scene]] = {
     'scales': {
         'diver, R true': Scene('diver', 1.0),
@@ -92,14 +102,7 @@ SCENES: dict[str, dict[str, Scene]] = {
     'sensors': {
         f'{target}, {name}': Scene(target, std, sensors=True, **values)
         for target, std in (('diver', 0.3), ('rov', 0.3), ('boat', 1.0))
-        for name, values in {
-            'two sensors': {},
-            'b 10 m off': {'off': (6.0, 8.0), 'warning': 'm apart'},
-            'b 3 m off': {'off': (1.8, 2.4), 'warning': 'm apart'},
-            'b 2 s late': {'late': 2.0, 'warning': 'stamps of sensor b are'},
-            'b worse': {'times': 4.0, 'warning': 'of sensor b too small'},
-            'b better': {'times': 0.2, 'warning': 'of sensor b are too small or'},
-        }.items()
+        for name, values in KINDS.items()
     },
 }
 

@@ -55,6 +55,7 @@ def linked_marginals(
     possible: BoolArray,
     target: IntArray,
     link: IntArray,
+    targets: int,
 ) -> LinkedMarginals:
     """Return the marginals over all classes.
 
@@ -62,11 +63,12 @@ def linked_marginals(
     :param missed: (G,) weight of each group without a detection; the first group of a target
         includes that the target does not exist.
     :param possible: (G, D) False for pairs outside the gate.
-    :param target: (G,) in rising order, with all T targets.
+    :param target: (G,) target of each group.
     :param link: (G,) target that the group excludes; -1 for none.
+    :param targets: number T of targets, each with a group without a link.
     """
     G, D = assigned.shape
-    T = int(target[-1]) + 1 if G else 0
+    T = targets
     pair, none, held = np.zeros((G, D)), np.zeros(G), np.ones(T)
     label = _clusters_of_links(possible, target, link, T)
     tied = np.isin(label, label[target[link >= 0]])

@@ -133,11 +133,12 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         if min(others, fixes) >= ENOUGH_OTHERS:
             found.append(_sensors_apart(sensors, int(rows.key['offset'][row]), burst.offset))
             continue
+        other = 'the track was wrong before' if rows.key['link'][row] == 0 else 'another target'
         seconds = (known.stamp_ns - int(rows.key['since'][row])) * 1e-9
         found.append(
             f'for {seconds:.3g} s the fixes of track {known.life.track_id[burst.track]} have been '
-            f'{distance:.2g} m off: a burst ({1.0 - readings[row]:.2g}), or the track was wrong '
-            'before; the estimate holds both'
+            f'{distance:.2g} m off: a burst ({1.0 - readings[row]:.2g}), or {other}; the estimate '
+            'holds both'
         )
     return found
 

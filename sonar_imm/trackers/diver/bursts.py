@@ -37,7 +37,7 @@ Source: docs/diver.md, 'Bursts'.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
 
 from attrs import evolve
@@ -45,14 +45,15 @@ import numpy as np
 
 from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.association import TENTATIVE
 from ...estimation.bank import Gaussians
-from ...estimation.rows import Borrowed, log_sum, ROW_LOST, Rows
+from ...estimation.rows import Borrowed, log_sum, reduce_targets, ROW_LOST, Rows
 from ...measurements import NOBODY
 from .config import DiverConfig
 from .known import Known, repair_covariances, row_outputs
 from .models import ModelSet, NO_OFFSET
-from .pairs import LEAVE, NOBODYS, OPEN, Pairs, Ways
-from .scan import Group
+from .pairs import Association, Groups, LEAVE, NOBODYS, OPEN, Pairs, Ways
+from .scan import Group, Scan
 from .sensors import scale_of
 
 TAIL = 2
@@ -76,6 +77,27 @@ REACH = 2.0
 
 ENDED = {name: value for name, value in NO_OFFSET.items() if name not in ('took', 'taken')}
 """Assumptions about offsets of a row without one."""
+
+FARTHEST_OFFSET = 6.0
+"""Standard deviations of a new offset beyond which no burst begins in scans of several targets."""
+
+MISSED, DIRECT_FIXES = 0.02, 10
+"""Scans of several targets: share of a miss, and number of fixes before, for a burst to begin."""
+
+OPEN_ODDS, OPEN_WEIGHT = 1e-3, 2e-4
+"""Scans of several targets: odds to a miss, and weight, of a burst that begins."""
+
+CLAIM = 0.3
+"""Probability above which a tentative track has the fix of a burst."""
+
+MOST_BURSTS, LONGEST_BURST = 4, 60
+"""Scans of several targets: maximum number of burst rows of a track, and of fixes of a burst."""
+
+PLAIN_LOST = math.log(1e-12)
+"""Log weight below which the last row without an offset is dropped."""
+
+BOUND = -40.0
+"""Log density below which the bound of a far fix stands for all rows."""
 
 JUMP_FLOOR = math.log(1e-3)
 """Log odds that an established track was wrong before, when a burst begins."""
@@ -108,11 +130,22 @@ def offset_factor(rows: Rows, sensor: int) -> FloatArray | None:
     return np.where(rows.key['offset'] == sensor, 1.0, 0.0)
 
 
-def add_ways(known: Known, group: Group, pairs: Pairs, models: ModelSet) -> Pairs:
-    """Add the ways of the fixes to the comparison with the rows."""
+def add_ways(
+    known: Known,
+    group: Group,
+    pairs: Pairs,
+    models: ModelSet,
+    openers: BoolArray | None = None,
+) -> Pairs:
+    """Add the ways of the fixes to the comparison with the rows.
+
+    :param openers: (T,) True for tracks of several targets on which a burst may begin; None for
+        none of them.
+    """
     rows, config = known.rows, group.config
     sensor = known.memory['sensors'].number(group.sensor)
-    row, fix = _candidates(known, group)
+    alone = is_alone(group)
+    row, fix = _candidates(known, group, openers)
     if not len(row):
         return pairs
     key = {name: column[row] for name, column in rows.key.items()}
@@ -127,10 +160,13 @@ def add_ways(known: Known, group: Group, pairs: Pairs, models: ModelSet) -> Pair
         far_shifted, wide_shifted = _is_far(*shifted, z, scaled, reach)
         far &= far_shifted | ~own
     aside = key['aside']
+    if not alone:
+        able = np.zeros(len(known), np.bool_) if openers is None else openers
+        far &= able[rows.target[row]]
     if not (far.any() or aside.any() or own.any()):
         return pairs
     e, end = config.burst_rate, config.burst_end
-    single = group.target_id is not None or len(group.z) == 1
+    single = alone and (group.target_id is not None or len(group.z) == 1)
     other = (key['offset'] >= 0) & ~own
     free = ~own & ~other
     # Log prior of the fix used by the row as it is.
@@ -150,7 +186,7 @@ def add_ways(known: Known, group: Group, pairs: Pairs, models: ModelSet) -> Pair
     some = np.flatnonzero(asked)
     std = np.maximum(config.burst_std, WIDER * wide[some])
     log[some], variance[some] = _opening_density(
-        pairs.expected, rows, row[some], z[some], scaled[some], std
+        pairs.expected, rows, row[some], z[some], scaled[some], std, TAILS if alone else TAILS[:1]
     )
     found = []
     for way, prior, density in ((OPEN, opens, log), (NOBODYS, nobodys, log)):
@@ -171,16 +207,44 @@ def add_ways(known: Known, group: Group, pairs: Pairs, models: ModelSet) -> Pair
     return _with_ways(rows, pairs, ways, row, fix, used)
 
 
-def _candidates(known: Known, group: Group) -> tuple[IndexArray, IndexArray]:
+def is_alone(group: Group) -> bool:
+    """Return whether a fix is of one target only: a single one, or one with an ID."""
+    return group.target_id is not None or group.config.max_tracks == 1
+
+
+def _candidates(
+    known: Known, group: Group, openers: BoolArray | None
+) -> tuple[IndexArray, IndexArray]:
     """Return the rows and fixes (k,) that are compared in several ways."""
-    target = known.rows.target
+    rows, T = known.rows, len(known)
     if group.target_id is not None:
         own = known['target_id'][:, None] == group.target_id
     else:
-        firm = known.life.status != 0
-        own = np.broadcast_to(firm[:, None], (len(known), len(group.z)))
-    row, fix = np.nonzero(own[target])
+        firm = known.life.status != TENTATIVE
+        if not is_alone(group):
+            bursting = np.zeros(T, np.bool_)
+            bursting[rows.target[rows.key['offset'] >= 0]] = True
+            firm = firm & (bursting if openers is None else bursting | openers)
+        own = np.broadcast_to(firm[:, None], (T, len(group.z)))
+    row, fix = np.nonzero(own[rows.target])
+    if not is_alone(group):
+        # A fix far beyond a usual offset is of another target: spare its comparison.
+        place = np.stack([block.x[:, :2].mean(axis=2) for block in rows.blocks]).mean(axis=0)
+        spread = np.sqrt(np.max([block.P[:, 0, 0].max(axis=1) for block in rows.blocks], axis=0))
+        reach = FARTHEST_OFFSET * np.maximum(group.config.burst_std, WIDER * spread)
+        near = np.hypot(*(group.z[fix] - place[row]).T) < reach[row]
+        row, fix = row[near], fix[near]
     return row, fix
+
+
+def openers(known: Known, association: Association) -> BoolArray:
+    """Return the tracks (T,) on which a burst may begin in a scan of several targets."""
+    rows = known.rows
+    taken = np.zeros(len(known), np.int64)
+    np.maximum.at(taken, rows.target, rows.key['taken'])
+    missed = association.missed > MISSED * np.maximum(association.exists, 1e-300)
+    firm = (known.life.status != TENTATIVE) & (known['target_id'] == NOBODY)
+    return np.asarray(firm & missed & (taken >= DIRECT_FIXES))
 
 
 def _row_fixes(
@@ -249,13 +313,14 @@ def _opening_density(
     z: FloatArray,
     R: FloatArray,
     std: FloatArray,
+    tails: Sequence[float],
 ) -> tuple[FloatArray, FloatArray]:
     """Return the log density (k,) of fixes with a new offset, and the variance (k,) of the offset.
 
-    std: (k,) standard deviation of an offset, m. The best of `TAILS` counts.
+    std: (k,) standard deviation of an offset, m. The best of `tails` counts.
     """
     best, variance = np.full(len(row), -np.inf), np.zeros(len(row))
-    for k, factor in enumerate(TAILS):
+    for k, factor in enumerate(tails):
         own = np.square(factor * std)
         log = _log_density(expected, rows, row, z, R + own[:, None, None] * np.eye(2))
         log = log - k * TAIL_COST
@@ -274,28 +339,103 @@ def _with_ways(
     own = among.has_row[pairs.assumption]
     log = pairs.log.copy()
     log[own] += prior[among.row[pairs.assumption[own]], pairs.fix[own]]
-    # All pairs of each track and fix, in order of the tracks.
-    track = np.concatenate([among.target[pairs.assumption], rows.target[ways.row]])
-    every = np.concatenate([among.logw[pairs.assumption] + log, rows.logw[ways.row] + ways.log])
-    place = track * D + np.concatenate([pairs.fix, ways.fix])
-    order = np.argsort(place, kind='stable')
-    whole, direct = pairs.track_log.copy(), np.zeros(pairs.track_log.shape)
-    places = np.unique(place)
-    total = log_sum(every[order], place[order])
-    compared = np.zeros(whole.size, np.bool_)
-    compared[among.target[pairs.assumption] * D + pairs.fix] = True
-    # A fix far from all rows has the bound of its density.
-    bound = np.where(compared[places], -np.inf, whole.ravel()[places])
-    whole.ravel()[places] = np.logaddexp(total, bound)
+    track = among.target[pairs.assumption], rows.target[ways.row]
+    compared = pairs._replace(log=log)
+    whole = _whole_density(rows, compared, ways, *track, pairs.track_log)
     strange = np.zeros(whole.size)
     new = ways.way != LEAVE
     at = rows.target[ways.row[new]] * D + ways.fix[new]
     np.add.at(strange, at, np.exp(rows.logw[ways.row] + ways.log)[new] / np.exp(whole.ravel()[at]))
     direct = np.clip(1.0 - strange.reshape(whole.shape), 0.0, 1.0)
-    return pairs._replace(log=log, track_log=whole, ways=ways._replace(direct=direct))
+    return compared._replace(track_log=whole, ways=ways._replace(direct=direct))
+
+
+def _whole_density(
+    rows: Rows, pairs: Pairs, ways: Ways | None, of: IntArray, of_ways: IntArray, bound: FloatArray
+) -> FloatArray:
+    """Return the log density (G, D) of each fix, over all pairs of each of G groups and all ways.
+
+    :param of: (p,) group of each pair.
+    :param of_ways: (E,) group of each way.
+    :param bound: (G, D) bound of the density of a fix that is far from all rows.
+    """
+    D = bound.shape[1]
+    every = pairs.among.logw[pairs.assumption] + pairs.log
+    place = of * D + pairs.fix
+    compared = np.zeros(bound.size, np.bool_)
+    compared[place] = True
+    if ways is not None:
+        every = np.concatenate([every, rows.logw[ways.row] + ways.log])
+        place = np.concatenate([place, of_ways * D + ways.fix])
+    places, number = np.unique(place, return_inverse=True)
+    order = np.argsort(number, kind='stable')
+    whole = bound.copy()
+    rest = np.where(compared[places], -np.inf, bound.ravel()[places])
+    whole.ravel()[places] = np.logaddexp(log_sum(every[order], number[order]), rest)
+    return whole
+
+
+def with_groups(known: Known, pairs: Pairs) -> Pairs:
+    """Return the pairs with the groups of linked rows, if there are any."""
+    rows, among, T = known.rows, pairs.among, len(known)
+    ids = {int(each): k for k, each in enumerate(known.life.track_id)}
+    link = np.array([ids.get(each, -1) for each in rows.key['link'].tolist()], np.int64)
+    linked = np.flatnonzero(link >= 0)
+    if not len(linked):
+        return pairs
+    of_row = rows.target.copy()
+    of_row[linked] = T + np.arange(len(linked))
+    of = np.where(among.has_row, of_row[among.row], among.target)
+    target = np.concatenate([np.arange(T), rows.target[linked]])
+    bound = np.full((len(target), pairs.track_log.shape[1]), -np.inf)
+    bound[:T] = np.where(pairs.track_log < BOUND, pairs.track_log, -np.inf)
+    ways = pairs.ways
+    of_ways = np.empty(0, np.int64) if ways is None else of_row[ways.row]
+    log = _whole_density(rows, pairs, ways, of[pairs.assumption], of_ways, bound)
+    weight = np.bincount(of, np.exp(among.logw), minlength=len(target)).astype(np.float64)
+    links = np.concatenate([np.full(T, -1), link[linked]])
+    return pairs._replace(groups=Groups(of, target, links, weight, log))
 
 
 # -- after the update ----------------------------------------------------------------------------
+
+
+def weights_of_ways(
+    known: Known, group: Group, ways: Ways, logw: FloatArray, association: Association
+) -> FloatArray:
+    """Return the log weights (E,) of ways, with those that leave no row at minus infinity."""
+    if is_alone(group):
+        return np.where(logw > math.log(ROW_LOST), logw, -np.inf)
+    track = known.rows.target[ways.row]
+    exists = np.maximum(association.exists, 1e-300)[track]
+    missed = np.maximum(association.missed[track] / exists, 1e-300)
+    begins = (np.exp(logw) > OPEN_ODDS * missed) & (exists * np.exp(logw) > OPEN_WEIGHT)
+    tentative = known.life.status == TENTATIVE
+    claims = (association.beta * tentative[:, None]).max(axis=0, initial=0.0)
+    linked = association.free | (claims > CLAIM)
+    kept = np.where(ways.way == OPEN, begins & linked[ways.fix], logw > PLAIN_LOST)
+    return np.where(kept, logw, -np.inf)
+
+
+def links_of_fixes(known: Known, group: Group) -> IntArray:
+    """Return the link (D,) of a burst that begins with each fix: the track which the fix begins or
+    which claims it; a number below -1 stands for a track that is not begun yet."""
+    association = group.association
+    if is_alone(group) or association is None:
+        return np.zeros(len(group.z), np.int64)
+    marks = birth_marks(known, group)
+    tentative = np.flatnonzero(known.life.status == TENTATIVE)
+    if not len(tentative):
+        return marks
+    claims = association.beta[tentative]
+    ids = known.life.track_id[tentative].astype(np.int64)[claims.argmax(axis=0)]
+    return np.where(association.free, marks, ids)
+
+
+def birth_marks(known: Known, group: Group) -> IntArray:
+    """Return a number (D,) below -1 for the track that each fix may begin."""
+    sensor = known.memory['sensors'].number(group.sensor)
+    return -2 - np.arange(len(group.z)) - sensor * 10**6
 
 
 def begin_rows(
@@ -307,7 +447,7 @@ def begin_rows(
     estimated: Sequence[BoolArray | None],
 ) -> Rows | None:
     """Return the rows that the ways lead to, with the weights `logw` (E,); None for none."""
-    kept = np.flatnonzero(logw > math.log(ROW_LOST))
+    kept = np.flatnonzero(logw > -np.inf)
     if not len(kept):
         return None
     row, fix, way = ways.row[kept], ways.fix[kept], ways.way[kept]
@@ -326,6 +466,9 @@ def begin_rows(
     key['aside'] = nobodys & (key['offset'] < 0)
     late, velocities = key['delay'][:, sensor], [part.outputs[2:4] for part in models.parts]
     started = _with_prior(rows.blocks, plain, np.where(opens, ways.variance[kept], 0.0))
+    key['link'] = np.where(
+        opens, links_of_fixes(known, group)[fix], np.where(plain, 0, key['link'])
+    )
     rows = rows.replace(
         blocks=tuple(bank.move_along(b, v, -late) for b, v in zip(started, velocities))
     )
@@ -430,7 +573,13 @@ def merge_rows(rows: Rows) -> Rows:
 def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, Borrowed]:
     """Drop rows of negligible weight, except rows that `stays` (N,). A scale without a row is
     borrowed."""
-    lost = (rows.logw < math.log(ROW_LOST)) & ~stays
+    bursting = rows.key['offset'] >= 0
+    plain = np.where(~bursting & ~rows.key['aside'], rows.logw, -np.inf)
+    last = (plain == reduce_targets(np.maximum, plain, rows.target)[rows.target]) & (
+        plain > PLAIN_LOST
+    )
+    lost = (rows.logw < math.log(ROW_LOST)) & ~stays & ~last
+    lost |= bursting & ~_heaviest(rows, bursting & (rows.key['link'] != 0), MOST_BURSTS)
     if not lost.any():
         return rows, borrowed
     left = np.flatnonzero(~lost)
@@ -448,6 +597,74 @@ def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, B
     return evolve(rows.select(left), parent=rows.parent[left]), borrowed
 
 
+# -- links ---------------------------------------------------------------------------------------
+
+
+def resolve_links(known: Known, begun: Mapping[int, int]) -> Known:
+    """Link rows to the tracks that have begun: IDs by `birth_marks`. Rows without one end."""
+    rows = known.rows
+    waiting = np.flatnonzero(rows.key['link'] < -1)
+    if not len(waiting):
+        return known
+    link = rows.key['link'].copy()
+    link[waiting] = [begun.get(each, 0) for each in link[waiting].tolist()]
+    ended = np.zeros(len(rows), np.bool_)
+    ended[waiting] = link[waiting] == 0
+    return known.replace(rows=_end_rows(rows.replace(key={**rows.key, 'link': link}), ended))
+
+
+def update_links(known: Known, _: Scan) -> Known:
+    """End rows whose linked track is confirmed, and rows of long bursts. A stage of the tracker.
+
+    A row whose linked track has ended is linked to none (-1).
+    """
+    rows = known.rows
+    if not rows.tail or not (rows.key['link'] != 0).any():
+        return known
+    key = rows.key
+    status = dict(zip(known.life.track_id.tolist(), known.life.status.tolist()))
+    state = np.array([status.get(each, -1) for each in key['link'].tolist()])
+    link = np.where((key['link'] > 0) & (state < 0), -1, key['link'])
+    rows = rows.replace(key={**key, 'link': link})
+    wrong = (key['link'] > 0) & (state > TENTATIVE)
+    if wrong.any():
+        kept = np.where(wrong, -np.inf, rows.logw)
+        left = rows.log_sum(kept)[rows.target]
+        # A row stays where it is the last.
+        kept = np.where(np.isfinite(left), kept - left, rows.logw)
+        some = np.flatnonzero(np.isfinite(kept))
+        rows = evolve(rows.replace(logw=kept).select(some), parent=rows.parent[some])
+    long = (rows.key['link'] != 0) & (
+        rows.key['fixes'] >= np.minimum(LONGEST_BURST, rows.key['taken'])
+    )
+    return known.replace(rows=_end_rows(rows, long))
+
+
+def _end_rows(rows: Rows, ended: BoolArray) -> Rows:
+    """Return the rows with the offsets of `ended` rows (N,) ended."""
+    if not ended.any():
+        return without_unused_tail(rows)
+    key = {
+        name: np.where(ended, ENDED[name], column) if name in ENDED else column
+        for name, column in rows.key.items()
+    }
+    blocks = _with_prior(rows.blocks, ended, np.zeros(len(rows)))
+    return without_unused_tail(merge_rows(rows.replace(key=key, blocks=blocks)))
+
+
+def existence_beside_bursts(known: Known) -> FloatArray:
+    """Return the existence (T,) of tracks, with the weights of the rows that exclude them."""
+    existence, rows = known['existence'], known.rows
+    linked = np.flatnonzero(rows.key['link'] > 0)
+    if not len(linked):
+        return existence
+    out = existence.copy()
+    owner = existence[rows.target[linked]] * rows.weight[linked]
+    for row, weight in zip(linked.tolist(), owner.tolist()):
+        out[known.life.track_id == rows.key['link'][row]] *= 1.0 - weight
+    return out
+
+
 # -- two readings --------------------------------------------------------------------------------
 
 
@@ -456,7 +673,9 @@ def reading_weights(rows: Rows, end: float) -> FloatArray:
     offset says."""
     key = rows.key
     odds = jump_log_odds(key['taken'], key['others'], key['fixes'], end)
-    return np.where(rows.key['offset'] >= 0, 1.0 / (1.0 + np.exp(-odds)), 0.0)
+    # A linked track is the other reading of its row.
+    two = (rows.key['offset'] >= 0) & (rows.key['link'] == 0)
+    return np.where(two, 1.0 / (1.0 + np.exp(-odds)), 0.0)
 
 
 def row_readings(rows: Rows, models: ModelSet, end: float) -> tuple[FloatArray, FloatArray]:
@@ -526,6 +745,17 @@ def without_offsets(rows: Rows) -> Rows:
         return rows
     ended = {name: np.full(len(rows), value) for name, value in ENDED.items()}
     return merge_rows(rows.with_tail(0).replace(key={**rows.key, **ended}))
+
+
+def _heaviest(rows: Rows, counted: BoolArray, most: int) -> BoolArray:
+    """Return the rows (N,) that are not `counted` (N,), or among the `most` heaviest of these of
+    their target."""
+    kept = np.ones(len(rows), np.bool_)
+    own = np.flatnonzero(counted)
+    order = own[np.lexsort((-rows.logw[own], rows.target[own]))]
+    first = np.searchsorted(rows.target[order], rows.target[order])
+    kept[order] = np.arange(len(order)) - first < most
+    return kept
 
 
 def divided(rows: Rows, began: Rows | None) -> BoolArray:

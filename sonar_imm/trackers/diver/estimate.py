@@ -48,7 +48,9 @@ def estimate_of(
 ) -> Estimate:
     """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
     # The existence is NaN for tracks confirmed by hits.
-    known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
+    existence = bursts.existence_beside_bursts(known)
+    shown = ~(existence <= PUBLISH_EXISTENCE)
+    known, existence = known.select(shown), existence[shown]
     mean, covariance = published_state(known, models, config.burst_end)
     if known.memory['recent'].pairs:
         covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
@@ -60,7 +62,9 @@ def estimate_of(
     extras: dict[str, np.ndarray] = {
         'track_id': known.life.track_id,
         'track_state': known.life.status,
-        **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
+        'nis': known['nis'],
+        'nis_dof': known['nis_dof'],
+        'existence': existence,
         'target_id': known['target_id'].astype(np.int32),
         **family_extras(known, models),
     }

@@ -37,7 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from attrs import evolve
 import numpy as np
@@ -45,6 +45,7 @@ import numpy as np
 from ...estimation import bank, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
+from ...estimation.linked_rows import linked_marginals
 from ...estimation.rows import (
     Borrowed,
     drop_weightless_rows,
@@ -60,7 +61,7 @@ from . import bursts
 from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
-from .pairs import Association, Assumptions, Pairs
+from .pairs import Association, Assumptions, Groups, LEAVE, Pairs
 from .scales import (
     can_restore,
     lending,
@@ -105,10 +106,17 @@ CONFIRM_EXISTENCE = 0.9
 # -- comparison ----------------------------------------------------------------------------------
 
 
-def compare(known: Known, group: Group, models: ModelSet, min_probability: float) -> Pairs:
+def compare(
+    known: Known,
+    group: Group,
+    models: ModelSet,
+    min_probability: float,
+    openers: BoolArray | None = None,
+) -> Pairs:
     """Compare the fixes of a group with rows near them, or with the tracks of the same ID.
 
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
+    :param openers: (T,) see `bursts.add_ways`.
     """
     among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
     expected = _predict_fixes(known, among, group.number, models)
@@ -120,7 +128,10 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     if len(each) == 1:
         assumption, fix, log, whole, nis = each[0]
         pairs = Pairs(among, assumption, fix, expected, log, whole, nis)
-        return bursts.add_ways(known, group, pairs, models) if has_ways(group, models) else pairs
+        if not has_ways(group, models):
+            return pairs
+        pairs = bursts.add_ways(known, group, pairs, models, openers)
+        return bursts.with_groups(known, pairs)
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
@@ -156,8 +167,8 @@ def _predict_fixes(
 
 def has_ways(group: Group, models: ModelSet) -> bool:
     """Return whether fixes of the group may be off by an offset (`bursts`)."""
-    one = group.target_id is not None or group.config.max_tracks == 1
-    return one and models.families is not None and group.config.burst_rate > 0.0
+    joint = bursts.is_alone(group) or group.config.pairing == 'jipda'
+    return joint and models.families is not None and group.config.burst_rate > 0.0
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -288,9 +299,16 @@ def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group]
     min_probability = MIN_MODEL_PROBABILITY[pairing]
 
     def associate(known: Known, group: Group) -> Known:
-        group.pairs = compare(known, group, models, min_probability)
+        pairs = compare(known, group, models, min_probability)
         associate_pairs = by_density if group.target_id is None else associate_by_id
-        group.association = associate_pairs(known, group, group.pairs)
+        group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
+        if has_ways(group, models) and not bursts.is_alone(group):
+            openers = bursts.openers(known, group.association)
+            if openers.any():
+                # With the bursts that may begin, which a first pass has found missing fixes for.
+                pairs = compare(known, group, models, min_probability, openers)
+                if pairs.ways is not None:
+                    group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
         return known
 
     return associate
@@ -374,18 +392,101 @@ def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
     # The existence of tracks from pings and starts is unknown.
     guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
     before = np.where(np.isnan(before), guess, before)
-    beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
-    if D == 1 and (held := _held(pairs)).any():
+    detected = np.where(looked, detected, 0.0)
+    linked = None
+    if pairs.groups is None:
+        beta, missed, after = jipda.associate(ratio, may, before, detected)
+    else:
+        linked = _associate_groups(group, pairs, pairs.groups, ratio, may, before, detected)
+        beta, missed, after = linked.beta, linked.missed, linked.exists
+    alone = bursts.is_alone(group)
+    if alone and D == 1 and (held := _held(pairs)).any():
         beta[:, 0], missed = np.where(held, before, 0.0), np.where(held, 0.0, missed)
         after = np.where(held, before, after)
     hit = beta.sum(axis=1) > 0.5 * after
     fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
     fix = _direct_hits(fix, pairs)
-    claimed = beta.sum(axis=0)
+    # In a scan of several targets, a fix with which a burst may begin may be of a new one.
+    claimed = (beta if alone else beta * pairs.direct).sum(axis=0)
     new = group.birth_density
     birth = new / (new + group.clutter) * (1.0 - claimed)
-    score = jipda.log_odds(after)
-    return Association(beta, missed, fix, claimed < 0.5, birth, score, True, pairs.direct)
+    score = jipda.log_odds(after if linked is None else after / linked.held)
+    found = Association(beta, missed, fix, claimed < 0.5, birth, score, True, pairs.direct)
+    if linked is None:
+        return found
+    return found._replace(
+        group_beta=linked.group_beta, group_missed=linked.group_missed, held=linked.held
+    )
+
+
+class _Linked(NamedTuple):
+    """Association with groups, see `Association`."""
+
+    beta: FloatArray
+    missed: FloatArray
+    exists: FloatArray
+    group_beta: FloatArray
+    group_missed: FloatArray
+    held: FloatArray
+
+
+def _associate_groups(
+    group: Group,
+    pairs: Pairs,
+    groups: Groups,
+    ratio: FloatArray,
+    may: BoolArray,
+    before: FloatArray,
+    detected: FloatArray,
+) -> _Linked:
+    """Compute the probabilities of all joint events where rows exclude tracks.
+
+    :param ratio: (T, D) density over that of all other fixes; for tracks without linked rows.
+    :param may: (T, D) True for possible pairs; other arguments (T,).
+    """
+    T, of = len(before), groups.target
+    with np.errstate(invalid='ignore', divide='ignore'):
+        other = np.exp(pairs.track_log) / ratio
+    other = np.where(np.isfinite(other) & (other > 0.0), other, 1.0)
+    density = np.exp(groups.log)
+    # The gate of a linked row is that of its own density.
+    gate = groups.log - np.log(np.maximum(groups.weight, 1e-300))[:, None]
+    passes = gate > gate_log_density(group)
+    tied = np.bincount(of, minlength=T) > 1
+    possible = np.concatenate([may & (passes[:T] | ~tied[:, None]), passes[T:]])
+    r, p = before[of], detected[of]
+    alive = r * groups.weight
+    missed = alive * (1.0 - p)
+    missed[:T] += 1.0 - before
+    found = linked_marginals(
+        (r * p)[:, None] * density / other[of], missed, possible, of, groups.link, T
+    )
+    none = found.none * np.where(missed > 0.0, alive * (1.0 - p) / missed, 0.0)
+    beta = np.zeros(may.shape)
+    np.add.at(beta, of, found.pair)
+    total = np.bincount(of, none, minlength=T).astype(np.float64)
+    held = found.held + _leaving(pairs, groups, found.pair, T)
+    exists = np.minimum(total + beta.sum(axis=1), 1.0)
+    return _Linked(beta, total, exists, found.pair, none, np.minimum(held, 1.0))
+
+
+def _leaving(pairs: Pairs, groups: Groups, beta: FloatArray, targets: int) -> FloatArray:
+    """Return the probability (T,) that a burst which excludes the track has ended."""
+    out = np.zeros(targets)
+    ways = pairs.ways
+    if ways is None:
+        return out
+    leave = np.flatnonzero(ways.way == LEAVE)
+    among = pairs.among
+    of_row = np.empty(int(among.row.max()) + 1, np.int64)
+    of_row[among.row[among.has_row]] = groups.of[among.has_row]
+    logw = np.empty(len(of_row))
+    logw[among.row[among.has_row]] = among.logw[among.has_row]
+    at, fix = of_row[ways.row[leave]], ways.fix[leave]
+    share = np.exp(logw[ways.row[leave]] + ways.log[leave] - groups.log[at, fix])
+    linked = groups.link[at] >= 0
+    np.add.at(out, groups.link[at[linked]], (beta[at, fix] * share)[linked])
+    return out
 
 
 # -- update --------------------------------------------------------------------------------------
@@ -408,7 +509,8 @@ def update_stage(
         if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
             named = known['target_id'] != NOBODY
-            columns['existence'] = np.where(named, known['existence'], association.exists)
+            after = association.exists / association.held
+            columns['existence'] = np.where(named, known['existence'], after)
             columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
         known = known.with_columns(**columns)
         if rejected is None and not (association.beta > 0.0).any():
@@ -434,25 +536,32 @@ def update_tracks(
     among = pairs.among
     exists = np.where(association.exists > 0.0, association.exists, 1.0)
     missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
-    track = among.target[pairs.assumption]
-    weight = association.beta[track, pairs.fix] / exists[track]
+    beta, logs, of = association.beta / exists[:, None], pairs.track_log, among.target
+    groups = pairs.groups
+    if groups is not None and association.group_beta is not None:
+        beta = association.group_beta / exists[groups.target][:, None]
+        heavy = np.where(groups.weight > 0.0, groups.weight, 1.0)
+        missed = np.asarray(association.group_missed) / heavy / exists[groups.target]
+        logs, of = groups.log, groups.of
+    weight = beta[of[pairs.assumption], pairs.fix]
     used = np.flatnonzero((weight > 0.0) & (pairs.log > -np.inf))
     assumption, weight = pairs.assumption[used], weight[used]
-    whole = pairs.track_log[track[used], pairs.fix[used]]
+    whole = logs[of[assumption], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    factor: FloatArray = np.add(missed[among.target], gain)
+    factor: FloatArray = np.add(missed[of], gain)
     weighed = np.asarray(association.beta.any(axis=1))
     if rejected is not None:
         factor *= _rejected_factor(pairs, *rejected)
         weighed = weighed | (rejected[1] > 0.0)
     sensor = group.number
-    rows, borrowed, of_ways = _update_weights(
-        known, pairs, factor, association.beta / exists[:, None]
-    )
+    of_row = np.empty(len(known.rows), np.int64)
+    of_row[among.row[among.has_row]] = of[among.has_row]
+    rows, borrowed, of_ways = _update_weights(known, pairs, factor, beta, logs, of_row)
     began = None
     if pairs.ways is not None:
+        of_ways = bursts.weights_of_ways(known, group, pairs.ways, of_ways, association)
         began = bursts.begin_rows(known, group, pairs.ways, of_ways, models, estimated)
-    if has_ways(group, models):
+    if has_ways(group, models) and bursts.is_alone(group):
         apart = begin_disagreement(known, group, models, estimated)
         began = apart if began is None else began if apart is None else began.append(apart)
     stays = protected_rows(rows) | bursts.divided(rows, began)
@@ -471,7 +580,7 @@ def update_tracks(
     for block, part, expected, mask in each:
         innovations = bank.compare(*expected, among.seen[assumption], z, R)
         block = bank.move_along(block, part.outputs[2:4], -late)
-        ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
+        ratio, none = weight * np.exp(innovations.log - whole), missed[of_row[left]]
         mask = bursts.with_tail_mask(mask, rows.tail)
         block, of_models = bank.update(
             block, innovations, row, ratio, none, part.measured, mask, offset
@@ -541,13 +650,20 @@ def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows
 
 
 def _update_weights(
-    known: Known, pairs: Pairs, factor: FloatArray, beta: FloatArray
+    known: Known,
+    pairs: Pairs,
+    factor: FloatArray,
+    beta: FloatArray,
+    logs: FloatArray,
+    of_row: IntArray,
 ) -> tuple[Rows, Borrowed, FloatArray]:
     """Multiply the weights of all assumptions by `factor` (A,).
 
     Return the rows, the borrowed list, and the log weights (E,) of the rows that ways lead to.
 
-    :param beta: (T, D) probability of each pair, if the target exists.
+    :param beta: (G, D) probability of each pair of a group, if the target exists.
+    :param logs: (G, D) log density of each pair.
+    :param of_row: (N,) group of each row; without links, the track.
     """
     among, ways, of_ways = pairs.among, pairs.ways, np.empty(0)
     with np.errstate(divide='ignore'):
@@ -555,8 +671,9 @@ def _update_weights(
         every, target = logw, among.target
         if ways is not None:
             track = known.rows.target[ways.row]
-            of_ways = known.rows.logw[ways.row] + ways.log - pairs.track_log[track, ways.fix]
-            of_ways = of_ways + np.log(beta[track, ways.fix])
+            of = of_row[ways.row]
+            of_ways = known.rows.logw[ways.row] + ways.log - logs[of, ways.fix]
+            of_ways = of_ways + np.log(beta[of, ways.fix])
             target = np.concatenate([target, track])
             order = np.argsort(target, kind='stable')
             every, target = np.concatenate([every, of_ways])[order], target[order]

@@ -112,6 +112,21 @@ class Ways(NamedTuple):
     offset it had."""
 
 
+class Groups(NamedTuple):
+    """G groups of the assumptions of T tracks: all without a link, then each linked row."""
+
+    of: IntArray
+    """(A,) group of each assumption; those without a link are in the group of their track."""
+    target: IntArray
+    """(G,) track."""
+    link: IntArray
+    """(G,) track that the group excludes; -1 for none."""
+    weight: FloatArray
+    """(G,) weight of the rows of the group, if the target exists."""
+    log: FloatArray
+    """(G, D) logarithm of the density of each fix, times this weight."""
+
+
 class Pairs(NamedTuple):
     """Comparison of D fixes with assumptions, as p pairs in order of the assumptions."""
 
@@ -132,6 +147,8 @@ class Pairs(NamedTuple):
     """(T, D) smallest NIS of any model; None for density gating."""
     ways: Ways | None = None
     """Further ways of the fixes; None for none."""
+    groups: Groups | None = None
+    """Groups of assumptions; None if no row is linked."""
 
     @property
     def direct(self) -> FloatArray | float:
@@ -159,6 +176,12 @@ class Association(NamedTuple):
     """True if existence follows from the probabilities."""
     direct: FloatArray | float = 1.0
     """(T, D) see `Ways`."""
+    group_beta: FloatArray | None = None
+    """(G, D) probability of each pair of a group; None without groups."""
+    group_missed: FloatArray | None = None
+    """(G,) probability that the target exists as in the group, and was not detected."""
+    held: FloatArray | float = 1.0
+    """(T,) probability that no linked row excludes the track."""
 
     @property
     def hit(self) -> BoolArray:

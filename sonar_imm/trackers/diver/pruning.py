@@ -32,7 +32,7 @@ from ...estimation import jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, TENTATIVE, TrackRules, Tracks
 from ...measurements import NOBODY
-from . import names
+from . import bursts, names
 from .config import DiverConfig
 from .fixes import CONFIRM_EXISTENCE
 from .known import Feature, Known, track_positions
@@ -179,7 +179,8 @@ def update_status(
     :param looked: (T,) True if a detection was possible.
     """
     was, existence = known.life.status != TENTATIVE, known['existence']
-    confirmed = was | (existence > CONFIRM_EXISTENCE) & (known['evidence'] >= CONFIRM_EVIDENCE)
+    likely = bursts.existence_beside_bursts(known) > CONFIRM_EXISTENCE
+    confirmed = was | likely & (known['evidence'] >= CONFIRM_EVIDENCE)
     alive = ~(existence < known['least_existence'])
     status = track_status(known.life.status, confirmed, hit, looked)
     if not looked.any():

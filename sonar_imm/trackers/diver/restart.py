@@ -90,8 +90,7 @@ def restart_lost_tracks(
         z, R, new = group.z[row], group.R[row], None
         hidden = seen is not None and seen.is_outside[track]
         lost = hidden or _may_be_lost(known, track, group)
-        if hidden or group.target_id is not None or group.config.max_tracks == 1:
-            lost = lost and _can_reach(known, track, z, R, group, models)
+        lost = lost and _can_reach(known, track, z, R, group, models)
         if np.isfinite(rejected[track, 0]) and lost:
             new = restarted_track(known, track, rejected[track], row, group, models, chain, layout)
         rejected = rejected.copy()

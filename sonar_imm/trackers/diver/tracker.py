@@ -157,6 +157,7 @@ class DiverTracker:
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
+            models.families and bursts.update_links,
             clutter.remove_first_fixes,
             births.spawn_stage(models, config, layouts, self._chain, self.features, self.rules),
         )

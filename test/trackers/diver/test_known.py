@@ -198,12 +198,14 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
         rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': of_sensor(stated, 0)})
     )
     for ours, due in zip(
-        published_state(agreeing, tracker.models), published_state(single, tracker.models)
+        published_state(agreeing, tracker.models, 0.05),
+        published_state(single, tracker.models, 0.05),
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
     spread = redistribute_weights(agreeing, tracker.models.scales)
     for ours, due in zip(
-        published_state(spread, tracker.models), published_state(single, tracker.models)
+        published_state(spread, tracker.models, 0.05),
+        published_state(single, tracker.models, 0.05),
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
 
@@ -236,7 +238,8 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
     healthy, other = (tracker._process_scan(each, *last) for each in (known, spoilt))
     assert other.counts['repairs'] > healthy.counts.get('repairs', 0)
     for ours, due in zip(
-        published_state(other, tracker.models), published_state(healthy, tracker.models)
+        published_state(other, tracker.models, 0.05),
+        published_state(healthy, tracker.models, 0.05),
     ):
         np.testing.assert_array_equal(ours[[0, 2]], due[[0, 2]])
         assert np.isfinite(ours).all()
