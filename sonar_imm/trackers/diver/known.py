@@ -172,6 +172,7 @@ class Known:
             and sizes in ({0}, {constants})
             and all(len(column) == T for column in self.features.values())
             and all(len(column) == len(rows) for column in rows.key.values())
+            and all(len(column) == len(self.borrowed) for column in self.borrowed.key.values())
             and np.array_equal(np.unique(rows.target), np.arange(T))
             and bool((np.diff(rows.target) >= 0).all() and (rows.parent >= -1).all())
             and bool(np.isin(self.borrowed.target, rows.target).all())

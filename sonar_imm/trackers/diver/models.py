@@ -510,7 +510,7 @@ def _build_families(config: DiverConfig) -> ModelSet:
             markov.RateChain(models.chain.matrix, T).generator for models in (steady, brisk)
         ]
         generators += [rates, np.zeros((len(QUIET), len(QUIET)))]
-        generator = family_generator(family, generators, config.family_switch_rate)
+        generator = markov.family_generator(family, generators, config.family_switch_rate)
         chain = markov.RateChain.of_generator(generator, T)
     if config.initial_probabilities:
         initial = initial_probabilities(config, M)
@@ -529,28 +529,6 @@ def _build_families(config: DiverConfig) -> ModelSet:
         # With depth as a state, rows are depth hypotheses instead of scaled filters.
         scales=(1.0,) if config.dimensions == 3 else tuple(sorted({*config.covariance_scales})),
     )
-
-
-def family_generator(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
-    """Return the generator (M, M) of the chains of all families.
-
-    The rate between two families is `rate` / 3, spread evenly over the models. Between the first
-    two families the index in the family is kept.
-    """
-    size = np.bincount(family)
-    out = np.asarray(rate / 3.0 / size[family][None] * (family[:, None] != family[None]))
-    count = int(size[0])
-    for a, b in ((0, 1), (1, 0)):
-        kept = slice(a * count, (a + 1) * count), slice(b * count, (b + 1) * count)
-        out[kept] = rate / 3.0 * np.eye(count)
-    first = 0
-    for block in blocks:
-        own = slice(first, first + len(block))
-        out[own, own] = block
-        first += len(block)
-    np.fill_diagonal(out, 0.0)
-    np.fill_diagonal(out, -out.sum(axis=1))
-    return out
 
 
 # -- depth, and errors of fixes ------------------------------------------------------------------
