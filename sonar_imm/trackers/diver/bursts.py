@@ -697,6 +697,8 @@ def row_readings(rows: Rows, models: ModelSet, end: float) -> tuple[FloatArray, 
 
 def row_offsets(rows: Rows) -> FloatArray:
     """Return the mean offset (N, 2) of each row."""
+    if not rows.tail:
+        return np.zeros((len(rows), TAIL))
     x = np.concatenate([block.x[:, -TAIL:] for block in rows.with_tail(TAIL).blocks], axis=-1)
     return np.asarray((x @ rows.mu[..., None])[..., 0])
 

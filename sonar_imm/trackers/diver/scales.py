@@ -229,8 +229,9 @@ def _redistribute(
     if name == 'delay':
         others = np.delete(entries.key['delay'], sensor, axis=1)
         can = can & entries.has_others & ~others.any(axis=1)
-    lacking = entries.lacking(name, sensor, values, prior, can, new)
-    if len(lacking):
+    complete = len(values) * (int(entries.context.max(initial=-1)) + 1)
+    if not (entries.is_plain.all() and len(entries.context) == complete):
+        lacking = entries.lacking(name, sensor, values, prior, can, new)
         borrowed = borrowed.append(lacking)
         entries = _Entries(rows, borrowed, name, sensor)
     value, half = entries.value, np.zeros(len(entries.value), np.int64)
