@@ -590,7 +590,9 @@ def update_tracks(
     sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
     again = can_restore(rows, borrowed) & weighed[borrowed.target]
-    rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lending(models))
+    last = association.fix if rejected is None else np.maximum(association.fix, rejected[0])
+    lend = lending(models, group, last)
+    rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lend)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
     if began is not None or rows.tail:

@@ -36,8 +36,9 @@ from attrs import evolve
 import numpy as np
 
 from ...estimation import bank
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
+from .births import with_velocities_at_fix
 from .known import Known, track_positions
 from .models import ModelSet, USUAL_SCALES
 from .scan import Group
@@ -62,6 +63,9 @@ FARTHEST_HEARD = 400.0
 
 DELAYED = 1e-3
 """Prior of any delay of a sensor."""
+
+YOUNG, FAR_SCALE = 6, 20.0
+"""Number of fixes of a young track, and ratio of scales above which its state is not lent."""
 
 RARE = 1e-3
 """Prior of the first scale beyond `USUAL_SCALES`, relative to the priors of those. Beyond, the
@@ -359,15 +363,40 @@ def usual_assumptions(
     return same
 
 
-def lending(models: ModelSet) -> Callable[[Rows, Borrowed], Rows]:
-    """Return the function that moves copies of lenders as `sensors.lent_moves` does."""
+def lending(models: ModelSet, group: Group, fix: IntArray) -> Callable[[Rows, Borrowed], Rows]:
+    """Return the function that changes copies of lenders where an assumption changes the state.
+
+    A delay moves the state (`sensors.lent_moves`). A scale changes the state of a young track: its
+    lender took the first fixes for far more accurate than they are under the scale, so the copy
+    begins anew at the last fix.
+
+    :param fix: (T,) last fix of each track; -1 for none.
+    """
 
     def lend(copies: Rows, borrowed: Borrowed) -> Rows:
         moved = lent_moves(copies.key, np.arange(len(copies)), borrowed.key)
-        each = zip(copies.blocks, models.parts)
-        return copies.replace(
-            blocks=tuple(bank.move_along(b, part.outputs[2:4], moved) for b, part in each)
+        blocks = tuple(
+            bank.move_along(block, part.outputs[2:4], moved)
+            for block, part in zip(copies.blocks, models.parts)
         )
+        its = scale_of(borrowed.key, group.number)
+        excess = its / scale_of(copies.key, group.number)
+        young = (copies.key['taken'] <= YOUNG) & (excess > FAR_SCALE)
+        young &= (fix[copies.target] >= 0) & (
+            blocks[0].x.shape[1] == len(models.parts[0].components)
+        )
+        chosen = np.flatnonzero(young)
+        if not len(chosen):
+            return copies.replace(blocks=blocks)
+        last = fix[copies.target[chosen]]
+        R = group.R[last] * its[chosen, None, None]
+        x, P, mu = models.initial_states(group.z[last], R, measured=False)
+        with_velocities_at_fix(P, models, group.config)
+        for block, new in zip(blocks, models.to_blocks(x[:, 0], P[:, 0])):
+            block.x[chosen], block.P[chosen] = new.x, new.P
+        probabilities = copies.mu.copy()
+        probabilities[chosen] = mu[:, 0]
+        return copies.replace(blocks=blocks, mu=probabilities)
 
     return lend
 
