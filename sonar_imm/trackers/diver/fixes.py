@@ -456,7 +456,9 @@ def _associate_groups(
     gate = groups.log - np.log(np.maximum(groups.weight, 1e-300))[:, None]
     passes = gate > gate_log_density(group)
     tied = np.bincount(of, minlength=T) > 1
-    possible = np.concatenate([may & (passes[:T] | ~tied[:, None]), passes[T:]])
+    # Openings have no gate.
+    plain = passes[:T] | (pairs.direct < 1.0) | ~tied[:, None]
+    possible = np.concatenate([may & plain, passes[T:]])
     r, p = before[of], detected[of]
     alive = r * groups.weight
     missed = alive * (1.0 - p)
