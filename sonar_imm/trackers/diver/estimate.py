@@ -23,7 +23,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, burst_reports, bursts, clutter, depth, offsets
+from . import births, burst_reports, bursts, clutter, depth, links, offsets
 from .config import DiverConfig
 from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
@@ -36,7 +36,7 @@ def estimate_of(
 ) -> Estimate:
     """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
     # The existence is NaN for tracks confirmed by hits.
-    existence = bursts.existence_beside_bursts(known)
+    existence = links.existence_beside_bursts(known)
     shown = ~(existence <= PUBLISH_EXISTENCE)
     known, existence = known.select(shown), existence[shown]
     mean, covariance = published_state(known, models, config.burst_end)

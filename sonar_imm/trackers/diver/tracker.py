@@ -60,8 +60,10 @@ from . import (
     depth,
     estimate,
     fixes,
+    links,
     names,
     offsets,
+    pairing,
     pruning,
     restart,
     scales,
@@ -118,7 +120,7 @@ class DiverTracker:
             return layout(known.memory['instruments'])
 
         covered = configured_coverage(config)
-        self._associate = fixes.association_stage(models, config.pairing)
+        self._associate = pairing.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
             **names.FEATURES,
@@ -152,7 +154,7 @@ class DiverTracker:
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
-            models.families and bursts.update_links,
+            models.families and links.update_links,
             clutter.remove_first_fixes,
             births.spawn_stage(models, config, layouts, self._chain, self.features, self.rules),
         )
