@@ -194,18 +194,18 @@ def test_a_burst_and_outliers_do_not_take_the_diver_along(more, settings):
 
 
 def test_a_burst_that_goes_on_is_said_and_becomes_the_truth():
-    t, truth, z, R = swim(320)
+    t, truth, z, R = swim(100)
     z[20:] += [30.0, 0.0]
-    tracker = DiverTracker(config())
+    tracker = DiverTracker(config(burst_end=0.1))
     made = [tracker.process(each)[-1] for each in fixes(t[:60], z, R)]
     (said,) = (each for each in tracker.warnings() if each.startswith('for '))
     assert said.startswith('for 39 s the fixes of track 1 have been')
     assert 'the estimate holds both' in said
     made += [tracker.process(each)[-1] for each in fixes(t[60:], z[60:], R[60:])]
-    # Twenty fixes before, then as many as make the odds 99.
+    # Twenty fixes before, then as many as make the odds 99, at ln .9 each.
     moved = [int(each.extras['track_id'][0]) for each in made]
     first = moved.index(2)
-    assert 100 < first < 140
+    assert first - 20 == pytest.approx(20 + np.log(99.0) / -np.log(0.9), abs=2.0)
     assert errors(made, truth + [30.0, 0.0])[first:].max() < 3.0
 
 
@@ -266,18 +266,18 @@ def test_a_new_diver_beside_one_who_is_missed_is_no_burst():
 
 
 def test_smoothing_leaves_bursts_out():
-    t, truth, z, R = swim(80)
-    z[30:40] += [25.0, 0.0]
+    t, truth, z, R = swim(50)
+    z[25:33] += [25.0, 0.0]
     tracker = SmoothingDiverTracker(config())
     for each in fixes(t, z, R):
         tracker.process(each)
     smoothed = tracker.smoothed()
-    assert len(smoothed) == 80
+    assert len(smoothed) == 50
     assert errors(smoothed, truth)[5:].max() < 3.0
 
 
 def test_clean_fixes_are_not_doubted():
-    t, truth, z, R = swim(150, seed=3)
+    t, truth, z, R = swim(70, seed=3)
     with_bursts, without = DiverTracker(config()), DiverTracker(config(burst_rate=0.0))
     for each in fixes(t, z, R):
         a, b = (tracker.process(each)[-1] for tracker in (with_bursts, without))
