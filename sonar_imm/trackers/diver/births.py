@@ -35,7 +35,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
 from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import bursts, depth
+from . import depth, links
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, track_positions
@@ -70,7 +70,7 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
     """Add a birth for each unassociated fix. A stage of the tracker."""
     association = group.association
     assert association is not None
-    marks = bursts.birth_marks(known, group)
+    marks = links.birth_marks(known, group)
     for d in np.flatnonzero(association.free).tolist():
         existence = math.nan if association.existence is None else float(association.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])
@@ -221,7 +221,7 @@ def spawn_stage(
             known = with_tracks(known, begun)
             ids = known.life.track_id[len(known) - len(begun) :].tolist()
             marks = {birth.mark: each for birth, each in zip(begun, ids) if birth.mark}
-        known = bursts.resolve_links(known, marks)
+        known = links.resolve_links(known, marks)
         for start in scan.starts:
             known, free = make_room(known, start, config, models)
             if free:

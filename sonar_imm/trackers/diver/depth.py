@@ -47,7 +47,7 @@ from ...estimation.association import gate_threshold
 from ...estimation.bank import Gaussians, LOG_2PI
 from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
-from . import bursts
+from . import bursts, ways
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, repair_covariances, track_positions
@@ -245,7 +245,7 @@ def _update_track(
     """
     own, threshold = known.row_indices(track), gate_threshold(group.config.gate_probability, 1)
     rows, value = known.track_rows(track), height.value - float(height.gain @ group.z[fix])
-    offset = bursts.offset_factor(rows, known.memory['sensors'].number(group.sensor))
+    offset = ways.offset_factor(rows, known.memory['sensors'].number(group.sensor))
     weight = rows.weight[:, None] * rows.mu
     masks = layout.estimated_masks(models)
     parts = [

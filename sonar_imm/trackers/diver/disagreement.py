@@ -186,7 +186,8 @@ def begin_disagreement(
     stated = known.replace(
         rows=rows.replace(key={**rows.key, 'scale': scale, 'delay': 0.0 * scale})
     )
-    began = bursts.begin_rows(stated, group, ways, np.full(N, math.log(BEGINS)), models, estimated)
+    weight, link = np.full(N, math.log(BEGINS)), np.zeros(len(group.z), np.int64)
+    began = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
     if began is None:
         return None
     return evolve(began, key={**began.key, 'taken': np.zeros_like(began.key['taken'])})

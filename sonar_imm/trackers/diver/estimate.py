@@ -30,6 +30,7 @@ from . import (
     bursts,
     clutter,
     depth,
+    links,
     offsets,
     polling,
 )
@@ -48,7 +49,7 @@ def estimate_of(
 ) -> Estimate:
     """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
     # The existence is NaN for tracks confirmed by hits.
-    existence = bursts.existence_beside_bursts(known)
+    existence = links.existence_beside_bursts(known)
     shown = ~(existence <= PUBLISH_EXISTENCE)
     known, existence = known.select(shown), existence[shown]
     mean, covariance = published_state(known, models, config.burst_end)

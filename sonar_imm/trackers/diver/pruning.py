@@ -32,11 +32,11 @@ from ...estimation import jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, TENTATIVE, TrackRules, Tracks
 from ...measurements import NOBODY
-from . import bursts, names
+from . import links, names
 from .config import DiverConfig
-from .fixes import CONFIRM_EXISTENCE
 from .known import Feature, Known, track_positions
 from .models import ModelSet
+from .pairing import CONFIRM_EXISTENCE
 from .scan import Group, Scan
 
 END_EXISTENCE = 0.002
@@ -179,7 +179,7 @@ def update_status(
     :param looked: (T,) True if a detection was possible.
     """
     was, existence = known.life.status != TENTATIVE, known['existence']
-    likely = bursts.existence_beside_bursts(known) > CONFIRM_EXISTENCE
+    likely = links.existence_beside_bursts(known) > CONFIRM_EXISTENCE
     confirmed = was | likely & (known['evidence'] >= CONFIRM_EVIDENCE)
     alive = ~(existence < known['least_existence'])
     status = track_status(known.life.status, confirmed, hit, looked)

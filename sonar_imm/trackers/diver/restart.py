@@ -29,7 +29,7 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.rows import Rows
-from . import bursts, fixes
+from . import fixes, ways
 from .births import with_velocities_at_fix
 from .instruments import Layout
 from .known import Feature, Known, predict_over, track_outputs
@@ -146,7 +146,7 @@ def _can_reach(
     outputs = tuple(part.outputs for part in models.parts)
     mean, _ = track_outputs(known.track_rows(track), outputs)
     passed = (known.stamp_ns - int(known.life.last_hit_ns[track])) * 1e-9
-    fastest = bursts.fastest_speed(mean[0, bursts.velocity_outputs(models)], group.config)
+    fastest = ways.fastest_speed(mean[0, ways.velocity_outputs(models)], group.config)
     return bool(np.hypot(*(z - mean[0, :2])) <= fastest * passed + 3.0 * math.sqrt(np.trace(R)))
 
 

@@ -62,8 +62,10 @@ from . import (
     disagreement,
     estimate,
     fixes,
+    links,
     names,
     offsets,
+    pairing,
     polling,
     pruning,
     restart,
@@ -121,7 +123,7 @@ class DiverTracker:
             return layout(known.memory['instruments'])
 
         covered = configured_coverage(config)
-        self._associate = fixes.association_stage(models, config.pairing)
+        self._associate = pairing.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
             **disagreement.FEATURES,
@@ -157,7 +159,7 @@ class DiverTracker:
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
-            models.families and bursts.update_links,
+            models.families and links.update_links,
             clutter.remove_first_fixes,
             births.spawn_stage(models, config, layouts, self._chain, self.features, self.rules),
         )
