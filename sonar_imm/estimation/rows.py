@@ -41,7 +41,15 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
+__all__ = [
+    'Borrowed',
+    'drop_weightless_rows',
+    'log_sum',
+    'normalise_weights',
+    'reduce_targets',
+    'restore_rows',
+    'Rows',
+]
 
 NOTHING: Mapping[str, Any] = {}
 LEAST_LOG = -345.0
@@ -340,3 +348,14 @@ def restore_rows(
     ended = {name: np.full(len(back), value) for name, value in without.items()}
     copies = evolve(copies, key={**copies.key, **ended, **back.key})
     return rows.append(copies), borrowed.select(~again)
+
+
+def normalise_weights(rows: Rows, borrowed: Borrowed) -> tuple[Rows, Borrowed]:
+    """Return rows and borrowed list whose weights sum to one for each target."""
+    every = np.concatenate([rows.logw, borrowed.logw])
+    target = np.concatenate([rows.target, borrowed.target])
+    total = np.log(np.bincount(target, np.exp(every)))
+    return (
+        evolve(rows, logw=rows.logw - total[rows.target]),
+        evolve(borrowed, logw=borrowed.logw - total[borrowed.target]),
+    )

@@ -38,8 +38,8 @@ from ...measurements import Arrivals, NOBODY, Start
 from . import depth, links
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, track_positions
-from .models import ModelSet, start_depths, VELOCITY
+from .known import Feature, Known, track_positions, with_velocities_at_fix
+from .models import ModelSet, start_depths
 from .scan import (
     bearing_variance,
     Birth,
@@ -285,13 +285,6 @@ def birth_rows(
     return (
         rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)
     )
-
-
-def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
-    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
-    if models.families is not None:
-        moving = np.flatnonzero(models.families.kind == VELOCITY)
-        P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
 
 
 def _birth_states(

@@ -49,6 +49,7 @@ from ...estimation.rows import (
     drop_weightless_rows,
     LEAST_LOG,
     log_sum,
+    normalise_weights,
     reduce_targets,
     restore_rows,
     ROW_LOST,
@@ -428,7 +429,7 @@ def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows
     """
     rows = bursts.merge_rows(rows if began is None else rows.append(began))
     rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
-    return bursts.without_unused_tail(rows), borrowed
+    return normalise_weights(bursts.without_unused_tail(rows), borrowed)
 
 
 def _update_weights(

@@ -36,7 +36,8 @@ from ...estimation.association import Tracks
 from ...estimation.bank import Gaussians
 from ...estimation.covariance import are_sound, with_jitter
 from ...estimation.rows import Borrowed, Rows
-from .models import ModelSet
+from .config import DiverConfig
+from .models import ModelSet, VELOCITY
 
 BORROWING = ('scale', 'delay')
 """Assumptions that can borrow (`estimation.rows`)."""
@@ -305,3 +306,10 @@ def predict_over(
         rows = rows.replace(blocks=moved, mu=mu, parent=np.arange(len(rows)))
         steps.append(Prediction(rows, transition, dt / count, repairs))
     return steps
+
+
+def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
+    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
+    if models.families is not None:
+        moving = np.flatnonzero(models.families.kind == VELOCITY)
+        P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2

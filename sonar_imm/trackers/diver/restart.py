@@ -30,9 +30,8 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.rows import Rows
 from . import fixes, ways
-from .births import with_velocities_at_fix
 from .instruments import Layout
-from .known import Feature, Known, predict_over, track_outputs
+from .known import Feature, Known, predict_over, track_outputs, with_velocities_at_fix
 from .models import ModelSet
 from .scan import Group
 

@@ -38,8 +38,7 @@ import numpy as np
 from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
-from .births import with_velocities_at_fix
-from .known import Known, track_positions
+from .known import Known, track_positions, with_velocities_at_fix
 from .models import ModelSet, USUAL_SCALES
 from .scan import Group
 from .sensors import lent_moves, scale_of

@@ -36,6 +36,7 @@ from ...measurements import (
 )
 from ..navigation import NavigationBuffer
 from .arrival_stamps import ArrivalStamps, Resolution
+from .burst_reports import BurstCounts
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
 from .innovations import FixConsistency, SensorConsistency
@@ -61,6 +62,6 @@ STATE_TYPES = (
         BiasTest,
         RecentPairs,
     ),
-    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
+    *(Clutter, Clutters, LastNamed, Sensors, BurstCounts, SingleFixes),
     *(ArrivalStamps, Resolution),
 )
