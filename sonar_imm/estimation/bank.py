@@ -61,6 +61,7 @@ __all__ = [
     'Innovations',
     'mix',
     'mixture_log_density',
+    'move_along',
     'Moves',
     'predict',
     'predict_fix',
@@ -391,6 +392,24 @@ def predict(block: Gaussians, moves: Moves) -> Gaussians:
     for j, row in changing:
         P[:, :, j] = sum(F[j, k] * left[:, :, k] for k in row)
     P[:, :n, :n] += moves.Q
+    return Gaussians(x, P)
+
+
+def move_along(block: Gaussians, velocity: FloatArray, dt: FloatArray) -> Gaussians:
+    """Move the positions of each row by its velocity times `dt` (N,), without noise.
+
+    :param velocity: (2, n, m) maps of the first n components to the velocity.
+    """
+    chosen = np.flatnonzero(dt)
+    if not len(chosen):
+        return block
+    x, P, step = block.x.copy(), block.P.copy(), dt[chosen, None, None]
+    n, place = velocity.shape[1], slice(X, Y + 1)
+    x[chosen, place] += step * np.einsum('qnm,Nnm->Nqm', velocity, block.x[chosen, :n])
+    half = block.P[chosen]
+    half[:, place] += step[..., None] * np.einsum('qnm,Nnkm->Nqkm', velocity, half[:, :n])
+    half[:, :, place] += step[..., None] * np.einsum('qnm,Nknm->Nkqm', velocity, half[:, :, :n])
+    P[chosen] = 0.5 * (half + np.swapaxes(half, 1, 2))
     return Gaussians(x, P)
 
 

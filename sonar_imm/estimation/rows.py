@@ -287,13 +287,25 @@ class Borrowed:
         """Return the row (B,) that each assumption borrows: the heaviest of its target.
 
         A scale changes the future of a filter. So the lender need not be near in scale: its state
-        must fit the target.
+        must fit the target. A delay changes the state too. So an assumption with a delay of a
+        sensor borrows from the heaviest row that agrees about the other sensors, if there is one.
         """
         if not len(self):
             return np.empty(0, np.intp)
         heaviest = np.maximum.reduceat(rows.logw, rows.first)[rows.target] == rows.logw
         lenders, first = np.unique(rows.target[heaviest], return_index=True)
-        return np.asarray(np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]])
+        lender = np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]]
+        if 'delay' not in self.key or not self.key['delay'].any():
+            return np.asarray(lender)
+        late = np.flatnonzero(self.key['delay'].any(axis=1))
+        own = self.key['delay'][late] == 0.0
+        agrees = self.target[late, None] == rows.target
+        for name, column in self.key.items():
+            differs = column[late, None] != rows.key[name]
+            agrees &= ~(differs & own[:, None]).any(axis=2)
+        best = np.where(agrees, rows.logw, -np.inf)
+        lender[late] = np.where(agrees.any(axis=1), best.argmax(axis=1), lender[late])
+        return np.asarray(lender)
 
 
 def drop_weightless_rows(

@@ -31,7 +31,8 @@ from __future__ import annotations
 
 from functools import singledispatch
 import hashlib
-from typing import Any, ClassVar
+import math
+from typing import Any, ClassVar, NamedTuple
 
 from attrs import define, evolve, field
 import numpy as np
@@ -67,6 +68,14 @@ SEEN_FROM_THE_SONAR = (Detections, Snapshot)
 """What cannot be used before the place of the sonar is known."""
 MOST_KEPT = 10_000
 """Positions remembered; the oldest are forgotten for more."""
+MOST_SOURCES = 1000
+"""Sources whose last value is remembered; the oldest are forgotten for more."""
+LAST_VALUES = 5
+"""Values of a source by which it is told whether it holds each for a while."""
+USUAL_HOLD = 1.5
+"""Part of the longest of the last times for which a value is expected to be held at most."""
+DEGREE = 111e3
+"""Metres of a degree of latitude."""
 
 
 class Intake:
@@ -86,7 +95,9 @@ class Intake:
         is used decides."""
         self.tracker = tracker
         self.frame_id = frame_id
-        self.repeats = RepeatFilter(getattr(tracker.config, 'repeat_time', 0.0))
+        self.repeats = RepeatFilter(
+            getattr(tracker.config, 'repeat_time', 0.0), getattr(tracker.config, 'fix_std', 1.0)
+        )
         self.transforms = TransformTree()
         vehicle, sonar = (
             getattr(tracker.config, name, '') for name in ('vehicle_frame', 'sonar_frame')
@@ -159,6 +170,55 @@ class Intake:
         self.tracker.remount(evolve(self.tracker.config, **self.mounting))
 
 
+class Source(NamedTuple):
+    """The last values of a source of positions: of a diver by a sensor."""
+
+    digest: str = ''
+    """Of the present value."""
+    since_ns: int = 0
+    """Stamp at which it came first."""
+    times: int = 0
+    """How often it came."""
+    places: tuple[tuple[float, float], ...] = ()
+    """Of the last values, m."""
+    held: tuple[float, ...] = ()
+    """For how long each of the values before was held, s; 0 for those that came once."""
+
+    def after(self, digest: str, stamp_ns: int, place: tuple[float, float]) -> Source:
+        """What is known after another position."""
+        if digest == self.digest:
+            return self._replace(times=self.times + 1)
+        held = self.held
+        if self.times:
+            time = abs(stamp_ns - self.since_ns) * 1e-9 if self.times > 1 else 0.0
+            held = (*held, time)[-LAST_VALUES:]
+        return Source(digest, stamp_ns, 1, (*self.places, place)[-LAST_VALUES:], held)
+
+    def hold(self, limit: float, std: float) -> float:
+        """How long the present value may be held, s: `limit` unless values come in runs.
+
+        Of a source with digits so fine that values differ by a third of the standard deviation,
+        equal ones are no chance, however old. Otherwise a diver may rest on a coarse grid.
+        """
+        runs = [time for time in self.held if time]
+        if not runs or 2 * len(runs) < len(self.held):
+            return limit
+        if len(runs) >= 3 and self._finest() < std / 3.0:
+            return math.inf
+        return max(limit, USUAL_HOLD * max(runs))
+
+    def _finest(self) -> float:
+        """The smallest difference of two of the last values, m."""
+        return min(
+            (
+                max(abs(x - a), abs(y - b))
+                for k, (x, y) in enumerate(self.places)
+                for a, b in self.places[:k]
+            ),
+            default=math.inf,
+        )
+
+
 @define(eq=False)
 class RepeatFilter:
     """Leaves out repeated polls: the same numbers once more, when a driver asks more often than it
@@ -167,21 +227,25 @@ class RepeatFilter:
     Noise makes no two measurements alike to the last bit, so that a fix whose numbers came before,
     for the same diver and a moment ago, is the old one with a new stamp. It says nothing, and its
     stamp is wrong. After `limit` the same numbers count again: a diver that rests on a coarse grid
-    is there.
+    is there. Where a slow sensor is written at a fast rate, each value comes many times, for as
+    long as the sensor takes: see `Source.hold`.
 
-    limit: what is repeated within so many seconds is left out; 0: nothing. rows: how many rows of
-    scans were left out so far. STATE: see `trackers.Tracker`.
+    limit: what is repeated within so many seconds is left out; 0: nothing. std: standard deviation
+    of a position that states none, m. rows: how many rows of scans were left out so far. STATE:
+    see `trackers.Tracker`.
     """
 
-    STATE: ClassVar = ('rows', '_first')
+    STATE: ClassVar = ('rows', '_first', '_sources')
 
     _limit_ns: int = field(alias='limit', converter=nanoseconds)
+    _std: float = field(alias='std', default=1.0)
     rows: int = field(init=False, default=0)
     _first: dict[str, int] = field(init=False, factory=dict)
+    _sources: dict[str, Source] = field(init=False, factory=dict)
 
     def reset(self) -> None:
         """Forget what came."""
-        self.rows, self._first = 0, {}
+        self.rows, self._first, self._sources = 0, {}, {}
 
     def fresh(self, measurement: Any) -> Any:
         """The measurement, of a scan of named positions the rows that are new.
@@ -193,8 +257,11 @@ class RepeatFilter:
         if isinstance(measurement, Fixes):
             return self._rows(measurement)
         if isinstance(measurement, (Fix, GeodeticFix, RelativeFix)):
-            source = f'{measurement.frame_id}\0{measurement.sensor}\0'.encode()
-            if self._came(source + measurement.key(), measurement.stamp_ns):
+            source = f'{measurement.frame_id}\0{measurement.sensor}\0'
+            content = source.encode() + measurement.key()
+            of_diver = f'{source}{measurement.target_id}'
+            place, std = _place_of(measurement), _std_of(measurement.covariance, self._std)
+            if self._came(content, measurement.stamp_ns, of_diver, place, std):
                 raise Rejection('repeated', 'the same position came before with another stamp')
         return measurement
 
@@ -208,9 +275,13 @@ class RepeatFilter:
         new = np.array(
             [
                 not self._came(
-                    f'{scan.frame_id}\0{name}'.encode() + place.tobytes(), scan.stamp_ns
+                    f'{scan.frame_id}\0{name}'.encode() + place.tobytes(),
+                    scan.stamp_ns,
+                    f'{scan.frame_id}\0{scan.sensor}\0{name}',
+                    (float(place[0]), float(place[1])),
+                    _std_of(None if scan.covariance is None else scan.covariance[k], self._std),
                 )
-                for name, place in zip(scan.target_id.tolist(), scan.position)
+                for k, (name, place) in enumerate(zip(scan.target_id.tolist(), scan.position))
             ]
         )
         if new.all():
@@ -225,17 +296,54 @@ class RepeatFilter:
             target_id=scan.target_id[new],
         )
 
-    def _came(self, content: bytes, stamp_ns: int) -> bool:
+    def _came(
+        self,
+        content: bytes,
+        stamp_ns: int,
+        name: str = '',
+        place: tuple[float, float] = (math.nan, math.nan),
+        std: float = 0.0,
+    ) -> bool:
         """Whether that content came with another stamp, not long ago; remembers it, by a digest
-        since a scan may have thousands of positions."""
+        since a scan may have thousands of positions. name, place, std: of its source, the position
+        in m, and its standard deviation; no name for a scan of several."""
         digest = hashlib.blake2b(content, digest_size=16).hexdigest()
         first = self._first.get(digest)
-        if first is not None and 0 < abs(stamp_ns - first) <= self._limit_ns:
+        held = bool(name) and self._is_held(name, digest, stamp_ns, place, std)
+        if held or (first is not None and 0 < abs(stamp_ns - first) <= self._limit_ns):
             return True
         if first is None and len(self._first) >= MOST_KEPT:
             self._first.pop(next(iter(self._first)))
         self._first[digest] = stamp_ns
         return False
+
+    def _is_held(
+        self, name: str, digest: str, stamp_ns: int, place: tuple[float, float], std: float
+    ) -> bool:
+        """Whether a source gives the value that it gave last, which it holds."""
+        before = self._sources.pop(name, Source())
+        if len(self._sources) >= MOST_SOURCES:
+            self._sources.pop(next(iter(self._sources)))
+        self._sources[name] = before.after(digest, stamp_ns, place)
+        age = abs(stamp_ns - before.since_ns) * 1e-9
+        return digest == before.digest and 0.0 < age <= before.hold(self._limit_ns * 1e-9, std)
+
+
+def _place_of(measurement: Fix | GeodeticFix | RelativeFix) -> tuple[float, float]:
+    """A position in metres, of latitudes nearly."""
+    if isinstance(measurement, GeodeticFix):
+        east = DEGREE * math.cos(math.radians(measurement.latitude)) * measurement.longitude
+        return east, DEGREE * measurement.latitude
+    x, y = (measurement.offset if isinstance(measurement, RelativeFix) else measurement.position)[
+        :2
+    ]
+    return float(x), float(y)
+
+
+def _std_of(covariance: FloatArray | None, usual: float) -> float:
+    """The standard deviation of the better axis, m; `usual` where it is not stated."""
+    variance = math.nan if covariance is None else float(np.min(np.diagonal(covariance)[:2]))
+    return math.sqrt(variance) if variance > 0.0 else usual
 
 
 UPRIGHT = 1.0 - 1e-6
@@ -414,5 +522,5 @@ def _after(yaw: float, q: FloatArray) -> FloatArray:
     return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
 
 
-STATE_TYPES = (Pose,)
+STATE_TYPES = (Pose, Source)
 """The classes that a saved state of the intake may hold, see `trackers.state_file`."""

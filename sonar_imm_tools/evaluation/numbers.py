@@ -109,24 +109,43 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     }
 
 
-def coverage_verdict(coverage: float, stated: float = 0.95) -> str:
-    """What `coverage`, the share of truth inside bands that state a share, says about them: twice
-    as much outside is overconfident, a fifth cautious."""
+MOST_NEES = 2.0
+"""Mean NEES, over its degrees of freedom, above which a tracker is overconfident whatever its
+bands hold: few errors are far too large then."""
+
+
+def coverage_verdict(coverage: float, stated: float = 0.95, nees: float = 0.0) -> str:
+    """Return the verdict on a stated uncertainty.
+
+    :param coverage: share of the truth inside bands. Twice as much outside as stated is
+        overconfident, a fifth cautious.
+    :param stated: share that the bands state.
+    :param nees: mean NEES over its degrees of freedom; both have to hold.
+    """
     outside, allowed = round(1.0 - coverage, 9), 1.0 - stated
-    if outside > round(2.0 * allowed, 9):
+    if outside > round(2.0 * allowed, 9) or nees > MOST_NEES:
         return 'overconfident'
     return 'cautious' if outside < round(0.2 * allowed, 9) else 'consistent'
 
 
-def coverage_sentence(coverage: float) -> str:
-    """The `coverage_verdict` in words."""
+def relative_nees(summary: Mapping[str, Any] | None) -> float:
+    """Return the mean of a `chi2_summary` over its degrees of freedom; 0 if there is none."""
+    mean = summary['mean'] / summary['dof'] if summary and summary.get('n') else 0.0
+    return float(mean) if mean == mean else 0.0
+
+
+def coverage_sentence(coverage: float, nees: float = 0.0) -> str:
+    """Return the `coverage_verdict` in words."""
     held = f'its 95 % ellipses hold the truth {100 * coverage:.0f} % of the time'
     words = {
         'overconfident': 'The tracker is overconfident',
         'cautious': 'The tracker is more cautious than it needs to be',
         'consistent': 'The stated uncertainty is consistent with the errors',
     }
-    return f'{words[coverage_verdict(coverage)]}: {held}.'
+    verdict = coverage_verdict(coverage, nees=nees)
+    if verdict == 'overconfident' and coverage_verdict(coverage) != verdict:
+        held += f', but the others lie far outside (mean NEES {nees:,.3g} times the expected one)'
+    return f'{words[verdict]}: {held}.'
 
 
 def bounds_remark(summary: Mapping[str, Any]) -> str:
@@ -168,7 +187,8 @@ class Metric:
     label, line: title and text of the line on the terminal. card, value, remark: title, value and
     explanation of the key number in the report. front: whether it is one of the few on the front
     page of several runs. covers: dotted name of the share of the truth inside a band, and the
-    share that the band states. when: whether to show it. Without a label it is not on the
+    share that the band states; nees: dotted name of the NEES that has to hold too. when: whether
+    to show it. Without a label it is not on the
     terminal, without a card not in the report, and without the first number that is named in
     neither.
     """
@@ -180,6 +200,7 @@ class Metric:
     remark: Text = ''
     front: bool = False
     covers: tuple[str, float] | None = None
+    nees: str = ''
     when: Callable[[Mapping[str, Any]], object] = lambda metrics: True
 
 
@@ -245,13 +266,15 @@ def front(cards: Iterable[Card], most: int = 3) -> list[Card]:
 
 
 def verdict(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> str:
-    """What the share of the truth inside a band says about the stated uncertainty; empty where
-    nothing tells."""
+    """What the share of the truth inside a band, and the NEES, say about the stated uncertainty;
+    empty where nothing tells."""
     for metric in shown:
         if metric.covers is not None and metric.when(metrics):
             inside, stated = look_up(metrics, metric.covers[0]), metric.covers[1]
             if inside is not None and inside == inside:
-                return coverage_verdict(inside, stated)
+                return coverage_verdict(
+                    inside, stated, relative_nees(look_up(metrics, metric.nees))
+                )
     return ''
 
 

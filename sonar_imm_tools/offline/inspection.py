@@ -26,9 +26,9 @@ import numpy as np
 
 from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
-from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Fix, GeodeticFix, Rejection
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.diver.polling import BEFORE, turn_of
 
 from .. import SECOND
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
@@ -36,8 +36,6 @@ from ..recordings.topics import fed, fitting_systems, instruments
 
 MOST_FIXES = 1000
 """Fixes of a topic by which it is told whether each has a stamp of its own."""
-BEFORE = 30
-"""Fixes before one among which the last one of the same diver is looked for."""
 LONG_GAP = 10.0
 """A gap is reported when it is this many times the usual time between two messages."""
 
@@ -178,27 +176,6 @@ def _scan_hint(found: _Found) -> list[str]:
         f'every fix has a stamp of its own, and each diver comes again after {period:.3g} s: '
         f'where the sensor rotates or polls, --set scan_period={period:.3g} makes scans of them'
     ]
-
-
-def turn_of(stamps_ns: IntArray, places: FloatArray) -> float | None:
-    """Seconds after which a sensor that stamps each fix by itself comes back to the same diver;
-    None where it does not.
-
-    stamps_ns (n,) rising, places (n, 2). Of the fixes before one the last that is as near as those
-    of one diver are is his; between the two lie fixes of others, and the time is always the same.
-    """
-    if 10 * len(np.unique(stamps_ns)) < 9 * len(stamps_ns):
-        return None
-    rows = range(BEFORE, len(stamps_ns))
-    apart = [np.hypot(*(places[k - BEFORE : k] - places[k]).T) for k in rows]
-    near = 4.0 * float(np.median([distance.min() for distance in apart]))
-    back = [(k, np.flatnonzero(distance <= near)) for k, distance in zip(rows, apart)]
-    last = np.array([(k, k - BEFORE + before[-1]) for k, before in back if len(before)])
-    seconds = (stamps_ns[last[:, 0]] - stamps_ns[last[:, 1]]) / SECOND
-    period = float(np.median(seconds))
-    regular = np.abs(seconds - period) <= 0.25 * period
-    between = last[:, 0] - last[:, 1] > 1
-    return period if np.mean(regular & between) > 0.6 else None
 
 
 def _scans(found: _Found) -> dict[str, int] | None:

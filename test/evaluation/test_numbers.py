@@ -23,6 +23,7 @@ from sonar_imm_tools.evaluation.numbers import (
     chi2,
     chi2_summary,
     coverage_sentence,
+    coverage_verdict,
     each,
     error,
     error_summary,
@@ -30,6 +31,7 @@ from sonar_imm_tools.evaluation.numbers import (
     Metric,
     nis_summary,
     usable_nees,
+    verdict,
 )
 
 
@@ -38,6 +40,18 @@ from sonar_imm_tools.evaluation.numbers import (
 )
 def test_coverage_is_put_in_words(coverage, words):
     assert words in coverage_sentence(coverage)
+
+
+def test_a_tracker_with_few_errors_far_too_large_is_overconfident():
+    assert coverage_verdict(0.96, nees=1.9) == 'consistent'
+    assert coverage_verdict(0.96, nees=2.1) == coverage_verdict(1.0, nees=2.1) == 'overconfident'
+    sentence = coverage_sentence(0.96, 31_500.0)
+    assert 'overconfident' in sentence and 'mean NEES 3.15e+04 times' in sentence
+    assert 'NEES' not in coverage_sentence(0.5, 31_500.0)
+    far = chi2_summary(np.array([1.0, 1.0, 126_000.0]), 2)
+    shown = [Metric(covers=('share', 0.95), nees='nees')]
+    assert verdict(shown, {'share': 0.96, 'nees': far}) == 'overconfident'
+    assert verdict(shown, {'share': 0.96}) == 'consistent'
 
 
 def test_lines_name_the_unit_and_are_left_out_without_errors():

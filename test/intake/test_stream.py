@@ -16,7 +16,7 @@
 
 import pickle
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 import pytest
 
@@ -230,6 +230,64 @@ def test_of_named_positions_the_new_ones_stay():
     assert not passes(repeats, scan(3, 1.0, 2.5, target_id=[4, 5]))
     repeats.reset()
     assert passes(repeats, scan(3, 1.0, 2.5, target_id=[4, 5]))
+
+
+def held(count, period, std, digits, seed=1, speed=0.4):
+    """Fixes at 1 Hz of a sensor that measures every `period` seconds; whether each is new."""
+    rng, place = np.random.default_rng(seed), None
+    for k in range(count):
+        new = k % period == 0
+        if new:
+            place = np.round((speed * k, 3.0) + std * rng.normal(size=2), digits)
+        yield (
+            Fix(
+                stamp_ns=(1 + k) * SECOND,
+                position=(*place, 0.0),
+                covariance=std**2 * np.eye(2),
+            ),
+            new,
+        )
+
+
+@pytest.mark.parametrize('period', [2, 7, 10, 12])
+@pytest.mark.parametrize('speed', [0.0, 0.4, 5.0])
+def test_a_value_that_is_held_counts_once(period, speed):
+    repeats = RepeatFilter(5.0)
+    found = [(passes(repeats, item), new) for item, new in held(200, period, 1.5, 3, speed=speed)]
+    # Of the first value it cannot be known.
+    assert all(used == new for used, new in found[period:])
+    assert sum(used for used, _ in found[:period]) <= 1 + (period > 6)
+
+
+def test_named_rows_and_latitudes_are_held_too():
+    repeats, geodetic = RepeatFilter(5.0), RepeatFilter(5.0)
+    for k, (item, new) in enumerate(held(60, 10, 1.5, 3)):
+        x, y = item.position[:2].tolist()
+        both = scan(1 + k, x, float(k), target_id=[4, 5])
+        rows = repeats.fresh(both).target_id.tolist()
+        degrees = {'latitude': 59.0 + 1e-5 * x, 'longitude': 10.0 + 1e-5 * y}
+        used = passes(geodetic, GeodeticFix(stamp_ns=(1 + k) * SECOND, **degrees))
+        assert k < 10 or (used == new and rows == ([4, 5] if new else [5]))
+
+
+def test_a_frozen_value_of_fine_digits_is_no_fix_however_old():
+    """Of coarse digits a diver may rest where he is."""
+    for digits, std, due in ((3, 1.5, 0), (0, 0.5, 3)):
+        repeats, last = RepeatFilter(5.0), None
+        for last, _ in held(60, 5, std, digits, speed=0.2):
+            passes(repeats, last)
+        frozen = [evolve(last, stamp_ns=(61 + k) * SECOND) for k in range(60)]
+        assert sum(passes(repeats, item) for item in frozen) >= due
+        assert due or not any(passes(repeats, item) for item in frozen)
+
+
+def test_a_value_that_came_once_each_is_not_held():
+    """A vehicle of a simulator without noise that stops: its fixes count after a while."""
+    repeats = RepeatFilter(5.0)
+    for k in range(30):
+        assert passes(repeats, fix(1 + k, x=0.1 * k))
+    rest = [passes(repeats, fix(31 + k, x=5.0)) for k in range(30)]
+    assert sum(rest) == 5
 
 
 def test_zero_lets_everything_pass_and_memory_is_bounded():

@@ -53,7 +53,7 @@ from .heavy_tails import DEGREES, student_t_maxima, student_t_ping
 from .instruments import Layout
 from .known import Known
 from .models import ModelSet, start_depths
-from .scales import MIN_PUBLISHED_SCALE
+from .scales import MIN_PUBLISHED_SCALE, scale_of, usual_assumptions
 from .scan import MOST_MEASUREMENTS, Ping, ping_measurements, tag_id
 
 MOST_SUBSETS = 6
@@ -184,8 +184,9 @@ def _associate_ping(
         return known, free
     instruments = known.memory['instruments'].with_receivers(ping, config)
     layout = instruments.layout(config, models)
-    usual = np.isin(known.borrowed.key['scale'], models.row_scales)
-    table, borrowed = restore_rows(known.rows, known.borrowed, usual)
+    number = known.memory['sensors'].number('')
+    can = usual_assumptions(known.rows, known.borrowed, models.row_scales, number)
+    table, borrowed = restore_rows(known.rows, known.borrowed, can)
     known = known.replace(rows=layout.rows_with_new_constants(table, models), borrowed=borrowed)
     known = known.with_memory(instruments=instruments)
     seen = ping_measurements(ping, rows, config, models, layout)
@@ -236,7 +237,7 @@ def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
     x, P = models.to_common(rows.blocks)
     N, M, n = x.shape
     mu = rows.weight[:, None] * rows.mu
-    scale = np.repeat(rows.key['scale'], M)
+    scale = np.repeat(scale_of(rows.key, known.memory['sensors'].number('')), M)
     return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
 
 

@@ -76,7 +76,8 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height
-        group.births.append(Birth(*place, group.rotation_sensor, int(marks[d])))
+        marked = group.rotation_sensor, group.number, int(marks[d])
+        group.births.append(Birth(*place, *marked))
     return known
 
 
@@ -198,7 +199,7 @@ def spawn_stage(
 
     def with_tracks(known: Known, found: Sequence[Birth]) -> Known:
         layout = layouts(known)
-        for _, group in groupby(found, key=lambda birth: birth.seen_by and birth.seen_by[0]):
+        for _, group in groupby(found, key=_sensor_of):
             births = list(group)
             columns = {name: feature.birth for name, feature in features.items()}
             columns['learnt'] = chain.initial_counts(len(births))
@@ -228,6 +229,11 @@ def spawn_stage(
         return known
 
     return spawn
+
+
+def _sensor_of(birth: Birth) -> tuple[int, str | None]:
+    """Return the number of the sensor of a birth, and its name if it has a bearing error."""
+    return birth.number, birth.seen_by and birth.seen_by[0]
 
 
 def max_total_tracks(config: DiverConfig) -> int:
@@ -274,7 +280,7 @@ def birth_rows(
                     models.height,
                     config,
                 )
-    rows = models.make_rows(x, P, mu, logw)
+    rows = models.make_rows(x, P, mu, logw, births[0].number)
     seen_by = births[0].seen_by
     return (
         rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)

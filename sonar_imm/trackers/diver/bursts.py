@@ -52,6 +52,7 @@ from .known import Known, repair_covariances, row_outputs
 from .models import ModelSet, NO_OFFSET
 from .pairs import LEAVE, NOBODYS, OPEN, Ways
 from .scan import Group
+from .sensors import scale_of
 
 TAIL = 2
 """Number of components of an offset."""
@@ -113,7 +114,7 @@ def begin_rows(
     row, fix, way = ways.row[kept], ways.fix[kept], ways.way[kept]
     rows = known.rows.with_tail(TAIL).select(row)
     opens, nobodys = way == OPEN, way == NOBODYS
-    sensor = known.memory['sensors'].number(group.sensor)
+    sensor = group.number
     key = dict(rows.key)
     plain = opens | (way == LEAVE)
     key['offset'] = np.where(opens, sensor, np.where(plain, -1, key['offset']))
@@ -125,11 +126,13 @@ def begin_rows(
     key['took'] = np.where(nobodys, key['took'], known.stamp_ns)
     key['aside'] = nobodys & (key['offset'] < 0)
     key['link'] = np.where(opens, link[fix], np.where(plain, 0, key['link']))
-    rows = rows.replace(
-        blocks=_with_prior(rows.blocks, plain, np.where(opens, ways.variance[kept], 0.0))
-    )
+    prior = _with_prior(rows.blocks, plain, np.where(opens, ways.variance[kept], 0.0))
+    # To the time of the fix, and back afterwards.
+    late, outputs = key['delay'][:, sensor], [part.outputs[2:4] for part in models.parts]
+    moved = tuple(bank.move_along(b, maps, -late) for b, maps in zip(prior, outputs))
+    rows = rows.replace(blocks=moved)
     each = np.flatnonzero(~nobodys)
-    R = group.R[fix[each]] * key['scale'][each, None, None]
+    R = group.R[fix[each]] * scale_of(key, group.number)[each, None, None]
     factor = np.where(opens, 1.0, 0.0)
     compared = [
         bank.compare(*bank.predict_fix(block, part.measured, factor), each, group.z[fix[each]], R)
@@ -142,7 +145,7 @@ def begin_rows(
         none = nobodys.astype(np.float64)
         wide = with_tail_mask(mask, TAIL)
         done = bank.update(block, pairs, each, ratio, none, part.measured, wide, factor)
-        blocks.append(done[0])
+        blocks.append(bank.move_along(done[0], part.outputs[2:4], late))
         factors.append(done[1])
     sound, _ = repair_covariances(tuple(blocks), TAIL)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
@@ -185,13 +188,15 @@ def count_fixes(rows: Rows, sensor: int, used: BoolArray, stamp_ns: int) -> Rows
     return rows.replace(key=key)
 
 
-MERGED = ('scale', 'start', 'offset', 'since', 'aside', 'link')
+MERGED = ('scale', 'delay', 'start', 'offset', 'since', 'aside', 'link')
 """Assumptions that rows which are merged have in common."""
 
 
 def merge_rows(rows: Rows) -> Rows:
     """Merge rows of the same target and assumptions, model by model, by their moments."""
-    table = np.stack([rows.target, *(rows.key[name] for name in MERGED)], axis=1)
+    N = len(rows)
+    columns = [rows.target, *(rows.key[name] for name in MERGED)]
+    table = np.concatenate([column.reshape(N, -1) for column in columns], axis=1)
     _, group = np.unique(table, axis=0, return_inverse=True)
     group = group.ravel()
     count = np.bincount(group)
@@ -227,8 +232,8 @@ def merge_rows(rows: Rows) -> Rows:
 
 
 def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, Borrowed]:
-    """Drop rows of negligible weight, except rows that `stays` (N,). A scale without a row is
-    borrowed."""
+    """Drop rows of negligible weight, except rows that `stays` (N,). Scales and delays without a
+    row are borrowed."""
     bursting = rows.key['offset'] >= 0
     plain = np.where(~bursting & ~rows.key['aside'], rows.logw, -np.inf)
     last = (plain == reduce_targets(np.maximum, plain, rows.target)[rows.target]) & (
@@ -239,13 +244,14 @@ def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, B
     if not lost.any():
         return rows, borrowed
     left = np.flatnonzero(~lost)
-    scale = rows.key['scale']
-    have = set(zip(rows.target[left].tolist(), scale[left].tolist()))
-    gone: dict[tuple[int, float], int] = {}
+    lendable = [rows.target[:, None], *(rows.key[name] for name in borrowed.key)]
+    _, number = np.unique(np.concatenate(lendable, axis=1), axis=0, return_inverse=True)
+    number = number.ravel()
+    have, gone = set(number[left].tolist()), dict[int, int]()
     for row in np.flatnonzero(lost).tolist():
-        pair = int(rows.target[row]), float(scale[row])
-        if pair not in have and rows.logw[row] >= rows.logw[gone.get(pair, row)]:
-            gone[pair] = row
+        own = int(number[row])
+        if own not in have and rows.logw[row] >= rows.logw[gone.get(own, row)]:
+            gone[own] = row
     if gone:
         borrowed = borrowed.append(
             Borrowed.from_rows(rows.select(np.array(sorted(gone.values()))), borrowed.key)

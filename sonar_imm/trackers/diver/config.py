@@ -153,6 +153,9 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'the published covariance is that of filters from 1 on; with dimensions 3: one filter, '
         'scale 1',
         range=(0.01, 1e6), kind='float[]')
+    sensor_delays: tuple[float, ...] = parameter((0.25, 0.5, 1.0, 2.0, 4.0), 's',
+        'families: delays that the stamps of one of several sensors may have; empty: none',
+        range=(1e-3, 3600.0), kind='float[]')
     adaptation: str = constant('counts', '',
         'correction of the transition matrix by the data: counts (Dirichlet) or fixed (none)',
         choices=ADAPTATIONS)
@@ -303,7 +306,7 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         kind='str[]')
     repeat_time: float = parameter(5.0, 's',
         'time within which the same values again are a repeated poll, which is left out and '
-        'counted; 0: use them', range=(0.0, 3600.0))
+        'counted, longer where a sensor holds its values; 0: use them', range=(0.0, 3600.0))
 
     # -- sensors ---------------------------------------------------------------------------------
     sensors: tuple[str, ...] = parameter((), '',

@@ -23,12 +23,25 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import births, burst_reports, bursts, clutter, depth, links, offsets
+from . import (
+    arrival_stamps,
+    births,
+    burst_reports,
+    bursts,
+    clutter,
+    depth,
+    links,
+    offsets,
+    polling,
+)
 from .config import DiverConfig
 from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
-from .scales import estimated_scales, weight_without_small_scales
+from .scales import delay_probabilities, estimated_scales, weight_without_small_scales
+
+SURELY_LATE = 0.95
+"""Probability of a delay of a sensor that triggers a warning."""
 
 
 def estimate_of(
@@ -114,7 +127,7 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
     rows, T = known.rows, len(known)
-    out['covariance_scale'] = estimated_scales(rows)
+    out['covariance_scale'] = estimated_scales(rows, known.memory['reporting'])
     off = rows.key['offset'] >= 0
     weight = np.where(off, rows.weight, 0.0)
     out['burst'] = rows.total(weight, T)
@@ -138,8 +151,8 @@ def health(known: Known, waiting: int) -> dict[str, float]:
         'broken_tracks': known.counts.get('broken', 0),
         'covariance_repairs': known.counts.get('repairs', 0),
         'not_started': known.counts.get('not_started', 0),
-        'fixes_mean_nis': known.memory['fixes'].mean_nis,
-        'fixes_lag_1': known.memory['fixes'].lag_1,
+        'fixes_mean_nis': known.memory['fixes'].together.mean_nis,
+        'fixes_lag_1': known.memory['fixes'].together.lag_1,
         'arrivals_mean_nis': known.memory['arrivals'].mean,
         'waiting_for_vessel': waiting,
     }
@@ -155,20 +168,46 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     if unset:
         advice += ', or set instrument errors: ' + ', '.join(unset)
     assumed = []
-    if known.memory['fixes'].assumed and not known.memory['fixes'].stated:
+    if known.memory['fixes'].assumed:
         assumed = [
             f'no message states a covariance: fix_std {config.fix_std:g} m is assumed, and no '
             'ellipse is better than that. Set fix_std'
         ]
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
-    exceeds = memory['excess'] >= ENOUGH
+    exceeds, largest = memory['excess'] >= ENOUGH, max(config.covariance_scales)
+    starving = polling.warnings(memory['single'], config)
+    # Of tracks that starve, nothing else is told by the fixes.
+    fixes = (
+        []
+        if starving
+        else memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
+    )
+    no_track = [] if starving else clutter.warnings(memory['clutter'], config, tracked)
     return [
-        *(assumed if config.has_usual_fix_std else []),
-        *memory['fixes'].warnings(config.fix_bias_std > 0.0, max(config.covariance_scales)),
+        *starving,
+        *(assumed if config.has_usual_fix_std and not starving else []),
+        *fixes,
+        *late_warnings(known),
         *burst_reports.warnings(known, config),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
+        *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
-        *clutter.warnings(memory['clutter'], config, tracked),
+        *no_track,
     ]
+
+
+def late_warnings(known: Known) -> list[str]:
+    """Return a warning for each sensor whose stamps are late."""
+    found, firm = [], known.life.status != TENTATIVE
+    for number, name in enumerate(known.memory['sensors'].names):
+        delay, weight = delay_probabilities(known.rows, number)
+        if not (firm & (weight > SURELY_LATE)).any():
+            continue
+        track = int(np.where(firm, weight, 0.0).argmax())
+        found.append(
+            f'the stamps of sensor {name or "without a name"} are {delay[track]:.2g} s late '
+            f'({weight[track]:.2g}): the estimate corrects them'
+        )
+    return found

@@ -69,12 +69,13 @@ from .scales import (
     weight_without_small_scales,
 )
 from .scan import Group
+from .sensors import MOST_SENSORS
 
 FEATURES = {
     'nis': Feature(math.nan),
     'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (2,)),
+    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
     'reported': Feature(math.nan, (3,)),
@@ -83,7 +84,7 @@ FEATURES = {
 
 score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
-white: whitened innovation of the last fix.
+white: whitened innovation of the last fix of each sensor.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
@@ -115,8 +116,8 @@ def compare(
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
     :param openers: (T,) see `ways.add_ways`.
     """
-    among = Assumptions.from_rows(known.rows, known.borrowed)
-    expected = _predict_fixes(known, group, models)
+    among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
+    expected = _predict_fixes(known, group, models, among)
     by_nis = models.families is None
     each = [
         _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
@@ -142,18 +143,23 @@ def compare(
 
 
 def _predict_fixes(
-    known: Known, group: Group, models: ModelSet
+    known: Known, group: Group, models: ModelSet, among: Assumptions
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return `Pairs.expected`."""
-    rows = known.rows
-    factor = ways.offset_factor(rows, known.memory['sensors'].number(group.sensor))
-    if factor is None:
-        return [bank.predict_fix(b, p.measured) for b, p in zip(rows.blocks, models.parts)]
-    both = [
-        [bank.predict_fix(b, p.measured, each) for each in (factor, np.zeros(len(rows)))]
-        for b, p in zip(rows.blocks, models.parts)
-    ]
-    return [(np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])) for a, b in both]
+    rows, delay, parts = known.rows, among.delay, models.parts
+    every = np.arange(len(rows))
+    factor = ways.offset_factor(rows, group.number)
+    wanted = np.concatenate([every, among.lent])
+    if factor is not None:
+        factor = np.concatenate([factor, np.zeros(len(wanted))])
+        wanted, delay = np.concatenate([wanted, every]), np.concatenate([delay, delay[every]])
+    blocks = rows.blocks
+    if len(wanted) > len(rows) or delay.any():
+        blocks = tuple(
+            bank.move_along(block.select(wanted), part.outputs[2:4], -delay)
+            for block, part in zip(blocks, parts)
+        )
+    return [bank.predict_fix(b, part.measured, factor) for b, part in zip(blocks, parts)]
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -183,7 +189,7 @@ def _compare_part(
     :param min_probability: of a model whose NIS counts; None if no NIS is needed.
     """
     rows, z, R = known.rows, group.z, group.R
-    among = Assumptions._make(column[part] for column in among)
+    among = among.select(part)
     track = among.target - (among.target[0] if len(among.target) else 0)
     off = _box_distance(expected, among, z, R)
     if len(z) > 1 and group.target_id is None:
@@ -212,9 +218,12 @@ def _compare_part(
     return assumption + part.start, fix, log, whole, nis
 
 
-def track_log_density(rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet) -> float:
-    """Return the log density of a fix z (2,), R (2, 2) under the rows of one track."""
-    every, scale = np.arange(len(rows)), rows.key['scale']
+def track_log_density(
+    rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet, sensor: int
+) -> float:
+    """Return the log density of a fix z (2,), R (2, 2) of a sensor under the rows of one new
+    track."""
+    every, scale = np.arange(len(rows)), rows.key['scale'][:, sensor]
     many = np.tile(z, (len(rows), 1)), R * scale[:, None, None]
     compared = [
         bank.weigh(block, every, *many, part.measured)
@@ -325,9 +334,10 @@ def update_tracks(
     whole = logs[of[assumption], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
     factor: FloatArray = np.add(missed[of], gain)
+    weighed = np.asarray(association.beta.any(axis=1))
     if rejected is not None:
         factor *= _rejected_factor(pairs, *rejected)
-    sensor = known.memory['sensors'].number(group.sensor)
+        weighed = weighed | (rejected[1] > 0.0)
     of_row = np.empty(len(known.rows), np.int64)
     of_row[among.row[among.has_row]] = of[among.has_row]
     rows, borrowed, of_ways = _update_weights(known, pairs, factor, beta, logs, of_row)
@@ -353,23 +363,25 @@ def update_tracks(
     row, weight, whole = row[own], weight[own, None], whole[own, None]
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
-    blocks, factors = [], []
-    offset = ways.offset_factor(rows, sensor)
+    blocks, factors, late = [], [], rows.key['delay'][:, group.number]
+    offset = ways.offset_factor(rows, group.number)
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
         innovations = bank.compare(*expected, among.seen[assumption], z, R)
         ratio, none = weight * np.exp(innovations.log - whole), missed[of_row[left]]
+        block = bank.move_along(block, part.outputs[2:4], -late)
         mask = bursts.with_tail_mask(mask, rows.tail)
         block, of_models = bank.update(
             block, innovations, row, ratio, none, part.measured, mask, offset
         )
-        blocks.append(block)
+        blocks.append(bank.move_along(block, part.outputs[2:4], late))
         factors.append(of_models)
     sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
-    rows, borrowed = restore_rows(rows, borrowed, can_restore(rows, borrowed), bursts.ENDED)
+    again = can_restore(rows, borrowed) & weighed[borrowed.target]
+    rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED)
     took = association.beta.sum(axis=1) > 0.5 * exists
-    rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
+    rows = bursts.count_fixes(rows, group.number, took[rows.target], known.stamp_ns)
     if began is not None or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
@@ -470,8 +482,13 @@ def _record_innovations(
 ) -> Known:
     """Store the whitened innovations of associated fixes, and update the covariance checks."""
     if len(group.z):
-        covariances = group.is_stated, group.config.has_usual_fix_std
-        known = known.with_memory(fixes=known.memory['fixes'].with_covariances(*covariances))
+        known = _with_consistency(
+            known,
+            group,
+            known.memory['fixes']
+            .of(group.number)
+            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
+        )
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
@@ -480,25 +497,35 @@ def _record_innovations(
     seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
     mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
     scale = (
-        estimated_scales(known.rows)[tracks] if len(models.scales) > 1 else np.ones(len(tracks))
+        estimated_scales(known.rows, group.number)[tracks]
+        if len(models.scales) > 1
+        else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
     tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes']
+    before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
         covariance[tracks],
         group.z[fix],
         R,
-        known['white'][tracks],
+        known['white'][tracks, group.number],
         tentative,
         before,
     )
     after = after.with_scale(scale, tentative)
     columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
-    columns['white'][tracks] = white
+    columns['white'][tracks, group.number] = white
     columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
     columns['nis'][tracks] += np.square(white).sum(axis=1)
     columns['nis_dof'][tracks] += np.uint16(2)
     # With fixes, no instrument errors are assumed.
-    return known.with_columns(**columns).with_memory(fixes=after, recent=RecentPairs())
+    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
+        recent=RecentPairs()
+    )
+
+
+def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
+    """Return the state with the consistency of the sensor of a group."""
+    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
+    return known.with_memory(fixes=fixes)

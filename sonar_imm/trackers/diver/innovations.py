@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -142,53 +143,103 @@ class FixConsistency(NamedTuple):
         small = self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED
         return small and self.mean_nis <= OPTIMISTIC
 
-    def warnings(self, bias_stated: bool, largest: float) -> list[str]:
+    def warnings(self, bias_stated: bool, largest: float = MOST, sensor: str = '') -> list[str]:
         """Return warnings about wrong covariances: for families when the evidence suffices,
         otherwise after `MEMORY` fixes.
 
         :param bias_stated: whether `fix_bias_std` is set.
         :param largest: largest scale of `covariance_scales`.
+        :param sensor: name of one of several sensors.
         """
+        whose = f' of sensor {sensor}' if sensor else ''
         if self.are_too_small:
-            return [self._too_small(largest)]
+            return [self._too_small(largest, whose)]
         if self.number < 0.99 * MEMORY:
             return []
         if self.mean_nis > OPTIMISTIC:
             return [
-                f'fix innovations are too large: NIS {self.mean_nis:.2g} per coordinate '
+                f'fix innovations{whose} are too large: NIS {self.mean_nis:.2g} per coordinate '
                 '(expected 1). Increase covariance_scale or the motion noise; model_set families '
                 'estimates the scale'
             ]
         if self.errors_last(bias_stated):
             return [
-                f'fix innovations are too small or correlated: NIS {self.mean_nis:.2g} per '
+                f'fix innovations{whose} are too small or correlated: NIS {self.mean_nis:.2g} per '
                 f'coordinate (expected 1), lag-1 correlation {self.lag_1:.2g} (expected 0). If '
                 'the source filters its output, set fix_bias_std; otherwise its covariances are '
                 'too large. The published covariance includes that of a fix'
             ]
         return []
 
-    def _too_small(self, largest: float) -> str:
+    def _too_small(self, largest: float, whose: str) -> str:
         """Return the warning about covariances that are too small."""
         times = self.scale * max(self.mean_nis, 1.0)
         if self.scale > LAST_SHARE * largest and largest > MOST:
             more = 'a million' if largest == 1e6 else f'{largest:,.6g}'
             return (
-                f'fix covariances too small by a factor of more than {more}: errors are more than '
-                f'{math.sqrt(largest):,.4g} times as large as reported. Check the unit of the '
+                f'fix covariances{whose} too small by a factor of more than {more}: errors are '
+                f'more than {math.sqrt(largest):,.4g} times as large as reported. Check the unit of the '
                 'covariances'
             )
         factor = _rounded(times)
+        action = 'Correct its covariances' if whose else f'Multiply covariance_scale by {factor}'
         return (
-            f'fix covariances too small by a factor {factor}: errors are '
-            f'{_rounded(math.sqrt(times))} times as large as reported. Multiply covariance_scale '
-            f'by {factor}'
+            f'fix covariances{whose} too small by a factor {factor}: errors are '
+            f'{_rounded(math.sqrt(times))} times as large as reported. {action}'
         )
 
 
 def _rounded(value: float) -> str:
     """Return a number >= 1 with two significant digits and without an exponent."""
     return f'{float(f"{value:.2g}"):.12g}'
+
+
+class SensorConsistency(NamedTuple):
+    """Consistency of the fixes of each sensor, by its number."""
+
+    sensors: tuple[FixConsistency, ...] = ()
+
+    def of(self, number: int) -> FixConsistency:
+        """Return the consistency of a sensor."""
+        return self.sensors[number] if number < len(self.sensors) else FixConsistency()
+
+    def with_sensor(self, number: int, consistency: FixConsistency) -> SensorConsistency:
+        """Replace the consistency of a sensor."""
+        found = [self.of(each) for each in range(max(len(self.sensors), number + 1))]
+        found[number] = consistency
+        return SensorConsistency(tuple(found))
+
+    @property
+    def together(self) -> FixConsistency:
+        """The sums over all sensors."""
+        if len(self.sensors) == 1:
+            return self.sensors[0]
+        number, nis, pairs, cross, square = (
+            (float(sum(column)) for column in zip(*(each[:5] for each in self.sensors)))
+            if self.sensors
+            else (0.0,) * 5
+        )
+        return FixConsistency(number, nis, pairs, cross, square)
+
+    @property
+    def assumed(self) -> bool:
+        """True if no fix states a covariance, and `fix_std` of a sensor is not set."""
+        return any(each.assumed for each in self.sensors) and not any(
+            each.stated for each in self.sensors
+        )
+
+    def errors_last(self, bias_stated: bool) -> bool:
+        """Return whether the errors of any sensor may last, see `FixConsistency`."""
+        return any(each.errors_last(bias_stated) for each in self.sensors)
+
+    def warnings(self, bias_stated: bool, largest: float, names: Sequence[str]) -> list[str]:
+        """Return the warnings of all sensors, by name if there are several with fixes."""
+        several = sum(each.number > 0.0 for each in self.sensors) > 1
+        found = []
+        for number, each in enumerate(self.sensors):
+            name = (names[number] or 'without a name') if several else ''
+            found += each.warnings(bias_stated, largest, name)
+        return found
 
 
 def whiten_innovations(

@@ -38,7 +38,7 @@ from ...estimation.covariance import are_sound, with_jitter
 from ...estimation.rows import Borrowed, Rows
 from .models import ModelSet
 
-BORROWING = ('scale',)
+BORROWING = ('scale', 'delay')
 """Assumptions that can borrow (`estimation.rows`)."""
 
 MOST_STEPS = 300
@@ -182,7 +182,7 @@ class Known:
     @property
     def _form(self) -> tuple[object, ...]:
         """Names, types and shapes, except the numbers of tracks, rows and constants."""
-        columns = sorted({**self.features, **self.rows.key}.items())
+        columns = sorted({**self.features, **self.rows.key, **self.borrowed.key}.items())
         return (
             [(name, column.shape[1:], column.dtype) for name, column in columns],
             [(name, type(value)) for name, value in sorted(self.memory.items())],

@@ -62,6 +62,7 @@ from ...estimation.motion import Motion, white_acceleration
 from ...estimation.rows import Rows
 from ..own_models import diver_models
 from .config import DiverConfig
+from .sensors import MOST_SENSORS, of_sensor
 
 __all__ = ['build_models', 'ModelSet', 'Part']
 
@@ -277,9 +278,14 @@ class ModelSet:
             P[..., :2, there] = P[..., there, :2] = -shared
         return x, P, np.broadcast_to(self.initial, shape).copy()
 
-    def make_rows(self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray) -> Rows:
+    def make_rows(
+        self, x: FloatArray, P: FloatArray, mu: FloatArray, logw: FloatArray, sensor: int = 0
+    ) -> Rows:
         """Return the rows of T tracks with K rows each: x (T, K, M, n), P (T, K, M, n, n), mu (T,
-        K, M), logw (T, K)."""
+        K, M), logw (T, K).
+
+        sensor: number of the sensor that started the tracks.
+        """
         T, K, M, size = x.shape
         scale = np.resize(np.array(self.row_scales), K)
         start = np.resize(np.arange(len(self.starts)), K)
@@ -290,7 +296,8 @@ class ModelSet:
             np.repeat(np.arange(T), K),
             np.full(T * K, -1),
             {
-                'scale': np.tile(scale, T),
+                'scale': of_sensor(np.tile(scale, T), sensor),
+                'delay': np.zeros((T * K, MOST_SENSORS)),
                 'start': np.tile(start, T),
                 **{name: np.full(T * K, value) for name, value in NO_OFFSET.items()},
             },

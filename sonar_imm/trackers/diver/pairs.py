@@ -22,43 +22,69 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, Rows
+from .sensors import scale_of
 
 
 class Assumptions(NamedTuple):
-    """All A assumptions of T tracks, in order of the tracks."""
+    """All A assumptions of T tracks about one sensor, in order of the tracks."""
 
     row: IndexArray
     """(A,) row whose states are used."""
     seen: IndexArray
-    """(A,) index of its prediction in `Pairs.expected`."""
+    """(A,) index of the prediction in `Pairs.expected`."""
     scale: FloatArray
-    """(A,) scale of the covariances."""
+    """(A,) scale of the covariances of the sensor."""
     logw: FloatArray
     """(A,) logarithm of the weight."""
     target: IntArray
     """(A,) track index."""
     has_row: BoolArray
     """(A,) True for assumptions with a row of their own, False for borrowed ones."""
+    lent: IndexArray
+    """(L,) row of each prediction beyond those of the rows, see `seen`."""
+    delay: FloatArray
+    """(N + L,) delay of the stamps of the sensor in each prediction, s."""
 
     @classmethod
-    def from_rows(cls, rows: Rows, borrowed: Borrowed) -> Assumptions:
-        """Return the assumptions of rows and of the borrowed list."""
-        N, scale = len(rows), rows.key['scale']
+    def from_rows(cls, rows: Rows, borrowed: Borrowed, sensor: int) -> Assumptions:
+        """Return the assumptions of rows and of the borrowed list about a sensor."""
+        N, scale, delay = len(rows), scale_of(rows.key, sensor), rows.key['delay'][:, sensor]
+        every, none = np.arange(N), np.empty(0, np.intp)
         if not len(borrowed):
-            every = np.arange(N)
-            return cls(every, every, scale, rows.logw, rows.target, np.ones(N, np.bool_))
+            has_row = np.ones(N, np.bool_)
+            return cls(every, every, scale, rows.logw, rows.target, has_row, none, delay)
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
-        lender = borrowed.find_lenders(rows)
-        # A borrowed scale has no offset.
-        nil = N if rows.tail else 0
+        lender, its = borrowed.find_lenders(rows), borrowed.key['delay'][:, sensor]
+        # A borrowed assumption has no offset.
+        unlike = (its != delay[lender]) | (rows.key['offset'][lender] == sensor)
+        seen, other = lender.copy(), np.flatnonzero(unlike)
+        lent, late = lender[other], its[other]
+        if len(other):
+            # One prediction for each row and delay.
+            pairs, place = np.unique(np.column_stack([lent, late]), axis=0, return_inverse=True)
+            seen[other] = N + place.ravel()
+            lent, late = pairs[:, 0].astype(np.intp), pairs[:, 1]
         return cls(
-            np.concatenate([np.arange(N), lender])[order],
-            np.concatenate([np.arange(N), lender + nil])[order],
-            np.concatenate([scale, borrowed.key['scale']])[order],
+            np.concatenate([every, lender])[order],
+            np.concatenate([every, seen])[order],
+            np.concatenate([scale, scale_of(borrowed.key, sensor)])[order],
             np.concatenate([rows.logw, borrowed.logw])[order],
             target[order],
             order < N,
+            lent,
+            np.concatenate([delay, late]),
+        )
+
+    def select(self, part: slice) -> Assumptions:
+        """Return a part of the assumptions; the predictions stay."""
+        return self._replace(
+            row=self.row[part],
+            seen=self.seen[part],
+            scale=self.scale[part],
+            logw=self.logw[part],
+            target=self.target[part],
+            has_row=self.has_row[part],
         )
 
 
@@ -108,8 +134,9 @@ class Pairs(NamedTuple):
     fix: IndexArray
     """(p,) index of the fix."""
     expected: list[tuple[FloatArray, FloatArray]]
-    """Prediction of a fix by each row, for each block of models: see `bank.predict_fix`. Where
-    rows have offsets, N predictions with the offset precede N predictions without."""
+    """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows, then
+    of the L rows of `Assumptions.lent` with another delay or without the offset, then, if rows
+    have offsets, of the N rows without them."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray

@@ -169,11 +169,12 @@ def restarted_track(
     x, P, mu = models.initial_states(np.array([[px, py]]), np.array([[[xx, xy], [xy, yy]]]))
     with_velocities_at_fix(P, models, group.config)
     x, P = layout.with_new_constants(x, P)
-    rows = models.make_rows(x, P, mu, np.full(x.shape[:2], -math.log(x.shape[1])))
+    logw = np.full(x.shape[:2], -math.log(x.shape[1]))
+    rows = models.make_rows(x, P, mu, logw, group.number)
     dt = max((known.stamp_ns - stamp) * 1e-9, 0.0)
     learnt = known['learnt'][track : track + 1]
     rows = predict_over(models, chain, rows, learnt, dt, group.config.longest_step)[-1].rows
-    whole = fixes.track_log_density(rows, z, R, models)
+    whole = fixes.track_log_density(rows, z, R, models, group.number)
     if whole <= fixes.gate_log_density(group)[row]:
         return None
     if group.target_id is None and group.config.max_tracks > 1:

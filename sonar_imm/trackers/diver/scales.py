@@ -12,11 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Covariance scales: assumptions about how wrong reported covariances are.
+"""Covariance scales and delays: assumptions about how wrong reported covariances and stamps are.
 
-Each scale of `covariance_scales` is one assumption of a track. Scales do not interact; the
-likelihoods of fixes weight them, and at each scan a small fraction of the weight is redistributed
-by the priors. Only probable scales have a row. The others borrow (`estimation.rows`).
+Each sensor has its scale of `covariance_scales`, and at most one sensor a delay of
+`sensor_delays`. Assumptions do not interact; the likelihoods of fixes weight them, and at each
+scan a small fraction of the weight is redistributed by the priors. Only probable assumptions have
+a row. Their neighbours, which differ in the sensor that reports, borrow (`estimation.rows`).
+
+`Rows.key` has a column for each sensor (`sensors`): `scale`, 0 where the track did not hear it,
+and `delay`, s.
 
 Scales below 1 contribute to the mean of a track, but not to its covariance: errors of a source
 that filters its output look like covariances that are reported too large.
@@ -26,15 +30,17 @@ Source: docs/diver.md, 'Scaled filters'.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from attrs import evolve
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
-from .known import Known
-from .models import USUAL_SCALES
+from .known import Known, track_positions
+from .models import ModelSet, USUAL_SCALES
+from .scan import Group
+from .sensors import scale_of
 
 REDISTRIBUTED_FRACTION = 5e-4
 """Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
@@ -43,6 +49,18 @@ quality is detected."""
 MIN_PUBLISHED_SCALE = 1.0
 """Smallest scale whose rows contribute to the published covariance. Smaller scales also fit
 time-correlated errors, so they contribute to the mean only."""
+
+NEAR_WEIGHT = np.exp(-3.0)
+"""Weight, relative to the heaviest, above which an assumption gets neighbours."""
+
+MOST_BORROWED = 64
+"""Maximum number of assumptions without a row, of one track."""
+
+FARTHEST_HEARD = 400.0
+"""Squared distance of a fix, relative to the variances, within which a track hears its sensor."""
+
+DELAYED = 1e-3
+"""Prior of any delay of a sensor."""
 
 RARE = 1e-3
 """Prior of the first scale beyond `USUAL_SCALES`, relative to the priors of those. Beyond, the
@@ -55,62 +73,207 @@ def scale_priors(scale: FloatArray) -> FloatArray:
     return np.where(scale <= most, 1.0, RARE * most / scale)
 
 
-def redistribute_weights(known: Known, scales: Sequence[float]) -> Known:
-    """Redistribute a small fraction of the scale weights by the priors.
+class _Entries:
+    """Rows and borrowed assumptions of all targets as one list, for one assumption of a sensor."""
+
+    def __init__(self, rows: Rows, borrowed: Borrowed, name: str, sensor: int):
+        self.target = np.concatenate([rows.target, borrowed.target])
+        self.weight = np.exp(np.concatenate([rows.logw, borrowed.logw]))
+        self.key = {
+            each: np.concatenate([rows.key[each], column]) for each, column in borrowed.key.items()
+        }
+        self.value = self.key[name][:, sensor]
+        self.heard = self.key['scale'][:, sensor] > 0.0
+        """(E,) whether the track heard the sensor."""
+        several = (self.key['scale'] > 0.0).sum(axis=1) > self.heard
+        self.has_others = several
+        """(E,) whether the track heard other sensors."""
+        offsets = [
+            np.concatenate([rows.key[each], np.zeros(len(borrowed), rows.key[each].dtype)])
+            for each in ('since', 'aside')
+        ]
+        self.strange = (offsets[0] != 0) | (offsets[1] != 0)
+        """(E,) whether a row has an offset, or its last fix was an outlier (`bursts`)."""
+        self.context = self.target
+        """(E,) number of the target and of all assumptions except `name` of the sensor."""
+        if several.any() or self.strange.any():
+            parts = [self.target[:, None], *(each[:, None] for each in offsets)]
+            for each, table in self.key.items():
+                parts.append(np.delete(table, sensor, axis=1) if each == name else table)
+            whole = np.concatenate(parts, axis=1)
+            self.context = np.unique(whole, axis=0, return_inverse=True)[1].ravel()
+
+    def lacking(
+        self,
+        name: str,
+        sensor: int,
+        values: FloatArray,
+        prior: FloatArray,
+        can: BoolArray,
+        new: BoolArray,
+    ) -> Borrowed:
+        """Return the `values` (k,) that contexts of sufficient weight lack.
+
+        A `new` context gets them at their priors, another one at the redistributed fraction.
+
+        :param can: (E,) True for entries whose value can be another one.
+        :param new: (T,) True for targets that have only usual values.
+        """
+        weight = np.bincount(self.context, self.weight)
+        first = np.unique(self.context, return_index=True)[1]
+        target = self.target[first]
+        best = np.zeros(int(target.max()) + 1)
+        np.maximum.at(best, target, weight)
+        there = np.zeros((len(weight), len(values)), np.bool_)
+        place = np.abs(self.value[:, None] - values).argmin(axis=1)
+        there[self.context[can], place[can]] = True
+        fresh = new[target]
+        possible = there.any(axis=1) & (fresh | (weight >= NEAR_WEIGHT * best[target]))
+        share = prior / np.where(there, prior, 0.0).sum(axis=1, keepdims=True).clip(1e-300)
+        fraction = np.where(fresh, 1.0, REDISTRIBUTED_FRACTION)
+        own, missing = np.nonzero(~there & possible[:, None])
+        key = {each: table[first[own]] for each, table in self.key.items()}
+        key[name][:, sensor] = values[missing]
+        logw = np.log(share[own, missing] * fraction[own] * weight[own])
+        return Borrowed(target[own], key, logw)
+
+    def redistributed(self, prior: FloatArray, half: IndexArray) -> FloatArray:
+        """Return the logarithms (E,) of the weights, of which a small fraction is redistributed
+        inside each context: by `prior` (E,) inside each `half` (E,) 0 or 1, and between them."""
+        group = 2 * self.context + half
+        size = 2 * (int(self.context.max(initial=-1)) + 1)
+        total, share = (np.bincount(group, x, minlength=size) for x in (self.weight, prior))
+        whole = total.reshape(-1, 2).sum(axis=1)[self.context]
+        groups = (share.reshape(-1, 2) > 0).sum(axis=1)[self.context]
+        after = (1.0 - REDISTRIBUTED_FRACTION) * total[group]
+        after += REDISTRIBUTED_FRACTION * whole / groups
+        kept = (1.0 - REDISTRIBUTED_FRACTION) * self.weight / total[group]
+        return np.log(after * (kept + REDISTRIBUTED_FRACTION * prior / share[group]))
+
+
+def redistribute_weights(
+    known: Known, scales: Sequence[float], delays: Sequence[float] = (), sensor: int = 0
+) -> Known:
+    """Redistribute a small fraction of the weights of the scales and delays of a sensor by the
+    priors. Other assumptions of a row stay.
 
     The fraction is spread over the scales from 1, over the smaller scales, and over these two
-    groups. So the relative weights of the scales from 1 do not depend on the smaller scales. New
-    tracks get the `scales` without a row.
+    groups. So the relative weights of the scales from 1 do not depend on the smaller scales.
+    Contexts of sufficient weight get the `scales` that they lack, and the `delays` if the track
+    has several sensors.
     """
-    rows, borrowed = known.rows, _with_all_scales(known, np.array(scales))
-    target = np.concatenate([rows.target, borrowed.target])
-    scale = np.concatenate([rows.key['scale'], borrowed.key['scale']])
-    weight, prior = np.exp(np.concatenate([rows.logw, borrowed.logw])), scale_priors(scale)
-    assumed, share = _same_offsets(rows, borrowed, target, weight)
-    group = 2 * assumed + (scale >= MIN_PUBLISHED_SCALE)
-    count = 2 * (int(assumed.max(initial=-1)) + 1)
-    total, whole = (np.bincount(group, each, minlength=count) for each in (weight, prior))
-    groups = (whole.reshape(-1, 2) > 0).sum(axis=1)[assumed]
-    after = (1.0 - REDISTRIBUTED_FRACTION) * total[group] + share * REDISTRIBUTED_FRACTION / groups
-    kept = (1.0 - REDISTRIBUTED_FRACTION) * weight / total[group]
-    logw = np.log(after * (kept + REDISTRIBUTED_FRACTION * prior / whole[group]))
+    ladder = np.array(scales)
+    new = np.bincount(known.borrowed.target, minlength=len(known)) == 0
+    known = _redistribute(known, 'scale', sensor, ladder, scale_priors(ladder), new)
+    if not delays:
+        return known
+    several = (known.rows.key['scale'] > 0.0).sum(axis=1) > 1
+    if not several.any():
+        return known
+    ladder = np.array([0.0, *delays])
+    prior = np.array([1.0 - DELAYED, *np.full(len(delays), DELAYED / len(delays))])
+    late = np.zeros(len(known), np.bool_)
+    for table in (known.rows, known.borrowed):
+        late[table.target[table.key['delay'][:, sensor] > 0.0]] = True
+    return _redistribute(known, 'delay', sensor, ladder, prior, ~late)
+
+
+def _redistribute(
+    known: Known,
+    name: str,
+    sensor: int,
+    values: FloatArray,
+    prior: FloatArray,
+    new: BoolArray,
+) -> Known:
+    """Redistribute the weights of one assumption; arguments as in `_Entries.lacking`."""
+    rows, borrowed = known.rows, known.borrowed
+    entries = _Entries(rows, borrowed, name, sensor)
+    can = entries.heard & ~entries.strange
+    if name == 'delay':
+        others = np.delete(entries.key['delay'], sensor, axis=1)
+        can = can & entries.has_others & ~others.any(axis=1)
+    lacking = entries.lacking(name, sensor, values, prior, can, new)
+    if len(lacking):
+        borrowed = borrowed.append(lacking)
+        entries = _Entries(rows, borrowed, name, sensor)
+    value, half = entries.value, np.zeros(len(entries.value), np.int64)
+    if name == 'scale':
+        half = (value >= MIN_PUBLISHED_SCALE).astype(np.int64)
+    own = np.abs(value[:, None] - values).argmin(axis=1)
+    logw = entries.redistributed(prior[own], half)
     N = len(rows)
     return known.replace(
-        rows=rows.replace(logw=logw[:N]), borrowed=evolve(borrowed, logw=logw[N:])
+        rows=rows.replace(logw=logw[:N]),
+        borrowed=_without_least(evolve(borrowed, logw=logw[N:])),
     )
 
 
-def _same_offsets(
-    rows: Rows, borrowed: Borrowed, target: IntArray, weight: FloatArray
-) -> tuple[IntArray, FloatArray | float]:
-    """Return the number of the offset of each assumption, and the weight of all its assumptions.
-
-    Weight is redistributed among the same offsets only. Borrowed scales have none.
-    """
-    if not rows.tail and not rows.key['aside'].any():
-        return target, 1.0
-    since, aside = (
-        np.concatenate([rows.key[name], np.zeros(len(borrowed), rows.key[name].dtype)])
-        for name in ('since', 'aside')
-    )
-    table = np.stack([target, since, aside], axis=1)
-    place = np.unique(table, axis=0, return_inverse=True)[1].ravel()
-    return place, np.bincount(place, weight)[place].astype(np.float64)
-
-
-def _with_all_scales(known: Known, scales: FloatArray) -> Borrowed:
-    """Return the borrowed list with the scales that tracks lack, at their priors."""
-    rows, borrowed = known.rows, known.borrowed
-    if len(rows) + len(borrowed) == len(known) * len(scales):
+def _without_least(borrowed: Borrowed) -> Borrowed:
+    """Return the list without the least assumptions of targets that have more than
+    `MOST_BORROWED`."""
+    if np.bincount(borrowed.target, minlength=1).max() <= MOST_BORROWED:
         return borrowed
-    there = np.zeros((len(known), len(scales)), np.bool_)
-    for each in (rows, borrowed):
-        there[each.target, np.abs(each.key['scale'][:, None] - scales).argmin(axis=1)] = True
-    prior = scale_priors(scales)
-    share = prior / np.where(there, prior, 0.0).sum(axis=1, keepdims=True)
-    target, missing = np.nonzero(~there)
-    logw = np.log(share[target, missing])
-    return borrowed.append(Borrowed(target, {'scale': scales[missing]}, logw))
+    order = np.lexsort([-borrowed.logw, borrowed.target])
+    target = borrowed.target[order]
+    rank = np.arange(len(order)) - np.searchsorted(target, target)
+    return borrowed.select(np.sort(order[rank < MOST_BORROWED]))
+
+
+def hearing_stage(models: ModelSet) -> Callable[[Known, Group], Known]:
+    """Return the stage by which tracks near a fix hear its sensor."""
+
+    def hear(known: Known, group: Group) -> Known:
+        if known.memory['reporting'] != group.number:
+            known = known.with_memory(reporting=group.number)
+        if (known.rows.key['scale'][:, group.number] > 0.0).all() or not len(group.z):
+            return known
+        if group.target_id is not None:
+            near = np.isin(known['target_id'], group.target_id)
+        elif len(group.z) == 1:
+            near = np.ones(len(known), np.bool_)
+        else:
+            mean, P = track_positions(known, models)
+            reach = P.trace(axis1=1, axis2=2)[:, None] + group.R.trace(axis1=1, axis2=2)
+            apart = np.square(mean[:, None] - group.z).sum(axis=2)
+            near = (apart < FARTHEST_HEARD * reach).any(axis=1)
+        return hear_sensor(known, near, models.scales, group.number)
+
+    return hear
+
+
+def hear_sensor(known: Known, heard: BoolArray, scales: Sequence[float], sensor: int) -> Known:
+    """Return the state in which the tracks `heard` (T,) know a sensor.
+
+    A row that does not know it is split: it continues with scale 1, and the other scales borrow.
+    """
+    rows, borrowed, ladder = known.rows, known.borrowed, np.array(scales)
+    ours, theirs = (
+        heard[table.target] & (table.key['scale'][:, sensor] == 0.0) for table in (rows, borrowed)
+    )
+    if not ours.any():
+        return known
+    usual = int(np.abs(np.log(ladder)).argmin())
+    others = np.delete(np.arange(len(ladder)), usual)
+    share = np.log(scale_priors(ladder) / scale_priors(ladder).sum())
+    best = np.maximum.reduceat(rows.logw, rows.first)[rows.target]
+    plain = (rows.key['offset'] < 0) & ~rows.key['aside']
+    split = np.flatnonzero(ours & plain & (rows.logw >= best + np.log(NEAR_WEIGHT)))
+    own, k = np.repeat(split, len(others)), np.tile(others, len(split))
+    new = Borrowed.from_rows(rows.select(own), borrowed.key)
+    new.key['scale'][:, sensor] = ladder[k]
+    new = evolve(new, logw=rows.logw[own] + share[k])
+    logw = rows.logw.copy()
+    logw[split] += share[usual]
+    tables = []
+    for table, chosen in ((rows, ours), (borrowed, theirs)):
+        scale = table.key['scale'].copy()
+        scale[chosen, sensor] = ladder[usual]
+        tables.append({**table.key, 'scale': scale})
+    return known.replace(
+        rows=rows.replace(logw=logw, key=tables[0]),
+        borrowed=_without_least(evolve(borrowed, key=tables[1]).append(new)),
+    )
 
 
 def protected_rows(rows: Rows) -> BoolArray:
@@ -119,7 +282,7 @@ def protected_rows(rows: Rows) -> BoolArray:
     These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
     scales of at least `MIN_PUBLISHED_SCALE`.
     """
-    first, scale = rows.first, rows.key['scale']
+    first, scale = rows.first, least_scale(rows.key)
     # A start depth is a state: all rows of such a track are kept, also the first.
     protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
     protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
@@ -133,24 +296,54 @@ def can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
 
     For scales of at least `MIN_PUBLISHED_SCALE`, the weight among these scales is sufficient.
     """
-    is_published = rows.key['scale'] >= MIN_PUBLISHED_SCALE
+    is_published = least_scale(rows.key) >= MIN_PUBLISHED_SCALE
     total = np.add.reduceat(np.where(is_published, np.exp(rows.logw), 0.0), rows.first)
     total = total[borrowed.target]
-    is_published = borrowed.key['scale'] >= MIN_PUBLISHED_SCALE
+    is_published = least_scale(borrowed.key) >= MIN_PUBLISHED_SCALE
     least = np.where(is_published & (total > 0.0), total, 1.0) * ROW_AGAIN
     return np.asarray(np.exp(borrowed.logw) > least)
 
 
 def weight_without_small_scales(rows: Rows) -> FloatArray:
     """Return row weights (N,) normalised over scales of at least `MIN_PUBLISHED_SCALE`."""
-    return rows.weights_among(rows.key['scale'] >= MIN_PUBLISHED_SCALE)
+    return rows.weights_among(least_scale(rows.key) >= MIN_PUBLISHED_SCALE)
 
 
-def estimated_scales(rows: Rows) -> FloatArray:
-    """Return the estimated covariance scale (T,) of each track, from scales of at least
-    `MIN_PUBLISHED_SCALE`."""
+def usual_assumptions(
+    rows: Rows, borrowed: Borrowed, usual: Sequence[float], sensor: int
+) -> BoolArray:
+    """Return which assumptions (B,) have a usual scale of a sensor, and otherwise those of their
+    lender."""
+    same, lender = np.ones(len(borrowed), np.bool_), borrowed.find_lenders(rows)
+    for name, table in borrowed.key.items():
+        differs = table != rows.key[name][lender]
+        if name == 'scale':
+            differs[:, sensor] = ~np.isin(table[:, sensor], usual)
+        same &= ~differs.any(axis=1)
+    return same
+
+
+def least_scale(key: dict[str, np.ndarray]) -> FloatArray:
+    """Return the least scale (k,) of any sensor that the track heard."""
+    scale = key['scale']
+    return np.asarray(np.where(scale > 0.0, scale, np.inf).min(axis=1))
+
+
+def estimated_scales(rows: Rows, sensor: int) -> FloatArray:
+    """Return the estimated covariance scale (T,) of a sensor, from rows with scales of at least
+    `MIN_PUBLISHED_SCALE`; 1 for tracks that did not hear it."""
     if not len(rows):
         return np.empty(0)
-    return np.asarray(
-        np.add.reduceat(weight_without_small_scales(rows) * rows.key['scale'], rows.first)
-    )
+    weight = weight_without_small_scales(rows) * scale_of(rows.key, sensor)
+    return np.asarray(np.add.reduceat(weight, rows.first))
+
+
+def delay_probabilities(rows: Rows, sensor: int) -> tuple[FloatArray, FloatArray]:
+    """Return the mean delay (T,) of a sensor over the rows with a delay, s, and their weight
+    (T,)."""
+    delay = rows.key['delay'][:, sensor]
+    if not len(rows):
+        return delay, delay
+    late = np.where(delay > 0.0, rows.weight, 0.0)
+    total = np.add.reduceat(late, rows.first)
+    return np.add.reduceat(late * delay, rows.first) / np.maximum(total, 1e-300), total

@@ -40,6 +40,7 @@ from .instruments import Layout
 from .known import Known, Prediction
 from .models import ModelSet
 from .pairs import Association, Pairs
+from .sensors import Sensors
 
 LEAST_VAR_TOA = 1e-13
 """Minimum variance of an arrival time, s^2: 0.5 mm of path. Below it, the joint covariance with a
@@ -124,6 +125,8 @@ class Birth(NamedTuple):
     """The z of the fix; None if the fix has no z."""
     seen_by: tuple[str, FloatArray] | None = None
     """Name and position (2,) of a sensor with a bearing error; None for others."""
+    number: int = 0
+    """Number of the sensor (`sensors`)."""
     mark: int = 0
     """Number of the fix of the birth, for links to its track (`bursts`); 0 for none."""
 
@@ -140,8 +143,9 @@ before a later one."""
 class Group:
     """D fixes of one stamp and sensor, with at most one per target.
 
-    Later stages use the slots `learnt_clutter` and `elapsed` (`clutter`), `detection`
-    (`coverage`), `pairs` and `association` (`fixes`), and `births`. One stage writes each slot.
+    The tracker sets `number`. Later stages use the slots `learnt_clutter` and `elapsed`
+    (`clutter`), `detection` (`coverage`), `pairs` and `association` (`fixes`), and `births`. One
+    stage writes each slot.
     """
 
     z: FloatArray
@@ -166,6 +170,8 @@ class Group:
     """(D,) estimated clutter density at each fix, 1/m^2; None if none is estimated."""
     elapsed: float = field(default=FIRST_LOOK, init=False)
     """Time since the scan before of this sensor, s."""
+    number: int = field(default=0, init=False)
+    """Number of the sensor (`sensors`)."""
     detection: DetectionProbability | None = field(default=None, init=False)
     pairs: Pairs | None = field(default=None, init=False)
     association: Association | None = field(default=None, init=False)
@@ -220,12 +226,26 @@ class Scan:
     """Target IDs of fixes and pings."""
     complete: bool
     """True if a track without a measurement was missed."""
+    numbers: set[int] = field(factory=set, init=False)
+    """Numbers of the sensors."""
     previous: Known = field(init=False)
     """State before the scan."""
     prediction: Prediction = field(init=False)
     """Prediction to the scan."""
     births: list[Birth] = field(factory=list, init=False)
     """Births from pings."""
+
+    def number_sensors(self, known: Sensors) -> Sensors:
+        """Number the sensors of the scan; arrivals are of the sensor without a name.
+
+        Return all sensors.
+        """
+        for name in [group.sensor for group in self.fixes] + [''] * bool(self.pings):
+            known = known.with_sensor(name)
+            self.numbers.add(known.number(name))
+        for group in self.fixes:
+            group.number = known.number(group.sensor)
+        return known
 
     @classmethod
     def from_items(cls, items: Sequence[Measurement], config: DiverConfig) -> Scan:

@@ -19,6 +19,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
+from ...estimation.arrays import FloatArray
+
 MOST_SENSORS = 20
 """Maximum number of numbered sensors; all later ones share the last number."""
 
@@ -37,3 +41,17 @@ class Sensors(NamedTuple):
     def number(self, name: str) -> int:
         """Return the number of a sensor that was heard."""
         return self.names.index(name) if name in self.names else MOST_SENSORS - 1
+
+
+def of_sensor(values: FloatArray, number: int) -> FloatArray:
+    """Return a table (k, MOST_SENSORS) with `values` (k,) of one sensor, and 0 for the others."""
+    table = np.zeros((len(values), MOST_SENSORS))
+    table[:, number] = values
+    return table
+
+
+def scale_of(key: dict[str, np.ndarray], number: int) -> FloatArray:
+    """Return the covariance scale (k,) of a sensor in a `Rows.key`; 1 if the track did not hear
+    it."""
+    scale = key['scale'][:, number]
+    return np.where(scale > 0.0, scale, 1.0)

@@ -35,13 +35,16 @@ from ...measurements import (
     VesselPose,
 )
 from ..navigation import NavigationBuffer
+from .arrival_stamps import ArrivalStamps, Resolution
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
-from .innovations import FixConsistency
+from .innovations import FixConsistency, SensorConsistency
 from .instruments import Instruments
 from .known import Known
 from .names import LastNamed
 from .offsets import BiasTest, RecentPairs
+from .polling import SingleFixes
+from .sensors import Sensors
 
 STATE_TYPES = (
     *STREAM_TYPES,
@@ -49,6 +52,15 @@ STATE_TYPES = (
     *(GeodeticFix, RelativeFix, Navigation, VesselFix, VesselHeading, VesselPose),
     *(NavigationBuffer, Origin),
     *(Known, Rows, Borrowed, Gaussians, Tracks),
-    *(NisMemory, FixConsistency, HeightCounts, Instruments, BiasTest, RecentPairs),
-    *(Clutter, Clutters, LastNamed),
+    *(
+        NisMemory,
+        FixConsistency,
+        SensorConsistency,
+        HeightCounts,
+        Instruments,
+        BiasTest,
+        RecentPairs,
+    ),
+    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
+    *(ArrivalStamps, Resolution),
 )

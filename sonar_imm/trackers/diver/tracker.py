@@ -52,6 +52,7 @@ from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from ..model_checks import track_rules
 from . import (
+    arrival_stamps,
     births,
     burst_reports,
     bursts,
@@ -64,6 +65,7 @@ from . import (
     names,
     offsets,
     pairing,
+    polling,
     pruning,
     restart,
     scales,
@@ -71,7 +73,7 @@ from . import (
 from .config import DiverConfig
 from .coverage_map import configured_coverage
 from .georeferencing import Georeferencer
-from .innovations import FixConsistency
+from .innovations import SensorConsistency
 from .instruments import Instruments, Layout
 from .known import Feature, Known, predict_over
 from .models import build_models, ModelSet
@@ -133,8 +135,9 @@ class DiverTracker:
         }
         turn = config.bearing_bias_std_deg > 0.0
         self._group_stages: tuple[GroupStage, ...] = select_stages(
-            hear_sensor,
+            polling.remember_single_fixes,
             clutter.estimate_densities,
+            len(models.scales) > 1 and scales.hearing_stage(models),
             turn and rotation_stage(models, layout),
             covered and coverage.detection_stage(covered, models),
             self._associate,
@@ -174,7 +177,7 @@ class DiverTracker:
     def _empty_state(self, life: Tracks) -> Known:
         nobody = Known.empty(life, self.models, self.models.n, self.features)
         return nobody.with_memory(
-            fixes=FixConsistency(),
+            fixes=SensorConsistency(),
             arrivals=NisMemory(),
             excess=0.0,
             heights=depth.HeightCounts(),
@@ -182,9 +185,12 @@ class DiverTracker:
             recent=offsets.RecentPairs(),
             instruments=Instruments(),
             clutter=clutter.Clutters(),
+            single=polling.SingleFixes(),
+            stamps=arrival_stamps.ArrivalStamps(),
             last_named=names.LastNamed(),
             sensors=Sensors(),
             bursts=burst_reports.BurstCounts(),
+            reporting=0,
         )
 
     def restored(self) -> None:
@@ -241,6 +247,7 @@ class DiverTracker:
     def _process_scan(self, previous: Known, stamp_ns: int, items: Sequence[Measurement]) -> Known:
         """Return the state after all measurements of one stamp. Pure function."""
         scan = Scan.from_items(items, self.config)
+        previous = previous.with_memory(sensors=scan.number_sensors(previous.memory['sensors']))
         known = self._predict(previous, scan, stamp_ns)
         for group in scan.fixes:
             for stage in self._group_stages:
@@ -255,9 +262,11 @@ class DiverTracker:
         """Predict the tracks to the scan. Stores the last step in `scan.prediction`."""
         dt = (stamp_ns - previous.stamp_ns) * 1e-9 if previous.stamp_ns else 0.0
         has_scales = len(previous) and len(self.models.scales) > 1
-        start = (
-            scales.redistribute_weights(previous, self.models.scales) if has_scales else previous
-        )
+        start = previous
+        for number in sorted(scan.numbers) if has_scales else ():
+            start = scales.redistribute_weights(
+                start, self.models.scales, self.config.sensor_delays, number
+            )
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )
@@ -281,12 +290,18 @@ class DiverTracker:
         from . import arrivals  # imported late: not needed for fixes
 
         known = known.replace(rows=bursts.without_offsets(known.rows))
+        known, usable = arrival_stamps.with_resolution(known, ping, self.config)
+        if usable is None:
+            return known
+        ping = usable
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
         layout = self._layouts(known)
         known = births.restart_track(known, ping, free, self.models, layout, self.config)
-        scan.births += births.births_from_ping(ping, free, self.config)
+        number = known.memory['sensors'].number('')
+        for birth in births.births_from_ping(ping, free, self.config):
+            scan.births.append(birth._replace(number=number))
         return known
 
     def _update_transitions(self, known: Known, scan: Scan) -> Known:
@@ -317,12 +332,6 @@ class DiverTracker:
 def select_stages(*stages: object) -> tuple:
     """Return the stages that are enabled, without False and None."""
     return tuple(stage for stage in stages if stage)
-
-
-def hear_sensor(known: Known, group: Group) -> Known:
-    """Number the sensor of the fixes. A stage of the tracker."""
-    sensors = known.memory['sensors'].with_sensor(group.sensor)
-    return known if sensors is known.memory['sensors'] else known.with_memory(sensors=sensors)
 
 
 def rotation_stage(

@@ -36,6 +36,7 @@ from .known import Known, row_outputs
 from .models import ModelSet
 from .pairs import Groups, LEAVE, NOBODYS, OPEN, Pairs, Ways
 from .scan import Group
+from .sensors import scale_of
 
 FARTHEST_OFFSET = 6.0
 """Standard deviations of a new offset beyond which no burst begins in scans of several targets."""
@@ -86,20 +87,20 @@ def add_ways(
         none of them.
     """
     rows, config = known.rows, group.config
-    sensor = known.memory['sensors'].number(group.sensor)
+    sensor = group.number
     alone = is_alone(group)
     row, fix = _candidates(known, group, openers)
     if not len(row):
         return pairs
     key = {name: column[row] for name, column in rows.key.items()}
     own = key['offset'] == sensor
-    scaled = group.R[fix] * key['scale'][:, None, None]
+    scaled = group.R[fix] * scale_of(key, group.number)[:, None, None]
     z = group.z[fix]
-    plain = _row_fixes(pairs.expected, rows, row, nil=True)
+    plain = _row_fixes(pairs, rows, row, nil=True)
     reach = _reach(known, group, models, row)
     far, wide = _is_far(*plain, z, scaled, reach)
     if own.any():
-        shifted = _row_fixes(pairs.expected, rows, row, nil=False)
+        shifted = _row_fixes(pairs, rows, row, nil=False)
         far_shifted, wide_shifted = _is_far(*shifted, z, scaled, reach)
         far &= far_shifted | ~own
     aside = key['aside']
@@ -129,14 +130,14 @@ def add_ways(
     some = np.flatnonzero(asked)
     std = np.maximum(config.burst_std, WIDER * wide[some])
     log[some], variance[some] = _opening_density(
-        pairs.expected, rows, row[some], z[some], scaled[some], std, TAILS if alone else TAILS[:1]
+        pairs, rows, row[some], z[some], scaled[some], std, TAILS if alone else TAILS[:1]
     )
     found = []
     for way, prior, density in ((OPEN, opens, log), (NOBODYS, nobodys, log)):
         chosen = np.flatnonzero(np.isfinite(prior))
         found.append((way, chosen, prior[chosen] + density[chosen]))
     chosen = np.flatnonzero(own)
-    direct = _log_density(pairs.expected, rows, row[chosen], z[chosen], scaled[chosen])
+    direct = _log_density(pairs, rows, row[chosen], z[chosen], scaled[chosen])
     found.append((LEAVE, chosen, leaves[chosen] + direct))
     at = np.concatenate([chosen for _, chosen, _ in found])
     ways = Ways(
@@ -181,12 +182,17 @@ def _candidates(
 
 
 def _row_fixes(
-    expected: Sequence[tuple[FloatArray, FloatArray]], rows: Rows, row: IndexArray, *, nil: bool
+    pairs: Pairs, rows: Rows, row: IndexArray, *, nil: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (k, 2) and covariance (k, 2, 2) of the fix that rows (k,) expect. nil: without
     the offset."""
-    at = row + len(rows) if nil and rows.tail else row
-    return bank.combine_fixes([(h[at], S[at]) for h, S in expected], rows.mu[row])
+    at = _without_offset(pairs, rows, row) if nil else row
+    return bank.combine_fixes([(h[at], S[at]) for h, S in pairs.expected], rows.mu[row])
+
+
+def _without_offset(pairs: Pairs, rows: Rows, row: IndexArray) -> IndexArray:
+    """Return the index (k,) in `Pairs.expected` of rows without their offset."""
+    return row + len(pairs.among.delay) if rows.tail else row
 
 
 def _reach(known: Known, group: Group, models: ModelSet, row: IndexArray) -> FloatArray:
@@ -227,20 +233,20 @@ def _is_far(
 
 
 def _log_density(
-    expected: Sequence[tuple[FloatArray, FloatArray]],
+    pairs: Pairs,
     rows: Rows,
     row: IndexArray,
     z: FloatArray,
     R: FloatArray,
 ) -> FloatArray:
     """Return the log density (k,) of fixes under rows without their offset."""
-    at = row + len(rows) if rows.tail else row
-    compared = tuple(bank.compare(h, S, at, z, R) for h, S in expected)
+    at = _without_offset(pairs, rows, row)
+    compared = tuple(bank.compare(h, S, at, z, R) for h, S in pairs.expected)
     return bank.mixture_log_density(rows.mu[row], compared)
 
 
 def _opening_density(
-    expected: Sequence[tuple[FloatArray, FloatArray]],
+    pairs: Pairs,
     rows: Rows,
     row: IndexArray,
     z: FloatArray,
@@ -255,7 +261,7 @@ def _opening_density(
     best, variance = np.full(len(row), -np.inf), np.zeros(len(row))
     for k, factor in enumerate(tails):
         own = np.square(factor * std)
-        log = _log_density(expected, rows, row, z, R + own[:, None, None] * np.eye(2))
+        log = _log_density(pairs, rows, row, z, R + own[:, None, None] * np.eye(2))
         log = log - k * TAIL_COST
         better = log > best
         best, variance = np.where(better, log, best), np.where(better, own, variance)

@@ -45,6 +45,7 @@ from ..numbers import (
     look_up,
     Metric,
     NO_TRUTH,
+    relative_nees,
     UNMATCHED,
 )
 from .scoring import fix_series, score
@@ -161,6 +162,7 @@ METRICS = (
     ),
     Metric(
         covers=('consistency.coverage.95', 0.95),
+        nees='consistency.nees_position',
         when=lambda metrics: look_up(metrics, 'consistency.verdict') is not None,
     ),
     Metric(
@@ -213,7 +215,9 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
     if judged and look_up(metrics, 'raw_fix.n'):
         sentences.append(_against_fixes(metrics))
     if judged:
-        sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
+        consistency = metrics['consistency']
+        nees = relative_nees(consistency.get('nees_position'))
+        sentences.append(coverage_sentence(consistency['coverage']['95'], nees))
     elif _truncated(metrics):
         sentences.append(
             'Whether the stated uncertainty holds cannot be said: {beyond_cutoff.share:.0%} of '
@@ -223,11 +227,16 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
 
 
 def _against_fixes(metrics: Mapping[str, Any]) -> str:
-    raw = metrics['raw_fix']['rmse_m']
+    """Compare the track with the fixes at the same stamps."""
+    same, beyond = metrics['same_stamps'], metrics['raw_fix']['beyond']
+    raw = same['raw_rmse_m']
+    if not same['n']:
+        return 'No fix has the stamp of an estimate to be compared with.'
     if not raw > 0.0:
         return 'The raw fixes are the truth itself: no tracker can be better than they are.'
-    change = 1.0 - metrics['position']['rmse_m'] / raw
-    return f'The raw fixes lie {raw:.2f} m away: tracking ' + (
+    change = 1.0 - same['track_rmse_m'] / raw
+    out = f', without {beyond} that lie beyond {metrics["cutoff_m"]:.3g} m' if beyond else ''
+    return f'The raw fixes lie {raw:.2f} m away at the same stamps{out}: tracking ' + (
         f'removes {100 * change:.0f} % of the error.'
         if change >= 0.0
         else f'adds {-100 * change:.0f} % to it.'

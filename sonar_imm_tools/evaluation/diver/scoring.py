@@ -30,6 +30,7 @@ models               probability of each motion model, and how often the most pr
 from __future__ import annotations
 
 from collections.abc import Iterable
+import math
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ from ..numbers import (
     coverage_verdict,
     error_summary,
     nis_summary,
+    relative_nees,
     usable_nees,
 )
 from .matching import match, Matching, track_summary
@@ -99,13 +101,28 @@ def score(
     speed_error = np.hypot(*matching.error[:, 2:].T)
     metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
     if fixes is not None and len(fixes):
-        metrics['raw_fix'] = error_summary(match(fixes, truth, cutoff=cutoff).distance)
+        raw = match(fixes, truth, cutoff=cutoff)
+        found: dict[str, Any] = error_summary(raw.distance)
+        metrics['raw_fix'] = {**found, 'beyond': len(raw.beyond_row)}
+        metrics['same_stamps'] = at_same_stamps(matching, raw)
     metrics['consistency'].update(truth_consistency(matching))
     metrics.update(depth_summary(matching, truth))
     metrics['tracks'] = track_summary(matching)
     metrics['gospa'] = gospa_summary(matching, truth, cutoff)
     metrics['lag'] = best_lag(matching, truth)
     return metrics
+
+
+def at_same_stamps(track: Matching, raw: Matching) -> dict[str, Any]:
+    """Return the RMSE, m, of estimates and fixes at the stamps that both have."""
+    stamps = [each.series.stamp_ns[each.row] for each in (track, raw)]
+    shared = [np.isin(own, other) for own, other in zip(stamps, stamps[::-1])]
+    names = ('track_rmse_m', 'raw_rmse_m')
+    rmse = {
+        name: float(np.sqrt(np.mean(np.square(each.distance[here])))) if here.any() else math.nan
+        for name, each, here in zip(names, (track, raw), shared)
+    }
+    return {'n': int(shared[0].sum()), **rmse}
 
 
 def usual_cutoff(series: Series, truth: Truth) -> float:
@@ -150,7 +167,7 @@ def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
 def truth_consistency(matching: Matching) -> dict[str, Any]:
     """NEES on position and on the whole state, and the coverage of the position ellipses.
 
-    verdict: what the coverage says; it, and `believable` of a NEES, are None where the pairs
+    verdict: what coverage and NEES say; it, and `believable` of a NEES, are None where the pairs
     beyond the cutoff would change them.
     """
     series = matching.series
@@ -162,11 +179,16 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
     )
     coverage = {f'{100 * level:g}': _coverage(position, level) for level in COVERAGE_LEVELS}
     whole = _coverage(np.concatenate([position, position_far]), 0.95)
-    verdict = coverage_verdict(coverage['95']) if len(position) else None
+    near = _summary(position, position_far, 2)
+    far_too = chi2_summary(np.concatenate([position, position_far]), 2)
+    verdict, of_all = (
+        coverage_verdict(share, nees=relative_nees(summary))
+        for share, summary in ((coverage['95'], near), (whole, far_too))
+    )
     result: dict[str, Any] = {
-        'nees_position': _summary(position, position_far, 2),
+        'nees_position': near,
         'coverage': coverage,
-        'verdict': verdict if verdict == coverage_verdict(whole) else None,
+        'verdict': verdict if len(position) and verdict == of_all else None,
         'singular_position_covariances': len(error) - len(position),
     }
     if known := int(np.isfinite(error).all(axis=1).sum()):

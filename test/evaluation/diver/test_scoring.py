@@ -89,6 +89,23 @@ def test_raw_fixes_are_scored_beside_the_track():
     metrics = scored(estimates, truth, fixes=fix_series(fixes))
     assert metrics['raw_fix']['rmse_m'] == pytest.approx(2.0)
     assert metrics['raw_fix']['n'] == 40
+    assert metrics['same_stamps']['n'] == 40
+    assert metrics['same_stamps']['raw_rmse_m'] == pytest.approx(2.0)
+
+
+def test_track_and_fixes_are_compared_at_the_same_stamps():
+    """A track that begins late, and an outlier: of single fixes all count."""
+    estimates, truth, times = single_run(count=40)
+    fixes = [
+        Fix(stamp_ns=stamp, position=[*(place + [0.0, 2.0 if k < 20 else 1.0]), 0.0])
+        for k, (stamp, place) in enumerate(zip(stamps(times), legs(times)[:, :2]))
+    ]
+    fixes[30] = evolve(fixes[30], position=fixes[30].position + [90.0, 0.0, 0.0])
+    metrics = scored(estimates[20:], truth, fixes=fix_series(fixes))
+    same = metrics['same_stamps']
+    assert same['n'] == 20 and metrics['raw_fix']['n'] == 40
+    assert same['raw_rmse_m'] == pytest.approx(np.sqrt(1.0 + 90.0**2 / 20.0))
+    assert same['track_rmse_m'] == pytest.approx(metrics['position']['rmse_m'])
 
 
 def test_a_lagging_track_tells_its_lag():
@@ -277,7 +294,8 @@ def test_depth_is_scored_where_both_have_it():
 def words_of(tracked, raw):
     return {
         'position': {'n': 5, 'rmse_m': tracked},
-        'raw_fix': {'n': 5, 'rmse_m': raw},
+        'raw_fix': {'n': 5, 'rmse_m': raw, 'beyond': 0},
+        'same_stamps': {'n': 5, 'track_rmse_m': tracked, 'raw_rmse_m': raw},
         'consistency': {'coverage': {'95': 0.95}, 'verdict': 'consistent'},
     }
 

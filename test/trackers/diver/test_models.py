@@ -47,7 +47,7 @@ def test_every_set_is_consistent(model_set):
     mean, covariance = imm.combine(x, P, mu, models.E)
     assert len(mean) == models.rows_per_track
     np.testing.assert_allclose(mean[:, :2], np.tile(CENTRE, (models.rows_per_track, 1)))
-    for row, scale in zip(covariance, models.scales):
+    for row, scale in zip(covariance, models.row_scales):
         np.testing.assert_allclose(row[:2, :2], scale * SPREAD)
 
 

@@ -188,7 +188,8 @@ def begun(models, position, covariance, from_fix=True):
     """The hypotheses of a diver who is first seen."""
     x, P, mu = models.initial_states(position[None], covariance[None], from_fix)
     N, n = x[0, ..., 0].size, x.shape[-1]
-    scale = np.repeat(np.resize(models.scales, models.rows_per_track), N // models.rows_per_track)
+    K = models.rows_per_track
+    scale = np.repeat(np.resize(models.row_scales, K), N // K)
     return Mixture(x.reshape(N, n), P.reshape(N, n, n), mu.ravel() / models.rows_per_track, scale)
 
 

@@ -47,6 +47,12 @@ def swim(seed, count=110, std=1.0, stated=1.0, lasting=0.0, time=60.0):
     return items, truth
 
 
+def held_scales(known, sensor=0):
+    """The scales of a sensor, of all rows and of what is borrowed."""
+    tables = known.rows, known.borrowed
+    return np.concatenate([table.key['scale'][:, sensor] for table in tables])
+
+
 def scored(items, truth, first=20, **values):
     """RMSE, NEES and the tracker."""
     tracker, error, squared = DiverTracker(DiverConfig(max_tracks=1, **values)), [], []
@@ -98,10 +104,10 @@ def test_a_new_track_has_no_rows_of_improbable_scales():
     tracker = DiverTracker(DiverConfig())
     items, _ = swim(7, count=3)
     tracker.process(items[0])
-    assert sorted(tracker._stream.state.rows.key['scale']) == [0.15, 1.0, 3.0, 10.0]
+    assert sorted(tracker._stream.state.rows.key['scale'][:, 0]) == [0.15, 1.0, 3.0, 10.0]
     tracker.process(items[1])
     known = tracker._stream.state
-    held = np.concatenate([known.rows.key['scale'], known.borrowed.key['scale']])
+    held = held_scales(known)
     assert sorted(held) == list(tracker.models.scales)
     weight = np.exp(np.concatenate([known.rows.logw, known.borrowed.logw]))
     assert weight.sum() == pytest.approx(1.0)
@@ -117,7 +123,7 @@ def test_the_priors_are_what_redistribution_tends_to():
     known = tracker._stream.state
     for _ in range(40000):
         known = redistribute_weights(known, tracker.models.scales)
-    scale = np.concatenate([known.rows.key['scale'], known.borrowed.key['scale']])
+    scale = held_scales(known)
     weight = np.exp(np.concatenate([known.rows.logw, known.borrowed.logw]))
     prior, large = scale_priors(scale), scale >= 1.0
     due = 0.5 * np.where(large, prior / prior[large].sum(), prior / prior[~large].sum())
@@ -142,7 +148,7 @@ def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track(
     update = update_stage(tracker.models, lambda _: (None, None))
     after = update(tracker._associate(known, group), group)
     assert not group.association.beta.any()
-    held = np.concatenate([after.rows.key['scale'], after.borrowed.key['scale']])
+    held = held_scales(after)
     weight = np.exp(np.concatenate([after.rows.logw, after.borrowed.logw]))
     np.testing.assert_allclose(weight, [due[scale] for scale in held], rtol=1e-9)
     assert due[1000.0] > 100.0 * np.exp(pairs.among.logw[pairs.among.scale == 1000.0][0])
@@ -176,7 +182,8 @@ def test_errors_that_last_widen_what_is_published():
         assert 'set fix_bias_std' in tracker.warnings()[0]
         found.append(nees)
         last = tracker._stream.state
-        calm = last.with_memory(fixes=last.memory['fixes']._replace(cross=0.0, nis=50.0))
+        own = last.memory['fixes'].of(0)._replace(cross=0.0, nis=50.0)
+        calm = last.with_memory(fixes=last.memory['fixes'].with_sensor(0, own))
         R = tracker._estimate(last).covariance - tracker._estimate(calm).covariance
         np.testing.assert_allclose(R[0, :2, :2], last['reported'][0, 0] * np.eye(2), atol=1e-9)
         assert last['reported'][0, 0] >= 1.0 and not R[0, 2:].any()

@@ -399,13 +399,13 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
     lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
     for item in (pessimistic, lasting):
-        assert 'set fix_bias_std' in item.warnings(False, 10.0)[0]
-        assert item.warnings(True, 10.0) == []
-        assert item._replace(number=0.9 * MEMORY).warnings(False, 10.0) == []
+        assert 'set fix_bias_std' in item.warnings(False)[0]
+        assert item.warnings(True) == []
+        assert item._replace(number=0.9 * MEMORY).warnings(False) == []
     optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
     for stated in (False, True):
-        assert 'Increase covariance_scale' in optimistic.warnings(stated, 10.0)[0]
-    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False, 10.0) == []
+        assert 'Increase covariance_scale' in optimistic.warnings(stated)[0]
+    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []
 
 
 def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=0.0):

@@ -1,0 +1,122 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sensors that stamp each fix by itself and look at several targets in turn.
+
+Each fix without a name is then a scan in which all others were missed: tracks starve. The fixes
+show it: between two of the same target lie fixes of others, and the time is always the same. What
+is to be done is `scan_period`, which joins the fixes of a turn.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from ...estimation.arrays import FloatArray, IntArray
+from .config import DiverConfig
+from .known import Known
+from .scan import Group
+
+BEFORE = 30
+"""Fixes before one among which the last one of the same target is looked for."""
+
+MOST_FIXES = 3 * BEFORE
+"""Maximum number of remembered fixes; two thirds of them are enough for a warning."""
+
+IN_TURN = 0.6
+"""Minimum share of fixes that come in turn."""
+
+APART = 8.0
+"""Change of the difference of two targets, in its usual step from turn to turn, that two sensors
+with a constant offset do not have."""
+
+
+class SingleFixes(NamedTuple):
+    """The last fixes with a stamp of their own and no name, of one sensor."""
+
+    sensor: str = ''
+    stamps: Annotated[IntArray, 'f'] = np.empty(0, np.int64)
+    """Rising, ns."""
+    places: Annotated[FloatArray, 'f2'] = np.empty((0, 2))
+    """m."""
+
+    def turn(self) -> float | None:
+        """Return the seconds in which the sensor looks at all; None if it does not turn."""
+        if len(self.stamps) < 2 * BEFORE:
+            return None
+        return turn_of(self.stamps, self.places)
+
+
+def remember_single_fixes(known: Known, group: Group) -> Known:
+    """Remember the fix of a group of one; forget all if the sensor gives scans. A stage."""
+    if group.target_id is not None or group.config.scan_period != 0.0 or not len(group.z):
+        return known
+    before: SingleFixes = known.memory['single']
+    if before.sensor != group.sensor or len(group.z) > 1:
+        before = SingleFixes(group.sensor)
+    if len(group.z) == 1:
+        stamps = np.append(before.stamps, known.stamp_ns)[-MOST_FIXES:]
+        places = np.concatenate([before.places, group.z])[-MOST_FIXES:]
+        before = SingleFixes(group.sensor, stamps, places)
+    return known.with_memory(single=before)
+
+
+def turn_of(stamps_ns: IntArray, places: FloatArray) -> float | None:
+    """Return the seconds after which a sensor that stamps each fix by itself comes back to the
+    same target; None if it does not.
+
+    Of the fixes before one, the last that is as near as those of one target are is his. Two that
+    take turns at a constant offset are two sensors of one target.
+
+    :param stamps_ns: (n,) rising, of more than `BEFORE` fixes.
+    :param places: (n, 2).
+    """
+    if 10 * len(np.unique(stamps_ns)) < 9 * len(stamps_ns):
+        return None
+    rows = range(BEFORE, len(stamps_ns))
+    apart = [np.hypot(*(places[k - BEFORE : k] - places[k]).T) for k in rows]
+    near = 4.0 * float(np.median([distance.min() for distance in apart]))
+    back = [(k, np.flatnonzero(distance <= near)) for k, distance in zip(rows, apart)]
+    last = np.array([(k, k - BEFORE + before[-1]) for k, before in back if len(before)])
+    seconds = (stamps_ns[last[:, 0]] - stamps_ns[last[:, 1]]) * 1e-9
+    period, between = float(np.median(seconds)), last[:, 0] - last[:, 1]
+    in_turn = (np.abs(seconds - period) <= 0.25 * period) & (between > 1)
+    if np.mean(in_turn) <= IN_TURN or (np.median(between) == 2 and _lie_parallel(places)):
+        return None
+    return period
+
+
+def _lie_parallel(places: FloatArray) -> bool:
+    """Return whether the difference of two that take turns, places (n, 2), is constant."""
+    sign = np.where(np.arange(len(places) - 2) % 2, -1.0, 1.0)[:, None]
+    # The middle of two of the one, less the other: motion cancels.
+    difference = sign * (0.5 * (places[2:] + places[:-2]) - places[1:-1])
+    step = float(np.median(np.hypot(*np.diff(difference, axis=0).T)))
+    quarter = len(difference) // 4
+    means = np.array([part.mean(axis=0) for part in np.array_split(difference, 4)])
+    return bool(np.ptp(means, axis=0).max() <= APART * step / np.sqrt(max(quarter, 1)) + 1e-9)
+
+
+def warnings(known: SingleFixes, config: DiverConfig) -> list[str]:
+    """Return a warning about fixes that have to be joined to scans."""
+    period = known.turn() if config.scan_period == 0.0 else None
+    if period is None:
+        return []
+    return [
+        f'every fix has a stamp of its own, and each target comes again after {period:.3g} s: a '
+        f'scan of one fix misses all others. Set scan_period to {period:.3g}, which joins them; '
+        '-1 if fixes are no scans'
+    ]

@@ -1,0 +1,74 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sensors that look at several targets in turn, and what the tracker says of them."""
+
+from attrs import evolve
+from helpers.diver_runs import fix, run
+import numpy as np
+import pytest
+
+from sonar_imm.trackers.diver.polling import MOST_FIXES
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SETTINGS = {'directions': 4, 'covariance_scales': (1.0,)}
+
+
+def in_turn(paths, rate, missing=0.1, std=0.3, count=120, seed=0):
+    """Fixes of targets one after the other; paths: (place at a time) of each."""
+    rng = np.random.default_rng(seed)
+    for k in range(count):
+        when = 5.0 + k / rate
+        place = paths[k % len(paths)](when) + std * rng.normal(size=2)
+        if rng.uniform() > missing:
+            yield fix(when, *place, std**2 * np.eye(2))
+
+
+def circle(t, phase, x=0.0):
+    return np.array([x + 8.0 * np.cos(t / 12 + phase), 8.0 * np.sin(t / 12 + phase)])
+
+
+def said(items, **settings):
+    tracker = DiverTracker(DiverConfig(**SETTINGS, **settings))
+    run(tracker, list(items))
+    return tracker, tracker.warnings()
+
+
+@pytest.mark.parametrize('targets, rate', [(4, 4.0), (3, 1.0), (2, 0.5)])
+def test_the_advice_once_followed_ends_the_sentence(targets, rate):
+    paths = [lambda t, k=k: circle(t, 1.6 * k, 30.0 * k) for k in range(targets)]
+    items = list(in_turn(paths, rate))
+    tracker, sentences = said(items)
+    (sentence,) = sentences  # of tracks that starve, the fixes tell nothing else
+    period = targets / rate
+    assert f'Set scan_period to {period:.3g}' in sentence and 'covariance' not in sentence
+    assert len(tracker._stream.state.memory['single'].stamps) <= MOST_FIXES
+    assert not any('scan_period' in text for text in said(items, scan_period=period)[1])
+    assert not any('scan_period' in text for text in said(items, scan_period=-1.0)[1])
+
+
+def test_names_scans_and_single_targets_are_not_polled():
+    one = list(in_turn([lambda t: circle(t, 0.0)], 1.0))
+    paths = [lambda t, k=k: circle(t, 1.6 * k, 12.0 * k) for k in range(3)]
+    named = [evolve(item, target_id=k % 3) for k, item in enumerate(in_turn(paths, 3.0, 0.0))]
+    together = [fix(5.0 + k, *circle(k, 2.0 * d)) for k in range(100) for d in range(2)]
+    for items in (one, named, together):
+        assert not any('scan_period' in text for text in said(items)[1])
+
+
+def test_two_sensors_of_one_target_are_not_polled():
+    """They take turns as two targets would, but lie at a constant offset."""
+    for offset in (6.0, 30.0):
+        paths = [lambda t: circle(t, 0.0), lambda t, off=offset: circle(t, 0.0) + (off, 1.0)]
+        assert not any('scan_period' in text for text in said(in_turn(paths, 1.0, 0.0))[1])
