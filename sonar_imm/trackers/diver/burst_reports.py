@@ -55,10 +55,11 @@ class BurstCounts(NamedTuple):
     taken: int = 0
     """Number of fixes of tracks, with these."""
 
-    def warnings(self) -> list[str]:
-        """Return sentences about bursts and outliers."""
+    def warnings(self, apart: bool) -> list[str]:
+        """Return sentences about bursts and outliers. apart: whether two sensors disagree, which
+        has a sentence of its own."""
         found = []
-        if self.runs:
+        if self.runs > apart:
             runs = f'{self.runs} runs' if self.runs > 1 else '1 run'
             found.append(
                 f'{self.fixes} fixes in {runs} lay {self.nearest:.2g} m or more from where the '
@@ -124,13 +125,15 @@ def current_bursts(known: Known) -> Iterator[Burst]:
 
 def warnings(known: Known, config: DiverConfig) -> list[str]:
     """Return sentences about bursts and outliers, and about bursts that last."""
-    found = list(known.memory['bursts'].warnings())
+    found: list[str] = []
+    apart = False
     rows, sensors = known.rows, known.memory['sensors']
     readings = bursts.reading_weights(rows, config.burst_end)
     for burst in current_bursts(known):
         row, distance = burst.row, np.hypot(*burst.offset)
         others, fixes = (int(rows.key[name][row]) for name in ('others', 'fixes'))
         if min(others, fixes) >= ENOUGH_OTHERS:
+            apart = True
             found.append(_sensors_apart(sensors, int(rows.key['offset'][row]), burst.offset))
             continue
         other = 'the track was wrong before' if rows.key['link'][row] == 0 else 'another target'
@@ -140,7 +143,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
             f'{distance:.2g} m off: a burst ({1.0 - readings[row]:.2g}), or {other}; the estimate '
             'holds both'
         )
-    return found
+    return [*known.memory['bursts'].warnings(apart), *found]
 
 
 def _sensors_apart(sensors: Sensors, number: int, offset: np.ndarray) -> str:

@@ -245,7 +245,7 @@ def _update_track(
     """
     own, threshold = known.row_indices(track), gate_threshold(group.config.gate_probability, 1)
     rows, value = known.track_rows(track), height.value - float(height.gain @ group.z[fix])
-    offset = ways.offset_factor(rows, known.memory['sensors'].number(group.sensor))
+    offset = ways.offset_factor(rows, group.number)
     weight = rows.weight[:, None] * rows.mu
     masks = layout.estimated_masks(models)
     parts = [

@@ -94,7 +94,7 @@ def links_of_fixes(known: Known, group: Group) -> IntArray:
 
 def birth_marks(known: Known, group: Group) -> IntArray:
     """Return a number (D,) below -1 for the track that each fix may begin."""
-    sensor = known.memory['sensors'].number(group.sensor)
+    sensor = group.number
     return -2 - np.arange(len(group.z)) - sensor * 10**6
 
 

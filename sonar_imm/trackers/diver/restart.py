@@ -67,9 +67,8 @@ def restart_stage(
 def restart_lost_tracks(
     known: Known, group: Group, models: ModelSet, chain: AdaptiveChain, layout: Layout
 ) -> tuple[Known, bool]:
-    """Restart tracks whose last two rejected fixes agree with each other.
-
-    A track outside the coverage restarts if the target can have reached the fix.
+    """Restart tracks whose last two rejected fixes agree with each other, if the target can have
+    reached the fix.
 
     :returns: the new state, and whether any track restarted.
     """
