@@ -244,7 +244,8 @@ def test_scales_below_one_say_where_the_diver_is_but_not_how_well_that_is_known(
         scale = np.mean([e.extras['covariance_scale'][0] for e in made])
         found.append((np.mean(nees), scale, np.square(off).sum()))
     (cautious, scale, error), (bold, _, least) = found
-    assert error < 1.1 * least and 1.0 <= scale < 1.6 and cautious < 0.6 * bold
+    # Both covariances include that of a fix: errors may last.
+    assert error < 1.1 * least and 1.0 <= scale < 1.6 and cautious < bold < 0.5
 
 
 def test_what_is_stated_and_how_far_the_rows_are_apart(monkeypatch):
