@@ -78,7 +78,7 @@ PEERS = {
     'sonar_imm_tools.evaluation.rerun_file': {'rerun'},
     'sonar_imm_tools.recordings.convert.hydrophones': {'soundfile'},
     'sonar_imm_tools.recordings.convert.nmea': {'pyais', 'pynmea2'},
-    'sonar_imm_tools.recordings.convert.segy': {'segyio'},
+    'sonar_imm_tools.recordings.segy_lines': {'segyio'},
     'sonar_imm_tools.recordings.convert.side_scan': {'PIL'},
     'sonar_imm_tools.recordings.export.horizons': {'rasterio', 'segyio'},
     'sonar_imm_tools.recordings.export.points': {'laspy', 'pyarrow', 'rasterio'},

@@ -56,6 +56,7 @@ __all__ = [
 
 _QUIET = 0.1
 """Quantile of the traces that is noise at every depth."""
+_STEADY = 0.6
 _RING, _FEW_VALUES, _ZEROS = 0.1, 4096, 0.05
 _RUNNING, _POOLED, _LEAST_POOLED, _ENOUGH = 31, 41, 200, 60
 _LOUDEST, _MOST, _RATIO = 0.995, 1.3, 2.0
@@ -89,9 +90,14 @@ def quietest(trace: FloatArray) -> float:
 
 
 def transmit_samples(traces: FloatArray) -> int:
-    """How many samples at the beginning of the traces (T, n) are loud in nine of ten of them."""
+    """How many samples at the beginning of the traces (T, n) are loud in nine of ten of them, and
+    steady: a floor that begins there is not."""
     loud = _quiet(traces) > _RING * float(np.median(np.nanmax(traces, axis=1)))
-    return int(np.argmin(np.append(loud, False)))
+    ring = int(np.argmin(np.append(loud, False)))
+    if not ring:
+        return 0
+    quiet, most = np.nanquantile(traces[:, :ring], [_QUIET, 1.0 - _QUIET], axis=0)
+    return ring if float(np.median(quiet / most)) > _STEADY else 0
 
 
 def first_noise(traces: FloatArray) -> FloatArray:
@@ -156,9 +162,9 @@ def rise(trace: FloatArray, onset: int) -> tuple[float, int] | None:
     """Half height to the first maximum below `onset`, in standard deviations of the pulse, and
     where it is, in samples; None where there is none.
 
-    It is the first local maximum from two samples on that exceeds half of the largest sample up
+    It is the first local maximum from two samples above that exceeds half of the largest sample up
     to seven further."""
-    for k in range(onset + 2, len(trace) - 1):
+    for k in range(max(onset - 2, 1), len(trace) - 1):
         if trace[k] < trace[k - 1] or trace[k] < trace[k + 1]:
             continue
         if not trace[k] > 0.5 * trace[k : k + _REACH].max():

@@ -71,7 +71,8 @@ class System:
 
     config, tracker, smoother: classes below `sonar_imm.trackers.<name>`, as ``module.Class``;
     smoother: '' when the tracker cannot look back. node_config: a class of
-    `sonar_imm.node_config`.
+    `sonar_imm.node_config`. words: in names of topics and types that tell that this tracker is
+    meant, where none can read them.
     """
 
     name: str
@@ -80,6 +81,7 @@ class System:
     tracker: str
     smoother: str = ''
     node_config: str = 'NodeConfig'
+    words: tuple[str, ...] = ()
 
     @property
     def scenes(self) -> str:
@@ -179,6 +181,7 @@ SYSTEMS = {
             config='config.BathymetryConfig',
             tracker='tracker.BathymetryTracker',
             node_config='BathymetryNodeConfig',
+            words=('swath', 'side_scan', 'sidescan', 'snapshot', 'bathy', 'stave'),
         ),
         System(
             name='diver',
@@ -187,6 +190,7 @@ SYSTEMS = {
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
             node_config='TracksNodeConfig',
+            words=('usbl', 'fix', 'diver', 'target', 'beacon', 'acoustic', 'gps', 'gnss', 'ais'),
         ),
         System(
             name='fathometer',
@@ -194,6 +198,7 @@ SYSTEMS = {
             'filter',
             config='config.FathometerConfig',
             tracker='tracker.FathometerTracker',
+            words=('hydrophone', 'pressure', 'profil', 'trace', 'fathometer'),
         ),
         System(
             name='obstacle',
@@ -202,6 +207,7 @@ SYSTEMS = {
             config='config.ObstacleConfig',
             tracker='tracker.ObstacleTracker',
             node_config='ObstacleNodeConfig',
+            words=('fls', 'sonar', 'detection', 'image', 'scan', 'echo', 'obstacle'),
         ),
     )
 }

@@ -91,7 +91,7 @@ def command(
     .geojson (lines and points with uncertainty and model), .csv and .parquet; --crs and
     --origin say where they lie where the run does not.
     """
-    from ..offline.run_folder import RunFolder
+    from ..offline.run_folder import RunFolder, SOUNDINGS
     from ..recordings.sources import BagError
 
     kind = out.suffix.lower().lstrip('.')
@@ -108,7 +108,7 @@ def command(
     asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
         result, text = _export_map(asked)
-    elif kind == 'csv' and asked.record['system'] == 'bathymetry':
+    elif kind == 'csv' and (run / SOUNDINGS).is_file():
         result, text = _export_soundings(asked, cell)
     elif kind in TRACK_FORMATS and asked.record['system'] != 'fathometer':
         result, text = _export_tracks(asked)

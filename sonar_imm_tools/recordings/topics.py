@@ -127,13 +127,6 @@ def remarks_on_topics(
     return sentences
 
 
-WORDS = {
-    'diver': ('usbl', 'fix', 'diver', 'target', 'beacon', 'acoustic', 'gps', 'gnss', 'tag', 'ais'),
-    'obstacle': ('fls', 'sonar', 'detection', 'image', 'scan', 'echo', 'obstacle'),
-    'bathymetry': ('swath', 'side_scan', 'sidescan', 'snapshot', 'bathy', 'stave'),
-    'fathometer': ('hydrophone', 'pressure', 'profil', 'trace', 'fathometer'),
-}
-"""Words in names of topics and types that tell which tracker is meant, if none reads them."""
 TYPES_NAMED = 3
 
 
@@ -169,7 +162,7 @@ def system_in_mind(bag: BagReader) -> str:
         ]
         required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
         names = ' '.join(f'{topic.name} {topic.type_name}' for topic in bag.topics).lower()
-        words = sum(word in names for word in WORDS[system])
+        words = sum(word in names for word in SYSTEMS[system].words)
         return bool(entries) and fed(entries).issuperset(required), len(entries), words
 
     return max(SYSTEMS, key=could)

@@ -30,7 +30,9 @@ from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.topics import fitting_systems, fitting_topics, instruments
 from sonar_imm_tools.recordings.writer import BagWriter
 
-FEW = ('--set', 'particles_per_model=10')
+STATED = ('tilt_std_deg', 'spacing_std', 'sound_speed_std')
+EXACT = tuple(word for name in STATED for word in ('--set', f'{name}=0'))
+"""What a simulated recording says of its array; a copy under other names says nothing."""
 COUPLED = ('--set', 'ping_coupling=0.35')
 
 
@@ -94,7 +96,7 @@ def test_words_in_a_name_tell_the_side(swaths, tmp_path):
         '/sidescan_PORT/snapshot': 'port/snapshot',
         '/sidescan_stbd/snapshot': 'starboard/snapshot',
     }
-    assert track(bag, tmp_path / 'words', *FEW) == 0 == track(swaths, tmp_path / 'own', *FEW)
+    assert track(bag, tmp_path / 'words', *EXACT) == 0 == track(swaths, tmp_path / 'own', *EXACT)
     assert contents(tmp_path / 'words') == contents(tmp_path / 'own')
 
 
@@ -118,9 +120,9 @@ def test_instruments_are_told_apart_and_share_what_is_nobodys(tmp_path):
 
 def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_path, capsys):
     out = tmp_path / 'out'
-    assert track(two_ships, out, *FEW, '--jobs', '2') == 0
+    assert track(two_ships, out, *EXACT, '--jobs', '2') == 0
     assert '2 runs in' in capsys.readouterr().out
-    assert track(swaths, tmp_path / 'alone', *FEW) == 0
+    assert track(swaths, tmp_path / 'alone', *EXACT) == 0
     alone = contents(tmp_path / 'alone')
     assert contents(out / 'fore') == contents(out / 'aft_sidescan') == alone
     summary = json.loads((out / 'summary.json').read_text())
@@ -144,7 +146,7 @@ def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_
 
 def test_a_named_topic_is_tracked_alone(two_ships, tmp_path):
     chosen = ('--topic', 'port/snapshot=/fore/port/snapshot')
-    assert track(two_ships, tmp_path / 'out', *FEW, *chosen) == 0
+    assert track(two_ships, tmp_path / 'out', *EXACT, *chosen) == 0
     run = json.loads((tmp_path / 'out' / 'run.json').read_text())
     assert run['topics'] == {'/fore/port/snapshot': 'port/snapshot'}
 
@@ -300,7 +302,7 @@ def test_a_folder_of_tables_becomes_a_folder_of_bags(tmp_path, capsys):
     assert not (tmp_path / 'p').exists() and not (tmp_path / 'q').exists()
 
 
-@pytest.mark.parametrize('options', [FEW, COUPLED], ids=['independent', 'coupled'])
+@pytest.mark.parametrize('options', [EXACT, COUPLED], ids=['independent', 'coupled'])
 def test_pings_are_shared_out(swaths, tmp_path, capsys, options):
     counts = []
     for jobs in ('1', '2'):
@@ -347,5 +349,5 @@ def test_a_worker_that_dies_is_one_sentence(swaths, tmp_path, capsys, monkeypatc
         raise BrokenProcessPool('gone')
 
     monkeypatch.setattr(OfflineRun, '_taken', dies)
-    assert main(['track', str(swaths), str(tmp_path / 'out'), *FEW, '--jobs', '2']) == 2
+    assert main(['track', str(swaths), str(tmp_path / 'out'), *EXACT, '--jobs', '2']) == 2
     assert 'Traceback' not in (errors := capsys.readouterr().err) and 'lack of memory' in errors

@@ -491,7 +491,7 @@ class FathometerTracker:
         before = {e.track_id: e.depth for e in self._ids.reflectors if not e.missed + e.absent}
         self._ids, ids = self._named(reflectors, records)
         moved = [z - before[i] for i, z in zip(ids.tolist(), reflectors.depth) if i in before]
-        if moved and records == 1:
+        if moved and records == 1 and not self._water.active:
             self._datum.add(float(np.mean(moved)))
         self._taken.append(Taken(response, self._ids.reflectors))
         self._health.update(
