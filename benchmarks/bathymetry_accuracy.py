@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.bathymetry_paper import PRINTED, PrintedTracker
+from benchmarks.bathymetry_paper import PRINTED, PrintedTracker, WALKS
 from benchmarks.study import cell, Parts, Row, study, truths
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
@@ -50,7 +50,7 @@ GRID: dict[str, Any] = {'engine': 'grid'}
 
 # Name: parameters that differ from `COMMON`, and smooth, patch, all (m), angle (deg), overlap as
 # found before by an independent prototype; None where it was not measured.
-COMMON: dict[str, Any] = {'shadow_gate': False, 'initial_std': 1.0}
+COMMON: dict[str, Any] = {**WALKS, 'shadow_gate': False, 'initial_std': 1.0}
 TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'random walk only': (
         {'model_set': 'height_bank', 'sigmas': (1.0,), 'engine': 'particles'},
@@ -93,7 +93,11 @@ TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
         {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},
         (None,) * 5,
     ),
-    'defaults': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
+    'height_two_rw, gate': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
+    'defaults': (
+        {'model_set': 'terrain', 'shadow_gate': True, 'initial_std': 0.0},
+        (None,) * 5,
+    ),
 }
 CLASSICAL: dict[str, tuple[float | None, ...]] = {
     'phase difference of one pair': (1.71, 0.98, 1.61, 1.51, None),
@@ -143,7 +147,9 @@ def tracked(values: Mapping[str, Any], scene: Scene, printed: bool) -> Answer:
         sd = np.sqrt([table['cov_height_height'] for table in tables])
         inside = np.abs(height - truth) < 2.0 * sd
     names = [key for key in tables[0] if key.startswith('prob_')]
-    if len(names) > 1 and 'initial_probabilities' not in values:
+    if 'rough' in tables[0]:
+        rough = np.array([table['rough'] > 0.5 for table in tables])
+    elif len(names) > 1 and 'initial_probabilities' not in values:
         of_rough = ['prob_rw'] if 'prob_rw' in names else names[len(names) // 2 :]
         rough = np.array([sum(table[key] for key in of_rough) > 0.5 for table in tables])
     return Answer(height, angle, rough, inside)

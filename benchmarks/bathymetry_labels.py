@@ -57,7 +57,7 @@ from sonar_imm.truth import TrueProfile
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SETS = {
-    'two walks': BathymetryConfig(layover='ignored'),
+    'two walks': BathymetryConfig(model_set='height_two_rw', layover='ignored'),
     'height_bank': BathymetryConfig(model_set='height_bank', layover='ignored'),
     'scatter_bank': BathymetryConfig(model_set='scatter_bank', layover='ignored'),
 }

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.bathymetry_paper import EXACT_ARRAY
 from benchmarks.study import Parts, study
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Snapshot
@@ -108,7 +109,7 @@ def count(bins: Bins, snapshot: Snapshot, facets: Facets) -> None:
     double, single = number >= 2, (power > 0.0).sum(axis=1) == 1
     estimates = []
     for value in ('gated', 'ignored'):
-        config = BathymetryConfig(layover=value, seed=1)
+        config = BathymetryConfig(layover=value, seed=1, **EXACT_ARRAY)
         (estimate,) = BathymetryTracker(config).process(snapshot)
         estimates.append(estimate)
     gated, ignored = (estimate.extras['valid'] > 0 for estimate in estimates)
@@ -158,7 +159,7 @@ def lost(name: str, pings: int, seed: int) -> dict[str, float]:
     """Bins of a floor without objects that are gated, and the worst ping."""
     scene_name, changes = FLAT[name]
     config = scenario(scene_name, {'pings': pings, **changes})
-    values = {**config.instruments(), 'layover': 'gated', 'engine': 'grid', 'grid_step': 0.05}
+    values = {**config.instruments(), 'layover': 'gated'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     parts = []
     for item in simulate(config, seed).measurements:

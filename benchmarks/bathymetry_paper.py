@@ -49,7 +49,12 @@ from sonar_imm_tools.evaluation.bathymetry.scoring import score
 from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
+EXACT_ARRAY: dict[str, Any] = {'tilt_std_deg': 0.0, 'spacing_std': 0.0, 'sound_speed_std': 0.0}
+"""The array is what it is said to be: covariances are those of the filter."""
+WALKS: dict[str, Any] = {'model_set': 'height_two_rw', **EXACT_ARRAY}
+"""The models of the paper, for rows that name no others."""
 PRINTED: dict[str, Any] = {
+    **WALKS,
     'stay_probability': 0.98,
     'shadow_gate': False,
     'layover': 'ignored',
@@ -118,13 +123,14 @@ CASES: dict[str, Case] = {
     'echoes with heavier tails': Case('paper', {'law': 'k'}, {}),
     'all three, fractal': Case('foreign', {}, {}),
     'all three, fractal, bank': Case('foreign', {}, {'model_set': 'height_bank'}),
+    'all three, fractal, terrain': Case('foreign', {}, {'model_set': 'terrain'}),
 }
 
 
 def judged(case: Case, pings: int, seed: int) -> dict[str, Any]:
     """Return the scores of a case."""
     scene = simulate(scenario(case.scene, {'pings': pings, **case.changes}), seed)
-    tracker = case.tracker(BathymetryConfig(**case.values))
+    tracker = case.tracker(BathymetryConfig(**{**WALKS, **case.values}))
     estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
     return score(profiles_of(estimates, truth_of(scene)))
 

@@ -45,6 +45,7 @@ import numpy as np
 from scipy.signal import resample
 
 from benchmarks.bathymetry_layover import by_range, FLAT, objects, SIZES
+from benchmarks.bathymetry_paper import EXACT_ARRAY
 from benchmarks.layover_tables import circular
 from benchmarks.speed.bathymetry import bench_layover
 from benchmarks.study import Parts, rms, study, truths
@@ -150,7 +151,9 @@ def off_facets(found: FloatArray, chosen: BoolArray, facets: Facets) -> FloatArr
 
 
 def tracked(snapshot: Snapshot, layover: str = 'resolved') -> Estimate:
-    (estimate,) = BathymetryTracker(BathymetryConfig(layover=layover, seed=1)).process(snapshot)
+    (estimate,) = BathymetryTracker(
+        BathymetryConfig(layover=layover, seed=1, **EXACT_ARRAY)
+    ).process(snapshot)
     return estimate
 
 
@@ -167,7 +170,7 @@ def floors(name: str, pings: int, seed: int) -> dict[str, float]:
     """Bins of a floor without objects that get two heights, or become no sounding for doubt."""
     scene_name, changes = FLAT[name]
     config = scenario(scene_name, {'pings': pings, **changes})
-    values = {**config.instruments(), 'layover': 'resolved', 'engine': 'grid', 'grid_step': 0.05}
+    values = {**config.instruments(), 'layover': 'resolved'}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(values))
     false = doubt = bins = 0
     for item in simulate(config, seed).measurements:

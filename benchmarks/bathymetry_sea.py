@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bathymetry_paper import truth_of
+from benchmarks.bathymetry_paper import truth_of, WALKS
 from benchmarks.study import known, Parts, study
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of
@@ -155,7 +155,9 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     config = scenario(scene_name, {'pings': pings, **changes})
     scene = simulate(config, seed)
     inputs = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
-    settings = BathymetryConfig.from_mapping({**config.instruments(), **values}).for_inputs(inputs)
+    settings = BathymetryConfig.from_mapping(
+        {**config.instruments(), **WALKS, **values}
+    ).for_inputs(inputs)
     if settings.navigation == 'ignored' and settings.sound_speed_profile:
         raise ValueError('a profile needs navigation')
     tracker = BathymetryTracker(settings)

@@ -28,6 +28,7 @@ from functools import partial
 import time
 from typing import Any
 
+from benchmarks.bathymetry_paper import WALKS
 from benchmarks.speed.bathymetry import a_ping, cut, numpy_filter, PEER_BINS, rates, Timed
 from benchmarks.study import Parts, study
 from sonar_imm.measurements import Snapshot
@@ -35,19 +36,20 @@ from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTr
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 ENGINES: dict[str, dict[str, Any]] = {
-    'particles': {},
-    'grid': {'engine': 'grid'},
+    'terrain': {},
+    'particles': WALKS,
+    'grid': {**WALKS, 'engine': 'grid'},
 }
 SCENES = {'at rest': 'paper', 'moving': 'moving', 'moving, bent rays': 'moving_profile'}
 LAYOVERS = ('ignored', 'gated')
 SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    'grid, forward-backward': ({'engine': 'grid', 'smoothing': 'states'}, {}),
+    'grid, forward-backward': ({**WALKS, 'engine': 'grid', 'smoothing': 'states'}, {}),
     'height_bank': ({'model_set': 'height_bank'}, {}),
     'scatter_bank': ({'model_set': 'scatter_bank'}, {}),
-    '1000 particles': ({'particles_per_model': 1000}, {}),
+    '1000 particles': ({**WALKS, 'particles_per_model': 1000}, {}),
     'four walks': ({'model_set': 'height_bank', 'engine': 'particles'}, {}),
-    '2 staves': ({}, {'staves': 2}),
-    '32 staves': ({}, {'staves': 32}),
+    '2 staves': (WALKS, {'staves': 2}),
+    '32 staves': (WALKS, {'staves': 32}),
 }
 
 

@@ -166,11 +166,11 @@ def clumps(seed: int, kind: Kind, clean: bool = False, seconds: int = 200) -> di
     }
 
 
-def existence(seed: int, dt: float, mean: float, count: int = 60) -> dict[str, FloatArray]:
+def existence(seed: int, dt: float, mean: float) -> dict[str, FloatArray]:
     """Sums over published tracks: stated existence, what is true, squares, and delays."""
     rng = np.random.default_rng([48, seed])
     kind = DIVERS._replace(half=80.0)
-    count = count if dt >= 1.0 else round(count / dt)
+    count = 60 if dt >= 1.0 else 300
     truth = legs(rng, count, 4, dt, kind)
     scans = scans_of(rng, truth, dt, kind, uniform(rng, mean, kind.half))
     tracker, stated, true = DiverTracker(DiverConfig()), [], []

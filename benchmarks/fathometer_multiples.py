@@ -29,7 +29,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.study import Parts, study
-from sonar_imm.trackers.fathometer.reflectors import Multiples, Seen, ways_above
+from sonar_imm.trackers.fathometer.multiples import Multiples, Seen, ways_above
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 PRIMARIES, DEEPEST, ERROR, RECORDS = 4, 45.0, 0.03, (1, 5, 20, 60)

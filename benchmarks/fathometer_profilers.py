@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How well the floor is followed on envelopes of sub-bottom profilers, with and without the model
-of volume scatter: python -m benchmarks.fathometer_profilers [--out FILE]
+"""How well the floor is followed on envelopes of sub-bottom profilers, with the water found and
+off: python -m benchmarks.fathometer_profilers [--out FILE]
 
 Real lines (SONAR_IMM_DATA, needs segyio), converted and tracked by the command as
 docs/fathometer.md says, and the simulated scene ``diffuse``. On the real lines the floor is picked
@@ -34,10 +34,10 @@ Crossings are those of the default rows. L3 and L9 cross where the floor is at 4
 first sample that is taken (4.5 m), so that this crossing is made once more from the end of the
 transmit pulse on (3.4 m). `between_lines` are the numbers of all horizons that were judged.
 
-The parameters that are not measured (scatter_spread, depth_std, the form of the likelihood) were
-chosen on lines L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that, but the
-rule by which the first return keeps its name was made with all four in view. Seeds of the scene
-here begin at 11. 5,000 particles throughout.
+The parameters that are not measured (depth_std, the form of the likelihood) were chosen on lines
+L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that, but the rule by which
+the first return keeps its name, and the chain of the water, were made with all four in view. Seeds
+of the scene here begin at 11. 5,000 particles throughout.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.study import mean_of, Parts, study
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.cli import main as command
 from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, summary
 from sonar_imm_tools.evaluation.fathometer.records import records_of
 from sonar_imm_tools.evaluation.fathometer.scoring import pair
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.convert.segy import arrival_edges, first_arrivals
 from sonar_imm_tools.recordings.segy_lines import read_segy
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
@@ -71,11 +71,12 @@ SPACING, FIRST, SAMPLES, STACK, NEAR, PARTICLES = 0.376, 12, 74, 4, 1.0, 5000
 UNCUT = 9
 """The first sample after the transmit pulse."""
 FEW = ('--set', f'particles={PARTICLES}')
-WITHOUT = ('--set', 'scatter_decay=[]')
+WITHOUT = ('--set', 'water=off')
+_RUN, _REACH, _LOUD = 3, 4, 8.0
 ROWS = {
-    'volume scatter (default)': (),
-    'volume scatter, seed 1': ('--set', 'seed=1'),
-    'without': WITHOUT,
+    'default': (),
+    'seed 1': ('--set', 'seed=1'),
+    'water off': WITHOUT,
 }
 
 
@@ -171,6 +172,29 @@ def sounder(stated: np.ndarray, edge: np.ndarray, peak: np.ndarray) -> dict[str,
     }
 
 
+def arrival_edges(amplitude: FloatArray) -> IntArray:
+    """Sample at which each trace (T, n) first begins, -1 where none does: the first of three
+    successive samples above an eighth of what the loud traces reach."""
+    loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
+    above = amplitude > loud
+    count = amplitude.shape[1] - _RUN + 1
+    if count < 1:
+        return np.full(len(amplitude), -1)
+    run = np.logical_and.reduce([above[:, k : k + count] for k in range(_RUN)])
+    return np.where(run.any(axis=1), run.argmax(axis=1), -1)
+
+
+def first_arrivals(amplitude: FloatArray) -> IntArray:
+    """Sample of the first arrival of each trace (T, n), -1 where there is none: the greatest of
+    the four from its edge on."""
+    return np.array(
+        [
+            -1 if i < 0 else i + int(np.argmax(trace[i : i + _REACH]))
+            for i, trace in zip(arrival_edges(amplitude), amplitude)
+        ]
+    )
+
+
 def _half(trace: np.ndarray) -> int:
     first = int(np.argmax(trace > 0.5 * trace.max()))
     return first + int(np.argmax(trace[first : first + 4]))
@@ -181,15 +205,15 @@ def share(values: Any) -> float:
 
 
 def scene_rows(runs: int) -> dict[str, Any]:
-    """The scene with the parameters it states, with and without scatter in the model."""
-    rows: dict[str, list[dict[str, float]]] = {'volume scatter (default)': [], 'without': []}
+    """The scene with the parameters it states, with the water found and off."""
+    rows: dict[str, list[dict[str, float]]] = {'default': [], 'water off': []}
     for seed in range(11, 11 + runs):
         config = scenario('diffuse', {'records': 100})
         scene = simulate(config, seed)
         for row, scores in rows.items():
             values = {**config.instruments(), 'particles': PARTICLES}
-            if row == 'without':
-                values['scatter_decay'] = ()
+            if row == 'water off':
+                values['water'] = 'off'
             tracker = FathometerTracker(FathometerConfig.from_mapping(values))
             estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
             scores.append(_score(estimates, scene.truth))

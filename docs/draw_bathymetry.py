@@ -49,7 +49,7 @@ IMAGES = ROOT / 'docs' / 'images'
 BLUE, RED, AMBER, INK = '#0072B2', '#D55E00', '#E69F00', '#1b2733'
 SETS = {
     'height_rw_ncs': {'model_set': 'height_rw_ncs', 'sigmas': (1.0, 1.0)},
-    'height_two_rw': {'sigmas': (0.01, 0.5)},
+    'height_two_rw': {**paper.WALKS, 'sigmas': (0.01, 0.5)},
     'angle_two_rw': {'model_set': 'angle_two_rw'},
 }
 AS_PRINTED = {

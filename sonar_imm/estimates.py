@@ -17,7 +17,8 @@ bin or reflector."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import dropwhile, takewhile
 from typing import Any
 
 from attrs import field, frozen
@@ -31,6 +32,13 @@ PLACES = ('px', 'py', 'pz')
 def places(xyz: NDArray[np.floating[Any]]) -> dict[str, NDArray[np.float64]]:
     """The columns `PLACES` of places (n, 3)."""
     return dict(zip(PLACES, np.asarray(xyz, np.float64).T))
+
+
+def model_columns(names: Iterable[str]) -> tuple[str, ...]:
+    """Of the columns of an estimate those of its models: the first that begin with ``prob_`` and
+    stand side by side. Later ones are further columns, of probabilities of something else."""
+    from_first = dropwhile(lambda name: not name.startswith('prob_'), names)
+    return tuple(takewhile(lambda name: name.startswith('prob_'), from_first))
 
 
 def _exact(columns: Mapping[str, NDArray]) -> tuple[str, ...]:
@@ -102,7 +110,7 @@ class Estimate:
             if name.startswith('cov_')
             and name[4 : 4 + (len(name) - 5) // 2] == name[5 + (len(name) - 5) // 2 :]
         )
-        models = tuple(name[5:] for name in names if name.startswith('prob_'))
+        models = tuple(name[5:] for name in model_columns(names))
         rows, n = len(columns['x']), len(states)
         covariance = np.empty((rows, n, n))
         for i, a in enumerate(states):
@@ -110,7 +118,7 @@ class Estimate:
                 if f'cov_{a}_{b}' not in columns:
                     raise ValueError(f'an estimate table needs the column cov_{a}_{b}')
                 covariance[:, i, j] = covariance[:, j, i] = columns[f'cov_{a}_{b}']
-        used = {'x', 'y', 'z', *states}
+        used = {'x', 'y', 'z', *states, *(f'prob_{model}' for model in models)}
         return cls(
             stamp_ns=stamp_ns,
             frame_id=frame_id,
@@ -125,6 +133,6 @@ class Estimate:
             extras={
                 name: np.asarray(columns[name])
                 for name in names
-                if name not in used and not name.startswith(('cov_', 'prob_'))
+                if name not in used and not name.startswith('cov_')
             },
         )

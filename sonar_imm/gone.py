@@ -135,6 +135,12 @@ GONE: dict[str, str] = {
         f'parameter {name}': 'was removed: choose navigation_grade (ins, dvl or dead_reckoning)'
         for name in ('position_noise', 'yaw_noise_deg', 'depth_noise')
     },
+    **{
+        f'parameter {name}': (
+            'was removed: scatter below the floor of an envelope is found (parameter water)'
+        )
+        for name in ('scatter_decay', 'scatter_spread')
+    },
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',
     **{
         f'parameter {name}': 'was removed: the printed form is in benchmarks/fathometer_paper.py'

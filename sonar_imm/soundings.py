@@ -47,6 +47,7 @@ COLUMNS: dict[str, type] = {
     'side': np.uint8,
     'surface': np.uint8,
     'existence': np.float32,
+    'geometry_std': np.float32,
     'px': np.float64,
     'py': np.float64,
     'pz': np.float64,
@@ -55,11 +56,12 @@ COLUMNS: dict[str, type] = {
 together); intensity: 10 log10 of the mean power of a stave, dB; beam_angle: rad from straight
 down, port positive; label: number of the most probable terrain model; range m; side: 0 port, 1
 starboard; surface: 1, of two the lower, or 2, the upper; existence: probability of a second
-surface in the bin; px py pz: the same place as x y z, which at map coordinates are half a metre
+surface in the bin; geometry_std m: what of the vertical uncertainty all pings have in common, as a
+standard deviation; px py pz: the same place as x y z, which at map coordinates are half a metre
 coarse."""
 
-LATER = {'surface': 1, 'existence': 0.0}
-"""Columns that tables of before `layover` lack, with what they mean."""
+LATER = {'surface': 1, 'existence': 0.0, 'geometry_std': 0.0}
+"""Columns that older tables lack, with what they mean."""
 
 
 @frozen(eq=False)
@@ -89,6 +91,7 @@ def soundings_of(estimate: Estimate) -> Soundings | None:
         **dict(zip('xyz', estimate.xyz.T)),
         **places(estimate.xyz),
         **extras,
+        'geometry_std': extras.get('geometry_std', np.zeros(n)),
         'surface': np.ones(n),
         'existence': extras.get('existence_2', np.zeros(n)),
     }

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.special import kve
 
+from benchmarks.bathymetry_paper import WALKS
 from benchmarks.speed import Bench
 from sonar_imm.acoustics.laplace import autocorrelation
 from sonar_imm.estimation.arrays import FloatArray
@@ -61,7 +62,12 @@ HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
 
 def config(**values: Any) -> BathymetryConfig:
     """Parameters with which the tracker computes what the peers compute."""
-    defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
+    defaults = {
+        **WALKS,
+        'sigmas': SIGMAS,
+        'initial_std': 1.0,
+        'transition_matrix': tuple(CHAIN.ravel()),
+    }
     return BathymetryConfig(**{**defaults, **values})
 
 
@@ -244,7 +250,7 @@ def bench_sea(rounds: int = 7) -> dict[str, Any]:
     uncertainties; particles and grid."""
     methods: dict[str, Timed] = {}
     for engine in ('particles', 'grid'):
-        changes = {'last_range': 117.0}, {'engine': engine}
+        changes = {'last_range': 117.0}, {**WALKS, 'engine': engine}
         methods[engine], _ = under_way('moving_profile', *changes)
     speed = rates(methods, rounds, clock=time.process_time)
     return {
@@ -279,7 +285,7 @@ def bench_layover(rounds: int = 7) -> dict[str, Any]:
     for scene in ('thermal', 'ledge', 'moving_ledge'):
         for engine in ('particles', 'grid'):
             for layover in ('ignored', 'gated', 'resolved'):
-                values = {'engine': engine, 'layover': layover}
+                values = {**WALKS, 'engine': engine, 'layover': layover}
                 changes = {'patch_std': 0.0} if scene == 'thermal' else {}
                 timed, seen = under_way(scene, changes, values)
                 methods[f'{scene}, {engine}, {layover}'] = timed
@@ -320,7 +326,7 @@ def bench_scaling(rounds: int = 7) -> dict[str, Any]:
         variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
     methods: dict[str, Timed] = {}
     for name, (values, shot) in variants.items():
-        tracker = BathymetryTracker(BathymetryConfig(shadow_gate=False, **values))
+        tracker = BathymetryTracker(BathymetryConfig(**WALKS, shadow_gate=False, **values))
         methods[name] = partial(tracker.process, shot), len(shot)
     return {'bins_per_second': rates(methods, rounds)}
 

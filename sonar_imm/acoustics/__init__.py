@@ -19,6 +19,7 @@ __all__ = [
     'arrivals_3d',
     'cfar',
     'coherence',
+    'envelopes',
     'fathometer',
     'geodesy',
     'geometry',

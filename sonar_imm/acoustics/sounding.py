@@ -90,6 +90,38 @@ class ErrorBudget:
     sound_speed: float
 
 
+@frozen
+class GeometryDoubt:
+    """Standard deviations of what an array and the water are known to: tilt, rad; the spacing of
+    the staves and the sound speed, as shares."""
+
+    tilt: float
+    spacing: float
+    sound_speed: float
+
+
+def geometry_variance(
+    depth: FloatArray, distance: FloatArray, angle: FloatArray, doubt: GeometryDoubt
+) -> tuple[FloatArray, FloatArray]:
+    """Variances (...,) m^2, vertical and horizontal, that all bins and pings have in common.
+
+    D depth below and Y distance from the array, theta the angle from broadside. The tilt turns the
+    swath; the spacing bends it, since u = sin theta is that share wrong; the sound speed does the
+    same, and scales the ranges::
+
+        (Y s_tilt)^2 + (s_spacing Y tan theta)^2 + s_c^2 (D + Y tan theta)^2
+
+    Consider parameters (Schmidt): nothing is estimated of them, since tilt is a slope of the floor
+    and the others a bend.
+    """
+    D, Y = np.abs(depth), np.asarray(distance, np.float64)
+    t = np.clip(np.tan(angle), -STEEPEST, STEEPEST)
+    turned = doubt.tilt**2 + np.square(doubt.spacing * t)
+    vertical = np.square(Y) * turned + np.square(doubt.sound_speed * (D + Y * t))
+    horizontal = np.square(D) * turned + np.square(doubt.sound_speed * (Y - D * t))
+    return vertical, horizontal
+
+
 def array_axes(side: str, tilt: float, mount: FloatArray) -> ArrayAxes:
     """The axes of an array that looks to `side`, ``'port'`` or ``'starboard'``; mount (3, 3)."""
     s = 1.0 if side == 'port' else -1.0

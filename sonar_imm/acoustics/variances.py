@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import uniform_filter1d
 
 from ..estimation.arrays import BoolArray, FloatArray
 
@@ -40,6 +41,11 @@ STRETCH, LOUD_STRETCH = 16, 8.0
 LEAST_SNR = 0.01
 """Signal variances are kept above this many noise variances: a silent bin has little
 weight then."""
+
+AROUND, FURTHEST = 101, 31
+"""Bins of the mean power by which correlated bins are weighed; the largest lag looked at."""
+BY_CHANCE, LEAST_EXCESS = 4.0, 0.02
+"""Of the square of a correlation, times the number of bins; and what ends the sum over lags."""
 
 
 def usable_bins(iq: NDArray) -> BoolArray:
@@ -68,6 +74,29 @@ def moving_mean(values: ArrayLike, half_width: int, usable: BoolArray | None = N
     last = np.minimum(np.arange(rows) + half_width + 1, rows)
     count = (counts[last] - counts[first]).reshape(shape)
     return np.where(count > 0, (sums[last] - sums[first]) / np.maximum(count, 1), np.nan)
+
+
+def bins_alike(iq: NDArray, usable: BoolArray) -> float:
+    """How many bins of a ping iq (n, P) say the same as one, where they are finer than the pulse:
+    1 where they are independent.
+
+    With the correlation r_l of bins l apart, each weighed by the mean power around it, n bins say
+    what n / tau independent ones do, tau = 1 + 2 sum_l r_l^2. Of r_l^2 chance has about 1 / n.
+    """
+    bins = int(np.count_nonzero(usable))
+    y = np.where(usable[:, None], iq, 0.0).astype(np.complex128)
+    power = uniform_filter1d(np.square(np.abs(y)).sum(axis=1), AROUND, mode='nearest')
+    y /= np.sqrt(np.maximum(power, 1e-300))[:, None]
+    total, tau = float(np.square(np.abs(y)).sum()), 1.0
+    if not total > 0.0:
+        return 1.0
+    for lag in range(1, min(FURTHEST, len(y) - 1) + 1):
+        share = float(abs(np.vdot(y[:-lag], y[lag:]))) / total
+        excess = share * share - BY_CHANCE / bins
+        if excess < LEAST_EXCESS:
+            break
+        tau += 2.0 * excess
+    return tau
 
 
 def noise_variance(iq: NDArray, quiet: BoolArray) -> float:

@@ -92,7 +92,6 @@ from .set_proposals import (
     walked_from,
     WalkTables,
 )
-from .set_scatter import fit_scatter, NO_SCATTER, ScatterFit
 from .set_shifts import Shift, ShiftPath, ShiftTables
 
 _STEP, _START, _RESAMPLE, _MOVE = range(4)
@@ -129,15 +128,14 @@ class AmplitudeModel(NamedTuple):
 class Record(NamedTuple):
     """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
     key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign that
-    walks look at, see `gains`; amplitudes: how members answer in it; background: of its scatter;
-    births; walks: as far as nothing of the record is known; passage: since the record before;
-    found: gains (S, n) by sign before they were levelled, and what stands out."""
+    walks look at, see `gains`; amplitudes: how members answer in it; births; walks: as far as
+    nothing of the record is known; passage: since the record before; found: gains (S, n) by sign
+    before they were levelled, and what stands out."""
 
     b: FloatArray
     key: tuple[int, int]
     gains: FloatArray
     amplitudes: AmplitudeModel
-    background: ScatterFit
     births: Births
     walks: Walks
     passage: Passage
@@ -245,14 +243,13 @@ class SetFilter:
         model, passage = self.model, self._passage(records)
         walks = walks or passage.walks
         amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
-        background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
-        g, peaks = gains(model, b, background, amplitudes.gram)
+        g, peaks = gains(model, b, amplitudes.gram)
         walked = levelled(model, g) if walks.wide else g
         births = propose_births(
             model, walked if records > 1 else g, model.birth_share, model.birth_cap
         )
         found = g, peaks
-        return Record(b, key, walked, amplitudes, background, births, walks, passage, found)
+        return Record(b, key, walked, amplitudes, births, walks, passage, found)
 
     def start(self, record: Record) -> Weighted:
         """Sets before the first record, drawn where it will want them."""
@@ -334,8 +331,8 @@ class SetFilter:
         def work(first: int, last: int) -> None:
             J, slots = self.model.order_max, kernels.SLOTS
             owner, kept = np.full(slots, -1, np.int64), np.empty(slots)
-            scratch = np.empty((J, J)), np.empty((3, J)), owner, kept
-            seen = record.b, *record.amplitudes, *record.background
+            scratch = np.empty((J, J)), np.empty((2, J)), owner, kept
+            seen = record.b, *record.amplitudes
             kernels.weigh(first, last, *seen, *sets, *scratch, log_weight, amplitude)
 
         self._split(work)

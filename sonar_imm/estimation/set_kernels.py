@@ -155,12 +155,6 @@ def weigh(
     penalty: float,
     marginal: bool,
     remembers: bool,
-    evidence: FloatArray,
-    level: FloatArray,
-    profile_row: IntArray,
-    profile: FloatArray,
-    spread: float,
-    apart: int,
     order: IntArray,
     cell: IntArray,
     prior_mean: FloatArray,
@@ -178,15 +172,13 @@ def weigh(
     where an amplitude is not of its member's sign, and write amplitude (N, J), its mean given the
     set, in units of the noise. Weights of -inf are left alone.
 
-    gram to remembers: of `set_filter.AmplitudeModel`; evidence to apart: of
-    `set_scatter.ScatterFit`. Scatter begins at the first member, or as probably at the second
-    where that is louder and well below. L (J, J), vectors (3, J), owner and kept (SLOTS,) are
-    scratch, owner -1 throughout.
+    gram to remembers: of `set_filter.AmplitudeModel`. L (J, J), vectors (2, J), owner and kept
+    (SLOTS,) are scratch, owner -1 throughout.
 
     Particles crowd at the peaks of a record: of twenty thousand some three thousand differ. What
     was found for one is kept, in a slot by its members, for those that are the same.
     """
-    scattered, middle, slot = len(level) > 0, profile.shape[1] // 2, 0
+    slot = 0
     for i in range(first, last):
         if not log_weight[i] > -math.inf:
             continue
@@ -207,71 +199,51 @@ def weigh(
                     amplitude[i, k] = amplitude[j, k]
                 log_weight[i] += kept[slot]
                 continue
-        found = -math.inf
-        beginnings = 2 if scattered and m > 1 and cell[i, 1] - cell[i, 0] >= apart else 1
-        for begins in range(beginnings):
-            begin, value = 0, 0.0
-            if scattered and m > 0:
-                begin = cell[i, begins] + shift[i]
-                value = evidence[begin]
-            # Cholesky: A = L L', y = L^-1 h, a = L'^-1 y; y, a and the scale are the vectors.
-            for r in range(m):
-                z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], ridge
-                if scattered:
-                    lag = middle + z + shift[i] - begin
-                    mean = level[begin] * profile[profile_row[begin], lag]
-                    scale = math.sqrt(1.0 + (spread * mean) ** 2)
-                    vectors[2, r] = scale
-                    h = (h - mean) / scale
-                if remembers:
-                    precision = 1.0 / prior_variance[i, r]
-                    mean = prior_mean[i, r]
-                    h += precision * mean
-                    value += 0.5 * (math.log(precision) - precision * mean * mean)
-                for c in range(r):
-                    product = gram[z - cell[i, c]]
-                    for k in range(c):
-                        product -= L[r, k] * L[c, k]
-                    product *= L[c, c]
-                    L[r, c] = product
-                    h -= product * vectors[0, c]
-                pivot = gram[0] + precision
-                for k in range(r):
-                    pivot -= L[r, k] * L[r, k]
-                if not pivot > 1e-12:
+        value = 0.0
+        # Cholesky: A = L L', y = L^-1 h, a = L'^-1 y; y and a are the vectors.
+        for r in range(m):
+            z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], ridge
+            if remembers:
+                precision = 1.0 / prior_variance[i, r]
+                mean = prior_mean[i, r]
+                h += precision * mean
+                value += 0.5 * (math.log(precision) - precision * mean * mean)
+            for c in range(r):
+                product = gram[z - cell[i, c]]
+                for k in range(c):
+                    product -= L[r, k] * L[c, k]
+                product *= L[c, c]
+                L[r, c] = product
+                h -= product * vectors[0, c]
+            pivot = gram[0] + precision
+            for k in range(r):
+                pivot -= L[r, k] * L[r, k]
+            if not pivot > 1e-12:
+                value = -math.inf
+                break
+            # The diagonal of L is kept as its reciprocal.
+            L[r, r] = 1.0 / math.sqrt(pivot)
+            vectors[0, r] = h * L[r, r]
+            value += 0.5 * vectors[0, r] * vectors[0, r]
+            if marginal:
+                value -= 0.5 * math.log(pivot)
+            if not remembers:
+                value -= penalty
+        if value > -math.inf:
+            for r in range(m - 1, -1, -1):
+                rest = vectors[0, r]
+                for k in range(r + 1, m):
+                    rest -= L[k, r] * vectors[1, k]
+                vectors[1, r] = rest * L[r, r]
+                if not vectors[1, r] * sign[i, r] > 0.0:
                     value = -math.inf
                     break
-                # The diagonal of L is kept as its reciprocal.
-                L[r, r] = 1.0 / math.sqrt(pivot)
-                vectors[0, r] = h * L[r, r]
-                value += 0.5 * vectors[0, r] * vectors[0, r]
-                if marginal:
-                    value -= 0.5 * math.log(pivot)
-                if not remembers:
-                    value -= penalty
-            if value > -math.inf:
-                for r in range(m - 1, -1, -1):
-                    rest = vectors[0, r]
-                    for k in range(r + 1, m):
-                        rest -= L[k, r] * vectors[1, k]
-                    vectors[1, r] = rest * L[r, r]
-                    if not vectors[1, r] * sign[i, r] > 0.0:
-                        value = -math.inf
-                        break
-                for r in range(m if scattered else 0):
-                    vectors[1, r] *= vectors[2, r]
-            better = begins == 0 and value > -math.inf
-            if begins == 0:
-                found = value
-            elif value > -math.inf and vectors[1, 1] > vectors[1, 0]:
-                better, best = value > found, max(value, found)
-                found = best + math.log(0.5 * (1.0 + math.exp(min(value, found) - best)))
-            if better:
-                for k in range(m):
-                    amplitude[i, k] = vectors[1, k]
+        if value > -math.inf:
+            for k in range(m):
+                amplitude[i, k] = vectors[1, k]
         if not remembers:
-            owner[slot], kept[slot] = i, found
-        log_weight[i] += found
+            owner[slot], kept[slot] = i, value
+        log_weight[i] += value
 
 
 @kernel

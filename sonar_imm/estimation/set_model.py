@@ -52,8 +52,7 @@ The record
     ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
                    charges for the place, so this charges twice: too much.
 
-    With ``scatter`` the members stand in a background that begins at the first of them: see
-    `set_scatter`. With ``shift`` all of them show elsewhere by the same distance: see
+    With ``shift`` all of them show elsewhere by the same distance: see
     `set_shifts`.
 
 Each member has a sign for life, drawn at its birth: negative with ``negative_probability``. A set
@@ -74,7 +73,6 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
 from .markov import check_transition_matrix
-from .set_scatter import Scatter
 from .set_shifts import Shift
 
 PRIORS = ('marginal', 'bic_half', 'paper')
@@ -184,8 +182,7 @@ class SetModel:
     0; amplitude_prior: of PRIORS, with amplitude_std: s, and independent_samples: N;
     walk_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
     noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
-    negative_probability: that a member is negative; shift: that all members share, None for none;
-    scatter: background below the first member, None for none.
+    negative_probability: that a member is negative; shift: that all members share, None for none.
     With a shift, records b have ``record_cells`` cells, the lattice with the largest shift before
     and after it.
     """
@@ -205,7 +202,6 @@ class SetModel:
     amplitude_memory: float = 0.0
     negative_probability: float = 0.0
     shift: Shift | None = None
-    scatter: Scatter | None = None
     start: FloatArray = Factory(
         lambda self: np.full(len(self.transition), 1.0 / len(self.transition)), takes_self=True
     )
@@ -215,10 +211,6 @@ class SetModel:
             raise ValueError(f'amplitude_prior is one of {PRIORS}, not {self.amplitude_prior!r}')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
             raise ValueError('only marginal amplitudes can have a memory')
-        if self.amplitude_memory and self.scatter:
-            raise ValueError('amplitudes against scatter cannot have a memory')
-        if self.scatter and self.scatter.profile.shape[1] < 2 * self.record_cells - 1:
-            raise ValueError('the profile of scatter is shorter than the record')
         if not 0.0 <= self.negative_probability < 1.0:
             raise ValueError('negative_probability lies in [0, 1)')
         if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:

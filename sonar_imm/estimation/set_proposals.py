@@ -43,7 +43,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .set_model import SetModel, Sets, Walks
-from .set_scatter import guide, ScatterFit
 
 _SWEEPS, _UNSURE, _SURE = 2, 0.05, 0.98
 _AT_ONCE = 1 << 15
@@ -100,15 +99,11 @@ def standing_out(model: SetModel, b: FloatArray, gram: FloatArray) -> tuple[Floa
     return alone, Peaks(first, last)
 
 
-def gains(
-    model: SetModel, b: FloatArray, fit: ScatterFit, gram: FloatArray
-) -> tuple[FloatArray, Peaks]:
+def gains(model: SetModel, b: FloatArray, gram: FloatArray) -> tuple[FloatArray, Peaks]:
     """g (S, n) for each sign, and what stands out of the record b (n,), gram (n,) of it; nothing
-    where proposals are blind, or there is scatter, out of which more stands than members."""
+    where proposals are blind."""
     peaks = NOTHING
-    if model.scatter:
-        b = guide(fit, b)
-    elif model.walk_share:
+    if model.walk_share:
         b, peaks = standing_out(model, b, gram)
     return np.stack([0.5 * np.square(np.maximum(sign * b, 0.0)) for sign in model.signs]), peaks
 

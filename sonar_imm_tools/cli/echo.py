@@ -26,6 +26,7 @@ from typing import Any, TYPE_CHECKING
 
 import click
 
+from sonar_imm.estimates import model_columns
 from sonar_imm.texts import visible
 
 from .common import example, say, timeout_option, warn
@@ -194,7 +195,7 @@ def readable(columns: Columns, most: int) -> tuple[list[str], Rows]:
     state, are left out.
     """
     states = [name for name in columns if f'cov_{name}_{name}' in columns]
-    models = [name for name in columns if name.startswith('prob_')]
+    models = model_columns(columns)
     drawn = {'x', 'y', 'z'} if {'px', 'py'} <= columns.keys() else set()
     plain = [
         name

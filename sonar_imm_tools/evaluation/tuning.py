@@ -369,6 +369,11 @@ def prepared(jobs: Sequence[Job], names: Sequence[str]) -> tuple[Fitting, int]:
     recordings = [_recording(job) for job in jobs]
     first = recordings[0]
     every = _predictive(first.system).tunables(first.config, first.measurements)
+    if not every:
+        raise ConfigError(
+            'these models have no parameter that a recording could fit; --set model_set=NAME '
+            'chooses others'
+        )
     known = {t.name for t in every}
     for name in names:
         if name not in known:

@@ -425,6 +425,7 @@ def _line(
         'side': (whole < 0.0).astype(np.float64),
         'surface': np.ones(D.shape),
         'existence': np.zeros(D.shape),
+        'geometry_std': np.zeros(D.shape),
     }
     stamps = first_ns + np.round(1e9 * t).astype(np.int64)
     stamp_ns = np.broadcast_to(stamps[:, None], D.shape)[found]

@@ -229,7 +229,7 @@ def _hypotheses(
     steep = 0.05 + 0.25 * np.hypot(slope[:, 0], slope[:, 1]) * cell
     v = line.noise[which] * (1.0 + far) + np.square(steep) * far
     basis = line.basis()[which]
-    common = common_variance(basis, slope, budget, line.sound_speed)
+    common = common_variance(basis, slope, budget, line.sound_speed) + line.geometry[which]
     # Soundings come by line, stamp, x and y: ties keep that order.
     order = np.lexsort((which, h, node))
     which, node, h, v = which[order], node[order], h[order], v[order]

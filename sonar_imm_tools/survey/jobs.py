@@ -46,7 +46,10 @@ TILE = 64
 """Cells along the side of a tile."""
 LONGEST_SECONDS = 1800.0
 """A longer line has more than one tide."""
-_STORED = dict.fromkeys(('D', 'Y', 'noise', 'speed', 'port'), 'f4') | {'s': 'i1', 'label': 'u1'}
+_STORED = dict.fromkeys(('D', 'Y', 'noise', 'geometry', 'speed', 'port'), 'f4') | {
+    's': 'i1',
+    'label': 'u1',
+}
 
 
 @frozen(kw_only=True)

@@ -66,7 +66,8 @@ STATED = (
 class Line:
     """Soundings (n,) sorted by stamp, x and y.
 
-    xy (n, 2), z (n,) m; noise (n,) variance of z that is a sounding's own, m^2; D, Y (n,) m;
+    xy (n, 2), z (n,) m; noise (n,) variance of z that is a sounding's own, m^2; geometry (n,)
+    variance of z that it has in common with all others; D, Y (n,) m;
     s (n,) +1 or -1; port (n, 2), zero where unknown; speed (n,) m/s; label (n,); sound_speed m/s.
     """
 
@@ -74,6 +75,7 @@ class Line:
     xy: FloatArray
     z: FloatArray
     noise: FloatArray
+    geometry: FloatArray
     D: FloatArray
     Y: FloatArray
     s: FloatArray
@@ -125,7 +127,8 @@ class Line:
 
 
 def line_of(points: Points, budget: ErrorBudget, sound_speed: float = 1500.0) -> Line:
-    """The line in a table of soundings. Own noise is the vertical uncertainty less the budget."""
+    """The line in a table of soundings. Own noise is the vertical uncertainty less the budget
+    and less what the geometry of the array makes all soundings have in common."""
     rows = np.lexsort((points['y'], points['x'], points.stamp_ns))
     stamp_ns = points.stamp_ns[rows]
     xy = np.column_stack([points['x'], points['y']])[rows]
@@ -133,12 +136,14 @@ def line_of(points: Points, budget: ErrorBudget, sound_speed: float = 1500.0) ->
     slant, angle = points['range'][rows], points['beam_angle'][rows]
     D, Y = slant * np.cos(angle), slant * np.abs(np.sin(angle))
     common, _ = uncertainties(np.zeros(len(D)), D, Y, budget, sound_speed)
+    geometry = np.square(points['geometry_std'][rows])
     port, speed = _directions(stamp_ns, xy, s * Y)
     return Line(
         stamp_ns=stamp_ns,
         xy=xy,
         z=points['z'][rows],
-        noise=np.maximum(points['vertical_uncertainty'][rows] - common, LEAST_NOISE),
+        noise=np.maximum(points['vertical_uncertainty'][rows] - common - geometry, LEAST_NOISE),
+        geometry=geometry,
         D=D,
         Y=Y,
         s=s,

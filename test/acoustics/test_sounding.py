@@ -110,3 +110,47 @@ def test_the_budget_is_finite_straight_below_and_infinite_where_the_depth_says_n
     )
     assert np.isfinite(horizontal).all() and np.isfinite(vertical[0])
     assert vertical[1] == np.inf
+
+
+def test_what_the_geometry_leaves_open_is_that_of_the_vectors():
+    file = Path(__file__).parents[1] / 'vectors' / 'bathymetry_by_default' / 'array.npz'
+    with np.load(file) as archive:
+        case = dict(archive)
+    elevation = np.arcsin(15.0 / case['r'])
+    parts = {
+        'variance': (0.2, 0.01, 2.0),
+        'tilt': (0.2, 0.0, 0.0),
+        'spacing': (0.0, 0.01, 0.0),
+        'speed': (0.0, 0.0, 2.0),
+    }
+    for name, (tilt, spacing, speed) in parts.items():
+        doubt = sounding.GeometryDoubt(np.radians(tilt), spacing, speed / 1500.0)
+        vertical, _ = sounding.geometry_variance(
+            np.full(len(elevation), 15.0),
+            case['r'] * np.cos(elevation),
+            elevation - np.radians(30.0),
+            doubt,
+        )
+        assert vertical == pytest.approx(case[f'common_{name}'], rel=1e-9), name
+
+
+def test_what_the_geometry_leaves_open_is_what_an_error_does():
+    """Seen by an array of another tilt and spacing through water of another speed."""
+    r, tilt = np.array([20.0, 40.0, 70.0]), np.radians(30.0)
+    elevation = np.arcsin(15.0 / r)
+    wrong = {'tilt': 1e-6, 'spacing': 1e-6, 'sound_speed': 1e-6}
+    for name, error in wrong.items():
+        told = dict.fromkeys(wrong, 0.0) | {name: error}
+        u = np.sin(elevation - tilt) * (1.0 + told['spacing'] + told['sound_speed'])
+        seen = np.arcsin(u) + tilt + told['tilt']
+        slant = r * (1.0 + told['sound_speed'])
+        dz = slant * np.sin(seen) - 15.0
+        dy = slant * np.cos(seen) - r * np.cos(elevation)
+        vertical, horizontal = sounding.geometry_variance(
+            np.full(3, 15.0),
+            r * np.cos(elevation),
+            elevation - tilt,
+            sounding.GeometryDoubt(**told),
+        )
+        assert np.sqrt(vertical) == pytest.approx(np.abs(dz), rel=1e-3)
+        assert np.sqrt(horizontal) == pytest.approx(np.abs(dy), rel=1e-3)

@@ -31,8 +31,7 @@ from sonar_imm_tools.recordings.topics import fitting_systems, fitting_topics, i
 from sonar_imm_tools.recordings.writer import BagWriter
 
 FEW = ('--set', 'particles_per_model=10')
-COUPLED = ('--set', 'engine=grid', '--set', 'grid_extent=3', '--set', 'smoothing=states')
-COUPLED += ('--set', 'ping_coupling=0.35')
+COUPLED = ('--set', 'ping_coupling=0.35')
 
 
 @pytest.fixture(scope='module')

@@ -130,8 +130,9 @@ def test_bounds_are_those_of_the_parameter() -> None:
 
 def test_an_element_that_is_fitted_leaves_the_others_of_its_list() -> None:
     """Also where the list was empty, which stands for values of the model set."""
-    config = BathymetryConfig()
+    config = BathymetryConfig(model_set='height_two_rw')
     first, second, _ = swaths.tunables(config, [])
+    assert swaths.tunables(BathymetryConfig(), []) == []  # terrain has nothing to fit
     assert not config.sigmas and not first.usual and second.label == 'sigmas[1]'
     changed = values_of([second], np.log([0.3]))
     assert changed == {'sigmas': (config.sigmas_used[0], pytest.approx(0.3))}

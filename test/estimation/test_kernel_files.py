@@ -35,6 +35,7 @@ FILES = (
     'estimation/set_shift_kernels.py',
     'trackers/bathymetry/filter_kernels.py',
     'trackers/bathymetry/surface_kernels.py',
+    'trackers/bathymetry/terrain_kernels.py',
 )
 """One kernel for each verb."""
 ALONE = (*FILES, 'trackers/bathymetry/grid_kernels.py')

@@ -40,7 +40,6 @@ from sonar_imm.estimation.set_proposals import (
     walked_from,
     WalkTables,
 )
-from sonar_imm.estimation.set_scatter import NO_SCATTER
 from sonar_imm.estimation.set_shifts import Shift
 
 N = 400
@@ -85,7 +84,7 @@ def test_negative_members_stand_out_where_there_can_be_some():
     signed = SIGMAS * np.where(np.arange(8) % 3 == 1, -1.0, 1.0)
     b = record(PLACES, signed)
     both = evolve(MODEL, negative_probability=0.05)
-    g, peaks = gains(both, b, NO_SCATTER, GRAM)
+    g, peaks = gains(both, b, GRAM)
     assert len(peaks.first) == 8 and g.shape == (2, N)
     for sign, low, high in zip(np.sign(signed), *peaks):
         place = low + np.argmax(g[:, low:high].max(axis=0))
@@ -94,9 +93,9 @@ def test_negative_members_stand_out_where_there_can_be_some():
 
 
 def test_nothing_stands_out_of_noise_and_blind_proposals_see_nothing():
-    assert not len(gains(MODEL, record(PLACES, 0.0 * SIGMAS), NO_SCATTER, GRAM)[1].first)
+    assert not len(gains(MODEL, record(PLACES, 0.0 * SIGMAS), GRAM)[1].first)
     b, blind = record(PLACES, SIGMAS), evolve(MODEL, walk_share=0.0, birth_share=0.0)
-    g, peaks = gains(blind, b, NO_SCATTER, GRAM)
+    g, peaks = gains(blind, b, GRAM)
     assert not len(peaks.first) and np.array_equal(g[0], 0.5 * np.square(np.maximum(b, 0.0)))
     beginning, births = begin(blind, g, peaks)
     assert beginning.decay == 1.0 and np.array_equal(beginning.elsewhere, births.running)

@@ -23,6 +23,8 @@ from sonar_imm.acoustics import array
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig
 
+EXACT = {'tilt_std_deg': 0.0, 'spacing_std': 0.0, 'sound_speed_std': 0.0}
+"""An array and water that are known: the covariance is that of the filter."""
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
 
 
@@ -39,6 +41,7 @@ def vector(name):
         'initial_std': float(case['sd0']),
         'particles_per_model': 3000,
         'shadow_gate': False,
+        **EXACT,
     }
     if name.startswith('set_ii_'):
         values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}

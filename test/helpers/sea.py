@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from helpers.bathymetry_cases import EXACT
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.bathymetry.likelihood import ship_swath
@@ -40,7 +41,7 @@ def sea_config(case, **values):
         'tilt_deg': float(case['tilt_deg']),
         'side': str(case['side']),
     }
-    return BathymetryConfig.from_mapping({**stated, **values})
+    return BathymetryConfig.from_mapping({**EXACT, **stated, **values})
 
 
 def navigation(case, *, late_s=0.0):

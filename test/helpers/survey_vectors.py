@@ -50,6 +50,7 @@ def lines(data):
             'beam_angle': data['beam'][rows].astype(float),
             'side': data['side'][rows].astype(float),
             'label': data['label'][rows].astype(float),
+            'geometry_std': np.zeros(len(x)),
         }
         made.append(line_of(Points(data['stamp_ns'][rows], columns), BUDGET))
     return made

@@ -41,13 +41,7 @@ RUNS = {
     'diver_table1': {},
     'diver_multistatic': {},
     'obstacle_tethers': {},
-    'bathymetry_ship': {
-        'engine': 'grid',
-        'smoothing': 'states',
-        'ping_coupling': '1.0',
-        'grid_extent': '3.0',
-        'grid_step': '0.1',
-    },
+    'bathymetry_ship': {'ping_coupling': '1.0'},
     'fathometer_drift': {'smoothing_lag': '2', 'particles': '300'},
     'fathometer_pressure': {
         'preview_seconds': '5.0',

@@ -221,17 +221,15 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
         assert found.frame_id == 'map' and len(found) == len(expected) > 100
         for name, column in expected.columns.items():
             np.testing.assert_array_equal(found.columns[name], column)
-        assert list(share.name) == ['rw_smooth', 'rw_rough']
+        assert list(share.name) == list(estimate.model_names)
         assert sum(share.position) == pytest.approx(1.0)
         labels = estimate.extras['label'][estimate.extras['valid'] > 0]
-        assert share.position[1] == pytest.approx(labels.mean())
+        assert share.position[1] == pytest.approx((labels == 1).mean())
     assert {int(read_soundings(cloud).columns['side'][0]) for cloud in clouds} == {0, 1}
 
 
 def test_with_coupled_labels_an_estimate_comes_with_the_next_ping(make_bench):
-    coupled = {'engine': 'grid', 'smoothing': 'states', 'grid_extent': 3.0, 'ping_coupling': 0.35}
-    given = [part for pair in coupled.items() for part in ('-p', '{}:={}'.format(*pair))]
-    rig = Rig(make_bench('-p', 'max_wait:=0.0', *given))
+    rig = Rig(make_bench('-p', 'max_wait:=0.0', '-p', 'ping_coupling:=0.35'))
     snapshots, _ = pings()
     rig.send(*[write_snapshot(snapshot, make) for snapshot in snapshots])
     found = [read_estimate(message).stamp_ns for message in rig.tables]

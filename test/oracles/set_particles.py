@@ -24,7 +24,6 @@ import numpy as np
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.set_model import SetModel, Sets
 from sonar_imm.estimation.set_proposals import begin, Beginning, Births, gains, propose_births
-from sonar_imm.estimation.set_scatter import fit_scatter, NO_SCATTER, ScatterFit
 from sonar_imm.estimation.set_shifts import Shift, ShiftTables
 
 IMPOSSIBLE = -math.inf
@@ -43,17 +42,12 @@ class Proposals(NamedTuple):
     shift: Shift | None
 
 
-def background(model: SetModel, b: FloatArray) -> ScatterFit:
-    """The volume scatter of a record."""
-    return fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
-
-
 def propose(model: SetModel, b: FloatArray) -> Proposals:
     """the tables for the record b (n,)."""
     n, radius = model.record_cells, len(model.walk) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
-    gained, _ = gains(model, b, background(model, b), model.gram)
+    gained, _ = gains(model, b, model.gram)
     K = np.where(there, model.walk, 0.0)
     signs = len(model.signs)
     g = np.where(there, gained[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
@@ -81,7 +75,7 @@ def start(
     """
     N, J = len(uniform), model.order_max
     sets, log_ratio = Sets.empty(model, N), np.zeros(N)
-    beginning, births = begin(model, *gains(model, b, background(model, b), model.gram))
+    beginning, births = begin(model, *gains(model, b, model.gram))
     outside = births._replace(running=beginning.elsewhere)
     for i in range(N):
         if model.shift:
@@ -233,25 +227,8 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
     """log likelihood (N,) of the record against that of an empty one, -inf where
     an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
     in units of the noise."""
-    first, amplitude = _weigh_from(0, model, b, sets)
-    if not model.scatter:
-        return first, amplitude
-    # Scatter begins at the first member, or at the second where that is louder and well below.
-    second, other = _weigh_from(1, model, b, sets)
-    either = (sets.order > 1) & (np.diff(sets.cell[:, :2])[:, 0] >= model.scatter.window)
-    either &= np.isfinite(second) & (other[:, 1] > other[:, 0])
-    amplitude = np.where((either & (second > first))[:, None], other, amplitude)
-    return np.where(either, np.logaddexp(first, second) - math.log(2.0), first), amplitude
-
-
-def _weigh_from(
-    begins: int, model: SetModel, b: FloatArray, sets: Sets
-) -> tuple[FloatArray, FloatArray]:
-    """`weigh` with scatter that begins at the member of that number, at the last if there are
-    fewer."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
-    fit = background(model, b)
     for m in np.unique(sets.order[sets.order > 0]):
         at = np.flatnonzero(sets.order == m)
         z = sets.cell[at, :m]
@@ -260,14 +237,7 @@ def _weigh_from(
         if model.amplitude_memory:
             precision = 1.0 / sets.prior_variance[at, :m]
             expected = sets.prior_mean[at, :m]
-        place = z + sets.shift[at, None]
-        seen, scale = b[place], np.ones(z.shape)
-        if model.scatter:
-            k = place[:, min(begins, m - 1), None]
-            mean = fit.level[k] * fit.profile[fit.row[k], len(b) - 1 + place - k]
-            scale = np.sqrt(1.0 + np.square(fit.spread * mean))
-            seen = (seen - mean) / scale
-        h = seen + precision * expected
+        h = b[z + sets.shift[at, None]] + precision * expected
         A = A + precision[:, :, None] * np.eye(m)
         a = np.linalg.solve(A, h[..., None])[..., 0]
         value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
@@ -276,9 +246,7 @@ def _weigh_from(
         if model.amplitude_memory:
             value -= 0.5 * np.sum(precision * np.square(expected), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
-        if model.scatter:
-            value += fit.evidence[k[:, 0]]
-        amplitude[at, :m] = scale * a
+        amplitude[at, :m] = a
         log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude
 

@@ -35,12 +35,14 @@ BUDGET = budget()
 HEAVE, OWN = BUDGET.heave**2, 0.04**2
 
 
-def line(x, y, z, stamp_ns=None, own=OWN, label=0.0):
+def line(x, y, z, stamp_ns=None, own=OWN, label=0.0, geometry=0.0):
     """Soundings straight below the array, where attitude and speed of sound do nothing much."""
     n = len(x)
     columns = {name: np.zeros(n) for name in COLUMNS}
     columns |= {'x': np.array(x, float), 'y': np.array(y, float), 'z': np.array(z, float)}
     columns |= {'range': np.full(n, 1e-3), 'vertical_uncertainty': np.full(n, own + HEAVE)}
+    columns['vertical_uncertainty'] += geometry**2
+    columns['geometry_std'] = np.full(n, geometry)
     columns['label'] = np.full(n, label)
     stamps = np.full(n, 5) if stamp_ns is None else np.array(stamp_ns)
     return line_of(Points(stamps, columns), BUDGET)
@@ -55,6 +57,14 @@ def test_a_sounding_at_a_node_is_the_node():
     assert made.z == pytest.approx([-10.0]) and made.sd == pytest.approx([np.sqrt(OWN + HEAVE)])
     assert made.count.tolist() == made.lines.tolist() == made.hypotheses.tolist() == [1]
     assert np.isnan(made.odds).all() and np.isnan(made.competing_z).all()
+
+
+def test_what_the_geometry_leaves_open_does_not_average_away():
+    place = np.full(1000, 0.5)
+    made = node([line(place, place, np.full(1000, -10.0), geometry=0.3)])
+    assert made.sd == pytest.approx([np.sqrt(HEAVE + 0.3**2)], rel=0.01)
+    single = node([line([0.5], [0.5], [-10.0], geometry=0.3)])
+    assert single.sd == pytest.approx([np.sqrt(OWN + HEAVE + 0.3**2)])
 
 
 def test_soundings_of_a_line_share_their_errors():

@@ -106,10 +106,10 @@ def test_live_lockstep_equals_offline(bags, tmp_path, capsys, name):
 
 def test_parameters_reach_the_node(bags, tmp_path, capsys):
     params = tmp_path / 'my.yaml'
-    settings = {'seed': 7, 'engine': 'grid', 'smoothing': 'states'}
+    settings = {'seed': 7, 'smoothing': 'none'}
     params.write_text(json.dumps({'/**': {'ros__parameters': settings}}))
     offline = checked(capsys, 'bathymetry', bags('bathymetry'), tmp_path, '--params', str(params))
-    assert run_of(offline)['parameters']['engine'] == 'grid'
+    assert run_of(offline)['parameters']['smoothing'] == 'none'
 
 
 def test_the_shipped_recordings_of_the_fathometer_pass(tmp_path, capsys):

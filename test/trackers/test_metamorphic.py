@@ -342,7 +342,7 @@ def test_obstacles_in_another_order():
 # -- the sea floor --------------------------------------------------------------------------------
 
 
-SWATH = {'engine': 'grid', 'grid_step': 0.1, 'smoothing': 'states', 'max_gap': 5.0}
+SWATH = {'max_gap': 5.0}
 
 
 @pytest.mark.parametrize('name', MOTIONS)

@@ -26,7 +26,7 @@ from attrs import evolve, frozen
 
 from ...acoustics.laplace import LIKELIHOODS
 from ...acoustics.rays import profile_problem
-from ...acoustics.sounding import ErrorBudget
+from ...acoustics.sounding import ErrorBudget, GeometryDoubt
 from ...parameters import live
 from ..model_checks import chain_problems
 from ..shared_parameters import MountingParameters
@@ -45,8 +45,24 @@ DEFAULT_STAY, BANK_STAY = 0.995, 0.998
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 BANKS = ('height_bank', 'scatter_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', *BANKS)
-MODEL_SETS = ('height_rw_ncs', *SCALAR_SETS)
-"""The sets of one state, which the grid engine can run."""
+MODEL_SETS = ('terrain', 'height_rw_ncs', *SCALAR_SETS)
+"""`SCALAR_SETS`: those of one state, which the grid engine can run."""
+SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
+"""m/s, of a sound speed that a snapshot states, and of one that nobody does."""
+BEND_STD = 0.5
+"""m/s, of the mean sound speed below the array: what bends a ray."""
+TERRAIN_MODELS = 9
+STEEP_DEG = 60.0
+"""An array that looks down by so much runs angle models."""
+OF_OTHER_SETS = (
+    'sigmas',
+    'sigmas_deg',
+    'scatters',
+    'transition_matrix',
+    'stay_probability',
+    'initial_probabilities',
+)
+"""Parameters that `terrain` does not take."""
 NAVIGATION = ('auto', 'required', 'ignored')
 LAYOVER = ('ignored', 'gated', 'resolved')
 
@@ -57,8 +73,11 @@ class BathymetryConfig(MountingParameters):
 
     # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = live('height_two_rw', '',
-        'terrain models run side by side', choices=MODEL_SETS)
+    model_set: str = live('terrain', '',
+        'terrain models run side by side: terrain has models of its own for smooth and rough '
+        'floors, height_two_rw with engine particles is the filter of the paper; an array that '
+        'looks down (tilt_deg of 60 or more) runs angle_two_rw in place of terrain',
+        choices=MODEL_SETS)
     sigmas: tuple[float, ...] = live((), '',
         'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
         'ncs; empty: values that suit most floors; height_bank takes any number of values, '
@@ -151,8 +170,9 @@ class BathymetryConfig(MountingParameters):
 
     # -- computation -----------------------------------------------------------------------------
     engine: str = live('auto', '',
-        'particles, or grid (exact, without Monte Carlo noise, for sets of one state); auto: grid '
-        'for height_bank and scatter_bank, else particles', choices=('auto', 'particles', 'grid'))
+        'gaussian (for terrain alone), particles, or grid (exact, without Monte Carlo noise, for '
+        'sets of one state); auto: gaussian for terrain, grid for height_bank and scatter_bank, '
+        'else particles', choices=('auto', 'gaussian', 'particles', 'grid'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
     grid_step: float = live(0.0, '',
@@ -163,8 +183,8 @@ class BathymetryConfig(MountingParameters):
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
         'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
-        'states (forward-backward on the grid: everything); auto: states for height_bank and '
-        'scatter_bank on the grid, which find little without, else none',
+        'states (outward and inward, everything: terrain and the grid); auto: states for terrain, '
+        'and for height_bank and scatter_bank on the grid, which find little without, else none',
         choices=('auto', 'none', 'modes', 'states'))
     ping_coupling: float = live(0.0, '',
         'strength with which the model labels of neighbouring pings influence each other; 0: not '
@@ -208,14 +228,22 @@ class BathymetryConfig(MountingParameters):
     heave_std: float = live(0.05, 'm', 'standard deviation of z in nav', range=(0.0, 100.0))
     position_std: float = live(0.1, 'm',
         'standard deviation of x and of y in nav', range=(0.0, 10_000.0))
-    sound_speed_std: float = live(0.5, 'm/s',
-        'standard deviation of the sound speed', range=(0.0, 100.0))
+    tilt_std_deg: float = live(0.2, 'deg',
+        'standard deviation of tilt_deg, the same in all pings; 0: exact', range=(0.0, 45.0))
+    spacing_std: float = live(0.01, '',
+        'standard deviation of the distance between staves, as a share of it; 0: exact',
+        range=(0.0, 0.5))
+    sound_speed_std: float = live(-1.0, 'm/s',
+        'standard deviation of the sound speed, the same in all pings; 0: exact; -1: 2 where the '
+        'snapshot states its sound speed, else 15', range=(-1.0, 100.0))
     # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check() + self._ship_problems() + self._check_sigmas()
         models = self.model_count()
-        if self.model_set == 'scatter_bank':
+        if self.is_terrain:
+            problems += self._terrain_problems()
+        elif self.model_set == 'scatter_bank':
             problems += self._scatter_problems()
         else:
             problems += chain_problems(
@@ -223,17 +251,22 @@ class BathymetryConfig(MountingParameters):
             )
             if self.scatters:
                 problems.append('scatters is for scatter_bank only')
-        if self.runs_on_grid and self.model_set not in SCALAR_SETS:
+        if self.engine == 'gaussian' and not self.is_terrain:
+            problems.append('engine gaussian is for model_set terrain only')
+        if self.runs_on_grid and self.model_set not in (*SCALAR_SETS, 'terrain'):
             problems.append(
                 f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
                 f'{self.model_set} has two'
             )
-        if self.smoothing == 'states' and not self.runs_on_grid:
-            problems.append('smoothing of the states needs engine grid; particles smooth modes')
+        if self.smoothing == 'states' and not (self.runs_on_grid or self.is_terrain):
+            problems.append(
+                'smoothing of the states needs model_set terrain or engine grid; particles smooth '
+                'modes'
+            )
         if self.ping_coupling > 0.0 and self.smoothing_used == 'none':
             problems.append(
-                'ping_coupling needs what a whole ping says of each bin: smoothing states (engine '
-                'grid) or modes'
+                'ping_coupling needs what a whole ping says of each bin: smoothing states (model '
+                'set terrain, or engine grid) or modes'
             )
         if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
             problems.append(
@@ -257,6 +290,20 @@ class BathymetryConfig(MountingParameters):
                 )
         return problems
 
+    def _terrain_problems(self) -> list[str]:
+        given = [name for name in OF_OTHER_SETS if getattr(self, name)]
+        problems = [
+            f'terrain has models of its own and takes no {name}: height_two_rw and other sets do'
+            for name in given
+        ]
+        if self.engine not in ('auto', 'gaussian'):
+            problems.append(
+                f'terrain runs on engine gaussian, not on {self.engine}, which is for other sets'
+            )
+        if self.smoothing == 'modes':
+            problems.append('terrain smooths states, or nothing (none)')
+        return problems
+
     def _scatter_problems(self) -> list[str]:
         problems = []
         if self.transition_matrix or self.initial_probabilities:
@@ -276,6 +323,8 @@ class BathymetryConfig(MountingParameters):
         return problems
 
     def _check_sigmas(self) -> list[str]:
+        if self.is_terrain:
+            return []
         if self.model_set == 'angle_two_rw':
             problems = ['angle_two_rw takes sigmas_deg, not sigmas'] if self.sigmas else []
             if len(self.sigmas_deg) not in (0, 3):
@@ -311,7 +360,36 @@ class BathymetryConfig(MountingParameters):
             heading=math.radians(self.heading_std_deg),
             heave=self.heave_std,
             position=self.position_std,
-            sound_speed=self.sound_speed_std,
+            sound_speed=BEND_STD,
+        )
+
+    def doubt(self, stated: float | None) -> GeometryDoubt:
+        """What all pings have in common; stated: the sound speed that a snapshot states, m/s."""
+        std = self.sound_speed_std
+        if std < 0.0:
+            std = SPEED_STD_OF_NONE if stated is None else SPEED_STD
+        speed = stated or self.sound_speed
+        return GeometryDoubt(math.radians(self.tilt_std_deg), self.spacing_std, std / speed)
+
+    @property
+    def looks_down(self) -> bool:
+        """Whether the array looks down so steeply that heights say too little of directions."""
+        return abs(self.tilt_deg) >= STEEP_DEG
+
+    def as_used(self) -> BathymetryConfig:
+        """The same with the models that an array that looks down can run. Below it the height of
+        a floor changes infinitely fast with the direction."""
+        if not (self.is_terrain and self.looks_down):
+            return self
+        smoothing = 'modes' if self.ping_coupling > 0.0 else 'none'
+        return evolve(
+            self,
+            model_set='angle_two_rw',
+            engine='auto',
+            smoothing=smoothing,
+            angle_drift=False,
+            initial_mean=0.0,
+            initial_std=0.0,
         )
 
     @property
@@ -320,11 +398,17 @@ class BathymetryConfig(MountingParameters):
         return self.engine == 'grid' or (self.engine == 'auto' and self.in_bank)
 
     @property
+    def is_terrain(self) -> bool:
+        """Whether the models are those of `terrain`, and the engine the Gaussian one."""
+        return self.model_set == 'terrain'
+
+    @property
     def smoothing_used(self) -> str:
         """``none``, ``modes`` or ``states``."""
         if self.smoothing != 'auto':
             return self.smoothing
-        return 'states' if self.in_bank and self.runs_on_grid else 'none'
+        whole = self.is_terrain or (self.in_bank and self.runs_on_grid)
+        return 'states' if whole else 'none'
 
     @property
     def stay_used(self) -> float:
@@ -355,5 +439,7 @@ class BathymetryConfig(MountingParameters):
         """Number of models in the set these parameters describe."""
         if self.model_set == 'angle_two_rw':
             return 2
+        if self.is_terrain:
+            return TERRAIN_MODELS
         smooth = 2 if self.model_set == 'scatter_bank' else 0
         return smooth + len(self.sigmas_used)

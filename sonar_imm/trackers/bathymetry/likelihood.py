@@ -45,7 +45,7 @@ from ...acoustics import (
 from ...acoustics import geometry as frames
 from ...acoustics.array import across_track, angle_of_depth, depth_of_angle, multipath_sines
 from ...acoustics.geometry import Pose
-from ...acoustics.sounding import ErrorBudget, Looks
+from ...acoustics.sounding import ErrorBudget, GeometryDoubt, Looks
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from .config import BathymetryConfig
@@ -137,6 +137,11 @@ class Swath:
         sine = s * g.cos_tilt[:, None] - np.sqrt(1.0 - s * s) * g.sin_tilt[:, None]
         return np.where(possible, sine, np.nan)
 
+    def height_from(self, sine: FloatArray) -> FloatArray:
+        """The height (T,) of a floor that is seen in the directions `sine` (T,)."""
+        angles = evolve(self, geometry=self.geometry._replace(of_heights=False))
+        return angles.floor(np.arcsin(np.clip(sine, -1.0, 1.0)), np.zeros(len(sine))).height
+
     def snapshot_std(self, angle: FloatArray, snr: FloatArray, staves: int) -> FloatArray:
         """Standard deviation (T,) of the height from one snapshot by itself, m: the bound of a
         plane wave from angle (T,), at signal-to-noise ratio snr (T,) of a stave."""
@@ -167,6 +172,13 @@ class Swath:
         return sounding.uncertainties(
             floor.variance, -offset[:, 2], distance, budget, self.sound_speed
         )
+
+    def doubt(self, floor: Floor, doubt: GeometryDoubt) -> tuple[FloatArray, FloatArray]:
+        """Vertical and horizontal variance (T,) m^2 of the floor that all pings have in common."""
+        offset = floor.xyz if self.looks is None else floor.xyz - self.looks.position
+        distance = np.linalg.norm(offset[:, :2], axis=1)
+        angle = np.nan_to_num(floor.angle)
+        return sounding.geometry_variance(-offset[:, 2], distance, angle, doubt)
 
     def _launch(self, depth: FloatArray) -> FloatArray:
         """r sin(phi) (T,) of floors `depth` (T,) below the array."""
@@ -292,11 +304,13 @@ def spacing_of(
 
 
 class BinLikelihood(NamedTuple):
-    """The likelihood of a ping, and which bins (T,) stand 20 dB above the noise, or, where that is
-    not known, above the quietest tenth of the bins."""
+    """The likelihood of a ping; which bins (T,) stand 20 dB above the noise, or, where that is not
+    known, above the quietest tenth of the bins; and the direction sine (T,) from which each is
+    loudest, NaN for silent ones."""
 
     likelihood: PingLikelihood
     loud: BoolArray
+    loudest: FloatArray
 
 
 def ping_likelihood(
@@ -331,7 +345,8 @@ def ping_likelihood(
         geometry=_drifting(swath.geometry, echo, config),
     )
     quiet = 1.0 if known.all() else float(np.quantile(parts.loudness, 0.1))
-    return BinLikelihood(likelihood, parts.loudness > loudness.VERY_LOUD * quiet)
+    loudest = math.copysign(1.0, spacing) * parts.sine
+    return BinLikelihood(likelihood, parts.loudness > loudness.VERY_LOUD * quiet, loudest)
 
 
 def _first_return(
@@ -358,7 +373,8 @@ def _drifting(geometry: Geometry, echo: BoolArray, config: BathymetryConfig) -> 
 
 class _Parts(NamedTuple):
     """What the likelihood is made of, see `PingLikelihood`; noise (T,) with what of the echo is
-    not the same at all staves; loudness (T,): power of a bin in powers of all that is no floor."""
+    not the same at all staves; sine (T,) from which a bin is loudest, by a phase that rises from
+    stave to stave; loudness (T,): power of a bin in powers of all that is no floor."""
 
     form: ComplexArray
     base: FloatArray
@@ -367,6 +383,7 @@ class _Parts(NamedTuple):
     noise: FloatArray
     log_determinant: FloatArray
     coherence: FloatArray
+    sine: FloatArray
     loudness: FloatArray
 
 
@@ -382,6 +399,7 @@ def _in_white_noise(
     spacing = swath.geometry.spacing
     above_noise = variances.mean_power(iq) / noise
     signal, noise = _split(_signal(snapshot, noise, np.ones(T)), noise, config)
+    gamma, sine = coherence.coherence(iq, abs(spacing))
     return _Parts(
         form=laplace.form_coefficients(iq, signal, noise),
         base=np.zeros(T),
@@ -389,7 +407,8 @@ def _in_white_noise(
         signal=signal,
         noise=noise,
         log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
-        coherence=coherence.coherence(iq, abs(spacing))[0] if config.shadow_gate else np.ones(T),
+        coherence=gamma,
+        sine=sine,
         loudness=above_noise,
     )
 
@@ -421,6 +440,7 @@ def _beside_surface(
         noise=noise,
         log_determinant=form.log_determinant,
         coherence=interference.coherence_beside(form, abs(spacing)),
+        sine=coherence.coherence(iq, abs(spacing))[1],
         loudness=form.base / P,
     )
 

@@ -17,6 +17,8 @@
 Each set is a few linear motions of one state, ``x <- F x + s G e`` with e standard normal, and
 says how fast the floor may change; which one holds where is the segmentation of the swath.
 
+terrain
+    Nine kinds of floor, smooth ones with slopes, rough ones whose bins scatter, see `terrain`.
 height_two_rw
     The height h of the floor is a random walk, slow (smooth floor) or fast (rough floor).
 height_bank
@@ -51,6 +53,7 @@ from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
 from .grid_kernels import Geometry
 from .scatter import bank_of, Scatter
+from .terrain import Terrain, terrain_of
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
 HEIGHT_STEP, ANGLE_STEP, SCATTER_STEP = 0.01, math.radians(0.05), 0.02
@@ -106,7 +109,8 @@ class TerrainModels:
     floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
     the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
 
-    With `scatter` several models are one entry of `names`, `rough`, `favour` and the answers.
+    With `scatter` several models are one entry of `names`, `rough`, `favour` and the answers. With
+    `terrain` motions are there: F, G and scale say nothing.
     """
 
     names: tuple[str, ...]
@@ -123,6 +127,7 @@ class TerrainModels:
     start: UnknownHeight | None = None
     favour: FloatArray = field(factory=lambda: np.empty((0, 0)))
     scatter: Scatter | None = None
+    terrain: Terrain | None = None
 
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
@@ -163,6 +168,24 @@ def build_models(
     T = len(ranges)
     mean, std = _start(config, geometry, first, floor_below)
     start = _unknown_height(config, ranges, geometry, first, floor_below)
+    if config.is_terrain:
+        terrain = terrain_of(_bin_width(ranges))
+        M = len(terrain.names)
+        return TerrainModels(
+            names=terrain.names,
+            state_names=_states(config),
+            F=np.ones((M, 1, 1)),
+            G=np.zeros((M, 1, 1)),
+            scale=np.zeros((T, M)),
+            transition=terrain.transition,
+            initial=terrain.stationary,
+            mean=np.array([mean]),
+            std=np.array([std]),
+            coast=0,
+            rough=terrain.rough,
+            start=start,
+            terrain=terrain,
+        )
     if config.model_set == 'scatter_bank':
         bank = bank_of(config.sigmas_used, config.scatters_used, config.stay_used)
         M = len(bank.sigma)

@@ -15,10 +15,10 @@
 """One ping, from the snapshot to the estimate: no ping needs another one, so these are functions.
 
 `look` says which bins hold an echo and which models there are, `run` runs the models along the
-ping, by particles or on a grid, and `summarise` makes the answer, a table and what to count. The
-same numbers come out wherever and whenever a ping is computed; a recording's pings can be shared
-out over processes. Particles and grid take the same models and the same likelihood, and give the
-same answer up to the Monte Carlo noise of the particles.
+ping, by Gaussian filters, by particles or on a grid, and `summarise` makes the answer, a table and
+what to count. The same numbers come out wherever and whenever a ping is computed; a recording's
+pings can be shared out over processes. All take the same likelihood. Particles and grid take the
+same models too, and give the same answer up to the Monte Carlo noise of the particles.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ from .likelihood import (
     Swath,
 )
 from .models import build_models, grid_cells, TerrainModels
+from .terrain_filter import run_terrain
 from .two_surfaces import EXISTS, FEWEST_STAVES, resolve, Surfaces
 
 SMOOTH, ROUGH, CANNOT_TELL = 0, 1, 2
@@ -103,16 +104,19 @@ class Ping:
 @frozen(eq=False)
 class Look:
     """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
-    noise; layover: None where it is ignored; floor_below: how far below the array the floor is
-    said to be, m."""
+    noise; loudest (T,): direction sine from which each bin is; layover: None where it is ignored;
+    floor_below: how far below the array the floor is said to be, m; alike:
+    `variances.bins_alike`."""
 
     ping: Ping
     swath: Swath
     models: TerrainModels
     likelihood: PingLikelihood
     loud: BoolArray
+    loudest: FloatArray
     layover: Layover | None
     floor_below: float
+    alike: float
 
     @property
     def config(self) -> BathymetryConfig:
@@ -124,7 +128,7 @@ class LoudBins(NamedTuple):
     of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
     where layover is ignored; how many bins from the depth of the floor on are usable, and how many
     of these are passed over; `coherence.common_mode`; whether there were too few staves for the
-    two surfaces of a bin."""
+    two surfaces of a bin; `variances.bins_alike`."""
 
     bins: int
     silent: int
@@ -134,6 +138,7 @@ class LoudBins(NamedTuple):
     beyond_silent: int = 0
     common_mode: float = 0.0
     unresolved: bool = False
+    alike: float = 1.0
 
 
 class Answer(NamedTuple):
@@ -157,11 +162,12 @@ def look(ping: Ping) -> Look:
     """The likelihood of each bin, and the models for it."""
     config = ping.config
     swath, floor_below = _swath(ping)
-    likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
+    likelihood, loud, loudest = ping_likelihood(ping.snapshot, config, swath, floor_below)
     first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
     second = _layover(ping, swath, likelihood)
-    return Look(ping, swath, models, likelihood, loud, second, floor_below)
+    alike = variances.bins_alike(ping.snapshot.iq, ping.snapshot.usable)
+    return Look(ping, swath, models, likelihood, loud, loudest, second, floor_below, alike)
 
 
 def _layover(ping: Ping, swath: Swath, likelihood: PingLikelihood) -> Layover | None:
@@ -185,7 +191,12 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     config, models, likelihood = seen.config, seen.models, seen.likelihood
     if favour is not None:
         models = evolve(models, favour=favour)
-    if config.runs_on_grid:
+    if config.is_terrain:
+        peak = seen.swath.height_from(seen.loudest)
+        smooth = config.smoothing_used == 'states'
+        track = run_terrain(models, likelihood, peak, smooth=smooth, temper=1.0 / seen.alike)
+        track = with_constants(track, likelihood)
+    elif config.runs_on_grid:
         cells = grid_cells(config, models)
         track = run_grid(models, likelihood, cells, smooth=config.smoothing_used == 'states')
     else:
@@ -239,7 +250,7 @@ def run_particles(
             )
             if watch is not None:
                 watch(first + b, particles)
-    return _with_constants(track, ping)
+    return with_constants(track, ping)
 
 
 def filter_bins(
@@ -292,18 +303,18 @@ def run_grid(
         kept = filter_scatter(p, moves, ping, window, track, smooth)
         if smooth:
             smooth_scatter(kept, window, moves, ping, track)
-        return _with_constants(track, ping)
+        return with_constants(track, ping)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:
         smooth_ping(kept, window, motion, ping, track)
-    return _with_constants(track, ping)
+    return with_constants(track, ping)
 
 
 def _empty(T: int, M: int, n: int) -> Track:
     return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
 
 
-def _with_constants(track: Track, ping: PingLikelihood) -> Track:
+def with_constants(track: Track, ping: PingLikelihood) -> Track:
     """The same with log likelihoods of the samples, not only of what depends on the state."""
     constant = np.where(ping.echo, ping.constant, 0.0)
     return track._replace(log_likelihood=track.log_likelihood + constant)
@@ -339,6 +350,7 @@ def summarise(seen: Look, track: Track) -> Answer:
         int((beyond & ~echo).sum()),
         common_mode(snapshot.iq, echo),
         config.layover_used == 'resolved' and snapshot.staves < FEWEST_STAVES,
+        seen.alike,
     )
     made = estimate_of(seen, track)
     if seen.layover is not None:
@@ -346,6 +358,7 @@ def summarise(seen: Look, track: Track) -> Answer:
         health['array_error'] = loud.array_error
     health['decorrelation'] = loud.decorrelation
     health['common_mode'] = loud.common_mode
+    health['independent_bins'] = 1.0 / seen.alike
     health['residual_ratio'] = _residual(seen, track)
     return Answer(made, counts, health, loud, health['residual_ratio'])
 
@@ -426,11 +439,21 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'label_probability': track.probability[np.arange(len(label)), label],
         **_label_columns(seen, track, floor),
     }
-    if config.in_bank:
+    if config.in_bank or config.is_terrain:
         extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     extras |= second
+    doubtful = config.doubt(snapshot.sound_speed)
+    common, aside = swath.doubt(floor, doubtful)
+    extras['geometry_std'] = np.sqrt(common).astype(np.float32)
+    covariance = covariance.copy()
+    if of_heights:
+        covariance[:, 0, 0] += common
+    else:  # the tilt is no part of an angle from broadside
+        turn = doubtful.spacing**2 + doubtful.sound_speed**2
+        covariance[:, 0, 0] += turn * np.square(np.tan(np.nan_to_num(floor.angle)))
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
+        vertical, horizontal = vertical + common, horizontal + aside
         extras |= {
             'vertical_uncertainty': vertical,
             'horizontal_uncertainty': horizontal,
@@ -440,7 +463,6 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         }
     elif of_heights and config.sonar_height_std > 0.0:
         # Heights are counted from where the sonar is believed to be: its error is theirs.
-        covariance = covariance.copy()
         covariance[:, 0, 0] += config.sonar_height_std**2
     if posed is not None or snapshot.side:
         extras['side'] = np.full(len(label), SIDES.index(swath.side), np.uint8)
@@ -489,17 +511,19 @@ def _upper(seen: Look, surfaces: Surfaces, two: BoolArray) -> dict[str, np.ndarr
     config, swath = seen.config, seen.swath
     height, variance = (np.where(two, part[:, 1], 0.0) for part in surfaces[1:])
     unposed = seen.ping.posed is None
-    std = np.sqrt(variance + (config.sonar_height_std**2 if unposed else 0.0))
+    floor = swath.of_heights.floor(height, variance)
+    common, aside = swath.doubt(floor, config.doubt(seen.ping.snapshot.sound_speed))
+    std = np.sqrt(variance + common + (config.sonar_height_std**2 if unposed else 0.0))
     columns: dict[str, np.ndarray] = {
         'height_2': height.astype(np.float32),
         'height_2_std': std.astype(np.float32),
     }
     if not unposed:
-        floor = swath.of_heights.floor(height, variance)
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         columns |= {
-            'vertical_uncertainty_2': vertical,
-            'horizontal_uncertainty_2': horizontal,
+            'geometry_std_2': np.sqrt(common).astype(np.float32),
+            'vertical_uncertainty_2': vertical + common,
+            'horizontal_uncertainty_2': horizontal + aside,
             'beam_angle_2': swath.beam_angle(floor.angle),
             **{f'{name}_2': part for name, part in places(floor.xyz).items()},
         }

@@ -32,7 +32,9 @@ The cycle of the particle filter, for each bin with an echo (`filter_kernels`):
 
 There is no rejuvenation step, `move`: the noise of every terrain model keeps copies of a particle
 apart. Through bins without an echo particles are only propagated. A model set of one state can run
-on a grid, whose verbs are the same, but for resampling, which cells do not need.
+on a grid, whose verbs are the same, but for resampling, which cells do not need. The default set,
+`terrain`, needs neither: two Gaussian filters run along the ping, outward and inward
+(`terrain_kernels`).
 
 Nothing is carried from one ping to the next, which loses more than it gains (docs/bathymetry.md).
 Late, shuffled or repeated pings therefore need no care; the random numbers of a ping come from its
@@ -91,6 +93,8 @@ MUCH_ARRAY_ERROR = 0.01
 SOME_DECORRELATION = 0.04
 """Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
 FEWEST_PINGS = 5
+SOME_ALIKE = 1.2
+"""So many bins that say the same as one are worth a sentence."""
 NOISE_BOUNDS = 0.5, 2.0
 """Between these ratios of its residual the noise is as stated, as far as the test goes."""
 NEIGHBOURS_NS = 5_000_000_000
@@ -154,7 +158,7 @@ class BathymetryTracker:
 
     def _warm_surfaces(self) -> None:
         snapshot, everywhere = self._short_ping(), Layover(np.ones(8), 0.0, np.ones(8, bool))
-        seen = look(Ping(self.config, snapshot, None))
+        seen = look(Ping(self._used, snapshot, None))
         geometry = seen.swath.of_heights.geometry
         resolve(snapshot.iq, seen.likelihood, geometry, everywhere, np.zeros(8))
 
@@ -170,12 +174,12 @@ class BathymetryTracker:
             gap = evolve(self.config, max_gap=60.0)
             tracker._queue.add_ping(snapshot)
             for ping in tracker._queue.ready(gap):
-                track_ping(evolve(ping, config=tracker.config))
-        track_ping(Ping(tracker.config, snapshot, None))
+                track_ping(evolve(ping, config=tracker._used))
+        track_ping(Ping(tracker._used, snapshot, None))
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
-        of the particles of a model (NaN for the grid), mean log likelihood of a bin, noise
+        of the particles of a model (NaN without particles), mean log likelihood of a bin, noise
         variance, what is left beside the echo in stated noises (`ping.residual_ratio`), what of
         loud echoes is no plane wave (`layover.array_error`), how much is the same at all staves
         (`coherence.common_mode`); and how many pings wait for navigation."""
@@ -187,6 +191,11 @@ class BathymetryTracker:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(ping.bins for ping in self._loud)
         stated = [*self._silence(), *self._common_mode(), *noise_warnings(self._residuals)]
+        if self._used is not self.config and self._loud:
+            stated.append(
+                f'the array looks down (tilt {self.config.tilt_deg:g} deg): angle models are used'
+            )
+        stated += self._oversampling()
         if any(ping.unresolved for ping in self._loud):
             stated.append(
                 'layover: resolved needs four staves: bins with two surfaces are only gated'
@@ -231,6 +240,18 @@ class BathymetryTracker:
             'which has to be quiet), sonar_height and element_spacing_wavelengths'
         ]
 
+    def _oversampling(self) -> list[str]:
+        """What to say when neighbouring bins say the same."""
+        if len(self._loud) < FEWEST_PINGS:
+            return []
+        alike = float(np.median([ping.alike for ping in self._loud]))
+        if alike < SOME_ALIKE:
+            return []
+        told = f'bins are finer than the pulse: {alike:.1f} neighbours say the same, '
+        if self._used.is_terrain:
+            return [told + 'likelihood tempered; relief finer than the pulse is not seen']
+        return [told + 'estimates are surer than they should be']
+
     def _common_mode(self) -> list[str]:
         """What to say when the echoes of most pings are a signal common to all staves."""
         shares = [ping.common_mode for ping in self._loud]
@@ -263,12 +284,12 @@ class BathymetryTracker:
             self.counts['other_spacing'] += 1
             return []
         elif not self._moving:
-            return [Ping(self.config, measurement, None)]
+            return [Ping(self._used, measurement, None)]
         else:
             self._queue.add_ping(measurement)
         if not self._moving:
             return []
-        return self._queue.ready(self.config)
+        return self._queue.ready(self._used)
 
     @staticmethod
     def work(task: Ping) -> Answer | Alone:
@@ -292,6 +313,11 @@ class BathymetryTracker:
         self._loud.append(answer.loud)
         self._residuals.append(answer.residual)
         return answer.estimate
+
+    @property
+    def _used(self) -> BathymetryConfig:
+        """The parameters that pings are estimated with."""
+        return self.config.as_used()
 
     @property
     def _moving(self) -> bool:

@@ -133,7 +133,8 @@ def with_resolution(
     found: ArrivalStamps = known.memory['stamps'].after(ping)
     least = found.resolution**2 / 12.0
     stated = np.where(ping.var_toa > 0.0, ping.var_toa, config.toa_std**2)
-    if not (stated < least).any():
+    # Messages state variances in single precision.
+    if not (stated < 0.999 * least).any():
         return known.with_memory(stamps=found), ping
     refused = config.sound_speed * math.sqrt(least) > COARSEST * found.span
     known = known.with_memory(stamps=found._replace(raised=True, refused=refused))

@@ -74,8 +74,8 @@ IN_DISC = 5.0
 MOST_REMEMBERED, LEAST_WEIGHT = 3000, 0.01
 """Maximum number of remembered false fixes, and their minimum weight."""
 
-MAX_TABLE = 1 << 19
-"""Largest number of distances that are computed at once."""
+MOST_COMPARED = 128
+"""Maximum number of fixes whose distances are computed at once."""
 
 LOOKS = 10.0
 """Scans over which the time between scans is averaged."""
@@ -165,21 +165,28 @@ class Clutter(NamedTuple):
         found = np.full(len(z), self.density)
         # If fixes stand for several others, as many of them have to be in a disc.
         least = IN_DISC * max(1.0, float(self.weight.max(initial=0.0)))
-        if self.weight.sum() < least:
+        if not len(z) or self.weight.sum() < least:
             return found
         size = np.sqrt(np.sqrt(np.linalg.det(R)))
-        step = max(1, MAX_TABLE // len(self.weight))
-        for start in range(0, len(z), step):
-            near = np.arange(start, min(start + step, len(z)))
-            square = np.square(z[near, 0, None] - self.points[:, 0])
-            square += np.square(z[near, 1, None] - self.points[:, 1])
-            for radius in RADII:
-                inside = (square <= radius**2) @ self.weight
-                enough = (inside >= least) & (size[near] <= radius)
+        # In the order of x, a few fixes are compared with a few points.
+        order, rows = np.argsort(self.points[:, 0]), np.argsort(z[:, 0])
+        x, y, weight = *self.points[order].T, self.weight[order]
+        for radius in RADII:
+            left = []
+            for start in range(0, len(rows), MOST_COMPARED):
+                some = rows[start : start + MOST_COMPARED]
+                low = np.searchsorted(x, z[some[0], 0] - radius)
+                high = np.searchsorted(x, z[some[-1], 0] + radius, side='right')
+                square = np.square(z[some, 0, None] - x[low:high])
+                square += np.square(z[some, 1, None] - y[low:high])
+                inside = (square <= radius**2) @ weight[low:high]
+                enough = (inside >= least) & (size[some] <= radius)
                 area = (PRIOR_SCANS + self.scans) * math.pi * radius**2
-                local = np.maximum(found[near[enough]], inside[enough] / area)
-                found[near[enough]] = np.minimum(local, MOST)
-                near, square = near[~enough], square[~enough]
+                local = np.maximum(found[some[enough]], inside[enough] / area)
+                found[some[enough]] = np.minimum(local, MOST)
+                left.append(some[~enough])
+            if not len(rows := np.concatenate(left)):
+                break
         return found
 
     @property

@@ -177,24 +177,21 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     exceeds, largest = memory['excess'] >= ENOUGH, max(config.covariance_scales)
     starving = polling.warnings(memory['single'], config)
     # Of tracks that starve, nothing else is told by the fixes.
-    fixes = (
-        []
-        if starving
-        else memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
-    )
-    no_track = [] if starving else clutter.warnings(memory['clutter'], config, tracked)
-    return [
-        *starving,
-        *(assumed if config.has_usual_fix_std and not starving else []),
+    fixes = memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
+    of_scans = [
+        *(assumed if config.has_usual_fix_std else []),
         *fixes,
         *late_warnings(known),
         *burst_reports.warnings(known, config),
+        *clutter.warnings(memory['clutter'], config, tracked),
+    ]
+    return [
+        *(starving or of_scans),
         *memory['heights'].warnings(config),
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
         *births.start_warnings(known, config),
-        *no_track,
     ]
 
 

@@ -178,8 +178,8 @@ class FixConsistency(NamedTuple):
             more = 'a million' if largest == 1e6 else f'{largest:,.6g}'
             return (
                 f'fix covariances{whose} too small by a factor of more than {more}: errors are '
-                f'more than {math.sqrt(largest):,.4g} times as large as reported. Check the unit of the '
-                'covariances'
+                f'more than {math.sqrt(largest):,.4g} times as large as reported. Check the unit '
+                'of the covariances'
             )
         factor = _rounded(times)
         action = 'Correct its covariances' if whose else f'Multiply covariance_scale by {factor}'

@@ -39,9 +39,9 @@ MOST_FIXES = 3 * BEFORE
 IN_TURN = 0.6
 """Minimum share of fixes that come in turn."""
 
-APART = 8.0
-"""Change of the difference of two targets, in its usual step from turn to turn, that two sensors
-with a constant offset do not have."""
+APART = 14.0
+"""Change of the mean difference of two targets, in the usual step of the difference over the root
+of the number of fixes, that two sensors with a constant offset do not have: eight sigma."""
 
 
 class SingleFixes(NamedTuple):

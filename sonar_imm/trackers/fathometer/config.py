@@ -28,9 +28,9 @@ PULSES = ('auto', 'band', 'processor', 'envelope', 'gaussian', 'file')
 POLARITIES = ('auto', 'positive', 'both')
 MULTIPLES = ('mark', 'off')
 PHONE_CORRECTIONS = ('off', 'gains', 'full')
-HEAVES = ('none', 'independent', 'memory')
+WATERS = ('auto', 'off')
+HEAVES = ('auto', 'none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
-MAX_DECAYS = 8
 MVDR_GAIN = 3.0
 """By how much further echoes stand out with mvdr than with the conventional processor."""
 
@@ -60,10 +60,11 @@ class FathometerConfig(StampParameters):
         'standard deviation of the stated depth of the array, a part of the error of every '
         'reflector; 0: depths are judged as seen from the array', range=(0.0, 1000.0))
 
-    heave: str = parameter('none', '',
+    heave: str = parameter('auto', '',
         'whether the error of the stated depth of the array (array_depth_std) is a state that all '
         'reflectors share: none; independent (a new error in each record); memory (correlated by '
-        'heave_memory)', choices=HEAVES)
+        'heave_memory); auto: none until the reflectors of an array move together by more than '
+        'twice of it, then independent with the error that was found', choices=HEAVES)
     heave_memory: float = parameter(0.9, '',
         'heave memory: share of the error of the array depth that stays from record to record',
         range=(0.01, 0.99))
@@ -144,14 +145,20 @@ class FathometerConfig(StampParameters):
     pulse_file: str = parameter('', '',
         'pulse file: path of a CSV of two columns, distance in m from 0 on, and value')
 
-    # -- volume scatter ---------------------------------------------------------------------------
-    scatter_decay: tuple[float, ...] = parameter((), 'm',
-        'for envelopes: depths over which the volume scatter below the first reflector may fall '
-        'to 1/e, all tried in each record; empty: no volume scatter', range=(0.01, 1000.0),
-        kind='float[]')
-    scatter_spread: float = parameter(0.4, '',
-        'volume scatter (scatter_decay): standard deviation of the scatter over its mean',
-        range=(0.01, 2.0))
+    # -- envelopes --------------------------------------------------------------------------------
+    water: str = parameter('auto', '',
+        'auto: traces that are never negative are envelopes, of which the noise by depth, the '
+        'transmit pulse, the water and the floor below it are found; off: their noise is taken '
+        'for Gaussian', choices=WATERS)
+    blanking: float = parameter(0.0, 'm',
+        'envelopes: depth above which nothing is looked at; 0: the transmit pulse is found',
+        range=(0.0, 12000.0))
+    bottom_jump: float = parameter(0.005, '',
+        'envelopes: probability that the floor jumps anywhere from one record to the next',
+        range=(1e-9, 0.5))
+    fish_rate: float = parameter(0.001, '1/m',
+        'envelopes: how often a run of loud samples, as of fish, begins in the water',
+        range=(1e-9, 1.0))
 
     # -- sediment ---------------------------------------------------------------------------------
     sediment_sound_speed: float = live(0.0, 'm/s',
@@ -219,6 +226,9 @@ class FathometerConfig(StampParameters):
     # -- output -----------------------------------------------------------------------------------
     existence_min: float = live(0.5, '',
         'least probability of existence with which a reflector is reported', range=(0.0, 1.0))
+    detectable_sigmas: float = live(4.0, '',
+        'amplitude, in units of the noise, above which reflectors are surely held: the columns '
+        'prob_detectable_k are of the number of those above it', range=(0.1, 1000.0))
     multiples: str = live('mark', '',
         'whether reflectors get a probability of being multiples of others, from their depths '
         'below the surface: mark or off; they are never left out', choices=MULTIPLES)
@@ -248,7 +258,7 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
-        if self.heave != 'none' and not self.array_depth_std:
+        if self.heave in ('independent', 'memory') and not self.array_depth_std:
             problems.append(f'heave {self.heave} needs array_depth_std')
         if self.particles * self.order_max > MAX_MEMBERS:
             problems.append(
@@ -258,26 +268,12 @@ class FathometerConfig(StampParameters):
             problems.append('output printed needs processor conventional or mvdr')
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
-        if self.scatter_decay:
-            problems += self._scatter_problems()
         if self.preview_seconds > self.record_seconds:
             problems.append('preview_seconds cannot exceed record_seconds')
         if 0.0 < self.snapshot_seconds < 1e-3:
             problems.append('snapshot_seconds is 0 or at least 0.001')
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
-        return problems
-
-    def _scatter_problems(self) -> list[str]:
-        problems = []
-        if self.pulse in ('auto', 'band'):
-            problems.append('scatter_decay is for envelopes: it needs pulse gaussian or file')
-        if self.negative_share:
-            problems.append('scatter_decay is for envelopes: it needs polarity positive')
-        if self.amplitude_memory:
-            problems.append('scatter_decay and amplitude_memory exclude each other')
-        if len(self.scatter_decay) > MAX_DECAYS:
-            problems.append(f'scatter_decay has at most {MAX_DECAYS} values')
         return problems
 
     def settled(self, hydrophones: int) -> FathometerConfig:

@@ -44,9 +44,9 @@ class PhoneFaults:
 
     STATE: ClassVar = ('_sum', '_seen', '_left', '_period')
 
-    _sum: Annotated[FloatArray, '4,M'] = field(init=False, factory=lambda: np.zeros((4, 0)))
-    _seen: Annotated[FloatArray, '4,M'] = field(init=False, factory=lambda: np.zeros((4, 0)))
-    _left: Annotated[FloatArray, 'M'] = field(init=False, factory=lambda: np.zeros(0))
+    _sum: Annotated[FloatArray, '4m'] = field(init=False, factory=lambda: np.zeros((4, 0)))
+    _seen: Annotated[FloatArray, '4m'] = field(init=False, factory=lambda: np.zeros((4, 0)))
+    _left: Annotated[FloatArray, 'm'] = field(init=False, factory=lambda: np.zeros(0))
     _period: float = field(init=False, default=0.0)
 
     def add(self, response: Response, config: FathometerConfig) -> bool:

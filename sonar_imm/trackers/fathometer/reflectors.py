@@ -12,39 +12,31 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Reflectors as they are reported: depth, amplitude, identity, and which are multiples.
+"""Reflectors as they are reported: depth, amplitude and identity.
 
 **Identity.** The filter knows sets; who is who from record to record is decided here, after it. A
 reflector found near one of the record before takes over its id, the nearest pair first; one that
 was missed is waited for `track_memory` records, and ids are never used again. Where no records
 came, none was missed: how far a reflector may have walked grows with the time, nothing else.
-
-**Multiples** are echoes that were reflected more than once. By depths from the surface, in which
-every way is counted once: a surface multiple lies at ``z_i + z_j``, its amplitude has the sign of
-``-a_i a_j``; a peg-leg, reflected down once more by a layer k above j and q, lies at ``z_j + z_q -
-z_k`` with the sign of ``-a_j a_q a_k``.
-
-How far a track is from such a place, record by record, is small for a multiple; for a primary it
-begins anywhere and walks, since layers move each for themselves. Both are Gaussian with a
-twentieth of outliers, without which one wrong association would decide. What pairs and triples
-there are share the prior probability evenly. A multiple is marked, never deleted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from typing import Annotated, NamedTuple
+import math
+from typing import NamedTuple
 
 from attrs import evolve, Factory, frozen
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
+from ...acoustics.envelopes import from_normal
 from ...acoustics.fathometer import sediment_thickness
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
-from ...estimation.arrays import FloatArray, IntArray
+from ...estimation.arrays import FloatArray
 from ...estimation.association import new_ids
 from ...estimation.set_members import Members
 from ...estimation.set_model import Walks
@@ -65,21 +57,23 @@ from .slopes import (
 
 IdArray = NDArray[np.uint32]
 BOTTOM_REACH = 12.0
-"""How many `depth_std` the first return in scatter may jump and keep its id."""
-PRIOR, OUTLIERS, RECORDS = 0.25, 0.05, 30
-MOST_WAYS = 200
-_NEAR = 6.0
+"""How many `depth_std` the floor may jump and keep its id."""
+SHOWN, STRENGTH_SPREAD = 20, 0.15
+"""Records that the strength of a reflector is a mean of, and how far it may be off besides."""
 
 
 class Identified(NamedTuple):
     """A reflector that has an id: where it was last seen, in how many records since it was not,
-    and for how many more there was time; its slope."""
+    and for how many more there was time; its slope; the mean of its strength, its amplitude in
+    units of the noise, and of how many records that is."""
 
     track_id: int
     depth: float
     missed: int
     absent: int = 0
     slope: Slope = STILL
+    strength: float = 0.0
+    shown: int = 0
 
     @property
     def walked(self) -> int:
@@ -107,12 +101,16 @@ class Identities:
         is_bottom: FloatArray,
         config: FathometerConfig,
         variance: FloatArray | None = None,
+        *,
+        strength: FloatArray | None = None,
+        floor_known: bool = False,
     ) -> tuple[Identities, IdArray]:
         """Ids (K,) for reflectors at `depth` (K,) of the next record, is_bottom (K,) the
-        probability of each to be the first return, variance (K,) of the depth, m^2."""
+        probability of each to be the floor, variance (K,) of the depth, m^2, strength (K,) in
+        units of the noise; floor_known: is_bottom is more than which of them is the first."""
         ids = nearest_ids(depth, self.reflectors, config)
         bottom_id = self.bottom_id
-        if config.scatter_decay and len(depth):
+        if floor_known and len(depth):
             bottom_id = self._follow_bottom(depth, is_bottom, ids, config)
         new = np.flatnonzero(ids == 0)
         living = np.array([known.track_id for known in self.reflectors], np.uint32)
@@ -120,15 +118,48 @@ class Identities:
         slopes = self._slopes(
             ids, depth, np.zeros(len(ids)) if variance is None else variance, config
         )
-        seen = [Identified(int(i), float(z), 0, 0, s) for i, z, s in zip(ids, depth, slopes)]
+        shown = self._shown(ids, np.zeros(len(ids)) if strength is None else strength)
+        seen = [
+            Identified(int(i), float(z), 0, 0, s, *each)
+            for i, z, s, each in zip(ids, depth, slopes, shown)
+        ]
         missed = [
             known._replace(missed=known.missed + 1)
             for known in self.reflectors
             if known.track_id not in ids and known.missed < config.track_memory
         ]
-        if config.scatter_decay and len(depth) and not bottom_id:
+        if floor_known and len(depth) and not bottom_id:
             bottom_id = _id_of_bottom(ids, is_bottom)
         return Identities((*seen, *missed), next_id, bottom_id), ids
+
+    def _shown(self, ids: IdArray, strength: FloatArray) -> list[tuple[float, int]]:
+        """Mean strength of those that now have `ids` (K,), and of how many records."""
+        known = {each.track_id: each for each in self.reflectors}
+        found = []
+        for track_id, new in zip(ids.tolist(), strength.tolist()):
+            before = known.get(track_id)
+            mean, count = (before.strength, before.shown) if before else (0.0, 0)
+            count = min(count + 1, SHOWN)
+            found.append((mean + (new - mean) / count, count))
+        return found
+
+    def detectable(
+        self, ids: IdArray, existence: FloatArray, config: FathometerConfig
+    ) -> FloatArray:
+        """PMF (order_max + 1,) of how many of the reflectors `ids` (K,) are there and stronger
+        than `detectable_sigmas`, by what each has shown."""
+        known = {each.track_id: each for each in self.reflectors}
+        pmf = np.zeros(config.order_max + 1)
+        pmf[0] = 1.0
+        for track_id, there in zip(ids.tolist(), existence.tolist()):
+            each = known.get(track_id)
+            if each is None or not each.shown:
+                continue
+            off = abs(each.strength) - config.detectable_sigmas
+            p = there * float(ndtr(off / math.sqrt(1.0 / each.shown + STRENGTH_SPREAD**2)))
+            pmf[1:] = pmf[1:] * (1.0 - p) + pmf[:-1] * p
+            pmf[0] *= 1.0 - p
+        return pmf
 
     def _slopes(
         self, ids: IdArray, depth: FloatArray, variance: FloatArray, config: FathometerConfig
@@ -170,7 +201,7 @@ class Identities:
     def _follow_bottom(
         self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig
     ) -> int:
-        """Give the first return the id of the one before, and say which it has now, 0 for a new
+        """Give the floor the id of the one before, and say which it has now, 0 for a new
         one.
 
         Within the reach of a reflector it has that id before any other looks for the nearest.
@@ -243,8 +274,10 @@ def _commons(reflectors: Sequence[Identified], config: FathometerConfig) -> list
 @frozen(eq=False)
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
-    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
-    above it; heave and heave_std: stated minus true depth of the array, m, 0 where it is no state.
+    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability to be the floor,
+    without an envelope that nothing lies above it; strength (K,): amplitude in units of the noise;
+    above_bottom (K,): probability to lie above the floor, NaN without an envelope; heave and
+    heave_std: stated minus true depth of the array, m, 0 where it is no state.
 
     What they share: the error of the array's depth, datum_std (m), a part of the covariance; and
     that of the speed of sound, speed_std (K,), m, the same share of the depth of each below the
@@ -256,6 +289,10 @@ class Reflectors:
     covariance: FloatArray
     existence: FloatArray
     is_bottom: FloatArray
+    strength: FloatArray = Factory(lambda self: np.zeros(len(self.depth)), takes_self=True)
+    above_bottom: FloatArray = Factory(
+        lambda self: np.full(len(self.depth), np.nan), takes_self=True
+    )
     speed_std: FloatArray = Factory(lambda self: np.zeros(len(self.depth)), takes_self=True)
     datum_std: float = 0.0
     heave: float = 0.0
@@ -279,35 +316,75 @@ def reflectors_of(
     pulse: Pulse,
     config: FathometerConfig,
     heave: tuple[float, float] | None = None,
+    array_depth_found: float = 0.0,
 ) -> Reflectors:
     """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
-    heave: its mean and standard deviation, m, where it is a state."""
-    depth = lattice.first + lattice.step * members.place
-    sigma = np.interp(depth + (heave[0] if heave else 0.0), response.depth, response.sigma)
+    heave: its mean and standard deviation, m, where it is a state; array_depth_found: error of the
+    array's depth, m, that counts where it is more than what is told."""
+    depth, lift = lattice.first + lattice.step * members.place, heave[0] if heave else 0.0
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
     covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse)
-    scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
+    amplitude, slope = members.amplitude, np.interp(depth + lift, response.depth, response.sigma)
+    is_bottom, above_bottom = members.foremost, np.full(len(depth), np.nan)
+    if response.floor is None:
+        amplitude = slope * amplitude
+    else:
+        # A normal number of an envelope, back in the unit of the trace.
+        rms = np.interp(depth + lift, response.depth, response.rms)
+        amplitude, slope = (rms * each for each in from_normal(amplitude))
+        is_bottom, above_bottom = response.floor.labels(depth + lift)
+    scale = np.stack([np.full(len(depth), lattice.step), slope], axis=-1)
     covariance *= scale[:, :, None] * scale[:, None, :]
     # The particles know depths as they follow from the depth stated with this record: it alone
     # fixes them to some centimetres, so that the errors of earlier records have no say.
     # Where it is a state, the places of the particles are spread by what is not known of it.
+    datum_std = max(config.array_depth_std, array_depth_found)
     if heave is None:
-        covariance[:, 0, 0] += config.array_depth_std**2
-    # Where the depth of the array is not known, depths count from it.
-    height = depth + (heave[0] if heave else 0.0) - np.nan_to_num(response.reference_depth)
-    speed_std = np.abs(height) * config.sound_speed_std / config.sound_speed
+        covariance[:, 0, 0] += datum_std**2
     return Reflectors(
         depth,
-        sigma * members.amplitude,
+        amplitude,
         covariance,
         members.existence,
-        members.foremost,
-        speed_std,
-        heave[1] if heave else config.array_depth_std,
+        is_bottom,
+        members.amplitude,
+        above_bottom,
+        _speed_std(depth + lift, response, config),
+        heave[1] if heave else datum_std,
         *(heave or (0.0, 0.0)),
     )
+
+
+def _speed_std(depth: FloatArray, response: Response, config: FathometerConfig) -> FloatArray:
+    """What the error of the speed of sound makes of depths (K,), m."""
+    # Where the depth of the array is not known, depths count from it.
+    height = depth - np.nan_to_num(response.reference_depth)
+    return np.asarray(np.abs(height) * config.sound_speed_std / config.sound_speed)
+
+
+def detectable_amplitude(response: Response, config: FathometerConfig) -> float:
+    """`detectable_sigmas` in the unit of the amplitude."""
+    if response.floor is None:
+        return config.detectable_sigmas * response.noise
+    return response.noise * float(from_normal(np.array([config.detectable_sigmas]))[0][0])
+
+
+def bottom_columns(
+    reflectors: Reflectors, response: Response, config: FathometerConfig
+) -> dict[str, float]:
+    """Depth of the floor and its standard deviation, m, and how deep the transmit pulse reaches;
+    NaN where that is not known, as for all but envelopes."""
+    if response.floor is None:
+        return dict.fromkeys(('bottom_depth', 'bottom_depth_std', 'blanked'), np.nan)
+    depth, std = response.floor.depth
+    speed = _speed_std(np.array([depth]), response, config)[0]
+    return {
+        'bottom_depth': depth - reflectors.heave,
+        'bottom_depth_std': float(np.sqrt(std**2 + speed**2 + reflectors.datum_std**2)),
+        'blanked': response.floor.blanked,
+    }
 
 
 def _conditional_variance(
@@ -341,27 +418,19 @@ def sediment_depths(
     keeps its depth."""
     if not len(reflectors.depth):
         return np.empty(0), np.empty(0)
-    bottom = reflectors.depth[np.argmax(reflectors.is_bottom)]
+    row = int(np.argmax(np.nan_to_num(reflectors.is_bottom)))
+    bottom = reflectors.depth[row]
     time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
     speed = config.sediment_sound_speed or config.sound_speed
     thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
     speed_std = reflectors.speed_std
     if config.sediment_sound_speed:
         # Below the bottom the water's speed tells the time only, which is seen.
-        speed_std = np.minimum(speed_std, speed_std[np.argmax(reflectors.is_bottom)])
+        speed_std = np.minimum(speed_std, speed_std[row])
     variance = reflectors.covariance[:, 0, 0] + np.square(speed_std)
     variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
     depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
     return depth, np.sqrt(variance)
-
-
-def seen_as(
-    reflectors: Reflectors, ids: IdArray, config: FathometerConfig, records: int = 1
-) -> Seen:
-    """What `multiples` needs to know of a record, `records` after the one before."""
-    sign = np.sign(reflectors.amplitude)
-    datum = reflectors.datum_std**2
-    return Seen(ids, reflectors.depth, reflectors.relative_variance, sign, datum, records)
 
 
 def write_estimate(
@@ -369,14 +438,15 @@ def write_estimate(
     ids: IdArray,
     pmf: FloatArray,
     multiple: FloatArray,
-    slopes: Sequence[FloatArray],
+    known: Identities,
     response: Response,
     config: FathometerConfig,
     *,
+    array_depth_found: float = 0.0,
     preview: bool = False,
 ) -> Estimate:
-    """One row per reflector, multiple (K,) the probability that it is a multiple, slopes: see
-    `Identities.slopes`; without any, one row whose depth is NaN, for the PMF's sake."""
+    """One row per reflector, multiple (K,) the probability that it is a multiple, known: with the
+    reflectors of this record; without any, one row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     extras: dict[str, np.ndarray] = {
@@ -390,15 +460,26 @@ def write_estimate(
         'depth_relative_std': np.full(rows, np.nan),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
+        'above_bottom': np.full(rows, np.nan),
         'multiple_probability': np.full(rows, np.nan),
         'dipping': np.zeros(rows),
         'slope': np.zeros(rows),
         'slope_std': np.zeros(rows),
         'sediment_depth': np.full(rows, np.nan),
         'sediment_depth_std': np.full(rows, np.nan),
-        'sigma': np.full(rows, float(np.median(response.sigma))),
+        'sigma': np.full(rows, response.noise),
         'preview': np.full(rows, int(preview), np.uint8),
     }
+    extras |= {
+        name: np.full(rows, value)
+        for name, value in {
+            **bottom_columns(reflectors, response, config),
+            'array_depth_found': array_depth_found,
+            'detectable_amplitude': detectable_amplitude(response, config),
+        }.items()
+    }
+    for k, p in enumerate(known.detectable(ids, reflectors.existence, config)):
+        extras[f'prob_detectable_{k}'] = np.full(rows, p)
     if len(ids):
         state[:] = np.column_stack([reflectors.depth, reflectors.amplitude])
         covariance[:] = reflectors.covariance
@@ -412,9 +493,10 @@ def write_estimate(
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
         extras['polarity'][:] = np.sign(reflectors.amplitude)
         extras['multiple_probability'][:] = multiple
-        for name, values in zip(('dipping', 'slope', 'slope_std'), slopes):
+        for name, values in zip(('dipping', 'slope', 'slope_std'), known.slopes(ids)):
             extras[name][:] = values
         extras['is_bottom'][:] = reflectors.is_bottom
+        extras['above_bottom'][:] = reflectors.above_bottom
         found = sediment_depths(reflectors, config)
         extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found
     zero = np.zeros(rows)
@@ -429,158 +511,3 @@ def write_estimate(
         probabilities=np.tile(pmf, (rows, 1)),
         extras=extras,
     )
-
-
-class Seen(NamedTuple):
-    """The reflectors of one record, by depth: track_id (K,), depth (K,) m, variance (K,) of the
-    depth without the error of the array's, sign (K,), datum: variance of the array's depth,
-    records: how many records' time passed since the one before."""
-
-    track_id: Annotated[NDArray[np.uint32], 'k']
-    depth: Annotated[FloatArray, 'k']
-    variance: Annotated[FloatArray, 'k']
-    sign: Annotated[FloatArray, 'k']
-    datum: float
-    records: int = 1
-
-
-class Ways(NamedTuple):
-    """Ways by which sound could come from where a reflector seems to be: member (H, 3) of the
-    reflectors above, factor (H, 3) of their depths, datum (H,) how often the error of the array's
-    depth is left, sign (H,) of the amplitude."""
-
-    member: IntArray
-    factor: FloatArray
-    datum: FloatArray
-    sign: FloatArray
-
-
-@frozen
-class Multiples:
-    """The reflectors of the last records. A value: `after` makes a new one."""
-
-    seen: tuple[Seen, ...] = ()
-
-    def after(self, record: Seen) -> Multiples:
-        return evolve(self, seen=(*self.seen, record)[-RECORDS:])
-
-    def probabilities(self, record: Seen, config: FathometerConfig, span: float) -> FloatArray:
-        """Probability (K,) that each reflector of `record` is a multiple of others; span: of the
-        depths that are tracked, m."""
-        K, found = len(record.depth), np.zeros(len(record.depth))
-        if not K:
-            return found
-        past = (*self.seen, record)[-RECORDS:]
-        depth, variance = _histories(past, record.track_id)
-        datum = np.array([record.datum for record in past])
-        time = np.cumsum([record.records for record in past])
-        for target in range(1, K):
-            ways = ways_above(record.depth, record.sign, target)
-            off = _offsets(depth[-1:], variance[-1:], datum[-1:], ways, target)
-            reach = _NEAR * np.sqrt(off[1][0]) + config.depth_std
-            near = np.flatnonzero(np.abs(off[0][0]) <= reach)
-            if len(near) > MOST_WAYS:
-                near = near[np.argsort(np.abs(off[0][0][near]), kind='stable')[:MOST_WAYS]]
-            if not len(near):
-                continue
-            close = Ways(ways.member[near], ways.factor[near], ways.datum[near], ways.sign[near])
-            logs = _log_odds(depth, variance, datum, time, close, target, config, span)
-            odds = np.exp(np.minimum(logs, 300.0))
-            if config.negative_share:
-                odds *= _sign_odds(close.sign == record.sign[target], record.sign[target], config)
-            total = PRIOR / (1.0 - PRIOR) * float(odds.sum()) / len(ways.sign)
-            found[target] = total / (1.0 + total)
-        return found
-
-
-def ways_above(depth: FloatArray, sign: FloatArray, target: int) -> Ways:
-    """Pairs and triples of the reflectors above `target`; depth (K,) ascending, sign (K,)."""
-    member, factor, datum = _combinations(target)
-    signs = sign[member]
-    product = -signs[:, 0] * signs[:, 1] * np.where(factor[:, 2] != 0.0, signs[:, 2], 1.0)
-    return Ways(member, factor, datum, product)
-
-
-@cache
-def _combinations(count: int) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Members, factors and share in the datum of `Ways`, of the first `count` reflectors."""
-    first, second = np.triu_indices(count)
-    # k above j and q: every pair has as many triples as there are reflectors above its upper one.
-    upper = np.repeat(np.arange(len(first)), first)
-    above = np.concatenate([np.arange(j) for j in first]) if len(first) else np.arange(0)
-    pairs = np.column_stack([first, second, np.zeros_like(first)])
-    triples = np.column_stack([first[upper], second[upper], above])
-    member = np.concatenate([pairs, triples]).astype(np.int64)
-    factor = np.repeat([[1.0, 1.0, 0.0], [1.0, 1.0, -1.0]], [len(pairs), len(triples)], axis=0)
-    datum = np.repeat([1.0, 0.0], [len(pairs), len(triples)])
-    return member, factor, datum
-
-
-def _offsets(
-    depth: FloatArray, variance: FloatArray, datum: FloatArray, ways: Ways, target: int
-) -> tuple[FloatArray, FloatArray]:
-    """How far (T, H) the target is from the end of each way, and its variance (T, H) if it were
-    there, NaN where one of them was not seen."""
-    # A way that is gone twice has twice the error.
-    twice = (ways.member[:, 0] == ways.member[:, 1])[:, None] * [[1.0, 1.0, 0.0]]
-    square = np.square(ways.factor) + twice
-    used = ways.factor != 0.0
-    parts = np.where(used, depth[:, ways.member] * ways.factor, 0.0)
-    errors = np.where(used, variance[:, ways.member] * square, 0.0)
-    off = depth[:, target, None] - parts.sum(axis=2)
-    return off, variance[:, target, None] + errors.sum(axis=2) + datum[:, None] * ways.datum
-
-
-def _log_odds(
-    depth: FloatArray,
-    variance: FloatArray,
-    datum: FloatArray,
-    time: IntArray,
-    ways: Ways,
-    target: int,
-    config: FathometerConfig,
-    span: float,
-) -> FloatArray:
-    """Log likelihood ratio (H,) of a multiple to a primary; time (T,), in records."""
-    off, spread = _offsets(depth, variance, datum, ways, target)
-    walk = config.depth_std**2 * (1.0 + np.square(ways.factor).sum(axis=1))
-    seen = np.isfinite(off)
-    # The last record before, at which the target and its way were seen; -1 for none.
-    record = np.arange(len(off))[:, None]
-    last = np.maximum.accumulate(np.where(seen, record, -1), axis=0)
-    last = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
-    there, way = np.maximum(last, 0), np.arange(off.shape[1])
-    walked = spread + spread[there, way] + (time[:, None] - time[there]) * walk
-    # Before the first a primary can be anywhere.
-    primary = np.where(last >= 0, _density(off - off[there, way], walked, span), 1.0 / span)
-    ratio = np.log(_density(off, spread, span)) - np.log(primary)
-    # Summed up in the order of the records, whatever the number of ways.
-    return np.asarray(np.cumsum(np.where(seen, ratio, 0.0), axis=0)[-1])
-
-
-def _histories(past: Sequence[Seen], track_id: NDArray[np.uint32]) -> tuple[FloatArray, ...]:
-    """Depth and variance (T, K) of the reflectors `track_id` (K,) in `past` records, NaN where
-    they were not seen."""
-    found = np.full((2, len(past), len(track_id)), np.nan)
-    every = np.concatenate([record.track_id for record in past])
-    row = np.repeat(np.arange(len(past)), [len(record.track_id) for record in past])
-    order = np.argsort(track_id)
-    place = np.minimum(np.searchsorted(track_id, every, sorter=order), len(track_id) - 1)
-    column = order[place]
-    use = track_id[column] == every
-    for values, name in zip(found, ('depth', 'variance')):
-        values[row[use], column[use]] = np.concatenate([getattr(record, name) for record in past])[
-            use
-        ]
-    return tuple(found)
-
-
-def _density(x: FloatArray, variance: FloatArray, span: float) -> FloatArray:
-    normal = np.exp(-0.5 * np.square(x) / variance) / np.sqrt(2.0 * np.pi * variance)
-    return np.asarray((1.0 - OUTLIERS) * normal + OUTLIERS / span)
-
-
-def _sign_odds(agrees: NDArray[np.bool_], sign: float, config: FathometerConfig) -> FloatArray:
-    """How much more probable the sign is for a multiple, a twentieth of whose signs are wrong."""
-    share = config.negative_share
-    return np.asarray(np.where(agrees, 0.95, 0.05) / (share if sign < 0.0 else 1.0 - share))

@@ -18,13 +18,14 @@ A `Lattice` of depths is laid out at the first record and kept. Every record, wh
 was, is put onto it: its `Response` is what the particles are weighed by. Traces come as they are;
 of an array the cross-spectra are looked at upward and downward at once, and correlated.
 
-An envelope, such as sub-bottom profilers record, has the pulse of an envelope, is never negative,
-and stands in the volume scatter of the floor. How wide the pulse is and what noise there is depend
-on the instrument; the rest is common (`envelope_parameters`).
+An envelope, such as sub-bottom profilers record, is never negative, and has the pulse and the
+noise of an envelope: `Water` makes normal numbers of it. How wide the pulse is and what noise
+there is depend on the instrument; the rest is common (`envelope_parameters`).
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -38,7 +39,6 @@ from ...acoustics.pulse import (
     band_pulse,
     envelope_pulse,
     gaussian_pulse,
-    independent_samples,
     measured_pulse,
     Pulse,
     SampledPulse,
@@ -46,24 +46,23 @@ from ...acoustics.pulse import (
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
 from ...estimation.set_model import walk_reach
-from ...estimation.set_scatter import decaying_profile, Scatter
 from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError, small_text
 from .config import FathometerConfig
 from .noise import LEAST_NOISE_SAMPLES, measured_sigma, mirror_sigma
+from .water import SeenFloor, Water
 
 MAX_CELLS = 100_000
 MAX_MOVES = 8_000_000
 """Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
 tables of moves, 32 where reflectors of either sign are looked for."""
+LEAST_SHIFT, MORE_ROOM = 0.02, 0.25
+"""Shares of the window of a trace: by how much it shifts to count, and what room is made."""
 MAX_SIGMAS = 1e6
 LOUDEST = 1e100
 """Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
-DECAYS = (2.0, 4.0, 8.0, 16.0)
-"""Depths, m, over which the scatter of an envelope may fall to 1/e: silt with gas to sand."""
-MAX_SCATTER_CELLS = 10_000
 _PHASES = 4
 """At how many depths the phase of an echo is found."""
 
@@ -103,7 +102,9 @@ class Response:
     the one that is configured. noise_unknown: sigma is that of the whole trace, reflectors
     included. phones (4, M): gain in dB, sign, delay in s and share of each hydrophone before it
     was corrected, NaN where it was not looked at, see `acoustics.hydrophones`. noise_wraps: the
-    depths that are configured for noise reach beyond half a snapshot.
+    depths that are configured for noise reach beyond half a snapshot. Of an envelope the amplitude
+    is a normal number: rms (n,) is the noise and scatter that it is seen against, in the unit of
+    the trace, empty for other records; floor: see `SeenFloor`.
     """
 
     stamp_ns: int
@@ -117,7 +118,14 @@ class Response:
     pulse: SampledPulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
     noise_wraps: bool = False
-    phones: Annotated[FloatArray, '4,M'] = field(factory=lambda: np.empty((4, 0)), repr=False)
+    phones: Annotated[FloatArray, '4m'] = field(factory=lambda: np.empty((4, 0)), repr=False)
+    rms: Annotated[FloatArray, 'r'] = field(factory=lambda: np.empty(0), repr=False)
+    floor: SeenFloor | None = field(default=None, repr=False)
+
+    @property
+    def noise(self) -> float:
+        """Median of the noise over the depths, in the unit of the record."""
+        return float(np.median(self.rms if len(self.rms) else self.sigma))
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
@@ -152,6 +160,24 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
         step = trace.step / np.ceil(0.5 * trace.step / config.depth_std)
     first = trace.depth[0] + step * np.ceil((low - trace.depth[0]) / step - 1e-6)
     return _checked(float(first), float(step), min(high, float(trace.depth[-1])), config)
+
+
+def widened(lattice: Lattice, trace: Trace, config: FathometerConfig) -> Lattice | None:
+    """Lattice with room for a trace whose window has shifted, None where it has room, lies further
+    away than it is long, or depths are configured. Raises `Rejection` for too many depths."""
+    low, high = float(trace.depth[0]), float(trace.depth[-1])
+    last = lattice.first + lattice.step * (lattice.cells - 1)
+    least = max(lattice.step, LEAST_SHIFT * (high - low))
+    if config.depth_max or (low > lattice.first - least and high < last + least):
+        return None
+    if low > 2.0 * last - lattice.first or high < 2.0 * lattice.first - last:
+        return None
+    # More than it takes: the window may go on shifting.
+    room = MORE_ROOM * (high - low)
+    above = math.ceil((lattice.first - low + room) / lattice.step) if low < lattice.first else 0
+    end = high + room if high > last else last
+    first = lattice.first - max(above, 0) * lattice.step
+    return evolve(_checked(first, lattice.step, end, config), hydrophones=lattice.hydrophones)
 
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:
@@ -205,7 +231,7 @@ def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
 
 
 def trace_response(
-    trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float
+    trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float, water: Water
 ) -> Response:
     """Put a trace onto the lattice; where it does not reach, the response is zero. Raises
     `Rejection` when it has no noise to compare with, or lies elsewhere."""
@@ -217,6 +243,13 @@ def trace_response(
         raise Rejection(
             'out_of_range', f'the trace holds {loudest:.3g}; {LOUDEST:g} is possible at most'
         )
+    depth = lattice.depth
+    if depth[0] > trace.depth[-1] or depth[-1] < trace.depth[0]:
+        raise Rejection('other_depths', 'the trace lies outside of the depths that are tracked')
+    if water.active is None:
+        water.begin(trace)
+    if water.active:
+        return _envelope_response(trace, lattice, config, reference_depth, water)
     noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
@@ -224,9 +257,6 @@ def trace_response(
         quiet = np.isfinite(trace.amplitude)
     if config.remove_background:
         amplitude = amplitude - np.median(amplitude[quiet])
-    depth = lattice.depth
-    if depth[0] > trace.depth[-1] or depth[-1] < trace.depth[0]:
-        raise Rejection('other_depths', 'the trace lies outside of the depths that are tracked')
     sigma = np.full(len(depth), config.noise_sigma)
     if not config.noise_sigma:
         if trace.sigma is not None:
@@ -243,6 +273,32 @@ def trace_response(
         sigma,
         reference_depth,
         noise_unknown=noise_unknown,
+    )
+
+
+def _envelope_response(
+    trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float, water: Water
+) -> Response:
+    """An envelope as normal numbers against its noise and the scatter below its floor."""
+    known = trace.amplitude[np.isfinite(trace.amplitude)]
+    if not np.ptp(known) > 0.0:
+        raise Rejection('no_noise', 'the record has no noise to compare its peaks with')
+    b, scale, floor = water.take(trace)
+    depth, own = lattice.depth, water.depth
+    pulse = None
+    if config.pulse == 'auto':
+        lag = 0.25 * lattice.step * np.arange(4 * lattice.cells, dtype=np.float64)
+        pulse = SampledPulse(lag, gaussian_pulse(water.pulse_width)(lag))
+    return Response(
+        trace.stamp_ns,
+        trace.frame_id,
+        depth,
+        np.interp(depth, own, b, left=0.0, right=0.0),
+        np.ones(len(depth)),
+        reference_depth,
+        pulse=pulse,
+        rms=np.interp(depth, own, scale),
+        floor=floor,
     )
 
 
@@ -524,40 +580,8 @@ def envelope_parameters(
         'pulse': 'gaussian',
         'pulse_width': pulse_width,
         'noise_sigma': noise_sigma,
-        'scatter_decay': DECAYS,
         'min_separation': separation,
         # Records come several a second and the floor slopes; 1.4 m a record can be followed.
         'depth_std': 0.35,
         'order_max': max(1, int(min(window / separation, 6.0))),
     }
-
-
-def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
-    """The background below the first reflector, on the cells of a record. Raises ValueError for
-    too many of them."""
-    if not config.scatter_decay:
-        return None
-    pulse, step = pulse_of(config), lattice.step
-    shift = heave_shift(config, step)
-    cells = lattice.cells + (2 * shift.pad if shift else 0)
-    if cells > MAX_SCATTER_CELLS:
-        raise ValueError(
-            f'volume scatter is looked for on up to {MAX_SCATTER_CELLS} steps of depth, not '
-            f'{cells}: use a greater depth_step or fewer depths'
-        )
-    independent = independent_samples(pulse, step * cells, 0.25 * step) / cells
-    decays = np.asarray(config.scatter_decay) / step
-    profile = decaying_profile(pulse(step * np.arange(cells, dtype=np.float64)), decays)
-    # Wide enough to take out a pulse: twice what of it is above one half.
-    half = (
-        float(
-            np.count_nonzero(pulse(0.01 * step * np.arange(100 * cells, dtype=np.float64)) > 0.5)
-        )
-        / 100.0
-    )
-    return Scatter(
-        profile=profile,
-        spread=config.scatter_spread,
-        share=min(1.0, independent),
-        window=2 * int(np.ceil(2.0 * half)) + 1,
-    )

@@ -18,21 +18,25 @@ from __future__ import annotations
 
 from ...acoustics.geodesy import Origin
 from ...acoustics.pulse import SampledPulse
+from ...estimation.onset import OnsetState
 from ...estimation.set_filter import SetStep, Weighted
 from ...estimation.set_model import Sets
 from ...estimation.set_shifts import ShiftPath
 from ...intake.stream import STREAM_TYPES
 from ...measurements import CrossSpectra, Pressure, Trace
+from .multiples import Multiples, Seen
 from .pressure import Beginning, Pace
-from .reflectors import Identified, Identities, Multiples, Seen
+from .reflectors import Identified, Identities
 from .response import Lattice, Response
 from .slopes import Slope
 from .tracker import Taken
+from .water import SeenFloor
 
 STATE_TYPES = (
     *STREAM_TYPES,
     *(CrossSpectra, Pressure, Trace, Origin),
     *(Beginning, Pace, Response, SampledPulse, Lattice, Taken),
     *(SetStep, Weighted, Sets, ShiftPath),
+    *(SeenFloor, OnsetState),
     *(Identities, Identified, Slope, Multiples, Seen),
 )

@@ -68,7 +68,9 @@ from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
-from .fit import Fit
+from .datum import DatumError
+from .fit import Fit, left_negative
+from .multiples import Multiples, seen_as
 from .phones import PhoneFaults
 from .pressure import (
     Collected,
@@ -82,11 +84,9 @@ from .reflectors import (
     IdArray,
     Identified,
     Identities,
-    Multiples,
     nearest_ids,
     Reflectors,
     reflectors_of,
-    seen_as,
     write_estimate,
 )
 from .response import (
@@ -102,16 +102,15 @@ from .response import (
     rank_deficient,
     residual_sigma,
     Response,
-    scatter_of,
     trace_response,
+    widened,
 )
 from .slopes import slopes_followed
+from .water import Water
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
 LONGEST_GAP = 5000
-_DEEP, _OF_STRONGEST = 6.0, 0.25
-"""How deep a negative echo is, in sigma and of the strongest one."""
 
 
 @frozen(eq=False)
@@ -148,6 +147,8 @@ class FathometerTracker:
         '_health',
         '_fit',
         '_phones',
+        '_water',
+        '_datum',
     )
 
     response: Response | None
@@ -167,6 +168,9 @@ class FathometerTracker:
     _health: dict[str, float]
     _fit: Fit
     _phones: PhoneFaults
+    _water: Water
+    _datum: DatumError
+    _own: FathometerConfig
 
     def __init__(self, config: FathometerConfig):
         self.config = config
@@ -185,29 +189,35 @@ class FathometerTracker:
 
     def _forget(self) -> None:
         """Begin anew, but for counts and ids."""
+        self._datum = DatumError()
+        self._own = self._datum.effective(self.config)
         self._hydrophones = self.config.phones
         self._pace = Pace()
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
         self._multiples = Multiples()
         self._lattice = None
-        self._settled = self.config
+        self._settled = self._own
         self._padded: Lattice | None = None
         self._filter: SetFilter | None = None
         self._before = None
-        self._smoother = LagSmoother(self.config.smoothing_lag)
-        self._taken = deque(maxlen=self.config.smoothing_lag + 1)
+        self._smoother = LagSmoother(self._own.smoothing_lag)
+        self._taken = deque(maxlen=self._own.smoothing_lag + 1)
         self._health = {}
         self._fit = Fit()
         self._phones = PhoneFaults()
+        self._water = Water(self._own)
 
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
+        self._datum.require()
+        self._own = self._datum.effective(self.config)
+        self._water.require()
         if self._lattice is None:
             if self._before is not None:
                 raise ValueError('sets without a lattice')
             return
-        self._lattice.require(self.config)
+        self._lattice.require(self._own)
         self._begin(self._lattice)
         if self._before is not None and self._filter is not None:
             self._filter.require(self._before, self._smoother.steps)
@@ -219,10 +229,11 @@ class FathometerTracker:
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
         heave_differs = config.array_depth_std != self.config.array_depth_std
-        self.config = config
+        self.config = self._water.config = config
+        self._own = config = self._datum.effective(config)
         if self._lattice is not None:
             self._settled = config.settled(self._lattice.hydrophones)
-        if config.heave != 'none' and heave_differs:
+        if self.config.heave in ('independent', 'memory') and heave_differs:
             # It is built into the filter as the spread of a state.
             self._forget()
 
@@ -231,7 +242,7 @@ class FathometerTracker:
             return
         depth = 0.05 * np.arange(200)
         config = evolve(
-            self.config,
+            self._own,
             depth_min=0.0,
             depth_max=0.0,
             depth_step=0.05,
@@ -264,7 +275,9 @@ class FathometerTracker:
                 f'in {heaving} records the array heaves by more than {MOST_HEAVE:g} m: their '
                 'echoes are weaker than they should be'
             )
-        return [*found, *self._phones.warnings(), *self._fit.warnings(self.config)]
+        found += self._phones.warnings() + self._water.warnings()
+        found += self._datum.warnings(self.config)
+        return [*found, *self._fit.warnings(self._own)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -293,16 +306,22 @@ class FathometerTracker:
         if isinstance(item, Trace):
             depth = self._array_depth(item, 0)
             if self._lattice is None:
-                self._begin(lattice_of_trace(item, self.config))
+                self._begin(lattice_of_trace(item, self._own))
+            elif wider := widened(self._lattice, item, self._own):
+                self._begin_anew(wider)
+                if self._water.active:
+                    own = wider.depth
+                    self._water.widen(float(own[0]), float(own[-1]))
             assert self._padded is not None
             reference = math.nan if depth is None else depth
-            return self._record(trace_response(item, self._padded, self.config, reference))
+            response = trace_response(item, self._padded, self._own, reference, self._water)
+            return self._record(response)
         self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
             return self._record(self._array_response(Collected(item, item.snapshots), 0))
         records, previews = self._pressure.push(item, self._reach(item))
         self.counts['blocks'] += 1
-        span_ns = round(self.config.record_seconds * 1e9)
+        span_ns = round(self._own.record_seconds * 1e9)
         made = []
         for record in records:
             made += self._record(self._array_response(record, span_ns))
@@ -314,10 +333,10 @@ class FathometerTracker:
         """From hydrophone 0 to the deepest depth that is tracked, m."""
         depth = block.reference_depth
         if depth is None:
-            depth = self._depths.nearest(block.stamp_ns, self.config) or self.config.array_depth
+            depth = self._depths.nearest(block.stamp_ns, self._own) or self._own.array_depth
         if self._lattice is not None:
             return float(self._lattice.depth[-1]) - depth
-        return depths_wanted(self.config, depth)[1] - depth
+        return depths_wanted(self._own, depth)[1] - depth
 
     def _count_hydrophones(self, item: Pressure | CrossSpectra) -> None:
         if self._hydrophones and item.hydrophones != self._hydrophones:
@@ -334,10 +353,10 @@ class FathometerTracker:
         """As the record says; else as the companion does; else as configured."""
         if item.reference_depth is not None:
             return item.reference_depth
-        depth = self._depths.over(item.stamp_ns, span_ns, self.config)
+        depth = self._depths.over(item.stamp_ns, span_ns, self._own)
         if depth is None:
-            self.counts['array_depth_unknown'] += not self.config.array_depth
-            depth = self.config.array_depth or None
+            self.counts['array_depth_unknown'] += not self._own.array_depth
+            depth = self._own.array_depth or None
         return depth
 
     # -- a record ---------------------------------------------------------------------------------
@@ -351,16 +370,16 @@ class FathometerTracker:
         self.counts['heave_within_record'] += spread > MOST_HEAVE
         depth = self._array_depth(record, span_ns) or 0.0
         if self._lattice is None:
-            lattice = lattice_of_array(depth, self.config)
+            lattice = lattice_of_array(depth, self._own)
             self._begin(evolve(lattice, hydrophones=self._hydrophones))
         assert self._padded is not None
         return array_response(record, self._padded, self._settled, depth)
 
     def _begin(self, lattice: Lattice) -> None:
-        settled = self.config.settled(lattice.hydrophones)
+        settled = self._own.settled(lattice.hydrophones)
         try:
             model = self._set_model(lattice)
-            self._filter = SetFilter(model, self.config.particles, self.config.threads)
+            self._filter = SetFilter(model, self._own.particles, self._own.threads)
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
         self._lattice, self._settled = lattice, settled
@@ -370,7 +389,7 @@ class FathometerTracker:
         """Return what the particle filter assumes. A subclass can change it, as the printed form
         in benchmarks/fathometer_paper.py does. Raises ValueError when the most reflectors do not
         fit."""
-        config = self.config.settled(lattice.hydrophones)
+        config = self._own.settled(lattice.hydrophones)
         pulse, step = pulse_of(config), lattice.step
         transition = banded_transition(config.orders, config.order_switch_probability)
         if config.order_transition_matrix:
@@ -388,15 +407,14 @@ class FathometerTracker:
             amplitude_memory=config.amplitude_memory,
             negative_probability=config.negative_share,
             shift=heave_shift(config, step),
-            scatter=scatter_of(config, lattice),
             start=independent_orders(config.order_min, config.orders),
         )
 
     def _filtered(self, response: Response) -> tuple[Response, SetStep, int, Pace]:
         """What this record would change, how many records' time passed, and the pace with it.
         Where its noise is not known, it is measured in what a first round's reflectors leave."""
-        place = self._places.at(response.stamp_ns, self.config)
-        records = self._pace.records(response.stamp_ns, self.config, place)
+        place = self._places.at(response.stamp_ns, self._own)
+        records = self._pace.records(response.stamp_ns, self._own, place)
         step = self._cycle(response, records)
         if response.noise_unknown:
             found, _ = self._summarise(step, response)
@@ -413,7 +431,7 @@ class FathometerTracker:
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
             b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
         b = np.ascontiguousarray(np.nan_to_num(b))
-        key, gram = (self.config.seed, response.stamp_ns), None
+        key, gram = (self._own.seed, response.stamp_ns), None
         if response.pulse is not None:
             lags = self._lattice.step * np.arange(self._lattice.cells, dtype=np.float64)
             gram = np.ascontiguousarray(response.pulse(lags))
@@ -422,8 +440,8 @@ class FathometerTracker:
             before = None
         records = 0 if before is None else records
         walks = None
-        if before is not None and slopes_followed(self.config):
-            walks = self._ids.walks(self._lattice, records, self.config)
+        if before is not None and slopes_followed(self._own):
+            walks = self._ids.walks(self._lattice, records, self._own)
         record = particles.record(b, key, gram, records, walks)
         before = before or particles.start(record)
         sets = particles.propagate(before, record)
@@ -436,16 +454,29 @@ class FathometerTracker:
         than half of the most reflectors come and go, and not more walks than there is room for.
         Otherwise they begin anew."""
         assert self._filter is not None and self._lattice is not None
-        if records > 1 and 2.0 * records * self._filter.model.mean_changes > self.config.order_max:
+        if records > 1 and 2.0 * records * self._filter.model.mean_changes > self._own.order_max:
             return False
-        reach = walk_reach(math.sqrt(records) * self.config.depth_std / self._lattice.step)
+        reach = walk_reach(math.sqrt(records) * self._own.depth_std / self._lattice.step)
         tables = self._lattice.cells * (2.0 * reach + 1.0)
         return records == 1 or (records <= LONGEST_GAP and tables <= MAX_MOVES)
+
+    @property
+    def _error_of_depth(self) -> float:
+        """Of the array, as it was found, m; 0 where it is not looked for."""
+        told = self.config.array_depth_std
+        return self._datum.found if told and not self._water.active else 0.0
 
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
         variance = reflectors.covariance[:, 0, 0]
-        return known.name(reflectors.depth, reflectors.is_bottom, self.config, variance)
+        return known.name(
+            reflectors.depth,
+            reflectors.is_bottom,
+            self._own,
+            variance,
+            strength=reflectors.strength,
+            floor_known=bool(self._water.active),
+        )
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step, records, self._pace = self._filtered(response)
@@ -454,35 +485,63 @@ class FathometerTracker:
         if records > 1:
             self.counts['gaps'] += 1
         if not self._bridged(records):
-            self._smoother = LagSmoother(self.config.smoothing_lag)
+            self._smoother = LagSmoother(self._own.smoothing_lag)
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
+        before = {e.track_id: e.depth for e in self._ids.reflectors if not e.missed + e.absent}
         self._ids, ids = self._named(reflectors, records)
+        moved = [z - before[i] for i, z in zip(ids.tolist(), reflectors.depth) if i in before]
+        if moved and records == 1:
+            self._datum.add(float(np.mean(moved)))
         self._taken.append(Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,
-            sigma=float(np.median(response.sigma)),
-            order=float(self.config.order_min + int(np.argmax(pmf))),
+            sigma=response.noise,
+            order=float(self._own.order_min + int(np.argmax(pmf))),
         )
         positive = self._settled.polarity == 'positive'
-        negative = positive and self._left_negative(reflectors, response)
-        self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self.config)
+        negative = positive and left_negative(
+            reflectors, response, response.pulse or self.pulse, self._own
+        )
+        self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self._own)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self._settled, records))
-        return [*self._smoothed(step), newest]
+        estimates = [*self._smoothed(step), newest]
+        self._follow_datum()
+        return estimates
 
-    def _left_negative(self, reflectors: Reflectors, response: Response) -> bool:
-        """Whether a negative echo is left where no reflector is, that no side lobe explains."""
-        with np.errstate(all='ignore'):
-            b = response.amplitude / response.sigma
-        least = max(_DEEP, _OF_STRONGEST * float(b.max()))
-        deep = np.flatnonzero(b < -least)
-        away = response.depth[deep, None] - reflectors.depth - reflectors.heave
-        echoes = (response.pulse or self.pulse)(away) @ reflectors.amplitude
-        left = b[deep] - echoes / response.sigma[deep] < -least
-        return bool(np.any(left & (np.abs(away) > self.config.min_separation).all(axis=1)))
+    def _follow_datum(self) -> None:
+        """Make the error of the array's depth a state from the next record on, where it is far
+        greater than what is told. The reflectors keep their ids."""
+        datum, lattice = self._datum, self._lattice
+        if self.config.heave != 'auto' or datum.followed or not datum.exceeds(self.config):
+            return
+        # What moves the floor of a profiler is its ship, which slopes follow.
+        if self._water.active or lattice is None:
+            return
+        datum.followed = datum.found
+        self._own = datum.effective(self.config)
+        try:
+            lattice.require(self._own)
+            self._begin(lattice)
+        except (ValueError, Rejection):
+            datum.followed = 0.0
+            self._own = datum.effective(self.config)
+            self._begin(lattice)
+            return
+        self._forget_sets()
+
+    def _begin_anew(self, lattice: Lattice) -> None:
+        """Go on with other depths. The reflectors keep their ids."""
+        self._begin(lattice)
+        self._forget_sets()
+
+    def _forget_sets(self) -> None:
+        self._before = None
+        self._smoother = LagSmoother(self.config.smoothing_lag)
+        self._taken.clear()
 
     def _preview(self, response: Response) -> Estimate:
         response, step, records, _ = self._filtered(response)
@@ -503,7 +562,7 @@ class FathometerTracker:
         for taken in self._taken:
             free = [named for named in taken.named if named.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
-            ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
+            ids[missing] = nearest_ids(reflectors.depth[missing], free, self._own)
         return [self._write(reflectors, ids, pmf, response, self._ids)]
 
     def _write(
@@ -518,27 +577,36 @@ class FathometerTracker:
         preview: bool = False,
     ) -> Estimate:
         multiple = np.full(len(ids), np.nan)
-        if self.config.multiples == 'mark':
+        if self._own.multiples == 'mark':
             assert self._lattice is not None
             span = self._lattice.step * self._lattice.cells
             seen = seen_as(reflectors, ids, self._settled, records)
             multiple = self._multiples.probabilities(seen, self._settled, span)
-        slopes = known.slopes(ids)
         return write_estimate(
-            reflectors, ids, pmf, multiple, slopes, response, self.config, preview=preview
+            reflectors,
+            ids,
+            pmf,
+            multiple,
+            known,
+            response,
+            self._own,
+            array_depth_found=self._error_of_depth,
+            preview=preview,
         )
 
     def _summarise(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
         """The reflectors of the most probable order, and the PMF (orders,) of the order."""
         assert self._filter is not None and self._lattice is not None
         pmf, sums, shift = self._filter.summarise(step)
-        most = self.config.order_min + int(np.argmax(pmf))
+        most = self._own.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
-        modes = bool(self.config.scatter_decay)
-        members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
+        modes = bool(self._water.active)
+        members = find_members(sums, separation, most, self._own.existence_min, modes=modes)
         heave = None
         if shift:
             heave = self._lattice.step * shift[0], self._lattice.step * shift[1]
         pulse = response.pulse or self.pulse
-        found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
+        found = reflectors_of(
+            members, response, self._lattice, pulse, self._own, heave, self._error_of_depth
+        )
         return found, pmf

@@ -43,9 +43,10 @@ UNEXPLAINED = -200.0
 
 def for_tuning(config: BathymetryConfig) -> BathymetryConfig:
     """On the grid, without Monte Carlo noise, where the models allow it; nothing looks back."""
+    engine = 'grid' if config.model_set in SCALAR_SETS else 'particles'
     return evolve(
         config,
-        engine='grid' if config.model_set in SCALAR_SETS else 'particles',
+        engine='auto' if config.is_terrain else engine,
         smoothing='none',
         ping_coupling=0.0,
         layover='ignored',
@@ -55,6 +56,8 @@ def for_tuning(config: BathymetryConfig) -> BathymetryConfig:
 def tunables(config: BathymetryConfig, measurements: Sequence[Any]) -> list[Tunable]:
     """The noise of the smoothest model only when it is asked for: a flat floor makes it so small
     that the next floor does not fit."""
+    if config.is_terrain:
+        return []
     if config.model_set == 'angle_two_rw':
         name, noise = 'sigmas_deg', config.sigmas_deg or DEFAULT_SIGMAS_DEG
     else:

@@ -124,8 +124,11 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
 
 
 def rough_models(names: tuple[str, ...]) -> BoolArray:
-    """Which models (M,) mean rough floor. Beside a constant slope it is the random walk, in a
-    bank, whose noise grows from model to model, the upper half. A single model never does."""
+    """Which models (M,) mean rough floor. Beside a constant slope it is the random walk, beside
+    `steady` floor what scatters or walks, in a bank, whose noise grows from model to model, the
+    upper half. A single model never does."""
+    if 'steady' in names:
+        return np.array([name.startswith(('scatter', 'rw', 'walk')) for name in names])
     if 'ncs' in names:
         return np.array([name == 'rw' for name in names])
     rough = np.arange(len(names)) >= len(names) // 2

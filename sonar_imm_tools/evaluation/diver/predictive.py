@@ -15,8 +15,8 @@
 """What the diver tracker predicts of each fix, for `evaluation.tuning`.
 
 A scan of m fixes, of which false ones and new divers come with density l = clutter_density + b
-over the area A in which fixes lie at all, b birth_density times the time since the scan before,
-has
+over the area A in which fixes lie at all, with b birth_density times the time since the scan
+before, has
 
     log p = m log l - l A + sum_t log(1 - r p + r p f / l)
 

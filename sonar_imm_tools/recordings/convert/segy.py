@@ -18,14 +18,10 @@
 not go with the depth of the water that the headers state, that is said, and the sample spacing has
 to be given. Where delay or interval change along the line, so do the depths of the traces.
 
-Traces that are never negative are envelopes. For them the pulse and the noise are measured
-and written beside the bag, where the tracker finds them: the water above the floor is quiet, so
-that the first arrival of a trace is plain to see, and its shape is that of the pulse where the
-floor is level and little scatters below it. Steep floors, gas and roughness only make it wider: of
-its widths at half height, where the arrivals beside it begin within a sample of it, the tenth part
-from below is taken. What is above the first arrival is noise; of coarse steps of a converter it is
-at least half a step. Where a gain that grows with time raises the noise with the depth, each trace
-states it by depth (`noise_by_depth`). Places become the topic ``/position``.
+Traces that are never negative are envelopes. For them the pulse and the noise are measured as the
+tracker does (`water.look`), from six hundred traces all along the line at most, and written beside
+the bag, where the tracker finds them. Where a gain that grows with time raises the noise with the
+depth, each trace states it by depth. Places become the topic ``/position``.
 """
 
 from __future__ import annotations
@@ -38,9 +34,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.array_records import write_trace
-from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.acoustics.envelopes import is_envelope
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.trackers.fathometer.response import envelope_parameters
+from sonar_imm.trackers.fathometer.water import look
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import SegyOptions
@@ -53,11 +51,9 @@ from .navigation import navigation_of_table
 READ_OPTIONS = ('time_zone', 'start', 'rate', 'crs')
 """Options that `read_segy` has, too."""
 GRID_OPTIONS = ('sound_speed', 'sample_spacing', 'depth_offset')
-_RUN, _REACH, _LOUD = 3, 4, 8.0
-_LEAST_ARRIVALS, _LEAST_QUIET, _AROUND = 10, 20, 3
-_NARROW = 0.1
-_NEAR = 1.5
-_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+_LEAST_ARRIVALS, _NEAR = 10, 1.5
+_RUNS, _RUN = 10, 60
+"""Stretches of successive traces that are looked at, and how many each has."""
 
 
 def convert_segy(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
@@ -177,15 +173,16 @@ def _instrument(
     measured = measured_instrument(amplitude, spacing, stack)
     if measured is None:
         report.notes['pulse'] = (
-            'the traces are envelopes, but no first arrival stands free to measure the pulse; '
-            'leave out the transmit pulse (--first-sample) or give the tracker parameters'
+            'the traces are envelopes, but no floor stands free to measure the pulse; leave out '
+            'what the instrument adds (--first-sample) or give the tracker parameters'
         )
         return {}, None
-    width, noise = (float(f'{value:.3g}') for value in measured)
-    sigma, window = noise_by_depth(amplitude, stack, noise), spacing * amplitude.shape[1]
-    described = f'{noise:g}'
-    if sigma is not None:
-        described, noise = f'{sigma[0]:.3g} to {sigma[-1]:.3g}, growing with the depth', 0.0
+    width, by_depth = float(f'{measured[0]:.3g}'), measured[1]
+    noise, window = float(f'{np.median(by_depth):.3g}'), spacing * amplitude.shape[1]
+    described, sigma = f'{noise:g}', None
+    if by_depth[-1] > 2.0 * by_depth[0]:
+        described = f'{by_depth[0]:.3g} to {by_depth[-1]:.3g}, growing with the depth'
+        noise, sigma = 0.0, by_depth
     report.notes['pulse'] = f'of an envelope, {width:g} m; noise {described}; see parameters.yaml'
     return envelope_parameters(width, noise, window), sigma
 
@@ -219,106 +216,28 @@ def _records(
     return records
 
 
-def is_envelope(amplitude: FloatArray) -> bool:
-    """True when no sample of the traces (T, n) is negative, and some are not zero."""
-    return bool(np.nanmin(amplitude) >= 0.0 and np.nanmax(amplitude) > 0.0)
-
-
-def arrival_edges(amplitude: FloatArray) -> IntArray:
-    """Sample at which each trace (T, n) first begins, -1 where none does: the first of three
-    successive samples above an eighth of what the loud traces reach."""
-    loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
-    above = amplitude > loud
-    count = amplitude.shape[1] - _RUN + 1
-    if count < 1:
-        return np.full(len(amplitude), -1)
-    run = np.logical_and.reduce([above[:, k : k + count] for k in range(_RUN)])
-    return np.where(run.any(axis=1), run.argmax(axis=1), -1)
-
-
-def first_arrivals(amplitude: FloatArray) -> IntArray:
-    """Sample of the first arrival of each trace (T, n), -1 where there is none: the greatest of
-    the four from its edge on."""
-    return np.array(
-        [
-            -1 if i < 0 else i + int(np.argmax(trace[i : i + _REACH]))
-            for i, trace in zip(arrival_edges(amplitude), amplitude)
-        ]
-    )
-
-
 def measured_instrument(
     amplitude: FloatArray, spacing: float, stack: int = 1
-) -> tuple[float, float] | None:
-    """Standard deviation of the pulse, m, and noise, for envelopes (T, n) with samples `spacing` m
-    apart, of which `stack` successive ones are averaged; None when too few first arrivals stand
-    free."""
-    step, amplitude = _step(amplitude), _stacked(amplitude, stack)
-    arrivals, edges = first_arrivals(amplitude), arrival_edges(amplitude)
-    free = [(trace, int(i)) for trace, i in zip(amplitude, arrivals) if i >= _REACH]
-    widths = np.array(
-        [
-            np.nan if i < _REACH or (width := _width(trace, int(i))) is None else width
-            for trace, i in zip(amplitude, arrivals)
-        ]
-    )
-    beside = np.pad(np.abs(np.diff(edges)), 1, 'edge') if len(edges) > 1 else np.zeros(2)
-    level = np.isfinite(widths) & (np.maximum(beside[1:], beside[:-1]) <= 1)
-    if np.count_nonzero(level) < _LEAST_ARRIVALS:
-        level = np.isfinite(widths)
-    if np.count_nonzero(level) < _LEAST_ARRIVALS:
-        return None
-    pulse = spacing * max(float(np.quantile(widths[level], _NARROW)) / _FWHM, 0.4)
-    quiet = np.concatenate([trace[: i - _REACH] for trace, i in free] or [np.empty(0)])
-    rms = float(np.sqrt(np.mean(np.square(quiet)))) if len(quiet) else 0.0
-    return pulse, max(rms, 0.5 * step, 1e-3 * float(amplitude.max()))
+) -> tuple[float, FloatArray] | None:
+    """Standard deviation of the pulse, m, and noise (n,), rms, of envelopes (T, n) with samples
+    `spacing` m apart, of which `stack` successive ones are averaged; None when too few traces have
+    a floor that stands free."""
+    seen = look(_stretches(_stacked(amplitude, stack)), spacing)
+    return (spacing * seen.pulse, seen.noise) if seen.pulse > 0.0 else None
 
 
-def noise_by_depth(amplitude: FloatArray, stack: int, least: float) -> FloatArray | None:
-    """Noise (n,), rms, of envelopes (T, n) of which `stack` successive ones are averaged, where it
-    grows with the depth to more than twice of what it is at first, else None; nowhere less than
-    `least`.
-
-    Above the first arrivals it is seen. Below them it is no more than what the quietest tenth of
-    the traces has at a depth, of which noise of that rms has as little; and since it only grows,
-    no more than at any greater depth."""
-    amplitude = _stacked(amplitude, stack)
-    edges, n = arrival_edges(amplitude), amplitude.shape[1]
-    water = np.arange(n) < (edges - _REACH)[:, None]
-    seen = water.sum(axis=0)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        above = np.sqrt((np.square(amplitude) * water).sum(axis=0) / seen)
-    drawn = np.random.default_rng(0).rayleigh(np.sqrt(0.5), (20_000, stack)).mean(axis=1)
-    scale = np.sqrt(np.mean(np.square(drawn))) / np.quantile(drawn, _NARROW)
-    found = np.where(seen >= _LEAST_QUIET, above, scale * np.quantile(amplitude, _NARROW, axis=0))
-    # Of a few samples each depth has chance in it.
-    pad = np.pad(found, _AROUND, 'edge')
-    found = np.median(np.lib.stride_tricks.sliding_window_view(pad, 2 * _AROUND + 1), axis=1)
-    sigma = np.maximum(np.minimum.accumulate(found[::-1])[::-1], least)
-    return sigma if sigma[-1] > 2.0 * sigma[0] else None
+def _stretches(amplitude: FloatArray) -> FloatArray:
+    """Of many traces (T, n) some stretches of successive ones, all along the line."""
+    T = len(amplitude)
+    if T <= _RUNS * _RUN:
+        return amplitude
+    begin = np.linspace(0, T - _RUN, _RUNS).astype(np.int64)
+    return amplitude[(begin[:, None] + np.arange(_RUN)).ravel()]
 
 
 def _stacked(amplitude: FloatArray, stack: int) -> FloatArray:
     count = len(amplitude) // stack
     return np.asarray(amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1))
-
-
-def _width(trace: FloatArray, peak: int) -> float | None:
-    """Width at half height of the hump at `peak`, samples, None when it leaves the trace."""
-    half = 0.5 * trace[peak]
-    before, after = np.flatnonzero(trace[:peak] <= half), np.flatnonzero(trace[peak:] <= half)
-    if not len(before) or not len(after):
-        return None
-    low, high = int(before[-1]), peak + int(after[0])
-    left = low + (half - trace[low]) / (trace[low + 1] - trace[low])
-    right = high - (half - trace[high]) / (trace[high - 1] - trace[high])
-    return float(right - left)
-
-
-def _step(amplitude: FloatArray) -> float:
-    """The step of a coarse converter: the least difference of few distinct values, else 0."""
-    values = np.unique(amplitude)
-    return float(np.diff(values).min()) if 1 < len(values) <= 4096 else 0.0
 
 
 def doubted_spacing(
@@ -330,11 +249,13 @@ def doubted_spacing(
     span = offset + spacing * amplitude.shape[1]
     if not 1.0 <= span <= 12_000.0:
         return f'the sample interval of the headers makes the traces end at {span:g} m'
-    arrivals = first_arrivals(amplitude)
-    known = (stated > 0.0) & (arrivals >= _REACH)
+    if np.count_nonzero(stated > 0.0) < _LEAST_ARRIVALS or not is_envelope(amplitude):
+        return None
+    seen = look(amplitude, spacing)
+    known = (stated > 0.0) & (seen.onset >= 0)
     if np.count_nonzero(known) < _LEAST_ARRIVALS:
         return None
-    sample = offset / spacing + arrivals[known]
+    sample = offset / spacing + seen.onset[known] + seen.lead
     fits = float(np.median(stated[known] / sample))
     if fits / _NEAR <= spacing <= fits * _NEAR:
         return None

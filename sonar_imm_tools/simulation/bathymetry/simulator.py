@@ -161,7 +161,9 @@ class BathymetryScenario(ShipScenario):
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
         second = {} if self.object == 'none' else {'layover': 'resolved'}
-        return {**super().instruments(), **mounted, **second}
+        # The array and the water of a scene are what the tracker is told.
+        exact = {'tilt_std_deg': 0.0, 'spacing_std': 0.0, 'sound_speed_std': 0.0}
+        return {**super().instruments(), **exact, **mounted, **second}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)

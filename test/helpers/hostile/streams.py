@@ -47,13 +47,10 @@ STEPS = 12
 
 VARIANTS = {
     'bathymetry': (
-        {'particles_per_model': 8, 'smoothing': 'none'},
+        {'model_set': 'height_two_rw', 'particles_per_model': 8, 'smoothing': 'none'},
         {'model_set': 'height_rw_ncs', 'particles_per_model': 8, 'smoothing': 'modes'},
         {
-            'engine': 'grid',
-            'grid_step': 0.5,
             'navigation': 'ignored',
-            'smoothing': 'states',
             'ping_coupling': 0.3,
         },
     ),

@@ -34,9 +34,13 @@ from sonar_imm.trackers.bathymetry.tracker import (
 )
 
 RANGES = 20.0 + 0.05 * np.arange(60)
-EXACT = BathymetryConfig(engine='grid', smoothing='states', grid_extent=4.0)
+EXACT = BathymetryConfig(
+    model_set='height_two_rw', engine='grid', smoothing='states', grid_extent=4.0
+)
 COUPLED = evolve(EXACT, ping_coupling=0.35)
-MODES = BathymetryConfig(particles_per_model=50, smoothing='modes', ping_coupling=0.35)
+MODES = BathymetryConfig(
+    model_set='height_two_rw', particles_per_model=50, smoothing='modes', ping_coupling=0.35
+)
 
 
 def ping(number, *, side='', seed=None, height=0.0, period_ns=10**8):
@@ -78,6 +82,7 @@ def test_favours_act_as_a_prior_of_each_bin(engine):
     """Equal walks: measurements say nothing of the model, and only chain and favours are left."""
     transition = (0.9, 0.1, 0.3, 0.7)
     config = BathymetryConfig(
+        model_set='height_two_rw',
         sigmas=(0.05, 0.05),
         transition_matrix=transition,
         initial_probabilities=(0.2, 0.8),
@@ -200,7 +205,7 @@ def test_switched_off_the_held_ping_comes_out_first():
 
 def test_it_needs_smoothing():
     with pytest.raises(ConfigError, match='ping_coupling needs'):
-        BathymetryConfig.from_mapping({'ping_coupling': 0.3})
+        BathymetryConfig.from_mapping({'ping_coupling': 0.3, 'smoothing': 'none'})
     assert BathymetryConfig().ping_coupling == 0.0
 
 

@@ -15,7 +15,7 @@
 """Labels that say when they cannot tell, and the bank whose bins scatter about a base."""
 
 from attrs import evolve
-from helpers.bathymetry_cases import floor, VECTORS
+from helpers.bathymetry_cases import EXACT, floor, VECTORS
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -28,7 +28,7 @@ from sonar_imm.trackers.bathymetry.ping import look, Ping, run, verdict
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
-BANK = BathymetryConfig(model_set='scatter_bank')
+BANK = BathymetryConfig(model_set='scatter_bank', **EXACT)
 
 
 def made(config, name='paper', seed=3, **changes):

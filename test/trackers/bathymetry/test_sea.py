@@ -66,7 +66,7 @@ def errors(estimates):
 
 
 @pytest.mark.parametrize(
-    'values', [{'engine': 'grid'}, {}, {'engine': 'grid', 'smoothing': 'states'}], ids=str
+    'values', [{}, {'smoothing': 'none'}, {'model_set': 'height_two_rw'}], ids=str
 )
 def test_a_rolling_ship_is_taken_out(values):
     estimates, _ = track(sea_config(CASE, **values))
@@ -76,7 +76,7 @@ def test_a_rolling_ship_is_taken_out(values):
 
 
 def test_the_exact_filter_reaches_what_is_attainable():
-    estimates, _ = track(sea_config(CASE, engine='grid'))
+    estimates, _ = track(sea_config(CASE, model_set='height_two_rw', engine='grid'))
     rmse, inside, place, _ = errors(estimates)
     assert rmse == pytest.approx(float(CASE['att_rmse_z']), abs=0.003)
     assert inside == pytest.approx(float(CASE['att_cov_z']), abs=0.01)
@@ -139,7 +139,7 @@ def test_a_mistake_in_the_swath_is_seen(mistake, least):
 def test_without_the_budget_too_little_truth_is_inside():
     config = sea_config(
         CASE,
-        engine='grid',
+        model_set='height_two_rw',
         attitude_std_deg=0.0,
         heave_std=0.0,
         heading_std_deg=0.0,
@@ -150,7 +150,7 @@ def test_without_the_budget_too_little_truth_is_inside():
 
 
 def test_navigation_half_a_tenth_of_a_second_off_costs_more_than_the_limit():
-    config = sea_config(CASE, engine='grid')
+    config = sea_config(CASE)
     assert errors(track(config, late_s=0.05)[0])[0] > 0.17
 
 
@@ -268,7 +268,13 @@ def test_a_clock_set_back_forgets_the_poses():
 
 
 def test_the_altitude_replaces_the_height_for_the_start():
-    config = sea_config(CASE, navigation='required', sonar_height=100.0, initial_std=0.3)
+    config = sea_config(
+        CASE,
+        navigation='required',
+        sonar_height=100.0,
+        initial_std=0.3,
+        model_set='height_two_rw',
+    )
     tracker = BathymetryTracker(config)
     for pose in navigation(CASE):
         tracker.process(pose)
@@ -367,7 +373,7 @@ def tracked(config, measurements):
 def test_a_heading_that_passes_through_180_degrees_is_no_jump():
     """The heading of the case, about 30 degrees, put to south; and quaternions that change their
     sign, which says nothing."""
-    config = sea_config(CASE, engine='grid')
+    config = sea_config(CASE)
     poses, pings = navigation(CASE), list(snapshots(CASE))[:3]
     plain = tracked(config, [*poses, *pings])
     heading = np.array(
@@ -395,7 +401,7 @@ def test_a_heading_that_passes_through_180_degrees_is_no_jump():
 def in_summer(**changes):
     scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
     made = simulate(scene, 3)
-    config = BathymetryConfig.from_mapping({**scene.instruments(), 'engine': 'grid'})
+    config = BathymetryConfig.from_mapping(scene.instruments())
     config = config.for_inputs(frozenset({'snapshot', 'nav'}))
     return made, config, [each.measurement for each in made.measurements]
 

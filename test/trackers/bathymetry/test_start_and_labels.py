@@ -152,7 +152,7 @@ def test_the_bank_finds_correlated_and_white_roughness():
 def test_which_walks_are_rough_and_what_a_bank_defaults_to():
     bank = BathymetryConfig(model_set='height_bank')
     assert (bank.runs_on_grid, bank.smoothing_used, bank.stay_used) == (True, 'states', 0.998)
-    other = BathymetryConfig()
+    other = BathymetryConfig(model_set='height_two_rw')
     assert (other.runs_on_grid, other.smoothing_used, other.stay_used) == (False, 'none', 0.995)
     particles = evolve(bank, engine='particles')
     assert particles.smoothing_used == 'none'

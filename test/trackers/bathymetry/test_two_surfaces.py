@@ -148,7 +148,12 @@ def test_existence_and_heights_of_the_prototype(monkeypatch):
 
 @pytest.mark.parametrize(
     'values',
-    [{}, {'model_set': 'height_rw_ncs'}, {'model_set': 'angle_two_rw'}, {'engine': 'grid'}],
+    [
+        {},
+        {'model_set': 'height_rw_ncs'},
+        {'model_set': 'angle_two_rw'},
+        {'model_set': 'height_two_rw', 'engine': 'grid'},
+    ],
 )
 def test_both_heights_of_a_step(values):
     snapshot = step()
@@ -299,7 +304,12 @@ def test_surface_echoes_leave_layover_alone():
 
 @pytest.mark.parametrize(
     'staves, values',
-    [(8, {}), (8, {'model_set': 'height_bank'}), (8, {'engine': 'grid'}), (3, {})],
+    [
+        (8, {}),
+        (8, {'model_set': 'height_bank'}),
+        (8, {'model_set': 'height_two_rw', 'engine': 'grid'}),
+        (3, {}),
+    ],
 )
 def test_a_gated_bin_is_marked_and_nothing_else_changes(staves, values):
     snapshot = step(P=staves)

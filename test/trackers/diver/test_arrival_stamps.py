@@ -69,7 +69,7 @@ def tracked(step, **how):
     tracker, errors, squared = DiverTracker(DiverConfig(max_tracks=1)), [], []
     for k, (place, ping) in enumerate(heard(step, **how)):
         (estimate,) = tracker.process(ping)
-        if k >= 20 and len(estimate):
+        if k >= 30 and len(estimate):
             error = estimate.state[0, :2] - place
             errors.append(np.hypot(*error))
             squared.append(error @ np.linalg.solve(estimate.covariance[0, :2, :2], error))
@@ -112,7 +112,7 @@ def test_stamps_of_messages_on_whole_seconds_are_no_resolution(active):
 @pytest.mark.parametrize('active', [False, True])
 def test_rounding_is_counted_in(step, active):
     _, squared, tracker = tracked(step, active=active)
-    assert len(squared) > 35 and squared.mean() < 4.0 and (squared < 5.99).mean() > 0.85
+    assert len(squared) > 25 and squared.mean() < 3.0 and (squared < 5.99).mean() > 0.85
     (sentence,) = [text for text in tracker.warnings() if 'multiples' in text]
     assert f'multiples of {step:g} s: a resolution of {1500 * step:.3g} m' in sentence
     assert f'toa_std raised to {step / 12**0.5:.2g} s' in sentence
@@ -131,5 +131,6 @@ def test_what_is_stated_is_used_and_exact_times_say_nothing():
     assert not any('multiples' in text for text in tracker.warnings())
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     for _, ping in heard(1e-3):
-        tracker.process(evolve(ping, var_toa=np.full(len(RECEIVERS), 1e-6)))
+        stated = np.float32(1e-6 / 12.0)  # as those who know of the rounding state it
+        tracker.process(evolve(ping, var_toa=np.full(len(RECEIVERS), stated, np.float64)))
     assert not any('multiples' in text for text in tracker.warnings())

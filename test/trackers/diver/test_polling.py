@@ -19,7 +19,7 @@ from helpers.diver_runs import fix, run
 import numpy as np
 import pytest
 
-from sonar_imm.trackers.diver.polling import MOST_FIXES
+from sonar_imm.trackers.diver.polling import BEFORE, MOST_FIXES, turn_of
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SETTINGS = {'directions': 4, 'covariance_scales': (1.0,)}
@@ -72,3 +72,17 @@ def test_two_sensors_of_one_target_are_not_polled():
     for offset in (6.0, 30.0):
         paths = [lambda t: circle(t, 0.0), lambda t, off=offset: circle(t, 0.0) + (off, 1.0)]
         assert not any('scan_period' in text for text in said(in_turn(paths, 1.0, 0.0))[1])
+
+
+@pytest.mark.parametrize('offset, std', [(3.0, 1.0), (6.0, 0.5)])
+def test_a_constant_offset_is_no_second_target_in_any_stretch(offset, std):
+    t, rng = np.arange(300.0), np.random.default_rng(4)
+    way = np.column_stack([25.0 * np.sin(t / 50.0) + 0.1 * t, 15.0 * np.cos(t / 35.0)])
+    places = way + np.outer(t % 2, (offset, 0.0)) + std * rng.normal(size=way.shape)
+    stamps = (t * 1e9).astype(np.int64)
+    for end in range(2 * BEFORE, 300, 10):
+        last = slice(max(0, end - MOST_FIXES), end)
+        assert turn_of(stamps[last], places[last]) is None
+    # A second target goes his own way.
+    other = places + np.outer(t % 2, (8.0, 0.15)) * np.column_stack([np.ones(300), t])
+    assert turn_of(stamps[:MOST_FIXES], other[:MOST_FIXES]) == pytest.approx(2.0)

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Trace
-from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.reflectors import Identities
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.evaluation.fathometer.records import records_of
@@ -89,24 +88,27 @@ def test_a_faint_floor_is_not_lost_to_what_scatters_below_it(scene):
 
 def test_the_first_return_keeps_its_name_on_a_wall():
     config = evolve(stated(), depth_std=0.3, min_separation=1.0)
-    first, ids = Identities().name(np.array([10.0, 14.0]), np.array([1.0, 0.0]), config)
+
+    def name(known, depth, bottom, floor_known=True):
+        return known.name(np.array(depth), np.array(bottom), config, floor_known=floor_known)
+
+    first, ids = name(Identities(), [10.0, 14.0], [1.0, 0.0])
     assert list(ids) == [1, 2]
     # It rises by 2 m, and something below it is nearer to where it was.
-    after, ids = first.name(np.array([8.0, 9.9, 14.0]), np.array([1.0, 0.0, 0.0]), config)
+    after, ids = name(first, [8.0, 9.9, 14.0], [1.0, 0.0, 0.0])
     assert list(ids) == [1, 3, 2] and after.bottom_id == 1
     # Ten metres are no slope.
-    _, ids = after.name(np.array([20.0]), np.array([1.0]), config)
+    _, ids = name(after, [20.0], [1.0])
     assert ids[0] not in (1, 2, 3)
-    # Without scatter there is no notion of a first return: the nearest counts.
-    plain = evolve(config, scatter_decay=())
-    _, ids = first.name(np.array([8.0, 9.9, 14.0]), np.array([1.0, 0.0, 0.0]), plain)
+    # Where the floor is not known, the nearest counts.
+    _, ids = name(first, [8.0, 9.9, 14.0], [1.0, 0.0, 0.0], floor_known=False)
     assert list(ids) == [3, 1, 2]
 
 
 def test_a_wrong_pulse_is_said_with_its_remedy(scene):
-    tracker, _ = track(scene, FathometerConfig(noise_sigma=0.02, particles=300))
+    tracker, _ = track(scene, FathometerConfig(noise_sigma=0.02, particles=300, water='off'))
     sentences = ' '.join(tracker.warnings())
-    assert 'envelopes need pulse gaussian' in sentences and 'no set of reflectors' in sentences
+    assert 'envelopes need water auto' in sentences and 'no set of reflectors' in sentences
     tracker, _ = track(scene, stated(particles=300))
     assert tracker.warnings() == []
 
@@ -129,26 +131,3 @@ def test_unexplained_records_are_said():
         assert tracker._before is None  # the next one begins anew
         assert bool(tracker.warnings()) == (second >= 10)  # a few records are no evidence
     assert any('no set of reflectors explains 100 %' in each for each in tracker.warnings())
-
-
-@pytest.mark.parametrize(
-    'values, words',
-    [
-        ({'pulse': 'band'}, 'pulse gaussian or file'),
-        ({'polarity': 'both'}, 'polarity positive'),
-        ({'amplitude_memory': 0.5}, 'exclude each other'),
-        ({'scatter_decay': (1.0,) * 9}, 'at most 8'),
-    ],
-)
-def test_what_does_not_go_with_scatter(values, words):
-    with pytest.raises(ConfigError, match=words):
-        FathometerConfig(**{'pulse': 'gaussian', 'scatter_decay': (4.0,), **values})
-
-
-def test_too_fine_a_lattice_is_refused_with_a_sentence():
-    config = stated(depth_step=0.001, depth_std=0.001, particles=10)
-    tracker = FathometerTracker(config)
-    depth = 5.0 + 0.1 * np.arange(400)
-    amplitude = np.exp(-0.5 * np.square(depth - 20.0))
-    assert tracker.process(Trace(stamp_ns=SECOND, depth=depth, amplitude=amplitude)) == []
-    assert tracker.counts['too_crowded'] == 1

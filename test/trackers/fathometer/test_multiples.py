@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.reflectors import Multiples, RECORDS, Seen, ways_above
+from sonar_imm.trackers.fathometer.multiples import Multiples, RECORDS, Seen, ways_above
 
 PRIMARIES = np.array([9.0, 12.5, 17.0, 23.0])
 

@@ -14,12 +14,14 @@
 
 """What is reported of a reflector: times, and depths in the sediment."""
 
+import itertools
 from pathlib import Path
 
 from attrs import evolve
 from helpers.fathometer_runs import run
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from benchmarks import fathometer_vectors
 from sonar_imm.acoustics.fathometer import sediment_thickness
@@ -211,3 +213,66 @@ def test_identities_beyond_32_bits_are_those_that_no_reflector_has():
     again, same = first.name(*here, FathometerConfig())
     assert ids.tolist() == same.tolist() == [2**32 - 2, 2**32 - 1, 1]
     assert (first.next_id, again.next_id) == (2, 2)
+
+
+# -- what can be counted --------------------------------------------------------------------------
+
+
+def test_pmf_of_what_is_detectable_is_that_of_independent_reflectors():
+    """Poisson-binomial, by enumeration of who is there."""
+    config = FathometerConfig(order_max=4, detectable_sigmas=4.0)
+    known = Identities(
+        (
+            Identified(1, 10.0, 0, strength=9.0, shown=20),
+            Identified(2, 12.0, 0, strength=-4.1, shown=5),
+            Identified(3, 14.0, 0, strength=2.0, shown=1),
+        )
+    )
+    existence = np.array([0.9, 0.8, 0.7])
+    pmf = known.detectable(np.array([1, 2, 3], np.uint32), existence, config)
+    off = np.array([5.0, 0.1, -2.0]) / np.sqrt(1.0 / np.array([20, 5, 1]) + 0.15**2)
+    p = existence * norm.cdf(off)
+    expected = np.zeros(5)
+    for there in itertools.product((0, 1), repeat=3):
+        expected[sum(there)] += np.prod(np.where(there, p, 1.0 - p))
+    assert pmf == pytest.approx(expected) and pmf.sum() == pytest.approx(1.0)
+
+
+def test_strength_is_a_mean_of_the_last_twenty_records():
+    config, known = FathometerConfig(), Identities()
+    for strength in [3.0] * 30 + [5.0]:
+        known, ids = known.name(
+            np.array([10.0]), np.ones(1), config, strength=np.array([strength])
+        )
+    (only,) = known.reflectors
+    assert only.shown == 20 and only.strength == pytest.approx(3.0 + 2.0 / 20.0)
+
+
+def test_weak_layers_are_not_counted_among_the_detectable():
+    rng, depth = np.random.default_rng(5), 0.1 * np.arange(400)
+    traces = []
+    for k in range(40):
+        echo = sum(
+            a * np.exp(-0.5 * np.square((depth - z) / 0.3))
+            for a, z in ((12.0, 10.0), (8.0, 18.0), (2.4, 27.0))
+        )
+        noise = np.convolve(
+            rng.standard_normal(430),
+            np.exp(-0.5 * np.square(np.arange(-15, 16) / 3.0 * 1.41)),
+            'same',
+        )[15:415]
+        noise /= noise.std()
+        traces.append(
+            Trace(
+                stamp_ns=(k + 1) * 10**9, depth=depth, amplitude=echo + noise, sigma=np.ones(400)
+            )
+        )
+    tracker = FathometerTracker(
+        FathometerConfig(pulse='gaussian', pulse_width=0.3, particles=1000)
+    )
+    rows = [tracker.process(trace)[0].columns() for trace in traces]
+    late = rows[10:]
+    said = np.mean([row['prob_detectable_2'][0] for row in late])
+    assert said > 0.95
+    assert late[0]['detectable_amplitude'][0] == pytest.approx(4.0)
+    assert sum(late[-1][f'prob_detectable_{k}'][0] for k in range(13)) == pytest.approx(1.0)

@@ -1,0 +1,174 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The floor of profiler lines in the tracker: labels, depth, the transmit pulse, and sentences."""
+
+from pathlib import Path
+
+from attrs import evolve
+import numpy as np
+import pytest
+
+from benchmarks.fathometer_floor import halves, line, LINES, real_lines, tracked
+from sonar_imm.measurements import Trace
+from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.tracker import FathometerTracker
+from sonar_imm.trackers.fathometer.water import SeenFloor, Water
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer_in_the_field'
+FEW = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max': 6}
+
+
+def run(traces, **options):
+    tracker = FathometerTracker(FathometerConfig(**{**FEW, 'sound_speed_std': 0.0, **options}))
+    return tracker, [each.columns() for trace in traces for each in tracker.process(trace)]
+
+
+def test_labels_of_the_vectors():
+    with np.load(VECTORS / 'floor.npz') as file:
+        v = {name: file[name] for name in file}
+    for k, row in enumerate(v['posterior_records']):
+        floor = SeenFloor(
+            v['posterior'][k], 0.0, float(v['step']), float(v['pulse']), 0.45, 0.1, 1.0
+        )
+        bottom, above = floor.labels(v['reflector_depth'])
+        assert bottom == pytest.approx(v['is_bottom'][row], abs=1e-6)
+        assert above == pytest.approx(v['above_bottom'][row], abs=1e-6)
+        depth, std = floor.depth
+        assert abs(depth - v['floor'][row]) < 3.0 * std
+
+
+@pytest.mark.parametrize('kind', ['flat', 'silent water', 'scatter', 'transmit pulse', 'waves'])
+def test_floor_is_the_floor(kind):
+    found = tracked(*line(7, records=60, **LINES[kind]), particles=1000)
+    assert found['ghosts'] < 0.05 and found['label'] > 0.95 and found['inside'] > 0.95
+    assert found['said'] > (0.7 if kind == 'waves' else 0.95)
+
+
+def test_nothing_is_said_of_the_floor_before_ten_traces_unless_noise_is_stated():
+    traces, floor = line(1, records=12)
+    _, rows = run(traces)
+    assert all(np.isnan(each['is_bottom']).all() for each in rows[:9])
+    assert all(np.isnan(each['bottom_depth']).all() for each in rows[:9])
+    assert rows[9]['is_bottom'].max() > 0.7
+    _, rows = run(traces, noise_sigma=0.02, pulse='gaussian', pulse_width=0.15)
+    assert rows[0]['is_bottom'].max() > 0.9 and rows[0]['existence'].min() > 0.5
+    error = [each['bottom_depth'][0] - z for each, z in zip(rows, floor)]
+    std = [each['bottom_depth_std'][0] for each in rows]
+    assert (np.abs(error) < 2.0 * np.array(std)).all()
+
+
+def test_amplitudes_are_in_the_unit_of_the_trace():
+    traces, _ = line(2, records=30, noise=0.01)
+    loud = [evolve(each, amplitude=1000.0 * each.amplitude) for each in traces]
+    _, rows = run(traces)
+    _, other = run(loud)
+    heard = [np.sort(each['amplitude'])[::-1][:3] for each in rows[10:]]
+    assert np.median(heard, axis=0) == pytest.approx([1.0, 0.5, 0.25], rel=0.1)
+    for one, two in zip(rows[10:], other[10:]):
+        assert two['amplitude'] == pytest.approx(1000.0 * one['amplitude'], rel=1e-6)
+        assert two['sigma'] == pytest.approx(1000.0 * one['sigma'], rel=1e-6)
+
+
+def test_the_transmit_pulse_is_left_out_and_said():
+    traces, _ = line(3, records=20, ring=1.5)
+    tracker, rows = run(traces)
+    assert rows[-1]['blanked'][0] == pytest.approx(1.75, abs=0.3)
+    assert min(each['depth'].min() for each in rows[10:]) > 5.0
+    sentence = tracker.warnings()[0]
+    assert sentence.startswith('the first ') and 'transmit pulse' in sentence
+    tracker, rows = run(traces, blanking=3.0)
+    assert tracker.warnings() == [] and rows[-1]['blanked'][0] == 0.0
+
+
+def test_an_echo_at_a_fixed_depth_is_doubted():
+    traces, _ = line(4, records=75, fixed=0.2, waves=1.0)
+    tracker, _ = run(traces, particles=50)
+    assert any('it may belong to the instrument' in each for each in tracker.warnings())
+    traces, _ = line(4, records=75, waves=1.0)
+    tracker, _ = run(traces, particles=50)
+    assert tracker.warnings() == []
+
+
+def test_a_line_that_begins_below_its_floor_is_said():
+    traces, floor = line(5, records=30, scatter=0.5)
+    cut = [
+        Trace(stamp_ns=each.stamp_ns, depth=each.depth[210:], amplitude=each.amplitude[210:])
+        for each in traces
+    ]
+    tracker, _ = run(cut, particles=50)
+    assert any('no water is seen' in each or 'none of' in each for each in tracker.warnings())
+
+
+def test_arrays_and_signed_traces_are_as_before():
+    rng, depth = np.random.default_rng(6), 0.05 * np.arange(300)
+    for options, sign in (({}, -1.0), ({'water': 'off'}, 1.0)):
+        amplitude = np.abs(rng.standard_normal(300)) + 20.0 * np.exp(-np.square(depth - 8.0))
+        amplitude[5] *= sign
+        trace = Trace(stamp_ns=1, depth=depth, amplitude=amplitude)
+        _, (row,) = run([trace], noise_sigma=1.0, pulse='gaussian', **options)
+        for name in ('above_bottom', 'bottom_depth', 'bottom_depth_std', 'blanked'):
+            assert np.isnan(row[name]).all()
+        assert np.isfinite(row['is_bottom']).all()
+
+
+def test_missing_samples_and_other_depths_are_taken():
+    traces, _ = line(8, records=30)
+    rng = np.random.default_rng(0)
+    odd = []
+    for k, each in enumerate(traces):
+        amplitude = each.amplitude.copy()
+        amplitude[rng.integers(0, len(amplitude), 20)] = np.nan
+        first = k % 3
+        odd.append(
+            Trace(stamp_ns=each.stamp_ns, depth=each.depth[first:], amplitude=amplitude[first:])
+        )
+    tracker, rows = run(odd)
+    assert tracker.counts['used'] == 30
+    assert np.mean([each['is_bottom'].max() > 0.9 for each in rows[9:]]) > 0.9
+
+
+def test_a_window_that_shifts_is_followed_under_the_same_ids():
+    """The recording delay of a line that gets deeper is changed once: 8 m of 12 m are new."""
+    traces, floor = line(9, records=60)
+    shifted = []
+    for k, each in enumerate(traces):
+        deeper = 0.1 * k
+        first = 6.0 if k < 30 else 9.0
+        depth = np.arange(first, first + 12.0, 0.05)
+        amplitude = np.interp(depth, each.depth + deeper, each.amplitude, right=0.02)
+        shifted.append(Trace(stamp_ns=each.stamp_ns, depth=depth, amplitude=amplitude))
+    options = {'noise_sigma': 0.02, 'pulse': 'gaussian', 'pulse_width': 0.15, 'particles': 1000}
+    tracker, rows = run(shifted, **options)
+    assert tracker.counts['used'] == 60 and not tracker.counts['other_depths']
+    named = set()
+    for k, row in enumerate(rows):
+        near = np.abs(row['depth'] - floor[k] - 0.1 * k) < 0.5
+        assert near.any() and row['is_bottom'][near].max() > 0.5
+        named |= set(row['track_id'][near].tolist())
+    assert len(named) == 1
+
+
+def test_a_short_trace_is_no_line():
+    water = Water(FathometerConfig())
+    water.begin(Trace(stamp_ns=1, depth=np.arange(10.0), amplitude=np.ones(10)))
+    assert water.active is False
+
+
+@pytest.mark.parametrize('path', real_lines() or [None], ids=lambda p: p.stem[-20:] if p else '-')
+def test_halves_of_real_lines_agree(path):
+    if path is None:
+        pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
+    found = halves(path, 0.376)
+    assert found['apart'] < 0.06 and found['inside'] > 0.95
