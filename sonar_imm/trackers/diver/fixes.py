@@ -382,7 +382,7 @@ def update_tracks(
     rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, group.number, took[rows.target], known.stamp_ns)
-    if began is not None or rows.tail:
+    if pairs.ways is not None or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
@@ -435,6 +435,12 @@ def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows
     """
     rows = bursts.merge_rows(rows if began is None else rows.append(began))
     rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
+    # What was dropped had a weight too.
+    target = np.concatenate([rows.target, borrowed.target])
+    order = np.argsort(target, kind='stable')
+    total = log_sum(np.concatenate([rows.logw, borrowed.logw])[order], target[order])
+    rows = rows.replace(logw=rows.logw - total[rows.target])
+    borrowed = evolve(borrowed, logw=borrowed.logw - total[borrowed.target])
     return bursts.without_unused_tail(rows), borrowed
 
 
