@@ -376,7 +376,7 @@ def update_tracks(
     rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lend)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
-    if began is not None or rows.tail:
+    if pairs.ways is not None or began is not None or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 

@@ -57,11 +57,12 @@ STATE_TYPES = (
         NisMemory,
         FixConsistency,
         SensorConsistency,
+        BurstCounts,
         HeightCounts,
         Instruments,
         BiasTest,
         RecentPairs,
     ),
-    *(Clutter, Clutters, LastNamed, Sensors, BurstCounts, SingleFixes),
+    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
     *(ArrivalStamps, Resolution),
 )
