@@ -138,10 +138,12 @@ class SmoothingDiverTracker(DiverTracker):
         found: dict[tuple[int, int], _Smoothed] = {}
         for track_id, first, last in self._find_passes(scans):
             self._smooth(scans, track_id, first, last, found)
-        return [
+        made = [
             self._estimate(self._with_smoothed_rows(scan, k, found))
-            for k, scan in enumerate(scans)
+            for k, scan in enumerate(scans[:-1])
         ]
+        # The last scan has no future; its rows keep their offsets.
+        return [*made, self._estimate(self._passed[max(self._passed)])]
 
     def _build_scans(self) -> list[_Scan]:
         """Return all scans with the constants of all instruments, and the steps between them."""
