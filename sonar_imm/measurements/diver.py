@@ -323,13 +323,14 @@ class Start:
 
     position: (3,) x, y, z in `frame_id`, the frame of the tracks, m; z is not used by a tracker of
     two dimensions. covariance: (3, 3) or (2, 2) in m^2 as of `Fix`; there is no start without one
-    of x and y.
+    of x and y. target_id: ID of the diver, or `NOBODY`.
     """
 
     stamp_ns: int
     position: FloatArray = field(converter=point)
     covariance: FloatArray
     frame_id: str = ''
+    target_id: int = NOBODY
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -346,4 +347,4 @@ class Start:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('start', self.position, self.covariance)
+        return content_key('start', self.position, self.covariance, np.int64(self.target_id))

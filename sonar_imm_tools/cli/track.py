@@ -45,6 +45,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..offline.batch import Job, Outcome
+    from ..offline.initial import Initial
     from ..recordings.own_files import OwnParameters
     from ..recordings.reader import BagReader
 
@@ -92,6 +93,13 @@ def _shard(
     metavar='FILE',
     help='Profile of sound speed (CARIS .svp, Kongsberg .asvp, Sea-Bird .cnv, CSV): rays of '
     'bathymetry bend by it, other systems take its mean.',
+)
+@click.option(
+    '--initial',
+    metavar='FILE',
+    type=click.Path(path_type=Path),
+    help='Where divers are at first, as the topic initial says it: YAML or JSON with position and '
+    'covariance, and if wanted name, time, frame_id.',
 )
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
 @click.option(
@@ -181,6 +189,7 @@ class Plan:
     topics: dict[str, str] = field(factory=dict)
     order: str = 'recorded'
     smooth: bool = False
+    initial: Path | None = None
     overwrite: bool = False
     strict: bool = False
     parquet: bool = False
@@ -225,6 +234,7 @@ class Plan:
         params = self.parameters_of(bag)
         overrides = self._overrides(system)
         config, node = load_config(system, params, overrides)
+        places = self._initial(system)
         detector = load_detector(system, params, overrides)
         several = len(found) > 1
         return [
@@ -241,6 +251,7 @@ class Plan:
                     world_frame=node.world_frame_convention,
                     origin=node.stated_origin(),
                     smooth=self.smooth,
+                    initial=places,
                     detector=detector,
                 ),
                 overwrite=self.overwrite,
@@ -249,6 +260,18 @@ class Plan:
             )
             for name, inputs in found.items()
         ]
+
+    def _initial(self, system: System) -> tuple[Initial, ...]:
+        """The places of `--initial`. Raises `ConfigError`."""
+        if self.initial is None:
+            return ()
+        from sonar_imm.parameters import ConfigError
+
+        from ..offline.initial import read_initial
+
+        if system.name != 'diver':
+            raise ConfigError(f'--initial is for divers; this is tracked by {system.name}')
+        return read_initial(self.initial)
 
 
 def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:

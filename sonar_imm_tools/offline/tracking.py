@@ -47,6 +47,7 @@ from ..recordings.measurements import measurements_of, Received
 from ..recordings.reader import BagError, BagReader
 from ..recordings.sources import TARGET_NAMES
 from ..recordings.topics import fitting_topics
+from .initial import Initial, target_numbers
 from .jobs import processes
 from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
 
@@ -63,7 +64,7 @@ class InputOptions:
     later input too, which takes memory in proportion to the recording. jobs: processes that share
     the work where a tracker can share it; the estimates do not depend on it. detector: parameters
     of the detector of images that are not the default. origin: where the frame of the navigation
-    lies on Earth.
+    lies on Earth. initial: where divers are said to be.
     """
 
     topics: Mapping[str, str] | None = None
@@ -74,6 +75,7 @@ class InputOptions:
     jobs: int = 1
     detector: Mapping[str, Any] = field(factory=dict)
     origin: Origin | None = None
+    initial: tuple[Initial, ...] = ()
 
 
 @define
@@ -161,6 +163,13 @@ class OfflineRun:
         self.durations = array('d')
         self._window_ns = window_ns(config)
         self._intake = Intake(self.tracker, self.options.frame_id)
+        tags = getattr(self.tracker.config, 'tags', ())
+        self._names = target_numbers(tags, bag.target_names)
+        for place in self.options.initial:
+            try:
+                place.start(1, self._names)
+            except Rejection as rejection:
+                raise BagError(f'--initial: {rejection.sentence}') from None
 
     @property
     def total(self) -> int:
@@ -233,16 +242,34 @@ class OfflineRun:
                 yield item
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
+        initial = list(self.options.initial)
         for item in self.read(advance):
-            try:
-                if isinstance(item.measurement, Rejection):
-                    raise item.measurement
-                measurement = self._intake.admit(item.measurement)
-            except Rejection as rejection:
-                self._refuse(item.topic, rejection)
-                continue
-            if measurement is not None:
-                yield measurement
+            measurement = item.measurement
+            stamp = getattr(measurement, 'stamp_ns', None)
+            if initial and stamp is not None:
+                due = [place for place in initial if (place.stamp_ns or 0) <= stamp]
+                initial = [place for place in initial if place not in due]
+                for place in sorted(due, key=lambda place: place.stamp_ns or 0):
+                    yield from self._admitted('--initial', place, stamp)
+            yield from self._admitted(item.topic, measurement)
+        for _ in initial:
+            late = Rejection('outside', 'the time of a start lies after the recording')
+            yield from self._admitted('--initial', late)
+
+    def _admitted(self, topic: str, measurement: Any, first_ns: int = 0) -> Iterator[Any]:
+        """Yield a measurement, or a start as of `first_ns`, as the tracker is to have it; nothing
+        if it is refused."""
+        try:
+            if isinstance(measurement, Rejection):
+                raise measurement
+            if isinstance(measurement, Initial):
+                measurement = measurement.start(first_ns, self._names)
+            admitted = self._intake.admit(measurement)
+        except Rejection as rejection:
+            self._refuse(topic, rejection)
+            return
+        if admitted is not None:
+            yield admitted
 
     def _refuse(self, topic: str, rejection: Rejection) -> None:
         entry = self.refused.setdefault(
@@ -263,6 +290,7 @@ class OfflineRun:
             'frame_id': options.frame_id,
             'parameters': self.tracker.config.as_dict(),
             **({'detector': dict(options.detector)} if options.detector else {}),
+            **({'initial': [asdict(each) for each in options.initial]} if options.initial else {}),
         }
 
     def outcomes(self) -> dict[str, int]:

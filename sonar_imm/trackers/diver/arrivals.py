@@ -34,10 +34,10 @@ import numpy as np
 from ...acoustics.arrivals_3d import EMISSION
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
-from ...estimation.covariance import add_jitter, is_psd
+from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, restore_rows
 from ...measurements import Arrivals, NOBODY
-from . import coverage, offsets
+from . import coverage, offsets, ranges, sides
 from .config import DiverConfig
 from .coverage_map import Coverage, DetectionProbability
 from .depth import replace_rows, respread_depths
@@ -45,6 +45,7 @@ from .explanations import (
     expect_measurements,
     expect_residuals,
     fit_measurements,
+    joint_nis,
     MOST_EXPLANATIONS,
     PingMeasurements,
     subset_ping,
@@ -189,15 +190,17 @@ def _associate_ping(
     table, borrowed = restore_rows(known.rows, known.borrowed, can)
     known = known.replace(rows=layout.rows_with_new_constants(table, models), borrowed=borrowed)
     known = known.with_memory(instruments=instruments)
+    known, line = ranges.line_of(known, ping, config)
     seen = ping_measurements(ping, rows, config, models, layout)
     if not len(known) or seen.pairs <= int(ping.passive):
         return known, free & (name == NOBODY)
     known = respread_depths(known, seen, layout, models)
+    known = sides.doubt_near_line(known, models, layout, line)
     mixtures = [track_mixture(known, track, models) for track in range(len(known))]
     if name != NOBODY:
         update = _update_track(mixtures[int(own[0])], seen, config, layout)
         updates = {} if update is None else {int(own[0]): update}
-        known = apply_updates(known, updates, models)
+        known = apply_updates(known, updates, models, line)
         return _accumulate_residuals(known, updates, ping, seen, config, models), ~free
     explain = _explain_tag if ping.passive else _explain_echoes
     updates, taken, score = explain(known, mixtures, seen, config, layout)
@@ -206,7 +209,7 @@ def _associate_ping(
         score = score + looks * (np.log1p(-detected.tracks) - np.log1p(-detected.nominal))
     free[seen.row[taken & seen.echo]] = False
     free &= free.all() or not ping.passive  # all arrivals of a tag belong to one track
-    known = apply_updates(known, updates, models).with_columns(score=score)
+    known = apply_updates(known, updates, models, line).with_columns(score=score)
     return _accumulate_residuals(known, updates, ping, seen, config, models), free
 
 
@@ -241,8 +244,10 @@ def track_mixture(known: Known, track: int, models: ModelSet) -> Mixture:
     return Mixture(x.reshape(N * M, n), P.reshape(N * M, n, n), mu.ravel(), scale)
 
 
-def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSet) -> Known:
-    """Return the state with the updated tracks."""
+def apply_updates(
+    known: Known, updates: dict[int, TrackUpdate], models: ModelSet, line: sides.Line | None = None
+) -> Known:
+    """Return the state with the updated tracks. line: that of all instruments, if there is one."""
     if not updates:
         return known
     nis, nis_dof, repairs = known['nis'].copy(), known['nis_dof'].copy(), 0
@@ -262,9 +267,10 @@ def apply_updates(known: Known, updates: dict[int, TrackUpdate], models: ModelSe
         nis[track] += update.nis
         nis_dof[track] += np.uint16(update.dof)
         repairs += update.after.repairs
-    return (
-        known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof).add_counts(repairs=repairs)
-    )
+    if line is not None and line.tells_nothing:
+        rows = sides.with_sides_of(known.rows, rows)
+    known = known.replace(rows=rows).with_columns(nis=nis, nis_dof=nis_dof)
+    return sides.drop_sides(known.add_counts(repairs=repairs), models, line)
 
 
 def _explain_echoes(
@@ -439,22 +445,8 @@ def make_track_update(
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.subsample(good)
         residual, covariance, dof = expected_residuals(before, own, config.target_z)
-        nis = _joint_nis(residual, covariance, own.measured.variance)
+        nis = joint_nis(residual, covariance, own.measured.variance)
     return TrackUpdate(after, good, nis, dof)
-
-
-def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
-
-    If rounding makes S singular, use eigenvalues in units of the variances.
-    """
-    S = covariance + np.diag(variance)
-    if is_psd(S) or not np.isfinite(S).all():
-        return float(residual @ np.linalg.solve(S, residual))
-    weight = 1.0 / np.sqrt(variance)
-    values, vectors = np.linalg.eigh(weight[:, None] * covariance * weight)
-    whitened = vectors.T @ (weight * residual)
-    return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
 
 
 def update_by_ping(

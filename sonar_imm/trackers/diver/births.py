@@ -35,7 +35,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
 from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import depth, links
+from . import depth, links, ranges, sides
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, track_positions, with_velocities_at_fix
@@ -122,6 +122,9 @@ def _locate_births(
     name = tag_id(ping)
     places = [(fix.position, fix.covariance)]
     places += [(place.position, place.covariance) for place in fix.alternatives]
+    line = sides.line_of_ping(ping, used, config)
+    if line is not None:
+        places = sides.without_images(places, line)
     return [Birth(*place, ping, used, target_id=name) for place in places], rows[fix.used]
 
 
@@ -281,6 +284,14 @@ def birth_rows(
                     config,
                 )
     rows = models.make_rows(x, P, mu, logw, births[0].number)
+    for track, birth in enumerate(births):
+        if birth.fit is not None:
+            own = ranges.fitted_rows(birth.fit, models, layout, birth.number)
+            rows = rows.replace_target(track, own)
+        elif birth.ping is not None and birth.rows is not None:
+            line = sides.line_of_ping(birth.ping, birth.rows, config)
+            if line is not None:
+                rows = sides.with_images(rows, track, models, layout, line)
     seen_by = births[0].seen_by
     return (
         rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)
@@ -356,7 +367,7 @@ def birth_from_start(start: Start, config: DiverConfig) -> Birth:
         stated = Heights.from_fixes(start.position[None], start.covariance[None], 1.0)
         height = stated and stated.row(0)
     plane = start.position[:2], start.covariance[:2, :2]
-    return Birth(*plane, measured=False, height=height)
+    return Birth(*plane, target_id=start.target_id, measured=False, height=height)
 
 
 def make_room(
@@ -369,6 +380,8 @@ def make_room(
     going = known['target_id'] == NOBODY
     if config.max_tracks > 1 and len(going):
         going &= _agrees_with_start(known, start, config, models)
+    if start.target_id != NOBODY:
+        going = going | (known['target_id'] == start.target_id)
     left = known.select(~going)
     if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
         return left, True

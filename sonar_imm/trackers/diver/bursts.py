@@ -188,7 +188,7 @@ def count_fixes(rows: Rows, sensor: int, used: BoolArray, stamp_ns: int) -> Rows
     return rows.replace(key=key)
 
 
-MERGED = ('scale', 'delay', 'start', 'offset', 'since', 'aside', 'link')
+MERGED = ('scale', 'delay', 'start', 'side', 'offset', 'since', 'aside', 'link')
 """Assumptions that rows which are merged have in common."""
 
 

@@ -50,7 +50,7 @@ from ...estimation.rows import LEAST_LOG, Rows
 from . import bursts, ways
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, repair_covariances, track_positions
+from .known import Feature, Known, repair_covariances, row_outputs
 from .models import ModelSet
 from .scan import Group, Height, Ping
 
@@ -354,29 +354,37 @@ def ambiguous_depths(known: Known, models: ModelSet) -> BoolArray:
 
 
 def respread_depths(known: Known, seen: Ping, layout: Layout, models: ModelSet) -> Known:
-    """Spread the rows of tracks that agree, if the paths of the ping bend within their
-    uncertainty."""
+    """Spread the rows of each side of a track that agree, if the paths of the ping bend within
+    their uncertainty."""
     echo = seen.echo
     if models.height < 0 or models.rows_per_track == 1 or not len(known) or not echo.any():
         return known
     weights, means, variances = _row_depths(known.rows, models)
-    positions, _ = track_positions(known, models)
-    measured = seen.measured
-    for track in range(len(known)):
-        own = known.row_indices(track)
+    maps = tuple(part.outputs[:2] for part in models.parts)
+    positions, _ = row_outputs(known.rows, maps)
+    measured, side = seen.measured, known.rows.key['side']
+    for track, each in np.unique([known.rows.target, side], axis=1).T.tolist():
+        own = np.flatnonzero((known.rows.target == track) & (side == each))
         weight, mean, variance = weights[own], means[own], variances[own]
+        whole = float(weight.sum())
+        if not whole > 0.0:
+            continue
+        weight = weight / whole
         middle = float(weight @ mean)
         between, within = float(weight @ (mean - middle) ** 2), float(weight @ variance)
         if not between < AGREE * within:
             continue
-        place = np.append(positions[track], middle)
+        place = np.append(weight @ positions[own], middle)
         bend = _path_curvature(place, measured.rx[echo])
         if not seen.passive:
             bend = bend + _path_curvature(place, measured.tx[echo])
         deviation = 0.5 * bend * (within + between) / np.sqrt(measured.variance[echo])
         if deviation.max() > BENT:
-            new = _spread_rows(known.track_rows(track), layout.mask, models)
-            known = known.replace(rows=replace_rows(known.rows, own, *new))
+            rows = known.rows.select(own)
+            rows = rows.replace(target=np.zeros(len(own), np.int64))
+            blocks, mu, logw = _spread_rows(rows, layout.mask, models)
+            logw = logw + math.log(whole)
+            known = known.replace(rows=replace_rows(known.rows, own, blocks, mu, logw))
             known = count_respread(known, track)
     return known
 

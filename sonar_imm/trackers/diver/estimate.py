@@ -33,6 +33,8 @@ from . import (
     links,
     offsets,
     polling,
+    ranges,
+    sides,
 )
 from .config import DiverConfig
 from .known import Known
@@ -54,7 +56,10 @@ def estimate_of(
     known, existence = known.select(shown), existence[shown]
     mean, covariance = published_state(known, models, config.burst_end)
     if known.memory['recent'].pairs:
-        covariance = offsets.with_assumed_errors(known.memory['recent'], mean, covariance, config)
+        places = sides.likely_positions(known, models, mean)
+        covariance = offsets.with_assumed_errors(
+            known.memory['recent'], places, covariance, config
+        )
     if known.memory['fixes'].errors_last(config.fix_bias_std > 0.0):
         covariance = with_fix_covariance(known['reported'], covariance)
     xyz = np.full((len(mean), 3), config.target_z)
@@ -67,6 +72,7 @@ def estimate_of(
         'nis_dof': known['nis_dof'],
         'existence': existence,
         'target_id': known['target_id'].astype(np.int32),
+        **sides.side_columns(known, models),
         **family_extras(known, models),
     }
     if models.height >= 0 and models.rows_per_track > 1:
@@ -158,7 +164,7 @@ def health(known: Known, waiting: int) -> dict[str, float]:
     }
 
 
-def warnings(known: Known, config: DiverConfig) -> list[str]:
+def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
     """Return warnings about implausible or unused input."""
     advice = 'check var_toa, var_bearing and toa_std'
     stds = 'receiver_position_std', 'receiver_clock_std', 'sound_speed_std'
@@ -191,6 +197,8 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
         *memory['arrivals'].warnings('arrivals', advice, more_than_stated=exceeds),
         *arrival_stamps.warnings(memory['stamps'], config),
         *memory['offsets'].warnings(config),
+        *sides.warnings(known, models),
+        *ranges.warnings(known),
         *births.start_warnings(known, config),
     ]
 

@@ -40,6 +40,7 @@ import numpy as np
 from ...acoustics.arrivals_3d import BEARING, observe
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.consider import apply_gain, innovation_variances, log_densities
+from ...estimation.covariance import is_psd
 
 PRUNE = 14.0
 """An explanation whose log-probability is this much below the best one's is dropped."""
@@ -185,6 +186,20 @@ def expect_measurements(
     apart = nu - residual[:, None]
     covariance = inside + (apart * mu) @ apart.T
     return residual, 0.5 * (covariance + covariance.T)
+
+
+def joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
+    """Return ``residual' S^-1 residual`` with ``S = covariance + diag(variance)``; variance (C,).
+
+    If rounding makes S singular, use eigenvalues in units of the variances.
+    """
+    S = covariance + np.diag(variance)
+    if is_psd(S) or not np.isfinite(S).all():
+        return float(residual @ np.linalg.solve(S, residual))
+    weight = 1.0 / np.sqrt(variance)
+    values, vectors = np.linalg.eigh(weight[:, None] * covariance * weight)
+    whitened = vectors.T @ (weight * residual)
+    return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
 
 
 # -- all subsets ---------------------------------------------------------------------------------

@@ -300,6 +300,7 @@ class ModelSet:
                 'delay': np.zeros((T * K, MOST_SENSORS)),
                 'start': np.tile(start, T),
                 **{name: np.full(T * K, value) for name, value in NO_OFFSET.items()},
+                'side': np.zeros(T * K, np.int64),
             },
         )
 

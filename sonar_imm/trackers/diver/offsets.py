@@ -316,9 +316,9 @@ def accumulate_residuals(
 
 
 def with_assumed_errors(
-    recent: RecentPairs, mean: FloatArray, covariance: FloatArray, config: DiverConfig
+    recent: RecentPairs, places: FloatArray, covariance: FloatArray, config: DiverConfig
 ) -> FloatArray:
-    """Add the assumed instrument errors to the covariances (T, q, q) of outputs `mean` (T, q).
+    """Add the assumed instrument errors to the covariances (T, q, q) of tracks at `places` (T, q).
 
     No effect if instrument errors are configured or fixes are used.
     """
@@ -327,7 +327,7 @@ def with_assumed_errors(
         return covariance
     # Excludes z: elevations and depth sensors also determine a depth state.
     covariance, known = covariance.copy(), 2
-    for t, row in enumerate(mean):
+    for t, row in enumerate(places):
         place = row[:3] if config.dimensions == 3 else np.append(row[:2], config.target_z)
         covariance[t, :known, :known] += recent.assumed_covariance(
             place, known, config.sound_speed

@@ -318,12 +318,13 @@ def hear_sensor(known: Known, heard: BoolArray, scales: Sequence[float], sensor:
 def protected_rows(rows: Rows) -> BoolArray:
     """Return which rows (N,) are kept at any total weight.
 
-    These are depth hypotheses, the heaviest row of each track, and rows of sufficient weight among
-    scales of at least `MIN_PUBLISHED_SCALE`.
+    These are depth hypotheses, rows of tracks whose side is in doubt, the heaviest row of each
+    track, and rows of sufficient weight among scales of at least `MIN_PUBLISHED_SCALE`.
     """
     first, scale = rows.first, least_scale(rows.key)
-    # A start depth is a state: all rows of such a track are kept, also the first.
-    protected = np.maximum.reduceat(rows.key['start'], first)[rows.target] > 0
+    # A start depth or a side is a state: all rows of such a track are kept, also the first.
+    state = np.maximum(rows.key['start'], rows.key['side'])
+    protected = np.maximum.reduceat(state, first)[rows.target] > 0
     protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE

@@ -104,6 +104,17 @@ class Heights(NamedTuple):
         return Height(float(self.value[d]), self.gain[d], float(self.rest[d]))
 
 
+class Fit(NamedTuple):
+    """Minima of single ranges (`ranges`): K states (x, y, vx, vy) at the last range."""
+
+    x: FloatArray
+    """(K, 4)."""
+    P: FloatArray
+    """(K, 4, 4)."""
+    weight: FloatArray
+    """(K,) probabilities."""
+
+
 class Birth(NamedTuple):
     """Position of a possible new track."""
 
@@ -129,6 +140,8 @@ class Birth(NamedTuple):
     """Number of the sensor (`sensors`)."""
     mark: int = 0
     """Number of the fix of the birth, for links to its track (`bursts`); 0 for none."""
+    fit: Fit | None = None
+    """Minima of single ranges; None for other births."""
 
 
 MOST_BIRTHS = 1.5

@@ -45,6 +45,7 @@ from .known import Known
 from .names import LastNamed
 from .offsets import BiasTest, RecentPairs
 from .polling import SingleFixes
+from .ranges import Ranges
 from .sensors import Sensors
 
 STATE_TYPES = (
@@ -63,6 +64,6 @@ STATE_TYPES = (
         BiasTest,
         RecentPairs,
     ),
-    *(Clutter, Clutters, LastNamed, Sensors, SingleFixes),
+    *(Clutter, Clutters, LastNamed, Ranges, Sensors, SingleFixes),
     *(ArrivalStamps, Resolution),
 )

@@ -68,8 +68,10 @@ from . import (
     pairing,
     polling,
     pruning,
+    ranges,
     restart,
     scales,
+    sides,
 )
 from .config import DiverConfig
 from .coverage_map import configured_coverage
@@ -133,6 +135,7 @@ class DiverTracker:
             **coverage.FEATURES,
             **depth.FEATURES,
             **burst_reports.FEATURES,
+            **sides.FEATURES,
             'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
         turn = config.bearing_bias_std_deg > 0.0
@@ -147,6 +150,7 @@ class DiverTracker:
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
             models.families and bursts.jump,
+            lambda known, group: sides.drop_sides(known, models),
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
             covered and coverage.miss_stage(models, lambda known: bool(layouts(known).mask.all())),
@@ -190,6 +194,7 @@ class DiverTracker:
             single=polling.SingleFixes(),
             stamps=arrival_stamps.ArrivalStamps(),
             last_named=names.LastNamed(),
+            ranges=ranges.Ranges(),
             sensors=Sensors(),
             reporting=0,
             bursts=burst_reports.BurstCounts(),
@@ -227,7 +232,7 @@ class DiverTracker:
 
     def warnings(self) -> list[str]:
         """Return warnings about implausible or unused input."""
-        tracker_warnings = estimate.warnings(self._stream.state, self.config)
+        tracker_warnings = estimate.warnings(self._stream.state, self.config, self.models)
         return [*self._georeferencer.warnings(), *tracker_warnings]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -269,6 +274,8 @@ class DiverTracker:
             start = scales.redistribute_weights(
                 start, self.models.scales, self.config.sensor_delays, number
             )
+        if has_scales:
+            start = start.replace(rows=sides.with_sides_of(previous.rows, start.rows))
         steps = predict_over(
             self.models, self._chain, start.rows, previous['learnt'], dt, self.config.longest_step
         )
@@ -299,10 +306,13 @@ class DiverTracker:
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )
+        known = sides.count_doubts(known)
         layout = self._layouts(known)
         known = births.restart_track(known, ping, free, self.models, layout, self.config)
+        found = births.births_from_ping(ping, free, self.config)
+        known, more = ranges.births_from_range(known, ping, free, self.config)
         number = known.memory['sensors'].number('')
-        for birth in births.births_from_ping(ping, free, self.config):
+        for birth in [*found, *more]:
             scan.births.append(birth._replace(number=number))
         return known
 

@@ -72,8 +72,9 @@ def test_the_estimate_is_the_contract():
         'prob_brisk_heading_000',
         'prob_quiet',
     ]
-    assert list(columns)[-16:] == [
+    assert list(columns)[-19:] == [
         *('track_id', 'track_state', 'nis', 'nis_dof', 'existence', 'target_id'),
+        *('side_probability', 'mirror_x', 'mirror_y'),
         *('family_steady', 'family_brisk', 'family_lively', 'family_quiet'),
         *('hover', 'covariance_scale', 'burst', 'offset_x', 'offset_y', 'rows'),
     ]

@@ -1,0 +1,253 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Raw arrivals in the field: two receivers, single ranges, few receivers a ping.
+
+    python -m benchmarks.diver_arrivals --out docs/results/diver_arrivals.json
+
+One diver swims legs of 7 to 15 s at .75 m/s for 100 s, a ping a second, ranges of .5 m. `two
+receivers` 80 m apart, `third from ping 40`, scored before and after it; single ranges: `buoys`,
+four at the corners of 80 m in turn; `ship on a circle` of 50 m at 5 m/s, of the diver and of a
+transponder that stands; `ship on a line`; `one receiver`. NEES of 2 is due; `inside` is the share
+in the 95 % ellipse; `sure and wrong` the share of runs of which a fifth of the estimates have a
+NEES above 50; `begins s` is the median of the first confirmed estimate; `tracked` of the runs have
+one. Side A and side B are in the estimate, so its RMSE is half their distance.
+
+`receivers a ping`: of eight receivers about, so many hear a ping (2 % wild, .3 m of path); `echo`
+has a transmitter, `tag` none, in steps of 1 s and of 29 s, as far apart as those of the towed tag.
+The ratio is that of the RMSE of the default to that of `heading_speed` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.study import final_estimates, Parts, study, truths
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Arrivals
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.truth import TrueTrack
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
+
+STD, SOUND = 0.5, 1500.0
+SETTLED, WRONG = 10, 50.0
+BUOYS = np.array([[-40.0, -40.0], [40.0, -40.0], [40.0, 40.0], [-40.0, 40.0]])
+POOL = np.array(
+    [[0, 0], [70, 10], [-60, 45], [10, 85], [-40, -60], [80, -50], [120, 70], [-90, -10]], float
+)
+"""Receivers of `receivers a ping`."""
+
+Places = Callable[[int, np.random.Generator], FloatArray]
+"""Where receivers (k, 2) ask at a ping."""
+
+
+class Score(NamedTuple):
+    """Of the estimates of a run with a confirmed track."""
+
+    ping: FloatArray
+    """(K,) number of the ping."""
+    square: FloatArray
+    """(K,) squared error, m^2."""
+    nees: FloatArray
+    """(K,)."""
+
+
+def path(seed: int, motion: str = 'legs', **values: Any) -> TrueTrack:
+    """A diver of the simulator."""
+    scene = simulate(scenario('multistatic', {'motion': motion, **values}), seed)
+    return truths(scene, TrueTrack)[0]
+
+
+def transponder(stamp_ns: int, at: FloatArray, target: FloatArray, rng: Any) -> Arrivals:
+    """Two-way ranges of a target (2,) from places (k, 2)."""
+    place = np.column_stack([at, np.zeros(len(at))])
+    length = 2.0 * np.hypot(*(at - target).T) + 2.0 * STD * rng.normal(size=len(at))
+    nothing = np.full(len(at), np.nan)
+    return Arrivals(
+        stamp_ns=stamp_ns,
+        tx_id=np.arange(len(at)) + 1,
+        rx_id=np.arange(len(at)),
+        tx=place,
+        rx=place,
+        toa=length / SOUND,
+        var_toa=np.full(len(at), (2.0 * STD / SOUND) ** 2),
+        bearing=nothing,
+        var_bearing=nothing,
+        frame_id='map',
+    )
+
+
+def followed(pings: list[Arrivals], track: TrueTrack, **values: Any) -> Score:
+    """Track a diver; estimates without a confirmed track are left out."""
+    at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
+    rows: list[tuple[float, float, float]] = []
+    for stamp, estimate in sorted(
+        final_estimates(DiverTracker(DiverConfig(**values)), pings).items()
+    ):
+        for row in np.flatnonzero(estimate.extras['track_state'] > 0)[:1]:
+            error = estimate.state[row, :2] - track.position[at[stamp], :2]
+            nees = error @ np.linalg.solve(estimate.covariance[row, :2, :2], error)
+            rows.append((at[stamp], float(error @ error), float(nees)))
+    return Score(*np.reshape(rows, (-1, 3)).T)
+
+
+# -- sides and single ranges ---------------------------------------------------------------------
+
+
+def baseline(third: int = 10**9) -> Places:
+    """Two receivers 80 m apart, turned at random, and a third from a ping on."""
+
+    def places(k: int, rng: np.random.Generator) -> FloatArray:
+        angle = rng.uniform(0.0, np.pi)
+        turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        every = np.array([[-40.0, 0.0], [40.0, 0.0], [10.0, 70.0]]) @ turned
+        return every[: 3 if k >= third else 2]
+
+    return places
+
+
+def circle(k: int, rng: np.random.Generator) -> FloatArray:
+    angle = 2.0 * np.pi * k / 63.0
+    return 50.0 * np.array([[np.cos(angle), np.sin(angle)]])
+
+
+SCENES: dict[str, tuple[Places, str, int]] = {
+    'two receivers': (baseline(), 'legs', 100),
+    'third from ping 40': (baseline(40), 'legs', 40),
+    'four buoys in turn': (lambda k, rng: BUOYS[[k % 4]], 'legs', 100),
+    'ship on a circle, diver': (circle, 'legs', 100),
+    'ship on a circle, transponder': (circle, 'still', 100),
+    'ship on a line': (lambda k, rng: np.array([[5.0 * k - 150.0, -60.0]]), 'legs', 100),
+    'one receiver': (lambda k, rng: np.zeros((1, 2)), 'legs', 100),
+}
+"""Places, motion, and the ping from which on the estimates are another row."""
+
+
+def scene(name: str, seeds: range) -> dict[str, dict[str, float | None]]:
+    """Rows of a scene over its seeds."""
+    places, motion, change = SCENES[name]
+    scores = []
+    for seed in seeds:
+        track = path(seed, motion, duration=99.0)
+        rng = np.random.default_rng([49, seed])
+        pings = [
+            transponder(int(stamp), places(k, np.random.default_rng([50, seed])), at, rng)
+            for k, (stamp, at) in enumerate(zip(track.stamp_ns, track.position[:, :2]))
+        ]
+        scores.append(followed(pings, track))
+    rows = {name: row_of(scores, SETTLED, change)}
+    if change < len(track.stamp_ns):
+        rows[f'{name}, after'] = row_of(scores, change + 2, len(track.stamp_ns))
+    return rows
+
+
+def row_of(scores: list[Score], first: int, last: int) -> dict[str, float | None]:
+    """The numbers of the pings from `first` to before `last`."""
+    parts = []
+    for score in scores:
+        inside = (score.ping >= first) & (score.ping < last)
+        parts.append(Score(*(column[inside] for column in score)))
+    shown = [part for part in parts if len(part.ping)]
+    row: dict[str, float | None] = {'tracked': len(shown) / len(scores)}
+    if not shown:
+        return row
+    square, nees = (np.concatenate([part[k] for part in shown]) for k in (1, 2))
+    return row | {
+        'RMSE': float(np.sqrt(square.mean())),
+        'median': float(np.sqrt(np.median(square))),
+        'NEES': float(nees.mean()),
+        'inside': float((nees < 5.991).mean()),
+        'sure and wrong': float(np.mean([(part.nees > WRONG).mean() > 0.2 for part in shown])),
+        'begins s': float(np.median([score.ping[0] for score in scores if len(score.ping)])),
+    }
+
+
+# -- few receivers a ping ------------------------------------------------------------------------
+
+KINDS: dict[str, tuple[bool, dict[str, Any]]] = {
+    'echo, 1 s': (False, {'duration': 99.0}),
+    'tag, 1 s': (True, {'duration': 99.0}),
+    'tag, 29 s': (True, {'duration': 2000.0, 'step': 29.0, 'turn_deg': 180.0}),
+}
+
+
+def thinned(seed: int, receivers: int, passive: bool, track: TrueTrack) -> list[Arrivals]:
+    """Pings that some of the receivers hear."""
+    rng, std = np.random.default_rng([51, seed, receivers]), 0.3
+    pings = []
+    for stamp, target in zip(track.stamp_ns, track.position[:, :2]):
+        own = np.sort(rng.permutation(len(POOL))[:receivers])
+        length = np.hypot(*(POOL[own] - target).T) + std * rng.normal(size=receivers)
+        length += (0.0 if passive else np.hypot(*target)) * np.ones(receivers)
+        length += (rng.random(receivers) < 0.02) * rng.uniform(5.0, 50.0, receivers)
+        nothing = np.full(receivers, np.nan)
+        pings.append(
+            Arrivals(
+                stamp_ns=int(stamp),
+                tx_id=np.zeros(receivers),
+                rx_id=own,
+                tx=np.full((receivers, 3), np.nan if passive else 0.0),
+                rx=np.column_stack([POOL[own], np.zeros(receivers)]),
+                toa=length / SOUND + (5.0 if passive else 0.0),
+                var_toa=np.full(receivers, (std / SOUND) ** 2),
+                bearing=nothing,
+                var_bearing=nothing,
+                frame_id='map',
+            )
+        )
+    return pings
+
+
+def few(kind: str, receivers: int, seeds: range) -> dict[str, float]:
+    """The default and `heading_speed` alone."""
+    passive, values = KINDS[kind]
+    square: dict[str, list[FloatArray]] = {'families': [], 'heading_speed': []}
+    nees: list[FloatArray] = []
+    for seed in seeds:
+        track = path(seed, **values)
+        pings = thinned(seed, receivers, passive, track)
+        for model_set, found in square.items():
+            score = followed(pings, track, max_tracks=1, model_set=model_set)
+            late = score.ping >= SETTLED
+            found.append(score.square[late])
+            if model_set == 'families':
+                nees.append(score.nees[late])
+    ours, theirs = (
+        float(np.sqrt(np.concatenate(square[name]).mean()))
+        for name in ('families', 'heading_speed')
+    )
+    return {
+        'RMSE': ours,
+        'heading_speed': theirs,
+        'ratio': ours / theirs,
+        'NEES': float(np.concatenate(nees).mean()),
+    }
+
+
+def main(runs: int = 20, first: int = 100, only: tuple[str, ...] = (*SCENES, *KINDS)) -> Parts:
+    yield {'runs': runs, 'first': first}
+    seeds = range(first, first + runs)
+    for name in only:
+        if name in SCENES:
+            yield {'table': scene(name, seeds)}
+            continue
+        for receivers in (5, 4, 3):
+            yield {'few': {f'{name}, {receivers} receivers': few(name, receivers, seeds)}}
+
+
+if __name__ == '__main__':
+    study(main, only={'choices': [*SCENES, *KINDS]})
