@@ -29,6 +29,8 @@ there from the start. Of tracks that are published with an existence near .6, .8
 share of which a diver is near, within 3 m and what he swims from scan to scan. Brier: the mean
 square of existence less what is true, over all published rows. `delay s`: until half of the divers
 have a confirmed track near them.
+
+Fixes that are off by a vector, and outliers: `diver_bursts`.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.diver_bursts import CASES, FAULTS, scans, single, TARGETS
 from benchmarks.study import mean_of, Parts, study
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.consistency import gospa
@@ -210,6 +213,12 @@ SCENES: dict[str, Scene] = {
         f'existence, {dt:g} s, {mean:g} false': partial(reliability, dt, mean)
         for dt in (0.1, 1.0, 5.0)
         for mean in (2.0, 10.0)
+    },
+    **{f'{kind}, {fault}': averaged(single, kind, fault) for kind in TARGETS for fault in FAULTS},
+    **{
+        f'scans, {case}, {false:g} false': averaged(scans, case, false)
+        for case in CASES
+        for false in (2.0, 5.0)
     },
 }
 

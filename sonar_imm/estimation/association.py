@@ -278,6 +278,16 @@ class Tracks:
             next_id,
         )
 
+    def renamed(self, chosen: BoolArray) -> Tracks:
+        """Give the `chosen` tracks (T,) new IDs."""
+        count = int(chosen.sum())
+        if not count:
+            return self
+        new, next_id = new_ids(self.next_id, count, self.track_id)
+        track_id = self.track_id.copy()
+        track_id[chosen] = new
+        return evolve(self, track_id=track_id, next_id=next_id)
+
     def resumed(self, track_id: int, stamp_ns: int, rules: TrackRules) -> Tracks:
         """Append a confirmed track that ended before, without a hit; it may coast from now on."""
         return Tracks(

@@ -55,10 +55,12 @@ from .arrays import BoolArray, FloatArray, IndexArray
 __all__ = [
     'Bank',
     'combine',
+    'combine_fixes',
     'compare',
     'Gaussians',
     'Innovations',
     'mix',
+    'mixture_log_density',
     'move_along',
     'Moves',
     'predict',
@@ -152,12 +154,19 @@ class Bank:
 
 
 def mix(
-    bank: Bank, blocks: Sequence[Gaussians], mu: FloatArray, transition: FloatArray
+    bank: Bank,
+    blocks: Sequence[Gaussians],
+    mu: FloatArray,
+    transition: FloatArray,
+    tail: int = 0,
 ) -> tuple[list[Gaussians], FloatArray]:
     """Mix the models of each row. Return the blocks and the predicted probabilities c (N, M).
 
     ``c_j = sum_i W_ij``, ``W_ij = transition_ij mu_i``. Model j gets mean and covariance of the
     mixture of all images with weights ``W_ij / c_j``.
+
+    :param tail: number of last components that a direction also conditions; others behind the
+        velocity are considered.
     """
     W = transition * mu[:, :, None]
     a = bank.units.shape[1]
@@ -168,7 +177,7 @@ def mix(
     moments = [_moments(block, _pad_centre(centre, k)) for k, block in enumerate(blocks)]
     images = None
     if bank.velocities:
-        images, fit = _to_headings(bank, blocks[1], centre)
+        images, fit = _to_headings(bank, blocks[1], centre, tail)
         _share_by_direction(W, fit, bank, a)
     c = W.sum(axis=1)
     dead = c <= DEAD
@@ -278,23 +287,23 @@ def _to_velocities(bank: Bank, moments: FloatArray, n: int) -> FloatArray:
 
 
 def _to_headings(
-    bank: Bank, block: Gaussians, centre: FloatArray
+    bank: Bank, block: Gaussians, centre: FloatArray, tail: int = 0
 ) -> tuple[FloatArray, FloatArray]:
     """Return the moments (N, q, b, D + 1) of b velocities as D headings and a hover, and the log
     likelihoods (N, b, D) of the headings."""
     x, P = block.x[..., None], block.P[..., None]  # (N, n', b, 1), (N, n', n', b, 1)
     ux, uy = bank.directions
-    own = slice(0, VY + 1)  # components after the velocity are not conditioned
+    considered = slice(VY + 1, x.shape[1] - tail)
     g = ux * P[:, :, VY] - uy * P[:, :, VX]
     speed, across = ux * x[:, VX] + uy * x[:, VY], ux * x[:, VY] - uy * x[:, VX]
     along = ux * ux * P[:, VX, VX] + 2.0 * ux * uy * P[:, VX, VY] + uy * uy * P[:, VY, VY]
     variance = ux * g[:, VY] - uy * g[:, VX]
     variance = variance + bank.sector * (speed * speed + along) + LEAST_ACROSS
     gain = g / variance[:, None]
-    x1 = np.broadcast_to(x, g.shape).copy()
-    x1[:, own] -= gain[:, own] * across[:, None]
+    x1 = x - gain * across[:, None]
+    x1[:, considered] = x[:, considered]
     P1 = P - gain[:, :, None] * g[:, None]
-    P1[:, VY + 1 :, VY + 1 :] = P[:, VY + 1 :, VY + 1 :]
+    P1[:, considered, considered] = P[:, considered, considered]
     # From (.., vx, vy, ..) to (.., s, ..).
     x2, P2 = _with_speed(x1, P1, ux, uy)
     fit = -0.5 * (across * across / variance + LOG_2PI + np.log(variance))
@@ -432,13 +441,19 @@ class Innovations(NamedTuple):
         return Innovations._make(part[chosen] for part in self)
 
 
-def predict_fix(block: Gaussians, measured: Measured = POSITION) -> tuple[FloatArray, FloatArray]:
+def predict_fix(
+    block: Gaussians, measured: Measured = POSITION, offset: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return the predicted measurement (N, 2, m) of each model, and its covariance (N, 3, m): xx,
-    xy, yy."""
-    PHt = np.swapaxes(_measure(block.P, measured), 1, 2)
-    HPHt = _measure(PHt, measured)
+    xy, yy.
+
+    :param offset: (N,) factor of the offset in the measurement of each row; the offset is the last
+        two components. None for no offset.
+    """
+    PHt = np.swapaxes(_measure(block.P, measured, offset), 1, 2)
+    HPHt = _measure(PHt, measured, offset)
     S = np.stack([HPHt[:, 0, 0], HPHt[:, 0, 1], HPHt[:, 1, 1]], axis=1)
-    return _measure(block.x, measured), S
+    return _measure(block.x, measured, offset), S
 
 
 def weigh(
@@ -470,12 +485,46 @@ def compare(
     return Innovations(v, S, R, np.where(good, nis, np.inf), np.where(good, log, -np.inf))
 
 
-def _measure(array: FloatArray, measured: Measured) -> FloatArray:
-    """Return the measured values (p, 2, ...) of the components (p, n, ...)."""
+def mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
+    """Return the log density (p,) of each pair over all models. mu: (p, M) model probabilities."""
+    with np.errstate(divide='ignore'):
+        of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
+        best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
+        safe = np.where(np.isfinite(best), best, 0.0)
+        return np.asarray(
+            (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
+        )
+
+
+def combine_fixes(
+    expected: Sequence[tuple[FloatArray, FloatArray]], mu: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (N, 2) and covariance (N, 2, 2) of the predictions of `predict_fix` over all
+    models, with probabilities mu (N, M)."""
+    h = np.concatenate([each for each, _ in expected], axis=-1)
+    S = np.concatenate([each for _, each in expected], axis=-1)
+    mean = (h @ mu[..., None])[..., 0]
+    d = h - mean[..., None]
+    S = S + np.stack([d[:, 0] * d[:, 0], d[:, 0] * d[:, 1], d[:, 1] * d[:, 1]], axis=1)
+    whole = (S @ mu[..., None])[..., 0]
+    return mean, whole[:, [[0, 1], [1, 2]]]
+
+
+def _measure(
+    array: FloatArray, measured: Measured, offset: FloatArray | None = None
+) -> FloatArray:
+    """Return the measured values (p, 2, ...) of the components (p, n, ...).
+
+    offset: (p,) factor of the last two components; None for zero.
+    """
     if all(len(each) == 1 for each in measured):
-        return array[:, [each[0] for each in measured]]
-    values = [array[:, list(each)].sum(axis=1) for each in measured]
-    return np.stack(values, axis=1)
+        values = array[:, [each[0] for each in measured]]
+    else:
+        values = np.stack([array[:, list(each)].sum(axis=1) for each in measured], axis=1)
+    if offset is None:
+        return values
+    factor = offset.reshape(-1, *(1,) * (array.ndim - 1))
+    return np.asarray(values + factor * array[:, -2:])
 
 
 def update(
@@ -486,6 +535,7 @@ def update(
     missed: FloatArray,
     measured: Measured = POSITION,
     estimated: BoolArray | None = None,
+    offset: FloatArray | None = None,
 ) -> tuple[Gaussians, FloatArray]:
     """Update the models of each row by its measurements.
 
@@ -495,6 +545,7 @@ def update(
     :param missed: (N,) probability that no measurement belongs to the target.
     :param estimated: (n,) False for considered components (Schmidt), which an update does not
         change.
+    :param offset: see `predict_fix`.
     :returns: the moment-matched block, and the factors (N, m) of the model probabilities and row
         weight.
     """
@@ -509,7 +560,8 @@ def update(
     at = np.repeat(np.arange(len(rows)), np.diff([*first, len(row)]))
     share = np.where(alive[at], ratio / scale[at], 0.0)
     none = np.where(alive, missed[rows, None] / scale, 1.0)
-    shift, after = _condition(block, pairs, row, measured, estimated)
+    of_pairs = None if offset is None else offset[row]
+    shift, after = _condition(block, pairs, row, measured, estimated, of_pairs)
     mean = np.add.reduceat(share[:, None] * shift, first)
     # Moments about the new mean: a small posterior variance is lost beside a squared shift.
     apart = shift - mean[at]
@@ -528,12 +580,13 @@ def _condition(
     row: IndexArray,
     measured: Measured,
     estimated: BoolArray | None,
+    offset: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mean shifts (p, n, m) and posterior covariances (p, n, n, m) of each pair, in
     Joseph form."""
     a, b, d = (pairs.S[:, None, k] for k in range(3))
     P = block.P[row]
-    PHt = np.swapaxes(_measure(P, measured), 1, 2)
+    PHt = np.swapaxes(_measure(P, measured, offset), 1, 2)
     with np.errstate(divide='ignore', invalid='ignore'):
         left = d - b * b / a
         second = (PHt[:, :, 1] - b / a * PHt[:, :, 0]) / left
@@ -545,7 +598,7 @@ def _condition(
     # (I - K H) P, then times (I - K H)' and with K R K'.
     for r in range(2):
         P -= K[:, :, None, r] * PHt[:, None, :, r]
-    PHt = np.swapaxes(_measure(np.swapaxes(P, 1, 2), measured), 1, 2)
+    PHt = np.swapaxes(_measure(np.swapaxes(P, 1, 2), measured, offset), 1, 2)
     for r in range(2):
         KR = K[:, :, 0] * pairs.R[:, None, 0, r, None] + K[:, :, 1] * pairs.R[:, None, 1, r, None]
         P += (KR - PHt[:, :, r])[:, :, None] * K[:, None, :, r]

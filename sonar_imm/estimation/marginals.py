@@ -45,7 +45,7 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 
-__all__ = ['clusters', 'marginals']
+__all__ = ['clusters', 'log_total', 'marginals']
 
 LARGEST = 12
 """Maximum number of tracks or detections of an exact cluster."""
@@ -78,6 +78,45 @@ def marginals(
         solve = _exact if min(len(tracks), len(detections)) <= LARGEST else _by_propagation
         pair[cell], none[tracks] = solve(weight[cell], alone[tracks])
     return pair, none
+
+
+def log_total(assigned: FloatArray, missed: FloatArray, possible: BoolArray) -> float:
+    """Return the logarithm of the weight of all events; arguments as in `marginals`.
+
+    >>> import numpy as np
+    >>> pair = np.array([[3.0, 0.0]])
+    >>> round(np.exp(log_total(pair, np.array([1.0]), pair > 0.0)), 12)
+    4.0
+    """
+    weight = np.where(possible, assigned, 0.0)
+    largest = np.maximum(weight.max(axis=1, initial=0.0), missed)
+    weight, alone = weight / largest[:, None], missed / largest
+    together = list(_small_clusters(weight, alone))
+    of_track = np.log(alone + weight.sum(axis=1))
+    total = float(np.log(largest).sum())
+    for tracks, detections in together:
+        of_track[tracks] = 0.0
+        total += _log_events(weight[np.ix_(tracks, detections)], alone[tracks])
+    return total + float(of_track.sum())
+
+
+def _log_events(weight: FloatArray, alone: FloatArray) -> float:
+    """Return the logarithm of the weight of all events of one cluster: weight (t, d), alone
+    (t,)."""
+    t, d = weight.shape
+    if d <= t:
+        a, m, rest = weight, alone, 0.0
+    else:
+        a, m, rest = (weight / alone[:, None]).T, np.ones(d), float(np.log(alone).sum())
+    without, with_it = _subsets(a.shape[1])
+    forward = np.zeros(1 << a.shape[1])
+    forward[0] = 1.0
+    for row, none in zip(a, m):
+        after = none * forward
+        for column in np.flatnonzero(row).tolist():
+            after[with_it[column]] += row[column] * forward[without[column]]
+        forward = after
+    return rest + float(np.log(forward.sum()))
 
 
 def clusters(possible: BoolArray) -> IntArray:

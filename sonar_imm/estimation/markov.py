@@ -38,7 +38,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import FloatArray
+from .arrays import FloatArray, IntArray
 
 NOT_EMBEDDABLE = 1e-6
 """A chain whose generator misses the matrix by more has none."""
@@ -247,4 +247,26 @@ def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
     out[:M, M] = enter
     out[M, :M] = (1.0 - stay) / M
     out[M, M] = stay
+    return out
+
+
+def family_generator(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
+    """Return the generator (M, M) of the chains of all families.
+
+    The rate between two families is `rate` / 3, spread evenly over the models. Between the first
+    two families the index in the family is kept.
+    """
+    size = np.bincount(family)
+    out = np.asarray(rate / 3.0 / size[family][None] * (family[:, None] != family[None]))
+    count = int(size[0])
+    for a, b in ((0, 1), (1, 0)):
+        kept = slice(a * count, (a + 1) * count), slice(b * count, (b + 1) * count)
+        out[kept] = rate / 3.0 * np.eye(count)
+    first = 0
+    for block in blocks:
+        own = slice(first, first + len(block))
+        out[own, own] = block
+        first += len(block)
+    np.fill_diagonal(out, 0.0)
+    np.fill_diagonal(out, -out.sum(axis=1))
     return out

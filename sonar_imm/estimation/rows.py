@@ -31,7 +31,7 @@ Arrays are never changed in place, because tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -41,8 +41,17 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .bank import Gaussians
 
-__all__ = ['Borrowed', 'log_sum', 'reduce_targets', 'restore_rows', 'Rows', 'drop_weightless_rows']
+__all__ = [
+    'Borrowed',
+    'drop_weightless_rows',
+    'log_sum',
+    'normalise_weights',
+    'reduce_targets',
+    'restore_rows',
+    'Rows',
+]
 
+NOTHING: Mapping[str, Any] = {}
 LEAST_LOG = -345.0
 """Minimum logarithm of a row weight, 1e-150, so that a row can recover."""
 
@@ -68,6 +77,9 @@ class Rows:
     """(N,) row of the previous table; -1 for none."""
     key: dict[str, np.ndarray] = field(factory=dict)
     """Assumptions of each row by name, (N,) each."""
+    tail: int = 0
+    """Number of last components that belong to an assumption: they are nil in rows without it, and
+    they are absent where no row has it."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -101,6 +113,7 @@ class Rows:
             self.target[rows],
             np.asarray(rows, np.int64),
             {name: column[rows] for name, column in self.key.items()},
+            self.tail,
         )
 
     def select_targets(self, kept: BoolArray) -> Rows:
@@ -119,9 +132,10 @@ class Rows:
         """
         if set(new.key) != set(self.key):
             raise ValueError(f'rows with {sorted(new.key)} do not fit {sorted(self.key)}')
+        tail = max(self.tail, new.tail)
         blocks = tuple(
             Gaussians(*(np.concatenate(parts) for parts in zip(ours, theirs)))
-            for ours, theirs in zip(self.blocks, new.blocks)
+            for ours, theirs in zip(self.with_tail(tail).blocks, new.with_tail(tail).blocks)
         )
         both = Rows(
             blocks,
@@ -130,11 +144,26 @@ class Rows:
             np.concatenate([self.target, new.target]),
             np.concatenate([self.parent, new.parent]),
             {name: np.concatenate([self.key[name], new.key[name]]) for name in self.key},
+            tail,
         )
         if (np.diff(both.target) >= 0).all():
             return both
         order = np.argsort(both.target, kind='stable')
         return evolve(both.select(order), parent=both.parent[order])
+
+    def with_tail(self, tail: int) -> Rows:
+        """Return the rows with `tail` last components, none of them or new ones, which are nil."""
+        if tail == self.tail:
+            return self
+        blocks = []
+        for x, P in self.blocks:
+            kept = x.shape[1] - self.tail
+            x, P = x[:, :kept], P[:, :kept, :kept]
+            if tail:
+                x = np.pad(x, ((0, 0), (0, tail), (0, 0)))
+                P = np.pad(P, ((0, 0), (0, tail), (0, tail), (0, 0)))
+            blocks.append(Gaussians(x, P))
+        return evolve(self, blocks=tuple(blocks), tail=tail)
 
     def replace_target(self, target: int, new: Rows) -> Rows:
         """Replace all rows of one target by `new`, without parents."""
@@ -170,6 +199,10 @@ class Rows:
         d = mean - centre[self.target]
         spread = covariance + d[:, :, None] * d[:, None]
         return centre, np.add.reduceat(w[..., None] * spread, first)
+
+    def total(self, values: FloatArray, targets: int) -> FloatArray:
+        """Return the sum (T,) of `values` (N,) over the rows of each of `targets` targets."""
+        return np.bincount(self.target, values, minlength=targets).astype(np.float64)
 
     def model_probabilities(self) -> FloatArray:
         """Return the model probabilities (T, M) of each target over all its rows."""
@@ -262,25 +295,13 @@ class Borrowed:
         """Return the row (B,) that each assumption borrows: the heaviest of its target.
 
         A scale changes the future of a filter. So the lender need not be near in scale: its state
-        must fit the target. A delay changes the state too. So an assumption with a delay of a
-        sensor borrows from the heaviest row that agrees about the other sensors, if there is one.
+        must fit the target.
         """
         if not len(self):
             return np.empty(0, np.intp)
         heaviest = np.maximum.reduceat(rows.logw, rows.first)[rows.target] == rows.logw
         lenders, first = np.unique(rows.target[heaviest], return_index=True)
-        lender = np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]]
-        if 'delay' not in self.key or not self.key['delay'].any():
-            return np.asarray(lender)
-        late = np.flatnonzero(self.key['delay'].any(axis=1))
-        own = self.key['delay'][late] == 0.0
-        agrees = self.target[late, None] == rows.target
-        for name, column in self.key.items():
-            differs = column[late, None] != rows.key[name]
-            agrees &= ~(differs & own[:, None]).any(axis=2)
-        best = np.where(agrees, rows.logw, -np.inf)
-        lender[late] = np.where(agrees.any(axis=1), best.argmax(axis=1), lender[late])
-        return np.asarray(lender)
+        return np.asarray(np.flatnonzero(heaviest)[first[np.searchsorted(lenders, self.target)]])
 
 
 def drop_weightless_rows(
@@ -302,14 +323,39 @@ def drop_weightless_rows(
     )
 
 
-def restore_rows(rows: Rows, borrowed: Borrowed, again: BoolArray) -> tuple[Rows, Borrowed]:
+def restore_rows(
+    rows: Rows,
+    borrowed: Borrowed,
+    again: BoolArray,
+    without: Mapping[str, Any] = NOTHING,
+    lend: Callable[[Rows, Borrowed], Rows] | None = None,
+) -> tuple[Rows, Borrowed]:
     """Give the assumptions `again` (B,) a row, a copy of their lender.
 
-    Return the rows and the list.
+    The copy has no tail.
+
+    :param without: values of other assumptions.
+    :param lend: changes the copies where an assumption also changes the state.
+    :returns: the rows and the list.
     """
     if not again.any():
         return rows, borrowed
     back = borrowed.select(again)
     lender = back.find_lenders(rows)
     copies = evolve(rows.select(lender), logw=back.logw, parent=rows.parent[lender])
-    return rows.append(evolve(copies, key={**copies.key, **back.key})), borrowed.select(~again)
+    copies = copies.with_tail(0)
+    copies = copies if lend is None else lend(copies, back)
+    ended = {name: np.full(len(back), value) for name, value in without.items()}
+    copies = evolve(copies, key={**copies.key, **ended, **back.key})
+    return rows.append(copies), borrowed.select(~again)
+
+
+def normalise_weights(rows: Rows, borrowed: Borrowed) -> tuple[Rows, Borrowed]:
+    """Return rows and borrowed list whose weights sum to one for each target."""
+    every = np.concatenate([rows.logw, borrowed.logw])
+    target = np.concatenate([rows.target, borrowed.target])
+    total = np.log(np.bincount(target, np.exp(every)))
+    return (
+        evolve(rows, logw=rows.logw - total[rows.target]),
+        evolve(borrowed, logw=borrowed.logw - total[borrowed.target]),
+    )

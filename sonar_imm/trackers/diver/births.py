@@ -35,11 +35,11 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE, TrackRules
 from ...estimation.rows import Rows
 from ...measurements import Arrivals, NOBODY, Start
-from . import depth, ranges, sides
+from . import depth, links, ranges, sides
 from .config import DiverConfig
 from .instruments import Layout
-from .known import Feature, Known, track_positions
-from .models import ModelSet, start_depths, VELOCITY
+from .known import Feature, Known, track_positions, with_velocities_at_fix
+from .models import ModelSet, start_depths
 from .scan import (
     bearing_variance,
     Birth,
@@ -70,12 +70,14 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
     """Add a birth for each unassociated fix. A stage of the tracker."""
     association = group.association
     assert association is not None
+    marks = links.birth_marks(known, group)
     for d in np.flatnonzero(association.free).tolist():
         existence = math.nan if association.existence is None else float(association.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])
         height = None if group.heights is None else group.heights.row(d)
         place = group.z[d], group.R[d], None, None, existence, name, True, height
-        group.births.append(Birth(*place, group.rotation_sensor, group.number))
+        marked = group.rotation_sensor, group.number, int(marks[d])
+        group.births.append(Birth(*place, *marked))
     return known
 
 
@@ -214,10 +216,15 @@ def spawn_stage(
         return known
 
     def spawn(known: Known, scan: Scan) -> Known:
+        marks: dict[int, int] = {}
         found = [birth for group in scan.fixes for birth in group.births] + scan.births
         if found:
             room = max(0, max_total_tracks(config) - len(known))
-            known = with_tracks(known, without_duplicate_ids(found)[:room])
+            begun = without_duplicate_ids(found)[:room]
+            known = with_tracks(known, begun)
+            ids = known.life.track_id[len(known) - len(begun) :].tolist()
+            marks = {birth.mark: each for birth, each in zip(begun, ids) if birth.mark}
+        known = links.resolve_links(known, marks)
         for start in scan.starts:
             known, free = make_room(known, start, config, models)
             if free:
@@ -289,13 +296,6 @@ def birth_rows(
     return (
         rows if seen_by is None else layout.rotate_about_sensor(rows, models, *seen_by, back=True)
     )
-
-
-def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
-    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
-    if models.families is not None:
-        moving = np.flatnonzero(models.families.kind == VELOCITY)
-        P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2
 
 
 def _birth_states(

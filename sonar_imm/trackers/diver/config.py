@@ -212,6 +212,15 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, OriginParameters, St
         'known to be there')
 
     # -- outliers --------------------------------------------------------------------------------
+    burst_rate: float = live(0.005, '',
+        'families: probability that a fix begins a burst, fixes that are all off by the same '
+        'vector (multipath, a sensor that is off), and that it is a single outlier; 0: neither',
+        range=(0.0, 0.3))
+    burst_end: float = live(0.05, '',
+        'probability that a burst ends at a fix', range=(1e-3, 0.5))
+    burst_std: float = live(20.0, 'm',
+        'standard deviation on each axis of the vector by which the fixes of a burst are off',
+        range=(0.1, 1e4))
     outlier_probability: float = live(0.02, '',
         'probability that an arrival time is an outlier: late by a reflection, or of something '
         'else', range=(1e-6, 0.5))

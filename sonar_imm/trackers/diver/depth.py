@@ -47,6 +47,7 @@ from ...estimation.association import gate_threshold
 from ...estimation.bank import Gaussians, LOG_2PI
 from ...estimation.covariance import add_jitter
 from ...estimation.rows import LEAST_LOG, Rows
+from . import bursts, ways
 from .config import DiverConfig
 from .instruments import Layout
 from .known import Feature, Known, repair_covariances, row_outputs
@@ -179,9 +180,7 @@ def update_depth(
         share = 1.0
         if association.is_joint:
             share = min(association.beta[track, fix] / association.exists[track], 1.0)
-        known, nis = _update_track(
-            known, track, own, group.z[fix], share, models, layout, threshold
-        )
+        known, nis = _update_track(known, track, own, group, fix, share, models, layout)
         variance = own.variance(group.R[fix])
         outside += _is_outside(own.value, variance, config)
         if nis <= threshold:
@@ -232,24 +231,25 @@ def _update_track(
     known: Known,
     track: int,
     height: Height,
-    z: FloatArray,
+    group: Group,
+    fix: int,
     share: float,
     models: ModelSet,
     layout: Layout,
-    threshold: float,
 ) -> tuple[Known, float]:
     """Update one track by a scalar: z of a fix less its `gain` times x and y (2,) of the fix.
 
     :param share: probability that the fix belongs to the track. Below 1, each model becomes a
         mixture.
-    :returns: the new state and the NIS of the mixture. A NIS above `threshold` changes nothing.
+    :returns: the new state and the NIS of the mixture. A NIS outside the gate changes nothing.
     """
-    own = known.row_indices(track)
-    rows, value = known.track_rows(track), height.value - float(height.gain @ z)
+    own, threshold = known.row_indices(track), gate_threshold(group.config.gate_probability, 1)
+    rows, value = known.track_rows(track), height.value - float(height.gain @ group.z[fix])
+    offset = ways.offset_factor(rows, group.number)
     weight = rows.weight[:, None] * rows.mu
     masks = layout.estimated_masks(models)
     parts = [
-        _depth_innovations(block, part.fix_matrix, part.height, height, value)
+        _depth_innovations(block, part.fix_matrix, part.height, height, value, offset)
         for part, block in zip(models.parts, rows.blocks)
     ]
     v, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
@@ -263,9 +263,10 @@ def _update_track(
     factor = share * density / (weight * density).sum() + (1.0 - share)
     blocks = []
     for part, block, mask, (PHt, nu, s) in zip(models.parts, rows.blocks, masks, parts):
+        mask = bursts.with_tail_mask(mask, rows.tail)
         certain = share * density[:, part.models] / (weight * density).sum()
         blocks.append(_update_scalar(block, PHt, nu, s, height.rest, certain, 1.0 - share, mask))
-    sound, repairs = repair_covariances(tuple(blocks))
+    sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, total = rows.replace(blocks=sound).multiply_models(factor)
     with np.errstate(divide='ignore'):
         logw = np.maximum(rows.logw + np.log(total), LEAST_LOG)
@@ -274,14 +275,21 @@ def _update_track(
 
 
 def _depth_innovations(
-    block: Gaussians, seen: FloatArray, place: int, height: Height, value: float
+    block: Gaussians,
+    seen: FloatArray,
+    place: int,
+    height: Height,
+    value: float,
+    offset: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return PHt (N, n, m), innovation (N, m) and innovation variance (N, m) of ``z - gain (x,
     y)``."""
-    h = np.zeros((block.x.shape[1], block.x.shape[2]))
-    h[: len(seen[0])] = -height.gain[0] * seen[0] - height.gain[1] * seen[1]
-    h[place] += 1.0
-    PHt = (block.P * h).sum(axis=2)
+    h = np.zeros(block.x.shape)
+    h[:, : len(seen[0])] = -height.gain[0] * seen[0] - height.gain[1] * seen[1]
+    h[:, place] += 1.0
+    if offset is not None:
+        h[:, -bursts.TAIL :] = -(offset[:, None] * height.gain)[..., None]
+    PHt = (block.P * h[:, None]).sum(axis=2)
     return PHt, value - (h * block.x).sum(axis=1), (h * PHt).sum(axis=1) + height.rest
 
 

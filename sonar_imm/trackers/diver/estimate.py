@@ -23,9 +23,21 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consistency import ENOUGH
-from . import arrival_stamps, births, clutter, depth, offsets, polling, ranges, sides
+from . import (
+    arrival_stamps,
+    births,
+    burst_reports,
+    bursts,
+    clutter,
+    depth,
+    links,
+    offsets,
+    polling,
+    ranges,
+    sides,
+)
 from .config import DiverConfig
-from .known import Known, row_outputs
+from .known import Known
 from .models import FAMILIES, HOVER, ModelSet
 from .pruning import PUBLISH_EXISTENCE
 from .scales import delay_probabilities, estimated_scales, weight_without_small_scales
@@ -39,8 +51,10 @@ def estimate_of(
 ) -> Estimate:
     """Return the estimate of a scan. origin: geodetic origin of the frame; None if unknown."""
     # The existence is NaN for tracks confirmed by hits.
-    known = known.select(~(known['existence'] <= PUBLISH_EXISTENCE))
-    mean, covariance = published_state(known, models)
+    existence = links.existence_beside_bursts(known)
+    shown = ~(existence <= PUBLISH_EXISTENCE)
+    known, existence = known.select(shown), existence[shown]
+    mean, covariance = published_state(known, models, config.burst_end)
     if known.memory['recent'].pairs:
         places = sides.likely_positions(known, models, mean)
         covariance = offsets.with_assumed_errors(
@@ -54,7 +68,9 @@ def estimate_of(
     extras: dict[str, np.ndarray] = {
         'track_id': known.life.track_id,
         'track_state': known.life.status,
-        **{name: known[name] for name in ('nis', 'nis_dof', 'existence')},
+        'nis': known['nis'],
+        'nis_dof': known['nis_dof'],
+        'existence': existence,
         'target_id': known['target_id'].astype(np.int32),
         **sides.side_columns(known, models),
         **family_extras(known, models),
@@ -77,7 +93,9 @@ def estimate_of(
     )
 
 
-def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatArray]:
+def published_state(
+    known: Known, models: ModelSet, burst_end: float
+) -> tuple[FloatArray, FloatArray]:
     """Return mean (T, q) and covariance (T, q, q) of the published state.
 
     All rows contribute to the mean. Only rows with scale >= 1 contribute to the covariance,
@@ -86,8 +104,7 @@ def published_state(known: Known, models: ModelSet) -> tuple[FloatArray, FloatAr
     uncorrelated with all other estimates. The covariance of the mean is then its covariance plus
     the squared difference. If fixes are better, the result is conservative.
     """
-    maps = tuple(part.outputs for part in models.parts)
-    rows, each = known.rows, row_outputs(known.rows, maps)
+    rows, each = known.rows, bursts.row_readings(known.rows, models, burst_end)
     mean, covariance = rows.combine(*each, rows.weight)
     if len(models.scales) > 1:
         own, covariance = rows.combine(*each, weight_without_small_scales(rows))
@@ -115,7 +132,16 @@ def family_extras(known: Known, models: ModelSet) -> dict[str, FloatArray]:
     family = np.eye(len(FAMILIES))[models.families.family]
     out = {f'family_{name}': each @ family[:, k] for k, name in enumerate(FAMILIES)}
     out['hover'] = each @ (models.families.kind == HOVER)
-    out['covariance_scale'] = estimated_scales(known.rows, known.memory['reporting'])
+    rows, T = known.rows, len(known)
+    out['covariance_scale'] = estimated_scales(rows, known.memory['reporting'])
+    off = rows.key['offset'] >= 0
+    weight = np.where(off, rows.weight, 0.0)
+    out['burst'] = rows.total(weight, T)
+    likely = np.where(out['burst'] > 0.5, out['burst'], np.nan)
+    offset = bursts.row_offsets(rows) * weight[:, None]
+    for axis, name in enumerate(('offset_x', 'offset_y')):
+        out[name] = rows.total(offset[:, axis], T) / likely
+    out['rows'] = rows.total(np.ones(len(rows)), T)
     return out
 
 
@@ -162,6 +188,7 @@ def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
         *(assumed if config.has_usual_fix_std else []),
         *fixes,
         *late_warnings(known),
+        *burst_reports.warnings(known, config),
         *clutter.warnings(memory['clutter'], config, tracked),
     ]
     return [

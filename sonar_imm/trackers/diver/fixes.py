@@ -35,62 +35,49 @@ Source: docs/diver.md, 'Association'.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import math
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
-from ...estimation import bank, jipda
+from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.association import assign_fits, gate_threshold, TENTATIVE
-from ...estimation.bank import Innovations
 from ...estimation.rows import (
     Borrowed,
     drop_weightless_rows,
     LEAST_LOG,
     log_sum,
+    normalise_weights,
     reduce_targets,
     restore_rows,
     ROW_LOST,
     Rows,
 )
 from ...measurements import NOBODY
-from .innovations import FixConsistency, whiten_innovations
-from .known import Feature, Known, repair_covariances, row_outputs
+from . import bursts, links, ways
+from .disagreement import begin_disagreement, record_innovations
+from .known import Feature, Known, repair_covariances
 from .models import ModelSet
-from .offsets import RecentPairs
 from .pairs import Association, Assumptions, Pairs
 from .scales import (
     can_restore,
-    estimated_scales,
+    lending,
     protected_rows,
-    weight_without_small_scales,
 )
 from .scan import Group
-from .sensors import MOST_SENSORS
 
 FEATURES = {
-    'nis': Feature(math.nan),
-    'nis_dof': Feature(0, kind=np.uint16),
     'score': Feature(0.0),
-    'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'existence': Feature(math.nan),
     'evidence': Feature(1.0),
-    'reported': Feature(math.nan, (3,)),
 }
-"""nis, nis_dof: of this scan, NaN and 0 without a hit.
-
-score: log-likelihood ratio of the track against clutter over about the last ten scans.
-
-white: whitened innovation of the last fix of each sensor.
+"""score: log-likelihood ratio of the track against clutter over about the last ten scans.
 
 existence: probability that the target exists; NaN for tracks confirmed by hits.
 
 evidence: sum of the detection probabilities of the track.
-
-reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
 """
 
 FAR = 80.0
@@ -100,35 +87,24 @@ bound decreases with the distance, so it still ranks tracks."""
 MAX_TABLE = 1 << 19
 """Largest number of assumptions times fixes that are compared at once."""
 
-MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
-"""Minimum probability of a model that opens the gate. A single assignment needs rare models, or
-it loses tracks in sharp turns; joint association does not."""
-
-MIN_DETECTION_PROBABILITY = 1e-9
-"""Lower bound of the detection probability of a track outside the coverage, because ratios are
-divided by it."""
-
-CONFIRM_EXISTENCE = 0.9
-"""Existence above which a track can be confirmed."""
-
 
 # -- comparison ----------------------------------------------------------------------------------
 
 
-def compare(known: Known, group: Group, models: ModelSet, min_probability: float) -> Pairs:
+def compare(
+    known: Known,
+    group: Group,
+    models: ModelSet,
+    min_probability: float,
+    openers: BoolArray | None = None,
+) -> Pairs:
     """Compare the fixes of a group with rows near them, or with the tracks of the same ID.
 
     :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
+    :param openers: (T,) see `ways.add_ways`.
     """
     among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
-    blocks, parts = known.rows.blocks, models.parts
-    if among.delay.any():
-        every = np.concatenate([np.arange(len(known.rows)), among.lent])
-        blocks = tuple(
-            bank.move_along(block.select(every), part.outputs[2:4], -among.delay)
-            for block, part in zip(blocks, parts)
-        )
-    expected = [bank.predict_fix(b, part.measured) for b, part in zip(blocks, parts)]
+    expected = _predict_fixes(known, among, group.number, models)
     by_nis = models.families is None
     each = [
         _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
@@ -136,7 +112,11 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
     ]
     if len(each) == 1:
         assumption, fix, log, whole, nis = each[0]
-        return Pairs(among, assumption, fix, expected, log, whole, nis)
+        pairs = Pairs(among, assumption, fix, expected, log, whole, nis)
+        if not ways.has_ways(group, models):
+            return pairs
+        pairs = ways.add_ways(known, group, pairs, models, openers)
+        return ways.with_groups(known, pairs)
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
@@ -147,6 +127,27 @@ def compare(known: Known, group: Group, models: ModelSet, min_probability: float
         np.concatenate(whole),
         np.concatenate(nis) if by_nis else None,
     )
+
+
+def _predict_fixes(
+    known: Known, among: Assumptions, sensor: int, models: ModelSet
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return `Pairs.expected` of a sensor."""
+    rows, N = known.rows, len(known.rows)
+    factor, found = ways.offset_factor(rows, sensor), []
+    for block, part in zip(rows.blocks, models.parts):
+        velocity, measured = part.outputs[2:4], part.measured
+        own = bank.move_along(block, velocity, among.moved[:N])
+        each = [bank.predict_fix(own, measured, factor)]
+        if factor is not None:
+            each.append(bank.predict_fix(own, measured, np.zeros(N)))
+        if len(among.lent):
+            lent = bank.move_along(block.select(among.lent), velocity, among.moved[N:])
+            none = None if factor is None else np.zeros(len(among.lent))
+            each.append(bank.predict_fix(lent, measured, none))
+        h, S = zip(*each)
+        found.append((np.concatenate(h), np.concatenate(S)) if len(each) > 1 else each[0])
+    return found
 
 
 def _parts(target: IntArray, fixes: int) -> list[slice]:
@@ -190,7 +191,7 @@ def _compare_part(
     row, scaled = among.row[assumption], R[fix] * among.scale[assumption][:, None, None]
     seen = among.seen[assumption]
     compared = tuple(bank.compare(*each, seen, z[fix], scaled) for each in expected)
-    log = _mixture_log_density(rows.mu[row], compared)
+    log = bank.mixture_log_density(rows.mu[row], compared)
     table = np.square(np.maximum(off, 1.0, out=off), out=off)
     table *= -0.5 * FAR
     table[assumption, fix] = log
@@ -205,17 +206,6 @@ def _compare_part(
     return assumption + part.start, fix, log, whole, nis
 
 
-def _mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> FloatArray:
-    """Return the log density (p,) of each pair over all models. mu: (p, M) model probabilities."""
-    with np.errstate(divide='ignore'):
-        of_models = np.log(mu) + np.concatenate([each.log for each in compared], axis=1)
-        best = of_models.max(axis=1, initial=-np.inf, keepdims=True)
-        safe = np.where(np.isfinite(best), best, 0.0)
-        return np.asarray(
-            (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
-        )
-
-
 def track_log_density(
     rows: Rows, z: FloatArray, R: FloatArray, models: ModelSet, sensor: int
 ) -> float:
@@ -227,7 +217,7 @@ def track_log_density(
         bank.weigh(block, every, *many, part.measured)
         for block, part in zip(rows.blocks, models.parts)
     ]
-    log = rows.logw + _mixture_log_density(rows.mu, compared)
+    log = rows.logw + bank.mixture_log_density(rows.mu, compared)
     return float(log_sum(log, np.zeros(len(rows), np.int64))[0])
 
 
@@ -269,96 +259,7 @@ def gate_log_density(group: Group) -> FloatArray:
     return np.asarray(np.log(group.clutter) + (math.log1p(-p) - math.log(p)))
 
 
-def gate_pairs(group: Group, pairs: Pairs) -> BoolArray:
-    """Return which pairs (T, D) pass the gate."""
-    if pairs.nis is not None:
-        threshold = gate_threshold(group.config.gate_probability, 2)
-        return np.asarray(pairs.nis <= threshold)
-    ratio = 0.0 if group.detection is None else group.detection.log_ratio
-    return np.asarray(pairs.track_log + ratio > gate_log_density(group))
-
-
 # -- association ---------------------------------------------------------------------------------
-
-
-def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group], Known]:
-    """Return the stage that compares and associates fixes: by ID if fixes have IDs, otherwise by
-    `pairing`."""
-    by_density = {'jipda': associate_jipda, 'gnn': associate_gnn}[pairing]
-    min_probability = MIN_MODEL_PROBABILITY[pairing]
-
-    def associate(known: Known, group: Group) -> Known:
-        group.pairs = compare(known, group, models, min_probability)
-        associate_pairs = by_density if group.target_id is None else associate_by_id
-        group.association = associate_pairs(known, group, group.pairs)
-        return known
-
-    return associate
-
-
-def associate_by_id(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Assign each fix to the track of its ID, if it passes the gate."""
-    T, D = pairs.track_log.shape
-    own = known['target_id'][:, None] == group.target_id
-    good = own & np.isfinite(pairs.track_log)
-    if pairs.nis is None:
-        good &= pairs.track_log > gate_log_density(group)
-    fix = np.where(good.any(axis=1), good.argmax(axis=1) if D else -1, -1)
-    free = ~own.any(axis=0)
-    return Association(*_hard_association(fix, D), fix, free, None, known['score'])
-
-
-def associate_gnn(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Select the most likely joint event; confirmed tracks are assigned before tentative
-    tracks."""
-    T, D = pairs.track_log.shape
-    seen, p = group.detection, group.config.detection_probability
-    ratio = 0.0 if seen is None else seen.log_ratio
-    fit = np.where(gate_pairs(group, pairs), pairs.track_log + ratio, -np.inf)
-    clutter = group.config.usual_clutter
-    fix = assign_fits(fit, known.life.status == TENTATIVE, p, clutter)
-    hit = np.flatnonzero(fix >= 0)
-    missed = np.full(T, math.log1p(-p)) if seen is None else np.log1p(-seen.tracks)
-    score = known['score'] + missed
-    score[hit] += fit[hit, fix[hit]] + math.log(p / (1.0 - p)) - math.log(clutter)
-    free = np.ones(D, np.bool_)
-    free[fix[hit]] = False
-    return Association(*_hard_association(fix, D), fix, free, None, score)
-
-
-def _hard_association(fix: IntArray, D: int) -> tuple[FloatArray, FloatArray]:
-    """Return beta (T, D) and missed (T,) of a single assignment. fix (T,): -1 for a miss."""
-    beta = np.zeros((len(fix), D))
-    hit = np.flatnonzero(fix >= 0)
-    beta[hit, fix[hit]] = 1.0
-    return beta, np.where(fix >= 0, 0.0, 1.0)
-
-
-def associate_jipda(known: Known, group: Group, pairs: Pairs) -> Association:
-    """Compute the probabilities of all joint events of tracks and fixes."""
-    T, D = pairs.track_log.shape
-    config, status, seen = group.config, known.life.status, group.detection
-    may = gate_pairs(group, pairs)
-    # With max_tracks confirmed tracks, no fix is attributed to a new target.
-    full = int((status != TENTATIVE).sum()) >= config.max_tracks
-    ratio = np.exp(pairs.track_log) / (group.clutter + (0.0 if full else group.birth_density))
-    detected = np.full(T, config.detection_probability)
-    if seen is not None:
-        detected = np.maximum(seen.tracks, MIN_DETECTION_PROBABILITY)
-        ratio = ratio * seen.fixes / detected[:, None]
-    looked = group.is_complete | may.any(axis=1)
-    before = known['existence']
-    # The existence of tracks from pings and starts is unknown.
-    guess = np.where(status == TENTATIVE, 0.5, CONFIRM_EXISTENCE)
-    before = np.where(np.isnan(before), guess, before)
-    beta, missed, after = jipda.associate(ratio, may, before, np.where(looked, detected, 0.0))
-    hit = beta.sum(axis=1) > 0.5 * after
-    fix = np.where(hit, beta.argmax(axis=1), -1) if D else np.full(T, -1)
-    claimed = beta.sum(axis=0)
-    new = group.birth_density
-    birth = new / (new + group.clutter) * (1.0 - claimed)
-    score = jipda.log_odds(after)
-    return Association(beta, missed, fix, claimed < 0.5, birth, score, True)
 
 
 # -- update --------------------------------------------------------------------------------------
@@ -376,12 +277,13 @@ def update_stage(
         association, pairs = group.association, group.pairs
         assert association is not None and pairs is not None
         rejected = _rejected_fixes(known, group, association, pairs) if has_scales else None
-        known = _record_innovations(known, group, association, models)
+        known = record_innovations(known, group, models)
         columns = {'score': association.score}
         if association.is_joint:
             # Tracks with an ID live by the hits of their own fixes.
             named = known['target_id'] != NOBODY
-            columns['existence'] = np.where(named, known['existence'], association.exists)
+            after = association.exists / association.held
+            columns['existence'] = np.where(named, known['existence'], after)
             columns['evidence'] = known['evidence'] + association.beta.sum(axis=1)
         known = known.with_columns(**columns)
         if rejected is None and not (association.beta > 0.0).any():
@@ -407,19 +309,44 @@ def update_tracks(
     among = pairs.among
     exists = np.where(association.exists > 0.0, association.exists, 1.0)
     missed = np.where(association.beta.any(axis=1), association.missed / exists, 1.0)
-    track = among.target[pairs.assumption]
-    weight = association.beta[track, pairs.fix] / exists[track]
+    beta, logs, of = association.beta / exists[:, None], pairs.track_log, among.target
+    groups = pairs.groups
+    if groups is not None and association.group_beta is not None:
+        beta = association.group_beta / exists[groups.target][:, None]
+        heavy = np.where(groups.weight > 0.0, groups.weight, 1.0)
+        missed = np.asarray(association.group_missed) / heavy / exists[groups.target]
+        logs, of = groups.log, groups.of
+    weight = beta[of[pairs.assumption], pairs.fix]
     used = np.flatnonzero((weight > 0.0) & (pairs.log > -np.inf))
     assumption, weight = pairs.assumption[used], weight[used]
-    whole = pairs.track_log[track[used], pairs.fix[used]]
+    whole = logs[of[assumption], pairs.fix[used]]
     gain = np.bincount(assumption, weight * np.exp(pairs.log[used] - whole), len(among.row))
-    factor: FloatArray = np.add(missed[among.target], gain)
+    factor: FloatArray = np.add(missed[of], gain)
     weighed = np.asarray(association.beta.any(axis=1))
     if rejected is not None:
         factor *= _rejected_factor(pairs, *rejected)
         weighed = weighed | (rejected[1] > 0.0)
-    rows, borrowed = _update_weights(known, among, factor)
-    rows, borrowed, left = drop_weightless_rows(rows, borrowed, protected_rows(rows))
+    sensor = group.number
+    of_row = np.empty(len(known.rows), np.int64)
+    of_row[among.row[among.has_row]] = of[among.has_row]
+    rows, borrowed, of_ways = _update_weights(known, pairs, factor, beta, logs, of_row)
+    began = None
+    if pairs.ways is not None:
+        of_ways = links.weights_of_ways(known, group, pairs.ways, of_ways, association)
+        began = bursts.begin_rows(
+            known,
+            group,
+            pairs.ways,
+            of_ways,
+            links.links_of_fixes(known, group),
+            models,
+            estimated,
+        )
+    if ways.has_ways(group, models) and ways.is_alone(group):
+        apart = begin_disagreement(known, group, models, estimated)
+        began = apart if began is None else began if apart is None else began.append(apart)
+    stays = protected_rows(rows) | bursts.divided(rows, began)
+    rows, borrowed, left = drop_weightless_rows(rows, borrowed, stays)
     # Pairs of the remaining rows, in row order.
     place = np.full(len(known.rows), -1)
     place[left] = np.arange(len(left))
@@ -428,19 +355,29 @@ def update_tracks(
     row, weight, whole = row[own], weight[own, None], whole[own, None]
     assumption, fix = assumption[own], pairs.fix[used[own]]
     z, R = group.z[fix], group.R[fix] * among.scale[assumption][:, None, None]
-    blocks, factors, late = [], [], rows.key['delay'][:, group.number]
+    blocks, factors = [], []
+    offset, late = ways.offset_factor(rows, sensor), rows.key['delay'][:, sensor]
     each = zip(rows.blocks, models.parts, pairs.expected, estimated)
     for block, part, expected, mask in each:
         innovations = bank.compare(*expected, among.seen[assumption], z, R)
         block = bank.move_along(block, part.outputs[2:4], -late)
-        ratio, none = weight * np.exp(innovations.log - whole), missed[rows.target]
-        block, factor = bank.update(block, innovations, row, ratio, none, part.measured, mask)
+        ratio, none = weight * np.exp(innovations.log - whole), missed[of_row[left]]
+        mask = bursts.with_tail_mask(mask, rows.tail)
+        block, of_models = bank.update(
+            block, innovations, row, ratio, none, part.measured, mask, offset
+        )
         blocks.append(bank.move_along(block, part.outputs[2:4], late))
-        factors.append(factor)
-    sound, repairs = repair_covariances(tuple(blocks))
+        factors.append(of_models)
+    sound, repairs = repair_covariances(tuple(blocks), rows.tail)
     rows, _ = rows.replace(blocks=sound).multiply_models(np.concatenate(factors, axis=1))
     again = can_restore(rows, borrowed) & weighed[borrowed.target]
-    rows, borrowed = restore_rows(rows, borrowed, again)
+    last = association.fix if rejected is None else np.maximum(association.fix, rejected[0])
+    lend = lending(models, group, last)
+    rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lend)
+    took = association.beta.sum(axis=1) > 0.5 * exists
+    rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
+    if pairs.ways is not None or began is not None or rows.tail:
+        rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
 
 
@@ -485,74 +422,50 @@ def _rejected_factor(pairs: Pairs, nearest: IntArray, share: FloatArray) -> Floa
     return np.asarray(1.0 - share[among.target] + gain, np.float64)
 
 
-def _update_weights(known: Known, among: Assumptions, factor: FloatArray) -> tuple[Rows, Borrowed]:
-    """Multiply the weights of all assumptions by `factor` (A,).
+def _join_rows(rows: Rows, borrowed: Borrowed, began: Rows | None) -> tuple[Rows, Borrowed]:
+    """Add new rows of offsets, and remove rows of negligible weight.
 
     Return the rows and the borrowed list.
     """
+    rows = bursts.merge_rows(rows if began is None else rows.append(began))
+    rows, borrowed = bursts.drop_rows(rows, borrowed, protected_rows(rows))
+    return normalise_weights(bursts.without_unused_tail(rows), borrowed)
+
+
+def _update_weights(
+    known: Known,
+    pairs: Pairs,
+    factor: FloatArray,
+    beta: FloatArray,
+    logs: FloatArray,
+    of_row: IntArray,
+) -> tuple[Rows, Borrowed, FloatArray]:
+    """Multiply the weights of all assumptions by `factor` (A,).
+
+    Return the rows, the borrowed list, and the log weights (E,) of the rows that ways lead to.
+
+    :param beta: (G, D) probability of each pair of a group, if the target exists.
+    :param logs: (G, D) log density of each pair.
+    :param of_row: (N,) group of each row; without links, the track.
+    """
+    among, ways, of_ways = pairs.among, pairs.ways, np.empty(0)
     with np.errstate(divide='ignore'):
         logw = among.logw + np.log(factor)
-    logw = np.maximum(logw - log_sum(logw, among.target)[among.target], LEAST_LOG)
+        every, target = logw, among.target
+        if ways is not None:
+            track = known.rows.target[ways.row]
+            of = of_row[ways.row]
+            of_ways = known.rows.logw[ways.row] + ways.log - logs[of, ways.fix]
+            of_ways = of_ways + np.log(beta[of, ways.fix])
+            target = np.concatenate([target, track])
+            order = np.argsort(target, kind='stable')
+            every, target = np.concatenate([every, of_ways])[order], target[order]
+    total = log_sum(every, target)
+    logw = np.maximum(logw - total[among.target], LEAST_LOG)
+    if ways is not None:
+        of_ways = of_ways - total[track]
     rows, borrowed = known.rows, known.borrowed
     of_rows, of_list = np.empty(len(rows)), np.empty(len(borrowed))
     of_rows[among.row[among.has_row]] = logw[among.has_row]
     of_list[np.argsort(borrowed.target, kind='stable')] = logw[~among.has_row]
-    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list)
-
-
-def _record_innovations(
-    known: Known, group: Group, association: Association, models: ModelSet
-) -> Known:
-    """Store the whitened innovations of associated fixes, and update the covariance checks."""
-    if len(group.z):
-        known = _with_consistency(
-            known,
-            group,
-            known.memory['fixes']
-            .of(group.number)
-            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
-        )
-    tracks = np.flatnonzero(association.hit)
-    if not len(tracks):
-        return known
-    fix = association.fix[tracks]
-    seen = tuple(part.fix_matrix for part in models.parts)
-    rows, late = known.rows, known.rows.key['delay'][:, group.number]
-    each = zip(rows.blocks, models.parts)
-    moved = tuple(bank.move_along(block, part.outputs[2:4], -late) for block, part in each)
-    mean, covariance = rows.combine(
-        *row_outputs(rows.replace(blocks=moved), seen), weight_without_small_scales(rows)
-    )
-    scale = (
-        estimated_scales(known.rows, group.number)[tracks]
-        if len(models.scales) > 1
-        else np.ones(len(tracks))
-    )
-    R = group.R[fix] * scale[:, None, None]
-    tentative = (known.life.status == TENTATIVE)[tracks]
-    before: FixConsistency = known.memory['fixes'].of(group.number)
-    white, after = whiten_innovations(
-        mean[tracks],
-        covariance[tracks],
-        group.z[fix],
-        R,
-        known['white'][tracks, group.number],
-        tentative,
-        before,
-    )
-    after = after.with_scale(scale, tentative)
-    columns = {name: known[name].copy() for name in ('white', 'nis', 'nis_dof', 'reported')}
-    columns['white'][tracks, group.number] = white
-    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
-    columns['nis'][tracks] += np.square(white).sum(axis=1)
-    columns['nis_dof'][tracks] += np.uint16(2)
-    # With fixes, no instrument errors are assumed.
-    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
-        recent=RecentPairs()
-    )
-
-
-def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
-    """Return the state with the consistency of the sensor of a group."""
-    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
-    return known.with_memory(fixes=fixes)
+    return rows.replace(logw=of_rows), evolve(borrowed, logw=of_list), of_ways

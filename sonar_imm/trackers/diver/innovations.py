@@ -212,13 +212,10 @@ class SensorConsistency(NamedTuple):
     @property
     def together(self) -> FixConsistency:
         """The sums over all sensors."""
-        if len(self.sensors) == 1:
-            return self.sensors[0]
-        number, nis, pairs, cross, square = (
-            (float(sum(column)) for column in zip(*(each[:5] for each in self.sensors)))
-            if self.sensors
-            else (0.0,) * 5
-        )
+        if len(self.sensors) < 2:
+            return self.of(0)
+        sums = np.sum([each[:5] for each in self.sensors], axis=0)
+        number, nis, pairs, cross, square = sums.tolist()
         return FixConsistency(number, nis, pairs, cross, square)
 
     @property

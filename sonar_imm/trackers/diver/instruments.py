@@ -135,7 +135,8 @@ class Layout:
         return self.n + len(self.variances)
 
     def estimated_masks(self, models: ModelSet) -> tuple[BoolArray | None, ...]:
-        """Return `mask` for the components of each block; None if an update may change all."""
+        """Return `mask` for the components of each block, without tail; None if an update may
+        change all."""
         if self.mask.all():
             return (None,) * len(models.parts)
         return tuple(self.mask[part.indices(self.n, self.size)] for part in models.parts)
@@ -172,8 +173,8 @@ class Layout:
         return wide, covariance
 
     def rows_with_new_constants(self, rows: Rows, models: ModelSet) -> Rows:
-        """Append new constants at their prior to rows."""
-        known = rows.blocks[0].x.shape[1] - len(models.parts[0].components)
+        """Append new constants at their prior to rows, before their tail."""
+        known = rows.blocks[0].x.shape[1] - len(models.parts[0].components) - rows.tail
         new = self.variances[known:]
         if not len(new):
             return rows
@@ -182,8 +183,9 @@ class Layout:
             N, n, m = x.shape
             wide = np.zeros((N, n + len(new), m))
             covariance = np.zeros((N, n + len(new), n + len(new), m))
-            wide[:, :n], covariance[:, :n, :n] = x, P
-            at = range(n, n + len(new))
+            at = np.arange(len(new)) + n - rows.tail
+            old = np.delete(np.arange(n + len(new)), at)
+            wide[:, old], covariance[:, old[:, None], old] = x, P
             covariance[:, at, at] = new[:, None]
             blocks.append(Gaussians(wide, covariance))
         return rows.replace(blocks=tuple(blocks))

@@ -36,7 +36,8 @@ from ...estimation.association import Tracks
 from ...estimation.bank import Gaussians
 from ...estimation.covariance import are_sound, with_jitter
 from ...estimation.rows import Borrowed, Rows
-from .models import ModelSet
+from .config import DiverConfig
+from .models import ModelSet, VELOCITY
 
 BORROWING = ('scale', 'delay')
 """Assumptions that can borrow (`estimation.rows`)."""
@@ -164,7 +165,7 @@ class Known:
         """
         rows, T = self.rows, len(self)
         sizes = {
-            block.x.shape[1] - there.x.shape[1]
+            block.x.shape[1] - there.x.shape[1] - rows.tail
             for block, there in zip(rows.blocks, other.rows.blocks)
         }
         good = (
@@ -172,6 +173,7 @@ class Known:
             and sizes in ({0}, {constants})
             and all(len(column) == T for column in self.features.values())
             and all(len(column) == len(rows) for column in rows.key.values())
+            and all(len(column) == len(self.borrowed) for column in self.borrowed.key.values())
             and np.array_equal(np.unique(rows.target), np.arange(T))
             and bool((np.diff(rows.target) >= 0).all() and (rows.parent >= -1).all())
             and bool(np.isin(self.borrowed.target, rows.target).all())
@@ -220,11 +222,19 @@ def track_positions(known: Known, models: ModelSet) -> tuple[FloatArray, FloatAr
     return track_outputs(known.rows, tuple(part.outputs[:2] for part in models.parts))
 
 
-def repair_covariances(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, ...], int]:
+def repair_covariances(
+    blocks: tuple[Gaussians, ...], tail: int = 0
+) -> tuple[tuple[Gaussians, ...], int]:
     """Return blocks with valid covariances, and the number of repairs.
 
     Other covariances stay bit-identical (`estimation.covariance`).
+
+    :param tail: number of last components, which are nil in some rows.
     """
+    if tail:
+        nil = np.all([block.P[:, -tail:, -tail:] == 0.0 for block in blocks][0], axis=(1, 2, 3))
+        if nil.any():
+            return _repair_in_groups(blocks, tail, nil)
     found, count = [], 0
     for block in blocks:
         P = block.P.transpose(1, 2, 0, 3)
@@ -236,6 +246,23 @@ def repair_covariances(blocks: tuple[Gaussians, ...]) -> tuple[tuple[Gaussians, 
             block = Gaussians(block.x, covariance)
             count += int(np.isfinite(P[:, :, row, model]).all(axis=(0, 1)).sum())
         found.append(block)
+    return tuple(found), count
+
+
+def _repair_in_groups(
+    blocks: tuple[Gaussians, ...], tail: int, nil: BoolArray
+) -> tuple[tuple[Gaussians, ...], int]:
+    """Repair rows whose last components are `nil` (N,) without these, and the other rows."""
+    found = [Gaussians(x.copy(), P.copy()) for x, P in blocks]
+    count = 0
+    for chosen, size in ((nil, tail), (~nil, 0)):
+        some = np.flatnonzero(chosen)
+        own = [slice(0, x.shape[1] - size) for x, _ in blocks]
+        part = tuple(Gaussians(x[some][:, n], P[some][:, n, n]) for (x, P), n in zip(blocks, own))
+        sound, repairs = repair_covariances(part)
+        count += repairs
+        for whole, (_, P) in zip(found, sound):
+            whole.P[some, : P.shape[1], : P.shape[1]] = P
     return tuple(found), count
 
 
@@ -272,10 +299,17 @@ def predict_over(
     per_row = transition if len(transition) == 1 else transition[rows.target]
     steps = []
     for _ in range(count):
-        blocks, mu = bank.mix(models.bank, rows.blocks, rows.mu, per_row)
+        blocks, mu = bank.mix(models.bank, rows.blocks, rows.mu, per_row, rows.tail)
         moved = tuple(bank.predict(block, each) for block, each in zip(blocks, moves))
-        moved, repairs = repair_covariances(moved)
+        moved, repairs = repair_covariances(moved, rows.tail)
         mu = mu / mu.sum(axis=1, keepdims=True) if len(mu) else mu
         rows = rows.replace(blocks=moved, mu=mu, parent=np.arange(len(rows)))
         steps.append(Prediction(rows, transition, dt / count, repairs))
     return steps
+
+
+def with_velocities_at_fix(P: FloatArray, models: ModelSet, config: DiverConfig) -> None:
+    """Set the velocity variance of tracks started at a fix: P (..., M, n, n), in place."""
+    if models.families is not None:
+        moving = np.flatnonzero(models.families.kind == VELOCITY)
+        P[..., moving, 2, 2] = P[..., moving, 3, 3] = config.velocity_std_at_fix**2

@@ -94,6 +94,25 @@ SPEED_MEMORY = 60.0
 for minutes is estimated as slowly swimming, also when it moves on."""
 
 
+NO_OFFSET: dict[str, int | bool] = {
+    'offset': -1,
+    'since': 0,
+    'took': 0,
+    'taken': 1,
+    'fixes': 0,
+    'others': 0,
+    'aside': False,
+    'link': 0,
+}
+"""Assumptions of a new row about offsets (`bursts`).
+
+offset: number of the sensor whose fixes are off, -1 for none; since: stamp of the first of them;
+took: stamp of the last fix that the row used, 0 for none; taken: number of fixes before;
+fixes: number of fixes of the sensor since; others: of other sensors; aside: whether its last fix
+was an outlier; link: ID of the track that the row excludes, 0 for none.
+"""
+
+
 class Families(NamedTuple):
     """Properties of models with unequal states."""
 
@@ -280,6 +299,7 @@ class ModelSet:
                 'scale': of_sensor(np.tile(scale, T), sensor),
                 'delay': np.zeros((T * K, MOST_SENSORS)),
                 'start': np.tile(start, T),
+                **{name: np.full(T * K, value) for name, value in NO_OFFSET.items()},
                 'side': np.zeros(T * K, np.int64),
             },
         )
@@ -491,7 +511,7 @@ def _build_families(config: DiverConfig) -> ModelSet:
             markov.RateChain(models.chain.matrix, T).generator for models in (steady, brisk)
         ]
         generators += [rates, np.zeros((len(QUIET), len(QUIET)))]
-        generator = family_generator(family, generators, config.family_switch_rate)
+        generator = markov.family_generator(family, generators, config.family_switch_rate)
         chain = markov.RateChain.of_generator(generator, T)
     if config.initial_probabilities:
         initial = initial_probabilities(config, M)
@@ -510,28 +530,6 @@ def _build_families(config: DiverConfig) -> ModelSet:
         # With depth as a state, rows are depth hypotheses instead of scaled filters.
         scales=(1.0,) if config.dimensions == 3 else tuple(sorted({*config.covariance_scales})),
     )
-
-
-def family_generator(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatArray:
-    """Return the generator (M, M) of the chains of all families.
-
-    The rate between two families is `rate` / 3, spread evenly over the models. Between the first
-    two families the index in the family is kept.
-    """
-    size = np.bincount(family)
-    out = np.asarray(rate / 3.0 / size[family][None] * (family[:, None] != family[None]))
-    count = int(size[0])
-    for a, b in ((0, 1), (1, 0)):
-        kept = slice(a * count, (a + 1) * count), slice(b * count, (b + 1) * count)
-        out[kept] = rate / 3.0 * np.eye(count)
-    first = 0
-    for block in blocks:
-        own = slice(first, first + len(block))
-        out[own, own] = block
-        first += len(block)
-    np.fill_diagonal(out, 0.0)
-    np.fill_diagonal(out, -out.sum(axis=1))
-    return out
 
 
 # -- depth, and errors of fixes ------------------------------------------------------------------

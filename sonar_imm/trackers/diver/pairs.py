@@ -22,7 +22,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, Rows
-from .sensors import scale_of
+from .sensors import lent_moves, scale_of
 
 
 class Assumptions(NamedTuple):
@@ -42,26 +42,30 @@ class Assumptions(NamedTuple):
     """(A,) True for assumptions with a row of their own, False for borrowed ones."""
     lent: IndexArray
     """(L,) row of each prediction beyond those of the rows, see `seen`."""
-    delay: FloatArray
-    """(N + L,) delay of the stamps of the sensor in each prediction, s."""
+    moved: FloatArray
+    """(N + L,) time over which each prediction moves along the velocity to the time of the fixes,
+    s."""
 
     @classmethod
     def from_rows(cls, rows: Rows, borrowed: Borrowed, sensor: int) -> Assumptions:
         """Return the assumptions of rows and of the borrowed list about a sensor."""
-        N, scale, delay = len(rows), scale_of(rows.key, sensor), rows.key['delay'][:, sensor]
+        N, scale, moved = len(rows), scale_of(rows.key, sensor), -rows.key['delay'][:, sensor]
         every, none = np.arange(N), np.empty(0, np.intp)
         if not len(borrowed):
             has_row = np.ones(N, np.bool_)
-            return cls(every, every, scale, rows.logw, rows.target, has_row, none, delay)
+            return cls(every, every, scale, rows.logw, rows.target, has_row, none, moved)
         target = np.concatenate([rows.target, borrowed.target])
         order = np.argsort(target, kind='stable')
-        lender, its = borrowed.find_lenders(rows), borrowed.key['delay'][:, sensor]
-        seen, other = lender.copy(), np.flatnonzero(its != delay[lender])
+        lender = borrowed.find_lenders(rows)
+        its = lent_moves(rows.key, lender, borrowed.key) - borrowed.key['delay'][:, sensor]
+        # A borrowed assumption has no offset.
+        nil = N if rows.tail else 0
+        seen, other = lender + nil, np.flatnonzero(its != moved[lender])
         lent, late = lender[other], its[other]
         if len(other):
-            # One prediction for each row and delay.
+            # One prediction for each row and time.
             pairs, place = np.unique(np.column_stack([lent, late]), axis=0, return_inverse=True)
-            seen[other] = N + place.ravel()
+            seen[other] = N + nil + place.ravel()
             lent, late = pairs[:, 0].astype(np.intp), pairs[:, 1]
         return cls(
             np.concatenate([every, lender])[order],
@@ -71,7 +75,7 @@ class Assumptions(NamedTuple):
             target[order],
             order < N,
             lent,
-            np.concatenate([delay, late]),
+            np.concatenate([moved, late]),
         )
 
     def select(self, part: slice) -> Assumptions:
@@ -86,6 +90,43 @@ class Assumptions(NamedTuple):
         )
 
 
+OPEN, NOBODYS, LEAVE = range(3)
+"""Ways of a fix: an offset begins, the fix is an outlier, an offset ends."""
+
+
+class Ways(NamedTuple):
+    """Further ways in which E pairs of a row and a fix are read, see `bursts`."""
+
+    row: IndexArray
+    """(E,) index of the row."""
+    fix: IndexArray
+    """(E,) index of the fix."""
+    way: IntArray
+    """(E,) `OPEN`, `NOBODYS` or `LEAVE`."""
+    variance: FloatArray
+    """(E,) variance of a new offset, m^2."""
+    log: FloatArray
+    """(E,) log density of the fix in this way, with the log prior of the way."""
+    direct: FloatArray
+    """(T, D) share of the density of a fix under a track that has the fix at the target, or at the
+    offset it had."""
+
+
+class Groups(NamedTuple):
+    """G groups of the assumptions of T tracks: all without a link, then each linked row."""
+
+    of: IntArray
+    """(A,) group of each assumption; those without a link are in the group of their track."""
+    target: IntArray
+    """(G,) track."""
+    link: IntArray
+    """(G,) track that the group excludes; -1 for none."""
+    weight: FloatArray
+    """(G,) weight of the rows of the group, if the target exists."""
+    log: FloatArray
+    """(G, D) logarithm of the density of each fix, times this weight."""
+
+
 class Pairs(NamedTuple):
     """Comparison of D fixes with assumptions, as p pairs in order of the assumptions."""
 
@@ -95,14 +136,25 @@ class Pairs(NamedTuple):
     fix: IndexArray
     """(p,) index of the fix."""
     expected: list[tuple[FloatArray, FloatArray]]
-    """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows, then
-    of the L rows of `Assumptions.lent` with another delay."""
+    """Predictions of a fix, for each block of models, see `bank.predict_fix`: of the N rows; where
+    rows have offsets, of the N rows without them; and of the L rows of `Assumptions.lent`, at
+    another time and without an offset."""
     log: FloatArray
     """(p,) log density of the fix under the assumption."""
     track_log: FloatArray
     """(T, D) log density of each fix under each track."""
     nis: FloatArray | None
     """(T, D) smallest NIS of any model; None for density gating."""
+    ways: Ways | None = None
+    """Further ways of the fixes; None for none."""
+    groups: Groups | None = None
+    """Groups of assumptions; None if no row is linked."""
+
+    @property
+    def direct(self) -> FloatArray | float:
+        """Return the share (T, D) of the density that has the fix at the target, or at the offset
+        it had."""
+        return 1.0 if self.ways is None else self.ways.direct
 
 
 class Association(NamedTuple):
@@ -122,6 +174,14 @@ class Association(NamedTuple):
     """(T,) new score of each track."""
     is_joint: bool = False
     """True if existence follows from the probabilities."""
+    direct: FloatArray | float = 1.0
+    """(T, D) see `Ways`."""
+    group_beta: FloatArray | None = None
+    """(G, D) probability of each pair of a group; None without groups."""
+    group_missed: FloatArray | None = None
+    """(G,) probability that the target exists as in the group, and was not detected."""
+    held: FloatArray | float = 1.0
+    """(T,) probability that no linked row excludes the track."""
 
     @property
     def hit(self) -> BoolArray:
@@ -130,8 +190,13 @@ class Association(NamedTuple):
 
     @property
     def claimed(self) -> FloatArray:
-        """(D,) probability that the fix belongs to any track."""
-        return np.asarray(self.beta.sum(axis=0))
+        """(D,) probability that the fix is at any track, or at the offset it had."""
+        return np.asarray((self.beta * self.direct).sum(axis=0))
+
+    @property
+    def taken(self) -> BoolArray:
+        """(T,) True if the rows of a track have taken a fix in any way."""
+        return np.asarray(self.beta.sum(axis=1) > 0.5 * self.exists)
 
     @property
     def exists(self) -> FloatArray:

@@ -32,11 +32,11 @@ from ...estimation import jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, TENTATIVE, TrackRules, Tracks
 from ...measurements import nanoseconds, NOBODY
-from . import names
+from . import links, names
 from .config import DiverConfig
-from .fixes import CONFIRM_EXISTENCE
 from .known import Feature, Known, track_positions
 from .models import ModelSet
+from .pairing import CONFIRM_EXISTENCE
 from .scan import Group, Scan
 
 END_EXISTENCE = 0.002
@@ -93,6 +93,10 @@ def pruning_stage(
         rejected = known['rejected'][:, 0] == known.stamp_ns
         if covered:
             looked, rejected, known = _weigh_misses(known, hit, looked, rejected)
+        # Rows that take a fix as an outlier, or as the first of a burst, are not missed.
+        for group in scan.fixes:
+            if group.association is not None:
+                looked = looked & ~(group.association.taken & ~hit)
         looked = looked | rejected
         by_existence = np.isfinite(known['existence'])
         life, kept = known.life.scan(hit, known.stamp_ns, rules, looked=looked & ~by_existence)
@@ -185,7 +189,8 @@ def update_status(
     :param looked: (T,) True if a detection was possible.
     """
     was, existence = known.life.status != TENTATIVE, known['existence']
-    confirmed = was | (existence > CONFIRM_EXISTENCE) & (known['evidence'] >= CONFIRM_EVIDENCE)
+    likely = links.existence_beside_bursts(known) > CONFIRM_EXISTENCE
+    confirmed = was | likely & (known['evidence'] >= CONFIRM_EVIDENCE)
     alive = ~(existence < known['least_existence'])
     status = track_status(known.life.status, confirmed, hit, looked)
     if not looked.any():

@@ -29,10 +29,9 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
 from ...estimation.rows import Rows
-from . import fixes
-from .births import with_velocities_at_fix
+from . import fixes, ways
 from .instruments import Layout
-from .known import Feature, Known, predict_over, track_outputs, track_positions
+from .known import Feature, Known, predict_over, track_outputs, with_velocities_at_fix
 from .models import ModelSet
 from .scan import Group
 
@@ -68,9 +67,8 @@ def restart_stage(
 def restart_lost_tracks(
     known: Known, group: Group, models: ModelSet, chain: AdaptiveChain, layout: Layout
 ) -> tuple[Known, bool]:
-    """Restart tracks whose last two rejected fixes agree with each other.
-
-    A track outside the coverage restarts if the target can have reached the fix.
+    """Restart tracks whose last two rejected fixes agree with each other, if the target can have
+    reached the fix.
 
     :returns: the new state, and whether any track restarted.
     """
@@ -78,7 +76,7 @@ def restart_lost_tracks(
     assert association is not None and group.pairs is not None
     if not len(known):
         return known, False
-    hit, firm = association.hit, known.life.status != TENTATIVE
+    hit, firm = association.hit | association.taken, known.life.status != TENTATIVE
     left = association.beta[firm].sum(axis=0) < 0.5
     if association.is_joint and seen is not None:
         hit = hit | ~seen.is_outside
@@ -89,11 +87,8 @@ def restart_lost_tracks(
     for track, row in _rejected_fixes(known, group, hit, left, group.pairs.track_log):
         z, R, new = group.z[row], group.R[row], None
         hidden = seen is not None and seen.is_outside[track]
-        lost = (
-            _can_reach(known, track, z, group, models)
-            if hidden
-            else _may_be_lost(known, track, group)
-        )
+        lost = hidden or _may_be_lost(known, track, group)
+        lost = lost and _can_reach(known, track, z, R, group, models)
         if np.isfinite(rejected[track, 0]) and lost:
             new = restarted_track(known, track, rejected[track], row, group, models, chain, layout)
         rejected = rejected.copy()
@@ -142,12 +137,15 @@ def _may_be_lost(known: Known, track: int, group: Group) -> bool:
     return bool(missed ** (before + 1) <= LOST)
 
 
-def _can_reach(known: Known, track: int, z: FloatArray, group: Group, models: ModelSet) -> bool:
-    """Return whether the target can have moved to z (2,) since its last hit."""
-    mean, _ = track_positions(known, models)
+def _can_reach(
+    known: Known, track: int, z: FloatArray, R: FloatArray, group: Group, models: ModelSet
+) -> bool:
+    """Return whether the target can have moved to z (2,), R (2, 2) since its last hit."""
+    outputs = tuple(part.outputs for part in models.parts)
+    mean, _ = track_outputs(known.track_rows(track), outputs)
     passed = (known.stamp_ns - int(known.life.last_hit_ns[track])) * 1e-9
-    fastest = group.config.speed_mean + 3.0 * group.config.speed_std
-    return bool(np.hypot(*(z - mean[track])) <= fastest * passed)
+    fastest = ways.fastest_speed(mean[0, ways.velocity_outputs(models)], group.config)
+    return bool(np.hypot(*(z - mean[0, :2])) <= fastest * passed + 3.0 * math.sqrt(np.trace(R)))
 
 
 def restarted_track(

@@ -35,12 +35,13 @@ from collections.abc import Callable, Sequence
 from attrs import evolve
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation import bank
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.rows import Borrowed, ROW_AGAIN, ROW_LOST, Rows
-from .known import Known, track_positions
+from .known import Known, track_positions, with_velocities_at_fix
 from .models import ModelSet, USUAL_SCALES
 from .scan import Group
-from .sensors import scale_of
+from .sensors import lent_moves, scale_of
 
 REDISTRIBUTED_FRACTION = 5e-4
 """Fraction of the scale weights that is redistributed at each scan, so that a change of the fix
@@ -61,6 +62,9 @@ FARTHEST_HEARD = 400.0
 
 DELAYED = 1e-3
 """Prior of any delay of a sensor."""
+
+YOUNG, FAR_SCALE = 6, 20.0
+"""Number of fixes of a young track, and ratio of scales above which its state is not lent."""
 
 RARE = 1e-3
 """Prior of the first scale beyond `USUAL_SCALES`, relative to the priors of those. Beyond, the
@@ -90,8 +94,12 @@ class _Entries:
         """(E,) whether the track heard other sensors."""
         self.context = self.target
         """(E,) number of the target and of all assumptions except `name` of the sensor."""
-        if several.any():
-            parts = [self.target[:, None]]
+        # A borrowed assumption has no offset.
+        off = [np.append(rows.key[each], np.zeros(len(borrowed))) for each in ('since', 'aside')]
+        self.is_plain = (off[0] == 0) & (off[1] == 0)
+        """(E,) True for entries without an offset."""
+        if several.any() or not self.is_plain.all():
+            parts = [self.target[:, None], *(each[:, None] for each in off)]
             for each, table in self.key.items():
                 parts.append(np.delete(table, sensor, axis=1) if each == name else table)
             whole = np.concatenate(parts, axis=1)
@@ -169,7 +177,44 @@ def redistribute_weights(
     late = np.zeros(len(known), np.bool_)
     for table in (known.rows, known.borrowed):
         late[table.target[table.key['delay'][:, sensor] > 0.0]] = True
-    return _redistribute(known, 'delay', sensor, ladder, prior, ~late)
+    known = _redistribute(known, 'delay', sensor, ladder, prior, ~late)
+    return _with_delays_beside_offsets(known, ladder[1:], sensor)
+
+
+def _with_delays_beside_offsets(known: Known, delays: FloatArray, sensor: int) -> Known:
+    """Return the state in which a delay has at least its prior beside each row with an offset.
+
+    While a target keeps its course, an offset and a delay explain the same fixes. A turn decides,
+    maybe long after.
+    """
+    rows, borrowed = known.rows, known.borrowed
+    best = np.maximum.reduceat(rows.logw, rows.first)[rows.target]
+    off = (rows.key['offset'] >= 0) & ~rows.key['delay'].any(axis=1)
+    off &= (rows.key['scale'][:, sensor] > 0.0) & (rows.logw > best + np.log(NEAR_WEIGHT))
+    chosen = np.flatnonzero(off)
+    if not len(chosen):
+        return known
+    own = np.repeat(chosen, len(delays))
+    new = Borrowed.from_rows(rows.select(own), borrowed.key)
+    new.key['delay'][:, sensor] = np.tile(delays, len(chosen))
+    new = evolve(new, logw=rows.logw[own] + np.log(DELAYED / len(delays)))
+    place = {each: k for k, each in enumerate(_names(borrowed))}
+    held = {each for each, plain in zip(_names(rows), rows.key['offset'] < 0) if plain}
+    logw, fresh = borrowed.logw.copy(), np.ones(len(new), np.bool_)
+    for k, each in enumerate(_names(new)):
+        if each in place:
+            logw[place[each]] = max(logw[place[each]], new.logw[k])
+        fresh[k] = each not in place and each not in held
+        held.add(each)
+    lengthened = evolve(borrowed, logw=logw).append(new.select(fresh))
+    return known.replace(borrowed=_without_least(lengthened))
+
+
+def _names(table: Rows | Borrowed) -> list[bytes]:
+    """Return a name of the target and of the assumptions that can borrow, of each entry."""
+    key = table.key
+    each = np.column_stack([table.target, key['scale'], key['delay']]).astype(np.float64)
+    return [row.tobytes() for row in each]
 
 
 def _redistribute(
@@ -183,12 +228,13 @@ def _redistribute(
     """Redistribute the weights of one assumption; arguments as in `_Entries.lacking`."""
     rows, borrowed = known.rows, known.borrowed
     entries = _Entries(rows, borrowed, name, sensor)
-    can = entries.heard
+    can = entries.heard & entries.is_plain
     if name == 'delay':
         others = np.delete(entries.key['delay'], sensor, axis=1)
         can = can & entries.has_others & ~others.any(axis=1)
-    lacking = entries.lacking(name, sensor, values, prior, can, new)
-    if len(lacking):
+    complete = len(values) * (int(entries.context.max(initial=-1)) + 1)
+    if not (entries.is_plain.all() and len(entries.context) == complete):
+        lacking = entries.lacking(name, sensor, values, prior, can, new)
         borrowed = borrowed.append(lacking)
         entries = _Entries(rows, borrowed, name, sensor)
     value, half = entries.value, np.zeros(len(entries.value), np.int64)
@@ -279,6 +325,7 @@ def protected_rows(rows: Rows) -> BoolArray:
     # A start depth or a side is a state: all rows of such a track are kept, also the first.
     state = np.maximum(rows.key['start'], rows.key['side'])
     protected = np.maximum.reduceat(state, first)[rows.target] > 0
+    protected &= (rows.key['offset'] < 0) & ~rows.key['aside']
     protected |= rows.logw == np.maximum.reduceat(rows.logw, first)[rows.target]
     is_published = scale >= MIN_PUBLISHED_SCALE
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
@@ -314,6 +361,44 @@ def usual_assumptions(
             differs[:, sensor] = ~np.isin(table[:, sensor], usual)
         same &= ~differs.any(axis=1)
     return same
+
+
+def lending(models: ModelSet, group: Group, fix: IntArray) -> Callable[[Rows, Borrowed], Rows]:
+    """Return the function that changes copies of lenders where an assumption changes the state.
+
+    A delay moves the state (`sensors.lent_moves`). A scale changes the state of a young track: its
+    lender took the first fixes for far more accurate than they are under the scale, so the copy
+    begins anew at the last fix.
+
+    :param fix: (T,) last fix of each track; -1 for none.
+    """
+
+    def lend(copies: Rows, borrowed: Borrowed) -> Rows:
+        moved = lent_moves(copies.key, np.arange(len(copies)), borrowed.key)
+        blocks = tuple(
+            bank.move_along(block, part.outputs[2:4], moved)
+            for block, part in zip(copies.blocks, models.parts)
+        )
+        its = scale_of(borrowed.key, group.number)
+        excess = its / scale_of(copies.key, group.number)
+        young = (copies.key['taken'] <= YOUNG) & (excess > FAR_SCALE)
+        young &= (fix[copies.target] >= 0) & (
+            blocks[0].x.shape[1] == len(models.parts[0].components)
+        )
+        chosen = np.flatnonzero(young)
+        if not len(chosen):
+            return copies.replace(blocks=blocks)
+        last = fix[copies.target[chosen]]
+        R = group.R[last] * its[chosen, None, None]
+        x, P, mu = models.initial_states(group.z[last], R, measured=False)
+        with_velocities_at_fix(P, models, group.config)
+        for block, new in zip(blocks, models.to_blocks(x[:, 0], P[:, 0])):
+            block.x[chosen], block.P[chosen] = new.x, new.P
+        probabilities = copies.mu.copy()
+        probabilities[chosen] = mu[:, 0]
+        return copies.replace(blocks=blocks, mu=probabilities)
+
+    return lend
 
 
 def least_scale(key: dict[str, np.ndarray]) -> FloatArray:

@@ -138,6 +138,8 @@ class Birth(NamedTuple):
     """Name and position (2,) of a sensor with a bearing error; None for others."""
     number: int = 0
     """Number of the sensor (`sensors`)."""
+    mark: int = 0
+    """Number of the fix of the birth, for links to its track (`bursts`); 0 for none."""
     fit: Fit | None = None
     """Minima of single ranges; None for other births."""
 

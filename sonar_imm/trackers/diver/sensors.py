@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import FloatArray, IndexArray
 
 MOST_SENSORS = 20
 """Maximum number of numbered sensors; all later ones share the last number."""
@@ -55,3 +55,31 @@ def scale_of(key: dict[str, np.ndarray], number: int) -> FloatArray:
     it."""
     scale = key['scale'][:, number]
     return np.where(scale > 0.0, scale, 1.0)
+
+
+def lent_moves(
+    rows: dict[str, np.ndarray], lender: IndexArray, borrowed: dict[str, np.ndarray]
+) -> FloatArray:
+    """Return the time (B,), s, over which the state of each lender (B,) moves along its velocity
+    under a borrowed assumption about delays.
+
+    A lender that relies on a sensor is where that sensor shows the target: if the sensor is late,
+    the target has moved on. A lender that relies on another sensor does not move. It relies on the
+    sensor with the least scale and without an offset.
+
+    :param rows: `Rows.key`.
+    :param borrowed: `Borrowed.key`.
+    """
+    moved = np.zeros(len(lender))
+    later = borrowed['delay'] - rows['delay'][lender]
+    several = np.flatnonzero(later.any(axis=1))
+    if not len(several):
+        return moved
+    scale = rows['scale'][lender[several]]
+    scale = np.where(scale > 0.0, scale, np.inf)
+    every, off = np.arange(len(several)), rows['offset'][lender[several]]
+    scale[every[off >= 0], off[off >= 0]] = np.inf
+    best = scale.argmin(axis=1)
+    alone = (scale <= scale[every, best, None]).sum(axis=1) == 1
+    moved[several] = np.where(alone, later[several, best], 0.0)
+    return moved

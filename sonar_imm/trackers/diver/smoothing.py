@@ -138,10 +138,12 @@ class SmoothingDiverTracker(DiverTracker):
         found: dict[tuple[int, int], _Smoothed] = {}
         for track_id, first, last in self._find_passes(scans):
             self._smooth(scans, track_id, first, last, found)
-        return [
+        made = [
             self._estimate(self._with_smoothed_rows(scan, k, found))
-            for k, scan in enumerate(scans)
+            for k, scan in enumerate(scans[:-1])
         ]
+        # The last scan has no future; its rows keep their offsets.
+        return [*made, self._estimate(self._passed[max(self._passed)])]
 
     def _build_scans(self) -> list[_Scan]:
         """Return all scans with the constants of all instruments, and the steps between them."""
@@ -150,7 +152,9 @@ class SmoothingDiverTracker(DiverTracker):
         scans: list[_Scan] = []
         for stamp in sorted(self._passed):
             known = self._passed[stamp]
-            known = known.replace(rows=layout.rows_with_new_constants(known.rows, self.models))
+            # Offsets are no part of the path of the target.
+            rows = layout.rows_with_new_constants(known.rows, self.models).with_tail(0)
+            known = known.replace(rows=rows)
             previous = scans[-1].known if scans else known
             dt = (known.stamp_ns - previous.stamp_ns) * 1e-9
             steps = predict_over(

@@ -36,6 +36,7 @@ from ...measurements import (
 )
 from ..navigation import NavigationBuffer
 from .arrival_stamps import ArrivalStamps, Resolution
+from .burst_reports import BurstCounts
 from .clutter import Clutter, Clutters
 from .depth import HeightCounts
 from .innovations import FixConsistency, SensorConsistency
@@ -57,6 +58,7 @@ STATE_TYPES = (
         NisMemory,
         FixConsistency,
         SensorConsistency,
+        BurstCounts,
         HeightCounts,
         Instruments,
         BiasTest,

@@ -53,13 +53,18 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, Start
 from . import (
     arrival_stamps,
     births,
+    burst_reports,
+    bursts,
     clutter,
     coverage,
     depth,
+    disagreement,
     estimate,
     fixes,
+    links,
     names,
     offsets,
+    pairing,
     polling,
     pruning,
     ranges,
@@ -119,14 +124,16 @@ class DiverTracker:
             return layout(known.memory['instruments'])
 
         covered = configured_coverage(config)
-        self._associate = fixes.association_stage(models, config.pairing)
+        self._associate = pairing.association_stage(models, config.pairing)
         self.features: dict[str, Feature] = {
             **fixes.FEATURES,
+            **disagreement.FEATURES,
             **names.FEATURES,
             **restart.FEATURES,
             **pruning.FEATURES,
             **coverage.FEATURES,
             **depth.FEATURES,
+            **burst_reports.FEATURES,
             **sides.FEATURES,
             'learnt': Feature(None, self._chain.initial_counts(0).shape[1:]),
         }
@@ -141,6 +148,7 @@ class DiverTracker:
             models.families
             and restart.restart_stage(models, self._chain, layouts, self._associate),
             fixes.update_stage(models, lambda known: layouts(known).estimated_masks(models)),
+            models.families and bursts.jump,
             lambda known, group: sides.drop_sides(known, models),
             config.dimensions == 3 and depth.depth_stage(models, layouts, config),
             clutter.count_clutter,
@@ -150,9 +158,11 @@ class DiverTracker:
         )
         self._scan_stages: tuple[ScanStage, ...] = select_stages(
             self._update_transitions,
+            models.families and burst_reports.count_bursts,
             names.id_times_stage(config.max_coast),
             pruning.pruning_stage(models, config, self.rules, bool(covered)),
             names.merge_stage(models),
+            models.families and links.update_links,
             clutter.remove_first_fixes,
             births.spawn_stage(models, config, layouts, self._chain, self.features, self.rules),
         )
@@ -186,6 +196,7 @@ class DiverTracker:
             ranges=ranges.Ranges(),
             sensors=Sensors(),
             reporting=0,
+            bursts=burst_reports.BurstCounts(),
         )
 
     def restored(self) -> None:
@@ -290,6 +301,7 @@ class DiverTracker:
         if usable is None:
             return known
         ping = usable
+        known = known.replace(rows=bursts.without_offsets(known.rows))
         known, free = arrivals.associate_and_update(
             known, ping, self.config, self.models, self._covered
         )

@@ -23,13 +23,14 @@ import pytest
 from sonar_imm.estimation import imm
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
-from sonar_imm.trackers.diver.fixes import associate_gnn, compare
+from sonar_imm.trackers.diver.fixes import compare
 from sonar_imm.trackers.diver.innovations import (
     FARTHEST,
     FixConsistency,
     MEMORY,
     whiten_innovations,
 )
+from sonar_imm.trackers.diver.pairing import associate_gnn
 from sonar_imm.trackers.diver.scan import Scan
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 

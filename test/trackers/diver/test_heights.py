@@ -433,6 +433,6 @@ def test_a_track_that_was_somewhere_else_begins_anew_with_all_its_rows():
         after = restart_track(known, ping, free, tracker.models, layout, config)
         assert after['respreads'][0] - known['respreads'][0] == again
     assert len(after.rows) == START_DEPTHS and (after.rows.parent == -1).all()
-    mean, covariance = published_state(after, tracker.models)
+    mean, covariance = published_state(after, tracker.models, 0.05)
     error = mean[0, :3] - places[ping.stamp_ns][:3]
     assert error @ np.linalg.solve(covariance[0, :3, :3], error) < 12.0

@@ -89,13 +89,15 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
         np.testing.assert_allclose(rows.mu.sum(axis=1), 1.0)
         for track in range(len(known)):
             these = known.row_indices(track)
-            own = rows.key['scale'][these]
+            plain = (rows.key['offset'] < 0) & ~rows.key['aside']
+            own = rows.key['scale'][these][plain[these]]
             own = np.append(own, borrowed.key['scale'][borrowed.target == track], axis=0)
             assert not own[:, 1:].any()
             # The improbable scales of a new or restarted track follow with its second scan.
             begun = (rows.parent[these] < 0).all()
             due = tracker.models.row_scales if begun else scales
-            assert np.array_equal(np.sort(own[:, 0]), due)
+            # A scale has several rows where a burst may have begun.
+            assert np.array_equal(np.unique(own[:, 0]), due)
         old = rows.parent >= 0
         parents = before.life.track_id[before.rows.target[rows.parent[old]]]
         assert np.array_equal(parents, ids[rows.target[old]])
@@ -107,7 +109,9 @@ def test_every_row_is_that_of_its_track_whoever_begins_and_ends(seed, settings):
 @pytest.mark.parametrize('settings', SETS)
 def test_tracks_in_one_table_are_trackers_of_one(settings):
     """Divers too far apart to share a fix."""
-    config = DiverConfig(max_tracks=9, clutter_density=1e-5, birth_density=1e-5, **settings)
+    # No fix of another diver may be one of a burst.
+    densities = {'clutter_density': 1e-5, 'birth_density': 1e-5, 'burst_rate': 0.0}
+    config = DiverConfig(max_tracks=9, **densities, **settings)
     made = list(swims(3, 30, 4))
     together = run(
         DiverTracker(config),
@@ -119,9 +123,11 @@ def test_tracks_in_one_table_are_trackers_of_one(settings):
             assert both.extras['track_id'][d] == d + 1 and len(single) == 1
             for name in ('state', 'covariance', 'probabilities'):
                 due = getattr(single, name)[0]
-                np.testing.assert_allclose(getattr(both, name)[d], due, rtol=1e-9, atol=1e-12)
+                # Of a whole scan, scales without weight do not see far fixes.
+                np.testing.assert_allclose(getattr(both, name)[d], due, rtol=1e-5, atol=1e-5)
             for name in ('existence', 'nis'):
-                np.testing.assert_allclose(both.extras[name][d], single.extras[name][0])
+                due = single.extras[name][0]
+                np.testing.assert_allclose(both.extras[name][d], due, rtol=1e-4)
 
 
 @pytest.mark.parametrize('settings', SETS)
@@ -198,12 +204,14 @@ def test_the_covariance_of_a_track_whose_scales_agree_is_that_of_one():
         rows=one.replace(logw=np.zeros(len(one)), key={**one.key, 'scale': of_sensor(stated, 0)})
     )
     for ours, due in zip(
-        published_state(agreeing, tracker.models), published_state(single, tracker.models)
+        published_state(agreeing, tracker.models, 0.05),
+        published_state(single, tracker.models, 0.05),
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
     spread = redistribute_weights(agreeing, tracker.models.scales)
     for ours, due in zip(
-        published_state(spread, tracker.models), published_state(single, tracker.models)
+        published_state(spread, tracker.models, 0.05),
+        published_state(single, tracker.models, 0.05),
     ):
         np.testing.assert_allclose(ours, due, rtol=1e-9, atol=1e-12)
 
@@ -236,7 +244,8 @@ def test_a_spoilt_covariance_is_repaired_alone(settings):
     healthy, other = (tracker._process_scan(each, *last) for each in (known, spoilt))
     assert other.counts['repairs'] > healthy.counts.get('repairs', 0)
     for ours, due in zip(
-        published_state(other, tracker.models), published_state(healthy, tracker.models)
+        published_state(other, tracker.models, 0.05),
+        published_state(healthy, tracker.models, 0.05),
     ):
         np.testing.assert_array_equal(ours[[0, 2]], due[[0, 2]])
         assert np.isfinite(ours).all()

@@ -219,13 +219,13 @@ def test_what_is_assumed_moves_no_estimate_and_ends_with_fixes():
     made = simulate(scenario('multistatic', {'duration': 20.0}), 1)
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     assumed = run(tracker, (item.measurement for item in made.measurements))[-1]
-    mean, inside = estimate.published_state(tracker._stream.state, tracker.models)
+    mean, inside = estimate.published_state(tracker._stream.state, tracker.models, 0.05)
     np.testing.assert_array_equal(assumed.state, mean)
     ratio = np.diag(assumed.covariance[0])[:2] / np.diag(inside[0])[:2]
     assert (ratio > 1.5).all() and (ratio < 30.0).all()
     last = made.measurements[-1].measurement.stamp_ns * 1e-9
     after = tracker.process(fix(last + 1.0, *mean[0, :2]))[-1]
-    inside = estimate.published_state(tracker._stream.state, tracker.models)[1]
+    inside = estimate.published_state(tracker._stream.state, tracker.models, 0.05)[1]
     np.testing.assert_array_equal(after.covariance, inside)
 
 

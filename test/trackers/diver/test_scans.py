@@ -22,7 +22,7 @@ import pytest
 
 from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
-from sonar_imm.trackers.diver import clutter, fixes, pruning
+from sonar_imm.trackers.diver import clutter, pairing, pruning
 from sonar_imm.trackers.diver import tracker as tracker_module
 from sonar_imm.trackers.diver.innovations import FixConsistency, MEMORY
 from sonar_imm.trackers.diver.known import Known
@@ -125,7 +125,7 @@ def test_a_fix_is_of_no_new_diver_where_there_may_be_none(most):
     known, (group,) = tracker._predict(tracker._stream.state, now, 11 * SECOND), now.fixes
     known = clutter.estimate_densities(known, group)
     assert group.elapsed == 1.0
-    fixes.association_stage(tracker.models, 'jipda')(known, group)
+    pairing.association_stage(tracker.models, 'jipda')(known, group)
     p, r = config.detection_probability, known['existence'][0]
     seen = r * p * np.exp(group.pairs.track_log[0, 0]) / (1e-5 + (most - 1) * 1e-4)
     assert 0.01 < group.association.beta[0, 0] < 0.99
@@ -255,7 +255,7 @@ def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     status = [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
     known = known.replace(life=evolve(known.life, status=np.array(status, np.uint8)))
     known = known.with_columns(existence=np.array([np.nan, np.nan, 0.3]))
-    fixes.association_stage(tracker.models, 'jipda')(known, group)
+    pairing.association_stage(tracker.models, 'jipda')(known, group)
     r, missed = np.array([0.5, 0.9, 0.3]), 1.0 - tracker.config.detection_probability
     np.testing.assert_allclose(group.association.exists, r * missed / (r * missed + 1.0 - r))
 
@@ -399,13 +399,13 @@ def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
     lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
     for item in (pessimistic, lasting):
-        assert 'set fix_bias_std' in item.warnings(False)[0]
-        assert item.warnings(True) == []
-        assert item._replace(number=0.9 * MEMORY).warnings(False) == []
+        assert 'set fix_bias_std' in item.warnings(False, 10.0)[0]
+        assert item.warnings(True, 10.0) == []
+        assert item._replace(number=0.9 * MEMORY).warnings(False, 10.0) == []
     optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
     for stated in (False, True):
-        assert 'Increase covariance_scale' in optimistic.warnings(stated)[0]
-    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []
+        assert 'Increase covariance_scale' in optimistic.warnings(stated, 10.0)[0]
+    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False, 10.0) == []
 
 
 def beside_each_other(seed, seen, std=0.15, detection_probability=0.95, clutter=0.0):

@@ -72,11 +72,11 @@ def test_the_estimate_is_the_contract():
         'prob_brisk_heading_000',
         'prob_quiet',
     ]
-    assert list(columns)[-15:] == [
+    assert list(columns)[-19:] == [
         *('track_id', 'track_state', 'nis', 'nis_dof', 'existence', 'target_id'),
         *('side_probability', 'mirror_x', 'mirror_y'),
         *('family_steady', 'family_brisk', 'family_lively', 'family_quiet'),
-        *('hover', 'covariance_scale'),
+        *('hover', 'covariance_scale', 'burst', 'offset_x', 'offset_y', 'rows'),
     ]
     assert columns['existence'] > 0.5 and columns['target_id'].tolist() == [-1]
     assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64

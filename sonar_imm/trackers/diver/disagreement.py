@@ -1,0 +1,193 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Innovations of fixes: checks of their covariances, and sensors that disagree.
+
+If two sensors are apart by a constant vector, large scales explain it before an offset does: with
+the covariances that scales grant, no fix is far from the track. So if the means of the last
+innovations of two sensors differ significantly, a row begins with scales 1 and an offset of the
+sensor that reports. Both readings of an offset are even then (`bursts`).
+
+Source: docs/diver.md, 'Several sensors'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+from attrs import evolve
+import numpy as np
+
+from ...estimation import bank
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.association import TENTATIVE
+from ...estimation.rows import Rows
+from . import bursts
+from .innovations import FixConsistency, whiten_innovations
+from .known import Feature, Known
+from .models import ModelSet
+from .offsets import RecentPairs
+from .pairs import OPEN, Ways
+from .scales import estimated_scales, weight_without_small_scales
+from .scan import Group
+from .sensors import MOST_SENSORS
+
+FEATURES = {
+    'nis': Feature(math.nan),
+    'nis_dof': Feature(0, kind=np.uint16),
+    'white': Feature(math.nan, (MOST_SENSORS, 2)),
+    'reported': Feature(math.nan, (3,)),
+    'lately': Feature(0.0, (MOST_SENSORS, 4)),
+}
+"""nis, nis_dof: of this scan, NaN and 0 without a hit.
+
+white: whitened innovation of the last fix of each sensor.
+
+reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scale.
+
+lately: number of the last innovations of each sensor, and sums of their x, y, m, and variance,
+m^2.
+"""
+
+LATELY, ENOUGH = 10.0, 3.4
+"""Number of innovations over which `lately` forgets, and minimum number for a comparison."""
+
+DISAGREE = 25.0
+"""Minimum chi-square of the difference of two means."""
+
+BEGINS = 0.01
+"""Weight of a row with an offset between two sensors, when it begins."""
+
+
+def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
+    """Store the whitened innovations of associated fixes, and update the covariance checks."""
+    association, pairs = group.association, group.pairs
+    assert association is not None and pairs is not None
+    if len(group.z):
+        known = _with_consistency(
+            known,
+            group,
+            known.memory['fixes']
+            .of(group.number)
+            .with_covariances(group.is_stated, group.config.has_usual_fix_std),
+        )
+    tracks = np.flatnonzero(association.hit)
+    if not len(tracks):
+        return known
+    fix = association.fix[tracks]
+    count = len(known.rows)
+    seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
+    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
+    scale = (
+        estimated_scales(known.rows, group.number)[tracks]
+        if len(models.scales) > 1
+        else np.ones(len(tracks))
+    )
+    R = group.R[fix] * scale[:, None, None]
+    tentative = (known.life.status == TENTATIVE)[tracks]
+    before: FixConsistency = known.memory['fixes'].of(group.number)
+    white, after = whiten_innovations(
+        mean[tracks],
+        covariance[tracks],
+        group.z[fix],
+        R,
+        known['white'][tracks, group.number],
+        tentative,
+        before,
+    )
+    after = after.with_scale(scale, tentative)
+    names = 'white', 'nis', 'nis_dof', 'reported', 'lately'
+    columns = {name: known[name].copy() for name in names}
+    columns['white'][tracks, group.number] = white
+    columns['reported'][tracks] = R[:, [0, 0, 1], [0, 1, 1]]
+    columns['lately'][tracks, group.number] = _with_innovations(
+        columns['lately'][tracks, group.number],
+        group.z[fix] - mean[tracks],
+        covariance[tracks] + group.R[fix],
+    )
+    columns['nis'][tracks] += np.square(white).sum(axis=1)
+    columns['nis_dof'][tracks] += np.uint16(2)
+    # With fixes, no instrument errors are assumed.
+    return _with_consistency(known.with_columns(**columns), group, after).with_memory(
+        recent=RecentPairs()
+    )
+
+
+def _with_consistency(known: Known, group: Group, consistency: FixConsistency) -> Known:
+    """Return the state with the consistency of the sensor of a group."""
+    fixes = known.memory['fixes'].with_sensor(group.number, consistency)
+    return known.with_memory(fixes=fixes)
+
+
+def _with_innovations(lately: FloatArray, v: FloatArray, S: FloatArray) -> FloatArray:
+    """Add innovations v (k, 2) with covariances S (k, 2, 2) to the sums (k, 4)."""
+    variance = 0.5 * S.trace(axis1=1, axis2=2)
+    new = np.column_stack([np.ones(len(v)), v, variance])
+    return np.asarray((1.0 - 1.0 / LATELY) * lately + new)
+
+
+def sensors_disagree(lately: FloatArray, sensor: int) -> BoolArray:
+    """Return which tracks (T,) have a sensor whose innovations differ from those of `sensor`.
+
+    lately: (T, MOST_SENSORS, 4) see `FEATURES`.
+    """
+    number = lately[..., 0]
+    enough = (number >= ENOUGH) & (number[:, sensor, None] >= ENOUGH)
+    count = np.maximum(number, 1.0)
+    mean, variance = lately[..., 1:3] / count[..., None], lately[..., 3] / count**2
+    apart = np.square(mean - mean[:, sensor, None]).sum(axis=2)
+    spread = variance + variance[:, sensor, None]
+    return np.asarray((enough & (apart > DISAGREE * spread)).any(axis=1))
+
+
+def begin_disagreement(
+    known: Known, group: Group, models: ModelSet, estimated: Sequence[BoolArray | None]
+) -> Rows | None:
+    """Return rows with an offset of the sensor, for tracks whose sensors disagree; None for none.
+
+    A track that has a row with an offset gets none.
+
+    estimated: as for `fixes.update_tracks`.
+    """
+    association, rows, T = group.association, known.rows, len(known)
+    if association is None or not T or len(known.memory['sensors'].names) < 2:
+        return None
+    found = sensors_disagree(known['lately'], group.number) & association.hit
+    if not found.any():
+        return None
+    held = rows.key['offset'] >= 0
+    found &= ~(np.bincount(rows.target, held, T) > 0.0)
+    heaviest = np.lexsort((rows.logw, rows.target))[np.cumsum(np.bincount(rows.target)) - 1]
+    row = heaviest[found]
+    if not len(row):
+        return None
+    track, N = np.flatnonzero(found), len(row)
+    scale = np.where(rows.key['scale'] > 0.0, 1.0, 0.0)
+    ways = Ways(
+        row,
+        association.fix[track],
+        np.full(N, OPEN),
+        np.full(N, group.config.burst_std**2),
+        np.zeros(N),
+        np.ones((T, len(group.z))),
+    )
+    stated = known.replace(
+        rows=rows.replace(key={**rows.key, 'scale': scale, 'delay': 0.0 * scale})
+    )
+    weight, link = np.full(N, math.log(BEGINS)), np.zeros(len(group.z), np.int64)
+    began = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
+    if began is None:
+        return None
+    return evolve(began, key={**began.key, 'taken': np.zeros_like(began.key['taken'])})
