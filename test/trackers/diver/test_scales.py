@@ -97,7 +97,8 @@ def test_covariances_that_are_far_too_small_cost_nothing_and_the_factor_is_named
     items, truth = swim(3, stated=1.0 / excess)
     rmse, nees, tracker = scored(items, truth)
     due, _, _ = scored(items, truth, covariance_scale=excess)
-    assert rmse < 1.15 * due and 1.0 < nees < 3.0
+    # Until the scale is found, some fixes look like the first of a burst.
+    assert rmse < 1.12 * due and 1.0 < nees < 3.0
     (warned,) = tracker.warnings()
     factor = float(warned.removeprefix(WARNED).partition(':')[0])
     assert 0.6 < factor / excess < 1.7 and 'e+' not in warned
@@ -160,7 +161,8 @@ def test_the_priors_are_what_redistribution_tends_to():
 
 def test_a_rejected_fix_weighs_the_scales_by_the_chance_that_it_is_of_the_track():
     """The two readings, enumerated: missed beside a false fix, or seen there under the scale."""
-    config = DiverConfig(max_tracks=1, clutter_density=1e-6)
+    # With bursts, the fix is an outlier or begins one.
+    config = DiverConfig(max_tracks=1, clutter_density=1e-6, burst_rate=0.0)
     tracker = DiverTracker(config)
     items, _ = swim(9, count=40, std=0.1)
     for item in items:
