@@ -91,12 +91,13 @@ def log_total(assigned: FloatArray, missed: FloatArray, possible: BoolArray) -> 
     weight = np.where(possible, assigned, 0.0)
     largest = np.maximum(weight.max(axis=1, initial=0.0), missed)
     weight, alone = weight / largest[:, None], missed / largest
-    together = list(_small_clusters(weight, alone))
     of_track = np.log(alone + weight.sum(axis=1))
     total = float(np.log(largest).sum())
-    for tracks, detections in together:
+    for tracks, detections in _shared_clusters(weight):
         of_track[tracks] = 0.0
-        total += _log_events(weight[np.ix_(tracks, detections)], alone[tracks])
+        is_small = min(len(tracks), len(detections)) <= LARGEST
+        solve = _log_events if is_small else _log_by_propagation
+        total += solve(weight[np.ix_(tracks, detections)], alone[tracks])
     return total + float(of_track.sum())
 
 
@@ -158,8 +159,26 @@ def _shared_clusters(weight: FloatArray) -> Iterator[tuple[IndexArray, IndexArra
 
 def _by_propagation(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return approximate marginals (t, d) and (t,) of one cluster: weight (t, d), alone (t,)."""
+    W, nu, _ = _messages(weight, alone)
+    total = 1.0 + (W * nu).sum(axis=1)
+    return W * nu / total[:, None], 1.0 / total
+
+
+def _log_by_propagation(weight: FloatArray, alone: FloatArray) -> float:
+    """Return the logarithm of the Bethe approximation of the weight of all events of one
+    cluster."""
+    W, nu, mu = _messages(weight, alone)
+    of_tracks = np.log(alone * (1.0 + (W * nu).sum(axis=1))).sum()
+    of_detections = np.log1p(mu.sum(axis=0)).sum()
+    return float(of_tracks + of_detections - np.log1p(mu * nu).sum())
+
+
+def _messages(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the weights (t, d) relative to a miss, and the messages (t, d) from detections to
+    tracks and from tracks to detections."""
     W = weight / alone[:, None]
     nu, before = np.ones(W.shape), np.zeros(W.shape)
+    mu = W
     for _ in range(ROUNDS):
         if np.abs(nu - before).max() < CLOSE:
             break
@@ -167,8 +186,7 @@ def _by_propagation(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, 
         rest = (W * nu).sum(axis=1, keepdims=True) - W * nu
         mu = W / (1.0 + np.maximum(rest, 0.0))
         nu = 1.0 / (1.0 + np.maximum(mu.sum(axis=0) - mu, 0.0))
-    total = 1.0 + (W * nu).sum(axis=1)
-    return W * nu / total[:, None], 1.0 / total
+    return W, nu, mu
 
 
 def _exact(weight: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:

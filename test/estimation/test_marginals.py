@@ -21,7 +21,7 @@ from oracles.jipda import events
 import pytest
 
 from sonar_imm.estimation import marginals as module
-from sonar_imm.estimation.marginals import clusters, marginals
+from sonar_imm.estimation.marginals import clusters, log_total, marginals
 
 
 def problem(seed, T, D, share=0.7):
@@ -82,6 +82,20 @@ def test_a_cluster_that_is_too_large_is_solved_by_propagation(monkeypatch):
     exact, alone = marginals(weight, missed, possible)
     assert 0.0 < np.abs(pair - exact).max() < 0.02
     assert np.abs(none - alone).max() < 0.02
+
+
+@pytest.mark.parametrize('spread', [0.05, 0.2])
+def test_the_weight_of_all_events_of_a_large_cluster(monkeypatch, spread):
+    """By propagation, which is exact where the cluster is a tree, against the exact sum."""
+    at = np.arange(14.0)
+    distance = np.square(at[:, None] - at[None] - 0.3)
+    weight, missed = 90.0 * np.exp(-0.5 * distance / spread), np.linspace(0.1, 0.4, 14)
+    for reach, tolerance in ((0.6, 1e-6), (16.0, 0.5)):
+        possible = distance < reach
+        total = log_total(weight, missed, possible)
+        with monkeypatch.context() as patch:
+            patch.setattr(module, 'LARGEST', 14)
+            assert total == pytest.approx(log_total(weight, missed, possible), abs=tolerance)
 
 
 def test_equal_pairs_in_a_large_cluster_end():
