@@ -25,7 +25,7 @@ from scipy.stats import multivariate_normal
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections
-from sonar_imm.trackers.obstacle.births import BEHAVIOURS, met, Seeds, sown, unmet
+from sonar_imm.trackers.obstacle.births import BEHAVIOURS, level, met, Seeds, sown, unmet
 from sonar_imm.trackers.obstacle.clutter import Clutter
 from sonar_imm.trackers.obstacle.existence import (
     detection,
@@ -203,7 +203,8 @@ def test_a_seed_is_met_as_the_closed_mixture_around_its_place_says():
     dt, d = 1.0, 60.0
     z = np.array([[60.9, 0.105], [95.0, -0.2]])
     expected = np.array([0.5, 0.02])
-    found = met(seeds, ping_of(z, SECOND + round(dt * SECOND)), expected, CONFIG)
+    place, _ = level(z, SONAR)
+    found = met(seeds, ping_of(z, SECOND + round(dt * SECOND)), place, expected, CONFIG)
     # In the axes of the seed: the sonar has not moved.
     off = [60.9 * np.cos(0.005) - d, 60.9 * np.sin(0.005)]
     R_r, R_b = CONFIG.range_std**2, np.radians(CONFIG.bearing_std_deg) ** 2
