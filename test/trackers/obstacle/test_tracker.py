@@ -353,9 +353,11 @@ def test_the_band_holds_the_offset_under_real_motion():
     assert found['tracked'] == 20
     assert found['band_coverage'] >= 0.8
     assert found['nees'] < 2.0
-    # It knows more than where obstacles are drawn, and than its own first answer.
-    assert found['rmse_m'] < 0.9 * min(found['answering_zero_rmse_m'], found['spread_of_truth_m'])
-    assert found['rmse_m'] < 0.9 * found['first_answer_rmse_m']
+    # It knows more than where obstacles are drawn, and than its own first answer. At 0.2 m/s the
+    # drift that it allows for is a tenth of the speed, and costs 7 % of the RMSE.
+    assert found['rmse_m'] < 0.95 * found['spread_of_truth_m']
+    assert found['rmse_m'] < 0.8 * found['answering_zero_rmse_m']
+    assert found['rmse_m'] < 0.8 * found['first_answer_rmse_m']
 
 
 def test_no_compiler_stands_before_the_first_estimate():
