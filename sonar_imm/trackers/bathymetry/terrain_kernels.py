@@ -129,7 +129,7 @@ def filter_terrain(
     echo: NDArray[np.bool_],
     form: NDArray[np.complex128],
     base: NDArray[np.float64],
-    spread: NDArray[np.complex128] | None,
+    spread: NDArray[np.complex128],
     signal: NDArray[np.float64],
     table: NDArray[np.float64],
     peak: NDArray[np.float64],
@@ -173,7 +173,7 @@ def filter_terrain(
     prediction was kept.
     """
     T, M, last = echo.shape[0], walk.shape[0], form.shape[1] - 1
-    law = slope0 * slope0
+    law, among = slope0 * slope0, spread.shape[1] > 0
     for turn in range(turns):
         center, wide = start_mean, start_std * start_std
         if turn == 1:
@@ -366,7 +366,7 @@ def filter_terrain(
                             z = work[3, s] * work[1, s] + work[4, s] * work[2, s] + re
                             work[4, s] = work[4, s] * work[1, s] - work[3, s] * work[2, s] + im
                             work[3, s] = z
-                    if spread is not None:
+                    if among:
                         re, im = spread[t, last].real, spread[t, last].imag
                         for s in range(lanes):
                             work[6, s] = re
@@ -378,7 +378,7 @@ def filter_terrain(
                                 work[7, s] = work[7, s] * work[1, s] - work[6, s] * work[2, s] + im
                                 work[6, s] = z
                 else:
-                    for part in range(1 if spread is None else 2):
+                    for part in range(2 if among else 1):
                         for s in range(lanes):
                             # With d = d/dz, the value p and d p and d^2 p / 2.
                             p, p1, p2 = 0j, 0j, 0j
@@ -386,7 +386,7 @@ def filter_terrain(
                             for k in range(last, -1, -1):
                                 p2 = p2 * z + p1
                                 p1 = p1 * z + p
-                                if spread is not None and part == 1:
+                                if among and part == 1:
                                     p = p * z + spread[t, k]
                                 else:
                                     p = p * z + form[t, k]
@@ -394,7 +394,7 @@ def filter_terrain(
                             work[3 + 3 * part, s] = p.real
                             work[4 + 3 * part, s] = p1.imag
                             work[5 + 3 * part, s] = -(2.0 * z * z * p2 + p1).real
-                if spread is not None:
+                if among:
                     # Beside interferers: the gain 1 + ss2 a^H R^-1 a; its logarithm into work[2].
                     for s in range(lanes):
                         gain = 1.0 + signal[t] * work[6, s]
@@ -420,7 +420,7 @@ def filter_terrain(
                     work[10, s] = temper * value
                     work[11, s] = temper * (table[1, cell] + f * (2.0 * square + 3.0 * f * cube))
                     work[13, s] = temper * (2.0 * square + 6.0 * f * cube)
-                if spread is not None:
+                if among:
                     for s in range(lanes):
                         work[10, s] -= temper * work[2, s]
                 if stage <= STEPS:
