@@ -139,7 +139,7 @@ def filter_terrain(
     cos_tilt: NDArray[np.float64],
     sin_tilt: NDArray[np.float64],
     spacing: float,
-    launch: NDArray[np.float64] | None,
+    launch: NDArray[np.float64],
     row: NDArray[np.float64],
     first_depth: float,
     depth_step: float,
@@ -163,7 +163,8 @@ def filter_terrain(
     bin, m; start_mean and start_std of the base before the first bin; favour (T, M): see
     `models.TerrainModels`, (0, M) for none.
 
-    The likelihood and the geometry: see `filter_kernels.filter_block`; temper: the log likelihood
+    The likelihood and the geometry: see `filter_kernels.filter_block`, but for spread and launch,
+    which have no column and no row where there are none; temper: the log likelihood
     counts so much; peak (T,): the height from which the beam is strongest, NaN for none.
 
     Scratch: peak_variance (T,), kept (2, T, M, 6), x (M, 5), pred (M, 6), mu (M,), who (M,), work
@@ -323,7 +324,7 @@ def filter_terrain(
                 for s in range(lanes):
                     work[1, s] = height[t] - work[0, s]
                     work[9, s] = -1.0
-                if launch is not None:
+                if len(launch):
                     k = min(max(int(row[t]), 0), launch.shape[0] - 2)
                     f, columns = row[t] - k, launch.shape[1] - 2
                     for s in range(lanes):
