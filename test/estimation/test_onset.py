@@ -24,13 +24,12 @@ import pytest
 from sonar_imm.acoustics.envelopes import log_likelihoods, transmit_samples
 from sonar_imm.estimation.onset import (
     ENTER_BELOW,
-    FADED,
     LEAVE_BELOW,
     LEAVE_FISH,
-    NO_FLOOR,
     OnsetChain,
     OnsetState,
 )
+from sonar_imm.estimation.onset_kernels import FADED, NO_FLOOR
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
 

@@ -21,14 +21,16 @@ is to be done is `scan_period`, which joins the fixes of a turn.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from ...estimation.arrays import FloatArray, IntArray
-from .config import DiverConfig
-from .known import Known
-from .scan import Group
+
+if TYPE_CHECKING:  # `sonar-imm info` needs little of this, and begins sooner
+    from .config import DiverConfig
+    from .known import Known
+    from .scan import Group
 
 BEFORE = 30
 """Fixes before one among which the last one of the same target is looked for."""
