@@ -73,7 +73,8 @@ class OnsetState:
 @define(eq=False, slots=False)
 class OnsetChain:
     """For traces of `cells` samples `step` m apart: pulse, m; ring: samples of the transmit pulse
-    at a first look; jump: probability per trace; fish_rate: runs of fish per m."""
+    at a first look, -1 where there can be none; jump: probability per trace; fish_rate: runs of
+    fish per m."""
 
     step: float
     cells: int
@@ -101,6 +102,8 @@ class OnsetChain:
 
     @cached_property
     def _ring_prior(self) -> FloatArray:
+        if self.ring < 0:
+            return np.ones(1)
         # The look sees it down to a tenth of the loudest.
         longest = min(RING_SHARE * self.cells, RING_LONGER * self.ring + RING_BEYOND)
         cell = np.arange(max(1, int(longest)))
