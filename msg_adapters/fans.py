@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.measurements import Rejection
@@ -91,6 +90,8 @@ def _outside(rows: int, columns: int, sector: float) -> BoolArray:
 def _by_beams(picture: NDArray[Any], sector: float) -> FloatArray:
     """Return the ranges by beams of a picture whose first row is the near one; beams are as far
     apart as pixels at half the range."""
+    from scipy.ndimage import map_coordinates  # loads a BLAS that others do not need
+
     rows, columns = picture.shape
     beams = max(LEAST_PIXELS, int(0.5 * sector * rows))
     angle = sector * ((np.arange(beams) + 0.5) / beams - 0.5)

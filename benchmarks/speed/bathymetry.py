@@ -326,7 +326,7 @@ def bench_scaling(rounds: int = 7) -> dict[str, Any]:
         variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
     methods: dict[str, Timed] = {}
     for name, (values, shot) in variants.items():
-        tracker = BathymetryTracker(BathymetryConfig(**WALKS, shadow_gate=False, **values))
+        tracker = BathymetryTracker(BathymetryConfig(**{**WALKS, 'shadow_gate': False, **values}))
         methods[name] = partial(tracker.process, shot), len(shot)
     return {'bins_per_second': rates(methods, rounds)}
 

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import uniform_filter1d
 
 from ..estimation.arrays import BoolArray, FloatArray
 
@@ -83,6 +82,8 @@ def bins_alike(iq: NDArray, usable: BoolArray) -> float:
     With the correlation r_l of bins l apart, each weighed by the mean power around it, n bins say
     what n / tau independent ones do, tau = 1 + 2 sum_l r_l^2. Of r_l^2 chance has about 1 / n.
     """
+    from scipy.ndimage import uniform_filter1d  # loads a BLAS that other systems do not need
+
     bins = int(np.count_nonzero(usable))
     y = np.where(usable[:, None], iq, 0.0).astype(np.complex128)
     power = uniform_filter1d(np.square(np.abs(y)).sum(axis=1), AROUND, mode='nearest')

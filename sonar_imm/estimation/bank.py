@@ -55,7 +55,6 @@ from .arrays import BoolArray, FloatArray, IndexArray
 __all__ = [
     'Bank',
     'combine',
-    'combine_fixes',
     'compare',
     'Gaussians',
     'Innovations',
@@ -494,20 +493,6 @@ def mixture_log_density(mu: FloatArray, compared: Sequence[Innovations]) -> Floa
         return np.asarray(
             (best + np.log(np.exp(of_models - safe).sum(axis=1, keepdims=True)))[:, 0]
         )
-
-
-def combine_fixes(
-    expected: Sequence[tuple[FloatArray, FloatArray]], mu: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean (N, 2) and covariance (N, 2, 2) of the predictions of `predict_fix` over all
-    models, with probabilities mu (N, M)."""
-    h = np.concatenate([each for each, _ in expected], axis=-1)
-    S = np.concatenate([each for _, each in expected], axis=-1)
-    mean = (h @ mu[..., None])[..., 0]
-    d = h - mean[..., None]
-    S = S + np.stack([d[:, 0] * d[:, 0], d[:, 0] * d[:, 1], d[:, 1] * d[:, 1]], axis=1)
-    whole = (S @ mu[..., None])[..., 0]
-    return mean, whole[:, [[0, 1], [1, 2]]]
 
 
 def _measure(

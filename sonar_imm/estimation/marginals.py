@@ -85,7 +85,7 @@ def log_total(assigned: FloatArray, missed: FloatArray, possible: BoolArray) -> 
 
     >>> import numpy as np
     >>> pair = np.array([[3.0, 0.0]])
-    >>> round(np.exp(log_total(pair, np.array([1.0]), pair > 0.0)), 12)
+    >>> round(float(np.exp(log_total(pair, np.array([1.0]), pair > 0.0))), 12)
     4.0
     """
     weight = np.where(possible, assigned, 0.0)

@@ -42,13 +42,12 @@ from attrs import define, field, frozen
 import numpy as np
 
 from .arrays import FloatArray
-from .jit import kernel
+from .onset_kernels import onset_pass
 
 __all__ = ['OnsetChain', 'OnsetState', 'onset_pass']
 
 WALK = (0.75, 0.15), (0.2, 0.6), (0.05, 1.5)
 """Share and standard deviation, m, of the ways the onset goes from trace to trace."""
-FADED, NO_FLOOR = 0.15, -6.0
 LEAVE_FISH, ENTER_BELOW, LEAVE_BELOW = 1.0, 0.1, 0.25
 """Probability per metre that a run of fish ends, and that runs below begin and end."""
 RING_STAYS, RING_SHARE, RING_SPREAD = 0.98, 0.35, 1e-3
@@ -74,7 +73,8 @@ class OnsetState:
 @define(eq=False, slots=False)
 class OnsetChain:
     """For traces of `cells` samples `step` m apart: pulse, m; ring: samples of the transmit pulse
-    at a first look; jump: probability per trace; fish_rate: runs of fish per m."""
+    at a first look, -1 where there can be none; jump: probability per trace; fish_rate: runs of
+    fish per m."""
 
     step: float
     cells: int
@@ -102,6 +102,8 @@ class OnsetChain:
 
     @cached_property
     def _ring_prior(self) -> FloatArray:
+        if self.ring < 0:
+            return np.ones(1)
         # The look sees it down to a tenth of the loudest.
         longest = min(RING_SHARE * self.cells, RING_LONGER * self.ring + RING_BEYOND)
         cell = np.arange(max(1, int(longest)))
@@ -147,71 +149,3 @@ class OnsetChain:
 def _normalised(log_weight: FloatArray) -> FloatArray:
     weight = np.exp(log_weight - log_weight.max())
     return np.asarray(weight / weight.sum())
-
-
-@kernel
-def onset_pass(
-    quiet: FloatArray,
-    loud: FloatArray,
-    onset: FloatArray,
-    log_onset: FloatArray,
-    log_ring: FloatArray,
-    rates: FloatArray,
-    window: int,
-    found: FloatArray,
-    ring: FloatArray,
-) -> None:
-    """Write the log weights of the onset, found (n,), and of the transmit pulse, ring (R,).
-
-    quiet, loud, onset (n,): log likelihoods of the samples; log_onset (n,) and log_ring (R,):
-    before this trace; rates (4,): probabilities per sample that fish begin and end, and that
-    runs of what is loud below the floor do; window: samples of the onset."""
-    n = len(quiet)
-    enter, leave = math.log(rates[0]), math.log(rates[1])
-    stay_quiet, stay_loud = math.log(1.0 - rates[0]), math.log(1.0 - rates[1])
-    # Down: water up to each sample, which ends quiet or in fish, for all transmit pulses.
-    down_quiet, down_loud = np.full(n + 1, -np.inf), np.full(n + 1, -np.inf)
-    pulse = np.zeros(n + 1)
-    for z in range(n + 1):
-        if z > 0:
-            q, f = down_quiet[z - 1], down_loud[z - 1]
-            down_quiet[z] = np.logaddexp(q + stay_quiet, f + leave) + quiet[z - 1]
-            down_loud[z] = np.logaddexp(q + enter, f + stay_loud) + loud[z - 1]
-            pulse[z] = pulse[z - 1] + loud[z - 1]
-        if z < len(log_ring):
-            down_quiet[z] = np.logaddexp(down_quiet[z], log_ring[z] + pulse[z])
-    # Up: what is below each sample, and the onset with it.
-    begin, end = math.log(rates[2]), math.log(rates[3])
-    keep_quiet, keep_loud = math.log(1.0 - rates[2]), math.log(1.0 - rates[3])
-    below_quiet, below_loud = np.zeros(n + 1), np.zeros(n + 1)
-    sum_onset, sum_quiet = np.zeros(n + 1), np.zeros(n + 1)
-    for z in range(n - 1, -1, -1):
-        q, f = quiet[z] + below_quiet[z + 1], loud[z] + below_loud[z + 1]
-        below_quiet[z] = np.logaddexp(keep_quiet + q, begin + f)
-        below_loud[z] = np.logaddexp(end + q, keep_loud + f)
-        sum_onset[z] = sum_onset[z + 1] + onset[z]
-        sum_quiet[z] = sum_quiet[z + 1] + quiet[z]
-    solid, faded = math.log(1.0 - FADED), math.log(FADED)
-    for k in range(n - 1):
-        m = min(k + window, n)
-        found[k] = log_onset[k] + np.logaddexp(
-            solid + sum_onset[k] - sum_onset[m] + below_loud[m],
-            faded + sum_quiet[k] - sum_quiet[m] + below_quiet[m],
-        )
-    found[n - 1] = log_onset[n - 1] + NO_FLOOR
-    # Up again, through the water, for each transmit pulse.
-    up_quiet, up_loud = found[n - 1], found[n - 1]
-    for z in range(n - 1, -1, -1):
-        q, f = quiet[z] + up_quiet, loud[z] + up_loud
-        up_quiet, up_loud = (
-            np.logaddexp(stay_quiet + q, enter + f),
-            np.logaddexp(leave + q, stay_loud + f),
-        )
-        if z < n - 1:
-            up_quiet = np.logaddexp(up_quiet, found[z])
-            up_loud = np.logaddexp(up_loud, found[z])
-        if z < len(log_ring):
-            ring[z] = log_ring[z] + pulse[z] + up_quiet
-    for k in range(n - 1):
-        found[k] += np.logaddexp(down_quiet[k], down_loud[k])
-    found[n - 1] += np.logaddexp(down_quiet[n], down_loud[n])

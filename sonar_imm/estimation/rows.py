@@ -31,7 +31,7 @@ Arrays are never changed in place, because tables of earlier scans share them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -49,6 +49,7 @@ __all__ = [
     'reduce_targets',
     'restore_rows',
     'Rows',
+    'combine_fixes',
 ]
 
 NOTHING: Mapping[str, Any] = {}
@@ -248,6 +249,20 @@ def log_sum(log: FloatArray, target: IntArray) -> FloatArray:
     with np.errstate(divide='ignore'):
         relative = log - top[target]
         return np.asarray(top + np.log(np.add.reduceat(np.exp(relative, out=relative), first)))
+
+
+def combine_fixes(
+    expected: Sequence[tuple[FloatArray, FloatArray]], mu: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (N, 2) and covariance (N, 2, 2) of the predictions of `predict_fix` over all
+    models, with probabilities mu (N, M)."""
+    h = np.concatenate([each for each, _ in expected], axis=-1)
+    S = np.concatenate([each for _, each in expected], axis=-1)
+    mean = (h @ mu[..., None])[..., 0]
+    d = h - mean[..., None]
+    S = S + np.stack([d[:, 0] * d[:, 0], d[:, 0] * d[:, 1], d[:, 1] * d[:, 1]], axis=1)
+    whole = (S @ mu[..., None])[..., 0]
+    return mean, whole[:, [[0, 1], [1, 2]]]
 
 
 @frozen(eq=False)

@@ -169,9 +169,16 @@ def _scan_hint(found: _Found) -> list[str]:
         return []
     stamps = np.array([stamp for stamp, _, _ in found.fixes], np.int64)
     order = np.argsort(stamps, kind='stable')
-    period = turn_of(stamps[order], np.array([place for _, *place in found.fixes])[order])
-    if period is None:
+    turn = turn_of(stamps[order], np.array([place for _, *place in found.fixes])[order])
+    if turn is None:
         return []
+    period = turn.seconds
+    if turn.offset is not None:
+        return [
+            f'two groups of fixes take turns and lie {turn.offset:.2g} m apart, always the same '
+            'way: two sensors of one target with an offset need a frame each; of two divers, '
+            f'--set scan_period={period:.3g} makes scans'
+        ]
     return [
         f'every fix has a stamp of its own, and each diver comes again after {period:.3g} s: '
         f'where the sensor rotates or polls, --set scan_period={period:.3g} makes scans of them'

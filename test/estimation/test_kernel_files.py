@@ -31,6 +31,7 @@ PACKAGE = Path(sonar_imm.__file__).parent
 FILES = (
     'acoustics/ray_kernels.py',
     'acoustics/wave_kernels.py',
+    'estimation/onset_kernels.py',
     'estimation/set_kernels.py',
     'estimation/set_shift_kernels.py',
     'trackers/bathymetry/filter_kernels.py',

@@ -24,13 +24,12 @@ import pytest
 from sonar_imm.acoustics.envelopes import log_likelihoods, transmit_samples
 from sonar_imm.estimation.onset import (
     ENTER_BELOW,
-    FADED,
     LEAVE_BELOW,
     LEAVE_FISH,
-    NO_FLOOR,
     OnsetChain,
     OnsetState,
 )
+from sonar_imm.estimation.onset_kernels import FADED, NO_FLOOR
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
 
@@ -94,12 +93,14 @@ def enumerated(chain, quiet, loud, onset, prior_onset, prior_ring):
     return onsets / onsets.sum(), rings / rings.sum()
 
 
+@pytest.mark.parametrize('ring', [2, -1])
 @pytest.mark.parametrize('seed', range(4))
-def test_sums_are_those_of_all_paths(seed):
+def test_sums_are_those_of_all_paths(seed, ring):
     rng = np.random.default_rng(seed)
-    chain = OnsetChain(0.3, 9, 0.3, 2, fish_rate=0.2)
+    chain = OnsetChain(0.3, 9, 0.3, ring, fish_rate=0.2)
     logs = [rng.normal(-1.0, 2.0, 9) for _ in range(3)]
-    before = OnsetState(rng.dirichlet(np.ones(9)), rng.dirichlet(np.ones(3)))
+    rings = rng.dirichlet(np.ones(len(chain.start().ring)))
+    before = OnsetState(rng.dirichlet(np.ones(9)), rings)
     predicted = chain.predict(before)
     onset, ring = enumerated(chain, *logs, predicted.onset, predicted.ring)
     found = chain.update(before, *logs)

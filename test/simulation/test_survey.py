@@ -117,8 +117,8 @@ def test_the_same_seed_is_the_same_survey():
 @pytest.mark.parametrize(
     'changes, off, spread',
     [
-        ({}, 0.0, 0.06),
-        ({'tide_std': 1.0}, None, 0.06),
+        ({}, 0.0, 0.02),
+        ({'tide_std': 1.0}, None, 0.02),
         ({'roll_bias_deg': 1.0}, 0.0, 0.8),
         ({'sound_speed_error': 10.0}, -0.33, 0.5),
     ],

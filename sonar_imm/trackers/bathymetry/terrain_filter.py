@@ -77,17 +77,15 @@ def _filtered(
     assert terrain is not None
     T, M = len(ping.ranges), len(models.names)
     work = np.empty((ROWS, NODES * M))
-    spread = ping.spread if ping.spread.shape[1] else None
-    launch = g.launch if len(g.launch) else None
     mean, variance, probability = np.empty(T), np.empty(T), np.empty((T, M))
     log_likelihood = np.empty(T)
     groups: tuple[tuple[Any, ...], ...] = (
         (terrain.walk, terrain.phi, terrain.follow, terrain.scatter, terrain.coast),
         (terrain.transition, terrain.stationary, SLOPE0, terrain.width),
         (*start, models.favour, temper),
-        (ping.echo, ping.form, ping.base, spread, ping.signal, ping.table),
+        (ping.echo, ping.form, ping.base, ping.spread, ping.signal, ping.table),
         (peak, np.empty(T), g.height, g.reach, g.cos_tilt, g.sin_tilt, g.spacing),
-        (launch, g.row, g.first_depth, g.depth_step),
+        (g.launch, g.row, g.first_depth, g.depth_step),
         (np.empty((2, T, M, 6)), np.empty((M, 5)), np.empty((M, 6)), np.empty(M)),
         (np.empty(M, np.int64), work, work.view(np.int64)),
         (mean, variance, probability, log_likelihood),

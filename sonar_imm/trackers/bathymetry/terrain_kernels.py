@@ -129,7 +129,7 @@ def filter_terrain(
     echo: NDArray[np.bool_],
     form: NDArray[np.complex128],
     base: NDArray[np.float64],
-    spread: NDArray[np.complex128] | None,
+    spread: NDArray[np.complex128],
     signal: NDArray[np.float64],
     table: NDArray[np.float64],
     peak: NDArray[np.float64],
@@ -139,7 +139,7 @@ def filter_terrain(
     cos_tilt: NDArray[np.float64],
     sin_tilt: NDArray[np.float64],
     spacing: float,
-    launch: NDArray[np.float64] | None,
+    launch: NDArray[np.float64],
     row: NDArray[np.float64],
     first_depth: float,
     depth_step: float,
@@ -163,7 +163,8 @@ def filter_terrain(
     bin, m; start_mean and start_std of the base before the first bin; favour (T, M): see
     `models.TerrainModels`, (0, M) for none.
 
-    The likelihood and the geometry: see `filter_kernels.filter_block`; temper: the log likelihood
+    The likelihood and the geometry: see `filter_kernels.filter_block`, but for spread and launch,
+    which have no column and no row where there are none; temper: the log likelihood
     counts so much; peak (T,): the height from which the beam is strongest, NaN for none.
 
     Scratch: peak_variance (T,), kept (2, T, M, 6), x (M, 5), pred (M, 6), mu (M,), who (M,), work
@@ -173,7 +174,7 @@ def filter_terrain(
     prediction was kept.
     """
     T, M, last = echo.shape[0], walk.shape[0], form.shape[1] - 1
-    law = slope0 * slope0
+    law, among = slope0 * slope0, spread.shape[1] > 0
     for turn in range(turns):
         center, wide = start_mean, start_std * start_std
         if turn == 1:
@@ -323,7 +324,7 @@ def filter_terrain(
                 for s in range(lanes):
                     work[1, s] = height[t] - work[0, s]
                     work[9, s] = -1.0
-                if launch is not None:
+                if len(launch):
                     k = min(max(int(row[t]), 0), launch.shape[0] - 2)
                     f, columns = row[t] - k, launch.shape[1] - 2
                     for s in range(lanes):
@@ -366,7 +367,7 @@ def filter_terrain(
                             z = work[3, s] * work[1, s] + work[4, s] * work[2, s] + re
                             work[4, s] = work[4, s] * work[1, s] - work[3, s] * work[2, s] + im
                             work[3, s] = z
-                    if spread is not None:
+                    if among:
                         re, im = spread[t, last].real, spread[t, last].imag
                         for s in range(lanes):
                             work[6, s] = re
@@ -378,7 +379,7 @@ def filter_terrain(
                                 work[7, s] = work[7, s] * work[1, s] - work[6, s] * work[2, s] + im
                                 work[6, s] = z
                 else:
-                    for part in range(1 if spread is None else 2):
+                    for part in range(2 if among else 1):
                         for s in range(lanes):
                             # With d = d/dz, the value p and d p and d^2 p / 2.
                             p, p1, p2 = 0j, 0j, 0j
@@ -386,7 +387,7 @@ def filter_terrain(
                             for k in range(last, -1, -1):
                                 p2 = p2 * z + p1
                                 p1 = p1 * z + p
-                                if spread is not None and part == 1:
+                                if among and part == 1:
                                     p = p * z + spread[t, k]
                                 else:
                                     p = p * z + form[t, k]
@@ -394,7 +395,7 @@ def filter_terrain(
                             work[3 + 3 * part, s] = p.real
                             work[4 + 3 * part, s] = p1.imag
                             work[5 + 3 * part, s] = -(2.0 * z * z * p2 + p1).real
-                if spread is not None:
+                if among:
                     # Beside interferers: the gain 1 + ss2 a^H R^-1 a; its logarithm into work[2].
                     for s in range(lanes):
                         gain = 1.0 + signal[t] * work[6, s]
@@ -420,7 +421,7 @@ def filter_terrain(
                     work[10, s] = temper * value
                     work[11, s] = temper * (table[1, cell] + f * (2.0 * square + 3.0 * f * cube))
                     work[13, s] = temper * (2.0 * square + 6.0 * f * cube)
-                if spread is not None:
+                if among:
                     for s in range(lanes):
                         work[10, s] -= temper * work[2, s]
                 if stage <= STEPS:

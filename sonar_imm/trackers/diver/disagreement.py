@@ -30,10 +30,9 @@ import math
 from attrs import evolve
 import numpy as np
 
-from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
-from ...estimation.rows import Rows
+from ...estimation.rows import combine_fixes, Rows
 from . import bursts
 from .innovations import FixConsistency, whiten_innovations
 from .known import Feature, Known
@@ -88,7 +87,7 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
         return known
     fix = association.fix[tracks]
     count = len(known.rows)
-    seen = bank.combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
+    seen = combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
     mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
     scale = (
         estimated_scales(known.rows, group.number)[tracks]

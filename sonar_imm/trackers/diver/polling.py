@@ -21,14 +21,16 @@ is to be done is `scan_period`, which joins the fixes of a turn.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from ...estimation.arrays import FloatArray, IntArray
-from .config import DiverConfig
-from .known import Known
-from .scan import Group
+
+if TYPE_CHECKING:  # `sonar-imm info` needs little of this, and begins sooner
+    from .config import DiverConfig
+    from .known import Known
+    from .scan import Group
 
 BEFORE = 30
 """Fixes before one among which the last one of the same target is looked for."""
@@ -40,8 +42,18 @@ IN_TURN = 0.6
 """Minimum share of fixes that come in turn."""
 
 APART = 14.0
-"""Change of the mean difference of two targets, in the usual step of the difference over the root
-of the number of fixes, that two sensors with a constant offset do not have: eight sigma."""
+"""Change of the median difference of two targets, in the usual step of the difference over the
+root of the number of fixes, that two sensors with a constant offset do not have: six sigma."""
+
+
+class Turn(NamedTuple):
+    """How a sensor looks at its targets in turn."""
+
+    seconds: float
+    """Time after which it comes back to the same target, s."""
+    offset: float | None
+    """Constant distance of the two that take turns, m: these may be two sensors of one target.
+    None if there are more, or if it changes."""
 
 
 class SingleFixes(NamedTuple):
@@ -53,8 +65,8 @@ class SingleFixes(NamedTuple):
     places: Annotated[FloatArray, 'f2'] = np.empty((0, 2))
     """m."""
 
-    def turn(self) -> float | None:
-        """Return the seconds in which the sensor looks at all; None if it does not turn."""
+    def turn(self) -> Turn | None:
+        """Return the turn of the sensor; None if it does not turn, or if fixes are few."""
         if len(self.stamps) < 2 * BEFORE:
             return None
         return turn_of(self.stamps, self.places)
@@ -74,12 +86,10 @@ def remember_single_fixes(known: Known, group: Group) -> Known:
     return known.with_memory(single=before)
 
 
-def turn_of(stamps_ns: IntArray, places: FloatArray) -> float | None:
-    """Return the seconds after which a sensor that stamps each fix by itself comes back to the
-    same target; None if it does not.
+def turn_of(stamps_ns: IntArray, places: FloatArray) -> Turn | None:
+    """Return the turn of a sensor that stamps each fix by itself; None if it does not turn.
 
-    Of the fixes before one, the last that is as near as those of one target are is his. Two that
-    take turns at a constant offset are two sensors of one target.
+    Of the fixes before one, the last that is as near as those of one target are is his.
 
     :param stamps_ns: (n,) rising, of more than `BEFORE` fixes.
     :param places: (n, 2).
@@ -94,27 +104,47 @@ def turn_of(stamps_ns: IntArray, places: FloatArray) -> float | None:
     seconds = (stamps_ns[last[:, 0]] - stamps_ns[last[:, 1]]) * 1e-9
     period, between = float(np.median(seconds)), last[:, 0] - last[:, 1]
     in_turn = (np.abs(seconds - period) <= 0.25 * period) & (between > 1)
-    if np.mean(in_turn) <= IN_TURN or (np.median(between) == 2 and _lie_parallel(places)):
+    if np.mean(in_turn) <= IN_TURN:
         return None
-    return period
+    offset = _constant_offset(stamps_ns, places, period, near) if np.median(between) == 2 else None
+    return Turn(period, offset)
 
 
-def _lie_parallel(places: FloatArray) -> bool:
-    """Return whether the difference of two that take turns, places (n, 2), is constant."""
-    sign = np.where(np.arange(len(places) - 2) % 2, -1.0, 1.0)[:, None]
+def _constant_offset(
+    stamps_ns: IntArray, places: FloatArray, period: float, near: float
+) -> float | None:
+    """Return the length of the difference of two that take turns, m; None if it changes.
+
+    near: distance, m, of two successive fixes of one.
+    """
+    halves = np.rint(np.diff(stamps_ns) * 2e-9 / period).astype(np.int64)
+    sign = np.where(np.cumsum(halves) % 2, 1.0, -1.0)[:-1]
+    two = places[2:] - places[:-2]
+    used = (halves[1:] == 1) & (halves[:-1] == 1) & (np.hypot(*two.T) <= near)
+    if used.sum() < 8:
+        return None
     # The middle of two of the one, less the other: motion cancels.
-    difference = sign * (0.5 * (places[2:] + places[:-2]) - places[1:-1])
+    difference = (sign[:, None] * (places[1:-1] - 0.5 * (places[2:] + places[:-2])))[used]
     step = float(np.median(np.hypot(*np.diff(difference, axis=0).T)))
-    quarter = len(difference) // 4
-    means = np.array([part.mean(axis=0) for part in np.array_split(difference, 4)])
-    return bool(np.ptp(means, axis=0).max() <= APART * step / np.sqrt(max(quarter, 1)) + 1e-9)
+    parts = np.array([np.median(part, axis=0) for part in np.array_split(difference, 4)])
+    if np.ptp(parts, axis=0).max() > APART * step / np.sqrt(len(difference) // 4) + 1e-9:
+        return None
+    return float(np.hypot(*np.median(difference, axis=0)))
 
 
 def warnings(known: SingleFixes, config: DiverConfig) -> list[str]:
-    """Return a warning about fixes that have to be joined to scans."""
-    period = known.turn() if config.scan_period == 0.0 else None
-    if period is None:
+    """Return a warning about fixes that have to be joined to scans, or whose sensors differ."""
+    turn = known.turn() if config.scan_period == 0.0 else None
+    if turn is None:
         return []
+    period = turn.seconds
+    if turn.offset is not None:
+        return [
+            f'two groups of fixes take turns of {period:.3g} s and lie {turn.offset:.2g} m apart, '
+            'always the same way. If they are two sensors of one target with an offset between '
+            'them, give each its own frame; if they are two targets, set scan_period to '
+            f'{period:.3g}'
+        ]
     return [
         f'every fix has a stamp of its own, and each target comes again after {period:.3g} s: a '
         f'scan of one fix misses all others. Set scan_period to {period:.3g}, which joins them; '

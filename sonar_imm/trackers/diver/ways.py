@@ -30,7 +30,7 @@ import numpy as np
 from ...estimation import bank
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import TENTATIVE
-from ...estimation.rows import log_sum, Rows
+from ...estimation.rows import combine_fixes, log_sum, Rows
 from .config import DiverConfig
 from .known import Known, row_outputs
 from .models import ModelSet
@@ -187,7 +187,7 @@ def _row_fixes(
     """Return mean (k, 2) and covariance (k, 2, 2) of the fix that rows (k,) expect. nil: without
     the offset."""
     at = row + len(rows) if nil and rows.tail else row
-    return bank.combine_fixes([(h[at], S[at]) for h, S in expected], rows.mu[row])
+    return combine_fixes([(h[at], S[at]) for h, S in expected], rows.mu[row])
 
 
 def _reach(known: Known, group: Group, models: ModelSet, row: IndexArray) -> FloatArray:

@@ -220,6 +220,13 @@ class Identities:
         ids[row] = before.track_id
         return before.track_id
 
+    def require(self) -> None:
+        """Raise ValueError where the state, which may come from a file, is impossible."""
+        for _, _, _, _, slope, *_ in self.reflectors:
+            known = math.isfinite(slope.mean) and 0.0 <= slope.dipping <= 1.0
+            if not (known and slope.variance > 0.0 and slope.noise >= 0.0):
+                raise ValueError('no reflector dips like that')
+
     def wait(self, records: int) -> Identities:
         """The time of so many records passes, and none comes."""
         if not records:

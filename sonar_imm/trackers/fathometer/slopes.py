@@ -112,8 +112,9 @@ class Ways(NamedTuple):
 
 
 def slopes_followed(config: FathometerConfig) -> bool:
-    """A datum that drifts and a floor that slopes are one thing: with heave there is no slope."""
-    return config.slope_std > 0.0 and config.heave == 'none'
+    """A datum that drifts and a floor that slopes are one thing: with heave there is no slope.
+    `auto` is none until the tracker puts what it found in its place."""
+    return config.slope_std > 0.0 and config.heave in ('none', 'auto')
 
 
 def begun(common: Common, noise: float, config: FathometerConfig) -> Slope:

@@ -211,6 +211,7 @@ class FathometerTracker:
     def restored(self) -> None:
         """Build anew what follows from the lattice, after a state was put in."""
         self._datum.require()
+        self._ids.require()
         self._own = self._datum.effective(self.config)
         self._water.require()
         if self._lattice is None:

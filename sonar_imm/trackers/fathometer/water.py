@@ -46,7 +46,7 @@ CAUTION = 1.15
 SCATTER_MEMORY = 0.9
 UNKNOWN_PULSE, LEAD = 2.0, 2.4
 """Samples of a pulse that is not known; pulses from the onset to the reflector, likewise."""
-LEAST_SAMPLES, DEAF, DEEPEST_TRANSMITTER = 20, 0.25, 10.0
+LEAST_SAMPLES, DEAF, NEAR, LOUD = 20, 0.25, 10.0, 3.0
 STILL_RECORDS, MOVED, MOVED_SAMPLES = 60, 0.5, 3.0
 """Traces in which a first return that never moves is doubted, and by how much, in m and samples,
 what is below moves then."""
@@ -70,8 +70,10 @@ class SeenFloor:
 
     @property
     def depth(self) -> tuple[float, float]:
-        """Mean and standard deviation of the depth of the floor, m; NaN where there is none."""
-        if not len(self.posterior) or self.posterior[-1] > _DEEP:
+        """Mean and standard deviation of the depth of the floor, m; NaN where there is none, and
+        where it begins with the window or above it, which nobody can tell."""
+        posterior = self.posterior
+        if not len(posterior) or max(posterior[-1], posterior[:2].sum()) > _DEEP:
             return math.nan, math.nan
         p = self.posterior[:-1] / self.posterior[:-1].sum()
         cell = np.arange(len(p), dtype=np.float64)
@@ -100,9 +102,9 @@ class SeenFloor:
 
 class Look(NamedTuple):
     """What T traces say together: noise (n,), rms; loudest: what loud traces reach; in samples the
-    transmit pulse at a first look, the standard deviation of the pulse (NaN when it is not known),
-    the lead from the onset to the reflector and its spread, and by trace the onset (T,), -1 for
-    none; state: of the chain at the end."""
+    transmit pulse at a first look (-1: there can be none), the standard deviation of the pulse
+    (NaN when it is not known), the lead from the onset to the reflector and its spread, and by
+    trace the onset (T,), -1 for none; state: of the chain at the end."""
 
     noise: FloatArray
     loudest: float
@@ -125,9 +127,9 @@ def look(
 ) -> Look:
     """Make the tables of the traces (T, n), samples `step` m apart. jump, fish_rate: see
     `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell;
-    least: noise that there is at least; top: depth of the first sample, m: a transmit pulse begins
-    near the surface."""
-    ring = envelopes.transmit_samples(traces) if top < DEEPEST_TRANSMITTER else 0
+    least: noise that there is at least; top: of the first sample below the transmitter, m: far
+    from it what is loud there is no transmit pulse but a floor that is cut."""
+    ring = envelopes.transmit_samples(traces) if top < NEAR else -1
     first = told[0] if told else np.maximum(envelopes.first_noise(traces), least)
     loudest = float(np.quantile(np.nanmax(traces, axis=1), 0.9))
     whole, cells = first, seen_cells(first, loudest)
@@ -170,16 +172,18 @@ class Water:
     """The water of one line of envelopes, trace by trace. STATE: see `trackers.Tracker`.
 
     active: whether the traces are envelopes, None before the first; first, step, cells: of the
-    depths they are put on, m; _traces (T, n): the first ones, until the tables are made for good;
-    _count: of all; _noise (n,), rms; _loudest: what loud traces reach; _pulse, _lead, _lead_std,
-    _ring: in samples; _state: what is known of onset and transmit pulse; _scatter (n,): power of
-    the scatter from four pulses below the onset on, of which _seen is how much of its memory is
-    filled; _dry: of _noted traces those without water above the first return; _beside (K, 2):
-    where the first return and the loudest below it lay in the last traces, in samples."""
+    depths they are put on, m; top: of the first below the transmitter, m; _traces (T, n): the
+    first ones, until the tables are made for good; _count: of all; _noise (n,), rms; _loudest:
+    what loud traces reach; _pulse, _lead, _lead_std, _ring: in samples; _state: what is known of
+    onset and transmit pulse; _scatter (n,): power of the scatter from four pulses below the onset
+    on, of which _seen is how much of its memory is filled; _dry: of _noted traces those without
+    water above the first return; _beside (K, 2): where the first return and the loudest below it
+    lay in the last traces, in samples."""
 
     STATE: ClassVar = (
-        *('active', 'first', 'step', 'cells', '_traces', '_count', '_noise', '_loudest', '_pulse'),
+        *('active', 'first', 'step', 'cells', 'top', '_traces', '_count', '_noise', '_loudest'),
         *(
+            '_pulse',
             '_lead',
             '_lead_std',
             '_ring',
@@ -197,6 +201,7 @@ class Water:
     first: float = field(init=False, default=0.0)
     step: float = field(init=False, default=0.0)
     cells: int = field(init=False, default=0)
+    top: float = field(init=False, default=0.0)
     _traces: Annotated[FloatArray, 'tn'] = field(init=False, factory=lambda: np.empty((0, 0)))
     _count: int = field(init=False, default=0)
     _noise: Annotated[FloatArray, 'n'] = field(init=False, factory=lambda: np.empty(0))
@@ -222,15 +227,16 @@ class Water:
             return
         self.first, self.step = float(trace.depth[below[0]]), trace.step
         self.cells = len(below)
+        self.top = self.first - (trace.reference_depth or 0.0)
 
     def require(self) -> None:
         """Raise ValueError where the state, which may come from a file, does not fit itself."""
         n = self.cells
         good = not self.active or (n >= LEAST_SAMPLES and 0.0 < self.step < math.inf)
-        good = good and math.isfinite(self.first) and self._traces.shape[1] in (0, n)
+        good = good and math.isfinite(self.first + self.top) and self._traces.shape[1] in (0, n)
         numbers = self._pulse, self._lead, self._lead_std, self._loudest, self._seen
         good = good and all(math.isfinite(number) and number >= 0.0 for number in numbers)
-        good = good and self._pulse > 0.0 and min(self._count, self._ring, self._noted) >= 0
+        good = good and self._pulse > 0.0 and min(self._count, self._ring + 1, self._noted) >= 0
         if self._state is not None:
             seen = len(self._state.onset)
             good = good and len(self._noise) == n == len(self._scatter) and 2 <= seen <= n
@@ -251,6 +257,7 @@ class Water:
         fresh = Water(self.config)
         fresh.active, fresh.step = True, step
         fresh.first, fresh.cells = self.first - above * step, cells + above
+        fresh.top = self.top - above * step
         for name in self.STATE:
             setattr(self, name, getattr(fresh, name))
 
@@ -328,7 +335,7 @@ class Water:
             told = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
         least = 0.0 if stated is None else stated
         chances = config.bottom_jump, config.fish_rate
-        found = look(self._traces, self.step, *chances, told, least, self.first)
+        found = look(self._traces, self.step, *chances, told, least, self.top)
         self._noise, self._loudest, self._ring, self._pulse = found[:4]
         self._lead, self._lead_std = found[4:6]
         if not self._pulse > 0.0:
@@ -380,7 +387,9 @@ class Water:
         assert self._state is not None
         onset = self._state.found
         self._noted += 1
-        self._dry += 0 <= onset <= ring + 2
+        # Fish do not swim at the first depth of all traces.
+        cut = self._ring < 0 and trace[0] > LOUD * self._noise[0]
+        self._dry += bool(cut or 0 <= onset <= ring + 2)
         begin = onset + math.ceil(5.0 * self._pulse) + 2
         if onset < 0 or not np.isfinite(trace[begin:]).any():
             return

@@ -141,13 +141,14 @@ def test_a_vessel_that_heads_east_sees_what_is_ahead_and_to_starboard(
 
 
 def test_a_vessel_by_latitude_and_longitude_is_placed_exactly(convert):
-    lines = ['5,60,10,45,500,0,.01', '6,60,10.18,45,500,0,.01']
+    # Of one fix in a second, a new target is not probable yet: the second place has two.
+    lines = ['5,60,10,45,500,0,.01', '6,60,10.18,45,500,0,.01', '7,60,10.18,45,500,0,.01']
     report = convert(
         'time,lat,lon,hdg,fwd,stbd,std\n' + '\n'.join(lines),
         options=CsvOptions(columns={'vessel_latitude': 'lat', 'vessel_longitude': 'lon'}),
     )
     kinds = [type(item) for item in measured(report)]
-    assert kinds == [VesselFix, VesselHeading, RelativeFix] * 2
+    assert kinds == [VesselFix, VesselHeading, RelativeFix] * 3
     assert known(report)['origin'][0] == 60.0
     there = pymap3d.enu2geodetic(*(500.0 * np.sqrt([0.5, 0.5, 0.0])), 60.0, 10.18, 0.0)
     expected = pymap3d.geodetic2enu(*there, 60.0, 10.0, 0.0)[:2]

@@ -26,6 +26,7 @@ import pytest
 from sonar_imm.estimation import rows as table
 from sonar_imm.estimation.bank import Gaussians
 from sonar_imm.measurements import Fixes
+from sonar_imm.trackers.diver import bursts
 from sonar_imm.trackers.diver.estimate import published_state
 from sonar_imm.trackers.diver.known import repair_covariances
 from sonar_imm.trackers.diver.scales import redistribute_weights
@@ -178,7 +179,8 @@ def test_rows_that_lost_their_weight_would_have_said_nothing_else(
     items = list(scans(2, 60, 7, apart=25.0, scatter=scatter))
     trackers, off, wide = [DiverTracker(config) for _ in range(2)], [], []
     thin = run(trackers[0], items)
-    monkeypatch.setattr(table, 'ROW_LOST', 1e-300)
+    for module in (table, bursts):
+        monkeypatch.setattr(module, 'ROW_LOST', 1e-300)
     for one, two in zip(thin, run(trackers[1], items)):
         assert np.array_equal(one.extras['track_id'], two.extras['track_id'])
         std, its = (np.sqrt(np.diagonal(e.covariance, axis1=1, axis2=2)) for e in (two, one))

@@ -67,11 +67,16 @@ def test_names_scans_and_single_targets_are_not_polled():
         assert not any('scan_period' in text for text in said(items)[1])
 
 
-def test_two_sensors_of_one_target_are_not_polled():
-    """They take turns as two targets would, but lie at a constant offset."""
-    for offset in (6.0, 30.0):
-        paths = [lambda t: circle(t, 0.0), lambda t, off=offset: circle(t, 0.0) + (off, 1.0)]
-        assert not any('scan_period' in text for text in said(in_turn(paths, 1.0, 0.0))[1])
+@pytest.mark.parametrize('missing', [0.0, 0.1])
+@pytest.mark.parametrize('offset', [6.0, 30.0])
+def test_two_at_a_constant_offset_are_two_targets_or_two_sensors(offset, missing):
+    """They take turns as two targets would: which it is cannot be known, so both are said."""
+    paths = [lambda t: circle(t, 0.0), lambda t: circle(t, 0.0) + (offset, 1.0)]
+    (sentence,) = said(in_turn(paths, 1.0, missing))[1]
+    assert 'two groups of fixes' in sentence and 'offset' in sentence
+    assert 'set scan_period to 2' in sentence and 'covariance' not in sentence
+    far = float(sentence.partition(' m apart')[0].split()[-1])
+    assert far == pytest.approx(np.hypot(offset, 1.0), abs=0.5)
 
 
 @pytest.mark.parametrize('offset, std', [(3.0, 1.0), (6.0, 0.5)])
@@ -82,7 +87,9 @@ def test_a_constant_offset_is_no_second_target_in_any_stretch(offset, std):
     stamps = (t * 1e9).astype(np.int64)
     for end in range(2 * BEFORE, 300, 10):
         last = slice(max(0, end - MOST_FIXES), end)
-        assert turn_of(stamps[last], places[last]) is None
+        turn = turn_of(stamps[last], places[last])
+        assert turn is None or turn.offset == pytest.approx(offset, abs=1.0)
     # A second target goes his own way.
     other = places + np.outer(t % 2, (8.0, 0.15)) * np.column_stack([np.ones(300), t])
-    assert turn_of(stamps[:MOST_FIXES], other[:MOST_FIXES]) == pytest.approx(2.0)
+    turn = turn_of(stamps[:MOST_FIXES], other[:MOST_FIXES])
+    assert turn.seconds == pytest.approx(2.0) and turn.offset is None

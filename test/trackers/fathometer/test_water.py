@@ -172,3 +172,44 @@ def test_halves_of_real_lines_agree(path):
         pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
     found = halves(path, 0.376)
     assert found['apart'] < 0.06 and found['inside'] > 0.95
+
+
+def cut_line(first, top=12.0):
+    """Two layers, the upper one with its middle at `top` m, in a window from `first` m on."""
+    rng, depth = np.random.default_rng(3), 0.25 * np.arange(140)
+    for k, lower in enumerate(np.linspace(18.0, 22.0, 41)):
+        echo = 0.01 * np.abs(rng.standard_normal(len(depth)))
+        echo += np.exp(-0.5 * np.square((depth[:, None] - [top, lower]) / 0.5)).sum(axis=1)
+        seen = depth >= first
+        yield Trace(stamp_ns=(k + 1) * 10**9, depth=depth[seen], amplitude=echo[seen])
+
+
+CUT = {'pulse': 'gaussian', 'noise_sigma': 0.05, 'min_separation': 1.5, 'depth_std': 0.1}
+
+
+def test_below_a_floor_that_the_window_cuts_nothing_is_the_floor():
+    """Far below a transmitter what is loud at the first depth is no transmit pulse. How deep the
+    floor is nobody can tell."""
+    tracker, found = run(cut_line(12.0), **CUT)
+    for columns in found[5:]:
+        assert columns['depth'][0] == pytest.approx(12.0) and columns['is_bottom'][0] > 0.9
+        assert (columns['is_bottom'][1:] < 0.1).all() and len(columns['depth']) == 2
+        assert np.isnan(columns['bottom_depth']).all() and (columns['blanked'] == 0.0).all()
+    assert any('below the floor' in each for each in tracker.warnings())
+
+
+def test_the_tail_of_a_floor_above_the_window_is_said():
+    tracker, _ = run(cut_line(12.5), **CUT)
+    assert any('below the floor' in each for each in tracker.warnings())
+    tracker, found = run(cut_line(11.0, top=13.5), **CUT)
+    assert not tracker.warnings() and found[-1]['bottom_depth'][0] == pytest.approx(13.5, abs=0.4)
+
+
+def test_a_transmitter_far_below_the_surface_has_a_transmit_pulse():
+    """Depths are those below the surface, the transmitter is at 100 m."""
+    traces, floor = line(7, records=60, **LINES['transmit pulse'])
+    deep = [evolve(each, depth=each.depth + 100.0, reference_depth=100.0) for each in traces]
+    plain, lower = (run(each)[1][-1] for each in (traces, deep))
+    assert lower['blanked'][0] == pytest.approx(plain['blanked'][0] + 100.0)
+    assert plain['blanked'][0] > 0.0
+    assert lower['bottom_depth'][0] == pytest.approx(floor[-1] + 100.0, abs=0.5)
