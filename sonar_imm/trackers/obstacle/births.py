@@ -35,11 +35,12 @@ Source: docs/obstacle.md, section Tracks.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, take
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
 from ...measurements import nanoseconds
 from .bodies import Bodies
 from .clutter import Clutter, sector_area
@@ -63,6 +64,8 @@ LONGEST = 60.0
 EARLY = 20
 """Pings in which seeds are reconsidered."""
 MOST = 3000
+STRIP = 64
+"""Seeds that are compared with echoes at once."""
 
 
 class Seeds(NamedTuple):
@@ -153,24 +156,43 @@ def met(
         return best
     dt = (ping.stamp_ns - seeds.stamp_ns) * 1e-9
     d, R = seeds.echoes.z[:, 0], seeds.echoes.R
-    off = place[None] - seeds.place[:, None]
-    north, east = seeds.along.T[:, :, None]
-    ahead = off[..., 0] * north + off[..., 1] * east
-    aside = off[..., 1] * north - off[..., 0] * east
     along = 2.0 * R[:, 0, 0] + LEAST_ALONG**2
     across = 2.0 * R[:, 1, 1] * d * d + (LEAST_ACROSS * d) ** 2 + (TURNS * dt) ** 2
     swung = 2.0 * config.sway_std**2 * -np.expm1(-dt / config.sway_time)
     gone = (0.5 * config.max_speed * dt) ** 2
     reach = 16.0 * (np.maximum(along, across) + max(swung, gone))
-    s, i = np.nonzero(ahead * ahead + aside * aside < reach[:, None])
-    L = np.zeros(len(s))
-    for share, more in zip(BEHAVIOURS, (0.0, swung, gone)):
-        a, c = along[s] + more, across[s] + more
-        square = ahead[s, i] ** 2 / a + aside[s, i] ** 2 / c
-        L += share * np.exp(-0.5 * square) / (2.0 * np.pi * np.sqrt(a * c))
     seen = (seeds.classes * detection(d, config)).sum(axis=1)
-    np.maximum.at(best, s, seen[s] * L * d[s] / expected[i])
+    for s, i in _near(seeds.place, np.sqrt(reach), place):
+        off, (north, east) = place[i] - seeds.place[s], seeds.along[s].T
+        ahead = off[:, 0] * north + off[:, 1] * east
+        aside = off[:, 1] * north - off[:, 0] * east
+        L = np.zeros(len(s))
+        for share, more in zip(BEHAVIOURS, (0.0, swung, gone)):
+            a, c = along[s] + more, across[s] + more
+            square = ahead * ahead / a + aside * aside / c
+            L += share * np.exp(-0.5 * square) / (2.0 * np.pi * np.sqrt(a * c))
+        np.maximum.at(best, s, seen[s] * L * d[s] / expected[i])
     return best
+
+
+def _near(
+    place: FloatArray, reach: FloatArray, others: FloatArray
+) -> Iterator[tuple[IndexArray, IndexArray]]:
+    """Yield the pairs of places (S, 2) and others (D, 2) within the reach (S,) of the place, m.
+
+    In parts, of which each has the places and others of one strip of northings: all pairs of a
+    ping of thousands of echoes would take gigabytes.
+    """
+    northward, sorted_ = np.argsort(place[:, 0]), np.argsort(others[:, 0])
+    north = others[sorted_, 0]
+    for first in range(0, len(place), STRIP):
+        rows = northward[first : first + STRIP]
+        widest = reach[rows].max()
+        ends = place[rows[0], 0] - widest, place[rows[-1], 0] + widest
+        near = sorted_[slice(*np.searchsorted(north, ends))]
+        apart = np.square(others[None, near] - place[rows, None]).sum(axis=2)
+        s, i = np.nonzero(apart < np.square(reach[rows])[:, None])
+        yield rows[s], near[i]
 
 
 def reconsidered(brood: Brood, clutter: Clutter, config: ObstacleConfig) -> Brood:
