@@ -151,7 +151,8 @@ class FathometerConfig(StampParameters):
         'transmit pulse, the water and the floor below it are found; off: their noise is taken '
         'for Gaussian', choices=WATERS)
     blanking: float = parameter(0.0, 'm',
-        'envelopes: depth above which nothing is looked at; 0: the transmit pulse is found',
+        'envelopes: depth above which nothing is looked at, because of the transmit pulse; 0: '
+        'the transmit pulse is found',
         range=(0.0, 12000.0))
     bottom_jump: float = parameter(0.005, '',
         'envelopes: probability that the floor jumps anywhere from one record to the next',

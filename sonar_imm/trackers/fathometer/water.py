@@ -335,7 +335,9 @@ class Water:
             told = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
         least = 0.0 if stated is None else stated
         chances = config.bottom_jump, config.fish_rate
-        found = look(self._traces, self.step, *chances, told, least, self.top)
+        # Who says where to look has cut off the transmit pulse.
+        top = math.inf if config.blanking else self.top
+        found = look(self._traces, self.step, *chances, told, least, top)
         self._noise, self._loudest, self._ring, self._pulse = found[:4]
         self._lead, self._lead_std = found[4:6]
         if not self._pulse > 0.0:
@@ -422,6 +424,6 @@ class Water:
                 found.append(
                     f'the first return stays within half a sample for {STILL_RECORDS} records '
                     f'while what is below moves by {self.step * moved:.1f} m: it may belong to '
-                    'the instrument; give blanking'
+                    f'the instrument; {"increase" if self.config.blanking else "give"} blanking'
                 )
         return found

@@ -27,6 +27,7 @@ depth, each trace states it by depth. Places become the topic ``/position``.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,6 +83,11 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
         if doubt := doubted_spacing(amplitude[usual.rows], usual.spacing, offset, stated):
             report.notes['sample_interval'] = doubt
     own, sigma = _instrument(report, amplitude[usual.rows], usual.spacing, how.stack)
+    if own and how.first_sample:
+        # The transmit pulse is left out: what comes first may be a shallow floor.
+        own['blanking'] = max(
+            0.0, math.floor(100.0 * min(w.depth(line)[0] for w in windows)) / 100.0
+        )
     records: list[Record] = []
     for window in windows:
         noise = sigma
