@@ -23,7 +23,7 @@ that of the first measurement.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import datetime, UTC
+from datetime import datetime
 import math
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,8 @@ from sonar_imm.measurements import NOBODY, Rejection, Start
 from sonar_imm.parameters import ConfigError, small_text, yaml_tree
 
 from .. import SECOND
+from ..recordings.sources import BagError
+from ..recordings.times import BadRow, moment_ns
 
 KEYS = {'position', 'covariance', 'name', 'time', 'frame_id'}
 """What a place may state."""
@@ -179,15 +181,15 @@ def _covariance(value: Any) -> tuple[float, ...]:
 def _stamp_ns(value: Any) -> int | None:
     if value is None:
         return None
-    if isinstance(value, str):
+    stamp_ns: int | None = None
+    if isinstance(value, str | datetime):
+        text = value.isoformat() if isinstance(value, datetime) else value
         try:
-            value = datetime.fromisoformat(value)
-        except ValueError:
-            raise ConfigError(
-                f"time '{value}' is neither seconds nor a date with a time"
-            ) from None
-    if isinstance(value, datetime):
-        value = (value if value.tzinfo else value.replace(tzinfo=UTC)).timestamp()
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 9e9:
+            stamp_ns = moment_ns(text, lambda: 'UTC')
+        except (BadRow, BagError) as error:
+            raise ConfigError(f"time '{value}': {error}") from None
+    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        stamp_ns = round(value * SECOND)
+    if stamp_ns is None or not 0 < stamp_ns < 2**63:
         raise ConfigError(f"time '{value}' is neither seconds since 1970 nor a date with a time")
-    return round(value * SECOND)
+    return stamp_ns

@@ -170,7 +170,8 @@ class Clutter(NamedTuple):
         size = np.sqrt(np.sqrt(np.linalg.det(R)))
         # In the order of x, a few fixes are compared with a few points.
         order, rows = np.argsort(self.points[:, 0]), np.argsort(z[:, 0])
-        x, y, weight = *self.points[order].T, self.weight[order]
+        x, y = self.points[order].T
+        weight = self.weight[order]
         for radius in RADII:
             left = []
             for start in range(0, len(rows), MOST_COMPARED):
