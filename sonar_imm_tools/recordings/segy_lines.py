@@ -38,13 +38,13 @@ from numpy.typing import NDArray
 
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
+from .. import SECOND
 from .sources import BagError
 from .times import BadRow, gps_minus_utc, moment_ns, zone_of
 
 if TYPE_CHECKING:
     import segyio
 
-SECOND = 10**9
 HEADERS, TRACE_HEADER = 3600, 240
 SAMPLE_BYTES = {3: 2, 8: 1, 6: 8, 7: 3, 9: 8, 11: 2, 12: 8, 15: 3, 16: 1}
 """Of each sample by the code of its format, where they are not 4."""
@@ -55,6 +55,8 @@ METRES, ARC_SECONDS, DEGREES, DMS = 1, 2, 3, 4
 FEET, FOOT = 2, 0.3048
 LOCAL, OTHER, GPS = 1, 3, 5
 """Time bases that are not UTC; 0 is taken for UTC."""
+READ_OPTIONS = ('time_zone', 'start', 'rate', 'crs')
+"""Arguments of `read_segy`, which are options of the conversion, too."""
 PLACES = (('SourceX', 'SourceY'), ('GroupX', 'GroupY'), ('CDP_X', 'CDP_Y'))
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from sonar_imm.acoustics.rays import FASTEST, Profile, SLOWEST
 from sonar_imm.estimation.arrays import FloatArray
 
+from .columns import plain
 from .sources import BagError, start_of
 
 MOST_POINTS = 200
@@ -118,11 +119,11 @@ def _table(path: Path, lines: list[str]) -> list[tuple[float, float]]:
 
 def _columns(path: Path, names: list[str]) -> tuple[int, int]:
     """Return the columns of depth and sound speed. Raises `BagError`."""
-    plain = [re.sub(r'[^a-z]+', '_', name.lower()).strip('_') for name in names]
+    plain_names = [plain(name) for name in names]
 
     def find(wanted: tuple[str, ...]) -> int | None:
         for word in wanted:
-            for k, name in enumerate(plain):
+            for k, name in enumerate(plain_names):
                 if name == word or name.startswith(f'{word}_') or len(word) > 3 and word in name:
                     return k
         return None

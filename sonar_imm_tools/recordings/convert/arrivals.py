@@ -253,20 +253,6 @@ def read_places(
     name: str,
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
     """Read the positions of receivers or transmitters by name, and the origin of local metres."""
-    with flags_of('receiver', report):
-        return _places(path, report, options, origin, name)
-
-
-def _places(
-    path: str | Path,
-    report: ConversionReport,
-    options: CsvOptions | None,
-    origin: tuple[float, ...] | None,
-    name: str,
-) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
-    table = CsvTable(path, options)
-    table.require(name)
-    frame = LocalFrame(table, origin)
     places: dict[str, tuple[float, float, float]] = {}
 
     def parse(row: Row) -> tuple[str, tuple[float, float, float]]:
@@ -276,9 +262,13 @@ def _places(
             raise BadRow(f"{name} '{row.text(name)}' is listed twice; the first position is used")
         return row.text(name), frame.position(row)
 
-    for _, (label, place) in report.read_rows(table, parse):
-        places[label] = place
-    if not places:
-        raise BagError(f'{table.path} lists no {name} with a position')
+    with flags_of('receiver', report):
+        table = CsvTable(path, options)
+        table.require(name)
+        frame = LocalFrame(table, origin)
+        for _, (label, place) in report.read_rows(table, parse):
+            places[label] = place
+        if not places:
+            raise BagError(f'{table.path} lists no {name} with a position')
     report.notes.update(frame.notes())
     return places, frame.origin

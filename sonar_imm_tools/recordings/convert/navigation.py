@@ -28,18 +28,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.navigation import write_navigation, write_range
-from sonar_imm.measurements import Altitude, Rejection
+from sonar_imm.measurements import Rejection
 
 from ..conversion import ConversionReport, flags_of
-from ..conversion import Record as Message
+from ..conversion import Record as Stamped
 from ..csv_table import CsvOptions, CsvTable, Row
-from ..messages import ros_message
 from ..places import Degrees
 from ..positions import write_position
 from ..sources import BagError
 from ..times import BadRow
-from .sonar_files import Frame, Record
+from .sonar_files import Frame, navigation_messages, Record
 
 ARRAYS: dict[str, tuple[str, ...]] = {
     'latitude': ('latitude', 'lat'),
@@ -63,7 +61,7 @@ _SMALL = math.radians(90.0)
 
 def navigation_of_table(
     path: Path | str | None, options: CsvOptions, report: ConversionReport, *, on_earth: bool
-) -> list[Message]:
+) -> list[Stamped]:
     """Return the messages of a table of positions: ``/position`` if `on_earth` and the table has
     degrees, else ``/nav``. Raises `BagError`."""
     if path is None:
@@ -90,21 +88,19 @@ def navigation_of_table(
 
         rows = [record for _, record in report.read_rows(table, parse)]
     units = 'degrees' if geodetic else 'metres'
+    report.rows -= len(rows)  # those of the input are counted
     if on_earth and geodetic:
-        report.rows -= len(rows)
         return [
             (row['stamp_ns'], '/position', write_position(row['stamp_ns'], *row['place']))
             for row in rows
         ]
     records = ({**row, 'units': units, 'altitude': math.nan} for row in rows)
-    messages = list(_messages(records, Path(path), report))
-    report.rows -= len(rows)
-    return messages
+    return list(_messages(records, Path(path), report))
 
 
 def navigation_of_arrays(
     arrays: Mapping[str, NDArray], stamps: list[int], path: Path, report: ConversionReport
-) -> list[Message]:
+) -> list[Stamped]:
     """Return the ``/nav`` and ``/altitude`` messages of arrays by the names of `ARRAYS`, one value
     per ping; none without a place. Raises `BagError`."""
     count = len(stamps)
@@ -140,11 +136,10 @@ def navigation_of_arrays(
 
 def _messages(
     records: Iterator[Record], path: Path, report: ConversionReport
-) -> Iterator[Message]:
+) -> Iterator[Stamped]:
     """Yield the messages of each record; what cannot be used is counted."""
     frame = Frame()
     for k, record in enumerate(records):
-        stamp_ns = record['stamp_ns']
         try:
             navigation = frame.navigation(record)
         except (Rejection, BadRow) as error:
@@ -152,10 +147,8 @@ def _messages(
             continue
         if navigation is None:
             continue
-        yield stamp_ns, '/nav', write_navigation(navigation, ros_message)
-        if record['altitude'] > 0.0 and math.isfinite(record['altitude']):
-            measured = Altitude(stamp_ns=stamp_ns, altitude=record['altitude'], frame_id='sonar')
-            yield stamp_ns, '/altitude', write_range(measured, ros_message)
+        for message in navigation_messages(record, navigation):
+            yield record['stamp_ns'], message.topic, message.content
     frame.tell(path, report)
 
 

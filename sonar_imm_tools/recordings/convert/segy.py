@@ -45,12 +45,10 @@ from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
-from ..segy_lines import read_segy, SegyLine
+from ..segy_lines import READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
 from .navigation import navigation_of_table
 
-READ_OPTIONS = ('time_zone', 'start', 'rate', 'crs')
-"""Options that `read_segy` has, too."""
 GRID_OPTIONS = ('sound_speed', 'sample_spacing', 'depth_offset')
 _LEAST_ARRIVALS, _NEAR = 10, 1.5
 _RUNS, _RUN = 10, 60

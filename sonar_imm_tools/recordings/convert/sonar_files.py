@@ -136,11 +136,6 @@ def write_records(
     notes = provenance(path.name, report.notes)
     own = {} if parameters is None else parameters
     with BagWriter(report.path, storage=how.storage, custom_data=notes, parameters=own) as bag:
-
-        def write(topic: str, content: Any, stamp_ns: int) -> None:
-            bag.write(topic, content, stamp_ns)
-            report.messages[topic] += 1
-
         for record in _in_time(records, path, report):
             stamp_ns = record['stamp_ns']
             try:
@@ -152,10 +147,10 @@ def write_records(
                 continue
             if made and nav is not None and stamp_ns != frame.last_ns:
                 frame.last_ns = stamp_ns
-                write('/nav', write_navigation(nav, ros_message), stamp_ns)
-                _write_altitude(record, write)
+                made = [*navigation_messages(record, nav), *made]
             for message in made:
-                write(message.topic, message.content, stamp_ns)
+                bag.write(message.topic, message.content, stamp_ns)
+                report.messages[message.topic] += 1
         if '/detections' in report.messages and frame.origin is not None:
             place = origin_parameters((frame.origin.latitude, frame.origin.longitude, 0.0))
             own['obstacle'] = {**own.get('obstacle', {}), **place}
@@ -164,11 +159,13 @@ def write_records(
     frame.tell(path, report)
 
 
-def _write_altitude(record: Record, write: Any) -> None:
+def navigation_messages(record: Record, navigation: Navigation) -> Iterator[Message]:
+    """Yield where the ship was and, if the record states it, its altitude."""
+    yield Message('/nav', write_navigation(navigation, ros_message))
     altitude = float(record['altitude'])
     if altitude > 0.0 and math.isfinite(altitude):
         measured = Altitude(stamp_ns=record['stamp_ns'], altitude=altitude, frame_id='sonar')
-        write('/altitude', write_range(measured, ros_message), record['stamp_ns'])
+        yield Message('/altitude', write_range(measured, ros_message))
 
 
 def _in_time(records: Iterator[Record], path: Path, report: ConversionReport) -> Iterator[Record]:

@@ -45,7 +45,7 @@ from sonar_imm.estimation.arrays import FloatArray, IntArray
 from ..convert_options import SegyOptions
 from ..csv_writer import CsvWriter
 from ..positions import Positions
-from ..segy_lines import opened_for_change, read_segy, SegyLine
+from ..segy_lines import opened_for_change, READ_OPTIONS, read_segy, SegyLine
 from ..sources import BagError
 from .points import wkt_of
 
@@ -248,9 +248,7 @@ def _line_of(
             'the recording does not say how it was made of SEG-Y; convert it again with '
             'sonar-imm convert segy'
         ) from None
-    line = read_segy(
-        original, time_zone=how.time_zone, start=how.start, rate=how.rate, crs=how.crs
-    )
+    line = read_segy(original, **{name: getattr(how, name) for name in READ_OPTIONS})
     first = line.first_depth(how.sound_speed, how.depth_offset)
     spacing = line.spacing(how.sound_speed, how.sample_spacing)
     if not (spacing > 0.0).all() or how.stack < 1:
