@@ -169,7 +169,7 @@ def command(
         if len(runs) == 1 and scheduler is None:
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
             print_json(run) if as_json else _print(run, out_dir)
-            if not run['estimates'] and not run['counts'].get('used', 0):
+            if _is_useless(run):
                 raise click.exceptions.Exit(1)
             return
         failures: list[Outcome] = []
@@ -390,6 +390,11 @@ def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
     return dict(outcome.run or {})
 
 
+def _is_useless(run: Mapping[str, Any]) -> bool:
+    """Return whether no measurement was used."""
+    return not run['estimates'] and not run['counts'].get('used', 0)
+
+
 def _print(run: Mapping[str, Any], out_dir: Path) -> None:
     say(
         f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
@@ -402,7 +407,7 @@ def _print(run: Mapping[str, Any], out_dir: Path) -> None:
         say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
     for problem in run['problems']:
         say(f'  problem: {problem}')
-    if not run['estimates'] and not run['counts'].get('used', 0):
+    if _is_useless(run):
         say('  no measurement was used')
     if run['rows'] == 0:
         say('  no track was made; sonar-imm info may show why')
