@@ -44,7 +44,7 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate, places
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import FloatArray, replace_rows, take
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import (
@@ -285,8 +285,11 @@ class ObstacleTracker:
         silent = known.stamp_ns - known.life.last_hit_ns > nanoseconds(SILENT)
         mixture = known.obstacles.mixture
         if ping.sweep is None:
-            steps = ping.before, ping.sonar, ping.dt
-            mixture, repairs = self.filter.advance(mixture, *steps, silent)
+            active = np.flatnonzero(~silent)
+            switched = self.filter.switch_behaviours(take(mixture, active), ping.dt)
+            mixture, repairs = self.filter.predict_unchanged(
+                replace_rows(mixture, active, switched), ping.before, ping.sonar, ping.dt
+            )
         else:
             where = self.filter.whereabouts(mixture, ping.before)
             met = ping.sweep.met(*where, ping.dt)
