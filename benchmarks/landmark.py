@@ -51,6 +51,7 @@ from sonar_imm.trackers.obstacle.filters import (
     BAND,
     beam_of,
     depth_span,
+    DepthSlices,
     HeightPrior,
     Mixture,
     Sonar,
@@ -165,7 +166,7 @@ def _wrap(vector: FloatArray, angles: BoolArray | None) -> FloatArray:
 _ANGLES = np.array([False, True])
 
 
-class Landmark:
+class Landmark(DepthSlices):
     """One Gaussian a target over its place in the world, north, east, depth, and the scale of the
     navigation: the unscented filter a navigator would write first."""
 
@@ -199,13 +200,8 @@ class Landmark:
         moved = unscented_transform(place, seen, covariance)
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
-    def advance(
-        self,
-        mixture: Mixture,
-        before: Sonar,
-        after: Sonar,
-        dt: float,
-        silent: BoolArray | None = None,
+    def predict_unchanged(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
         level, depth = (part * dt for part in self._noise)
@@ -220,7 +216,7 @@ class Landmark:
         self, mixture: Mixture, sonar: Sonar, met: Sequence[Sonar] | None = None
     ) -> tuple[FloatArray, FloatArray]:
         seen = unscented_transform(
-            lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
+            lambda points: self._measure(points, sonar), mixture.x, mixture.P, angles=_ANGLES
         )
         return seen.mean, seen.covariance
 
@@ -228,8 +224,8 @@ class Landmark:
         self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
         after = update(
-            mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
-            angles=_ANGLES,
+            mixture.x, mixture.P, z[:, None], lambda points: self._measure(points, sonar),
+            R[:, None], angles=_ANGLES,
         )  # fmt: skip
         return (
             Mixture(after.x, after.P, mixture.mu),
@@ -270,7 +266,7 @@ class Landmark:
         P[..., 2, 2] = mixture.P[..., 2, 2]
         return mixtures.visible(m, P, mixture.mu, *self._beam)
 
-    def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
+    def _measure(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])
         if sonar.late is None:
             return np.stack(geometry.project(out, self.model), axis=-1)
@@ -285,4 +281,4 @@ class LandmarkTracker(ObstacleTracker):
         super()._apply_config(
             evolve(config, drift_std=0.0, yaw_error_std_deg=0.0, navigation_delay_std=0.0)
         )
-        self.filter = Landmark(config)  # type: ignore[assignment]
+        self.filter = Landmark(config)

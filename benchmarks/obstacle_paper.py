@@ -75,7 +75,7 @@ from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.angles import wrap_angle
-from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -230,15 +230,10 @@ class Seafloor(DepthSlices):
     ) -> Mixture:
         return self._clamped(super().begin(z, R, sonar, height), sonar)
 
-    def advance(
-        self,
-        mixture: Mixture,
-        before: Sonar,
-        after: Sonar,
-        dt: float,
-        silent: BoolArray | None = None,
+    def predict_unchanged(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
-        return super().advance(self._clamped(mixture, before), before, after, dt)
+        return super().predict_unchanged(self._clamped(mixture, before), before, after, dt)
 
     def _clamped(self, mixture: Mixture, sonar: Sonar) -> Mixture:
         x, P = mixture.x.copy(), mixture.P.copy()

@@ -20,9 +20,9 @@ the elevation of an echo as well: a third measurement of each component,
     eps(d, delta, z) = asin(m_z / d),    positive down, m the point seen from the sonar,
 
 linearised at the mean: within a depth slice it is nearly straight. A new obstacle has its slices
-over `REACH` standard deviations of the measured elevation, and no longer over the whole beam.
+over `REACH` standard deviations of the measured elevation, not over the whole beam.
 Range and azimuth go into the update first, the elevation after them; clutter is spread evenly over
-the height of the beam. Rows without elevation are treated as ever, also beside others.
+the height of the beam. Rows without elevation update by range and azimuth alone.
 
 **Misses** (`misses: evidence`). Where an obstacle lies at the elevation eps, a ping shows it with
 the probability p B(eps): p is how often this obstacle gives an echo inside the beam, B the pattern
@@ -147,13 +147,17 @@ def apply_elevations(
     mixture: Mixture, seen: Elevations, pose: Pose, config: ObstacleConfig
 ) -> tuple[Mixture, FloatArray]:
     """After one elevation of each obstacle (T,), and the log (T,) of its density beside that of
-    clutter, which is as dense at any elevation in the beam. NaN changes nothing."""
+    clutter, which is as dense at any elevation in the beam. NaN changes nothing. pose: of the
+    sonar, or of one for each obstacle, see `unscented.points`."""
     known = np.flatnonzero(np.isfinite(seen.angle))
     if len(known) < len(seen.angle):
         log = np.zeros(len(seen.angle))
         if not len(known):
             return mixture, log
-        some, log[known] = apply_elevations(take(mixture, known), take(seen, known), pose, config)
+        theirs = take(pose, known) if pose.position.ndim > 1 else pose
+        some, log[known] = apply_elevations(
+            take(mixture, known), take(seen, known), theirs, config
+        )
         return replace_rows(mixture, known, some), log
     x, P, mu = mixture
     angle, H = expected_elevations(mixture, pose, config.azimuth_model == 'cone')

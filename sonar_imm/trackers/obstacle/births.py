@@ -12,23 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How obstacles begin: seeds.
+"""Track initiation: seeds.
 
-An echo that may be nobody's begins as a seed, which is only a place and an existence,
+An echo that may belong to no track becomes a seed, which is only a place and an existence,
 
     q = u lambda_b / (lambda_b + lambda) q0,    lambda_b = birth_rate dt / A,
 
 u the probability that it is no track's. Its bank of components is made when a later echo could be
-of the same obstacle: when q P_D L / lambda exceeds `WORTH`, with L the density of that echo around
-the place of the seed seen level,
+of the same obstacle: when q P_D L / lambda exceeds `LEAST_RATIO`, with L the density of that echo
+around the place of the seed seen level,
 
     along   2 R_r + .05^2 + e^2
     across  2 R_b d^2 + (.004 d)^2 + (.03 dt)^2 + e^2,
 
 e^2 = 0 where the obstacle is fixed, 2 sway_std^2 (1 - exp(-dt / sway_time)) where it sways and
 (max_speed dt / 2)^2 where it moves. lambda counts what the tracks expect there as well: an echo
-that is another's makes no bank. Pings that do not meet a seed lower its q, and it goes after
-`WAITS`. So clutter costs little.
+of a track makes no bank. Pings without an echo near a seed lower its q; after `LIFETIME` it is
+dropped. So clutter costs little.
 
 Source: docs/obstacle.md, section Tracks.
 """
@@ -50,20 +50,19 @@ from .filters import DepthSlices, Mixture, Sonar
 from .navigation_errors import NavigationErrors
 from .pings import default_variance, Echoes, Met, Ping
 
-WAITS = 2.5
-"""Seconds without an echo, after which a seed goes."""
-WORTH = 0.003
+LIFETIME = 2.5
+"""Seconds without an echo, after which a seed is dropped."""
+LEAST_RATIO = 0.003
+"""Least q P_D L / lambda of an echo for which a seed gets its bank."""
 BEHAVIOURS = 0.65, 0.17, 0.18
-"""Of a new obstacle: fixed, swaying, moving."""
+"""Prior of a new obstacle: fixed, swaying, moving."""
 LEAST_ALONG, LEAST_ACROSS, TURNS = 0.05, 0.004, 0.03
-"""m, rad, m/s: what a level place leaves out."""
-FIRST = 0.5
-"""Seconds that count for the first ping."""
-LONGEST = 60.0
-"""Most seconds in which new obstacles gather."""
-EARLY = 20
-"""Pings in which seeds are reconsidered."""
-MOST = 3000
+"""m, rad, m/s: errors that a place seen level leaves out."""
+FIRST_INTERVAL, LONGEST_INTERVAL = 0.5, 60.0
+"""Seconds of births that count for the first ping, and at most for any ping."""
+EARLY_PINGS = 20
+"""Pings in which the clutter density of seeds is updated."""
+MAX_SEEDS = 3000
 STRIP = 64
 """Seeds that are compared with echoes at once."""
 
@@ -94,13 +93,13 @@ class Seeds(NamedTuple):
         )
 
 
-Brood = tuple[Seeds, ...]
-"""Those of the last pings, the oldest first."""
+SeedBatches = tuple[Seeds, ...]
+"""Seeds of the last pings, the oldest first."""
 Bank = tuple[Mixture, Bodies, Existence, Met | None, int]
-"""See `bank`."""
+"""See `build_bank`."""
 
 
-def level(z: FloatArray, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+def level_places(z: FloatArray, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
     """Return the places (S, 2) of echoes z (S, 2) seen level, NED m, and the unit vectors to
     them."""
     pose = sonar.pose
@@ -110,43 +109,43 @@ def level(z: FloatArray, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
     return pose.position[:2] + z[:, :1] * along, along
 
 
-def sown(
-    brood: Brood,
+def add_seeds(
+    batches: SeedBatches,
     ping: Ping,
     false: FloatArray,
     density: FloatArray,
     config: ObstacleConfig,
-) -> Brood:
-    """Return the seeds with those of a ping.
+) -> SeedBatches:
+    """Return the seeds with those of a ping, without those that are too old.
 
     :param false: (D,) probability that each echo is no track's.
     :param density: (D,) of false echoes.
     """
-    dt = min(ping.dt, LONGEST) if ping.dt > 0.0 else FIRST
+    dt = min(ping.dt, LONGEST_INTERVAL) if ping.dt > 0.0 else FIRST_INTERVAL
     born = config.birth_rate * dt / sector_area(config)
     r = np.clip(false, 0.0, 1.0) * born / (born + density)
     takes = 0.0 if ping.echoes.late is None else -float(ping.echoes.late.min(initial=0.0))
-    oldest = ping.stamp_ns - nanoseconds(max(WAITS, ping.dt) + takes)
-    kept = [seeds for seeds in brood if seeds.stamp_ns >= oldest and len(seeds.classes)]
+    oldest = ping.stamp_ns - nanoseconds(max(LIFETIME, ping.dt) + takes)
+    kept = [seeds for seeds in batches if seeds.stamp_ns >= oldest and len(seeds.classes)]
     classes, echoes = r[:, None] * PRIOR, ping.echoes
     if echoes.late is None:
-        places = level(echoes.z, ping.sonar)
+        places = level_places(echoes.z, ping.sonar)
         kept.append(Seeds(ping.stamp_ns, ping.sonar, echoes, classes, density, *places))
     else:
         for i, (late, sonar) in enumerate(zip(echoes.late.tolist(), ping.places())):
             one, stamp_ns = slice(i, i + 1), ping.stamp_ns + nanoseconds(late)
-            places = level(echoes.z[one], sonar)
+            places = level_places(echoes.z[one], sonar)
             own = echoes.rows(np.array([i]))
             kept.append(Seeds(stamp_ns, sonar, own, classes[one], density[one], *places))
-    while sum(len(seeds.classes) for seeds in kept) > MOST and len(kept) > 1:
+    while sum(len(seeds.classes) for seeds in kept) > MAX_SEEDS and len(kept) > 1:
         kept.pop(0)
     return tuple(kept)
 
 
-def met(
+def association_ratios(
     seeds: Seeds, ping: Ping, place: FloatArray, expected: FloatArray, config: ObstacleConfig
 ) -> FloatArray:
-    """Return q P_D L / lambda (S,) of the echo that fits each seed best.
+    """Return q P_D L / lambda (S,) of each seed with the echo that fits it best.
 
     :param place: (D, 2) of the echoes, seen level.
     :param expected: (D,) density of false echoes and of those that tracks expect.
@@ -162,7 +161,7 @@ def met(
     gone = (0.5 * config.max_speed * dt) ** 2
     reach = 16.0 * (np.maximum(along, across) + max(swung, gone))
     seen = (seeds.classes * detection(d, config)).sum(axis=1)
-    for s, i in _near(seeds.place, np.sqrt(reach), place):
+    for s, i in _pairs_within(seeds.place, np.sqrt(reach), place):
         off, (north, east) = place[i] - seeds.place[s], seeds.along[s].T
         ahead = off[:, 0] * north + off[:, 1] * east
         aside = off[:, 1] * north - off[:, 0] * east
@@ -175,7 +174,7 @@ def met(
     return best
 
 
-def _near(
+def _pairs_within(
     place: FloatArray, reach: FloatArray, others: FloatArray
 ) -> Iterator[tuple[IndexArray, IndexArray]]:
     """Yield the pairs of places (S, 2) and others (D, 2) within the reach (S,) of the place, m.
@@ -195,59 +194,65 @@ def _near(
         yield rows[s], near[i]
 
 
-def reconsidered(brood: Brood, clutter: Clutter, config: ObstacleConfig) -> Brood:
-    """Return the seeds as what is known of false echoes by now has them: those of the first pings
-    began when nothing was."""
-    if clutter.pings > EARLY or config.clutter_density > 0.0:
-        return brood
+def with_clutter_density(
+    batches: SeedBatches, clutter: Clutter, config: ObstacleConfig
+) -> SeedBatches:
+    """Return the seeds with the clutter density as it is known by now: seeds of the first pings
+    began when nothing was known."""
+    if clutter.pings > EARLY_PINGS or config.clutter_density > 0.0:
+        return batches
     found = []
-    for seeds in brood:
+    for seeds in batches:
         density = np.maximum(clutter.density(seeds.echoes.z, config), seeds.density)
         less = (seeds.density / density)[:, None]
         found.append(seeds._replace(classes=less * seeds.classes, density=density))
     return tuple(found)
 
 
-def unmet(seeds: Seeds, config: ObstacleConfig) -> Seeds:
-    """Return the seeds after a ping that does not meet them."""
+def with_miss(seeds: Seeds, config: ObstacleConfig) -> Seeds:
+    """Return the seeds after a ping without an echo of them."""
     q = seeds.classes
     left = q * (1.0 - detection(seeds.echoes.z[:, 0], config))
     total = 1.0 - q.sum(axis=1) + left.sum(axis=1)
     return seeds._replace(classes=left / total[:, None])
 
 
-def grown(
-    brood: Brood,
+def start_banks(
+    batches: SeedBatches,
     ping: Ping,
     expected: FloatArray,
     errors: NavigationErrors,
     filter_: DepthSlices,
     room: int,
-) -> tuple[Brood, list[Bank]]:
-    """Return the seeds that are left after a ping, and the banks of those that it may meet, as
-    they are when it does: at most `room` of them, the likeliest first; errors: of the
-    navigation."""
+) -> tuple[SeedBatches, list[Bank]]:
+    """Return the seeds that are left after a ping, and the banks of those that it may show again,
+    at the instant at which it does.
+
+    :param expected: (D,) density of false echoes and of those that tracks expect.
+    :param errors: of the navigation.
+    :param room: most seeds that get a bank, those of the largest ratio first.
+    """
     config, z = filter_.config, ping.echoes.z
     if ping.sweep is None:
-        place, _ = level(z, ping.sonar)
+        place, _ = level_places(z, ping.sonar)
     else:
-        seen = [level(z[i : i + 1], sonar)[0] for i, sonar in enumerate(ping.places())]
+        seen = [level_places(z[i : i + 1], sonar)[0] for i, sonar in enumerate(ping.places())]
         place = np.concatenate(seen)
-    found = (met(seeds, ping, place, expected, config) for seeds in brood)
+    found = (association_ratios(seeds, ping, place, expected, config) for seeds in batches)
     worth = np.concatenate([np.empty(0), *found])
     best = np.argsort(-worth, kind='stable')[: max(room, 0)]
     grows = np.zeros(len(worth), np.bool_)
-    grows[best] = worth[best] > WORTH
+    grows[best] = worth[best] > LEAST_RATIO
     banks, left = [], []
-    for seeds in brood:
+    for seeds in batches:
         chosen, grows = grows[: len(seeds.classes)], grows[len(seeds.classes) :]
-        left.append(unmet(seeds.rows(~chosen), config))
+        left.append(with_miss(seeds.rows(~chosen), config))
         if chosen.any():
-            banks.append(bank(seeds.rows(chosen), ping, errors, filter_))
+            banks.append(build_bank(seeds.rows(chosen), ping, errors, filter_))
     return tuple(left), banks
 
 
-def bank(seeds: Seeds, ping: Ping, errors: NavigationErrors, filter_: DepthSlices) -> Bank:
+def build_bank(seeds: Seeds, ping: Ping, errors: NavigationErrors, filter_: DepthSlices) -> Bank:
     """Return the components of seeds, made at their instant and carried to a ping, where that met
     them, and how many covariances had to be repaired."""
     echoes, config, then = seeds.echoes, filter_.config, seeds.sonar

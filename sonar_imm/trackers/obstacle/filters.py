@@ -53,7 +53,7 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation.arrays import BoolArray, FloatArray, IndexArray, replace_rows, take
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
 from ..own_models import obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
@@ -199,16 +199,12 @@ class DepthSlices:
         return fresh
 
     def advance(
-        self,
-        mixture: Mixture,
-        before: Sonar,
-        after: Sonar,
-        dt: float,
-        silent: BoolArray | None = None,
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
-        to be repaired; silent (T,): those that go on with what they do."""
-        return self.predict_unchanged(mixture, before, after, dt)
+        to be repaired."""
+        switched = self.switch_behaviours(mixture, dt)
+        return self.predict_unchanged(switched, before, after, dt)
 
     def advance_each(
         self,
@@ -218,13 +214,23 @@ class DepthSlices:
         dt: FloatArray,
         silent: BoolArray | None = None,
     ) -> tuple[Mixture, int]:
-        """`advance` of each target by itself, from one sonar of its own to another."""
+        """`advance` of each target by itself, from one sonar of its own to another; silent (T,):
+        targets that go on with what they do."""
         if not len(before):
             return mixture, 0
         quiet = np.zeros(len(dt), np.bool_) if silent is None else silent
-        steps = zip(before, after, dt.tolist(), quiet[:, None])
-        done = [self.advance(take(mixture, np.array([t])), *step) for t, step in enumerate(steps)]
+        steps = zip(quiet.tolist(), before, after, dt.tolist())
+        done = [
+            (self.predict_unchanged if unchanged else self.advance)(
+                take(mixture, np.array([t])), *step
+            )
+            for t, (unchanged, *step) in enumerate(steps)
+        ]
         return joined([each for each, _ in done]), sum(repairs for _, repairs in done)
+
+    def switch_behaviours(self, mixture: Mixture, dt: float) -> Mixture:
+        """The targets with what they may begin to do within `dt` seconds."""
+        return mixture
 
     def whereabouts(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Mean place (T, 3) in the world and velocity (T, 3) of the targets, NED."""
@@ -419,20 +425,11 @@ class BehaviourSlices(DepthSlices):
             P[:, :, i, i] = self._prior
         return self._unshift(Mixture(x, P, mu), z, sonar)
 
-    def advance(
-        self,
-        mixture: Mixture,
-        before: Sonar,
-        after: Sonar,
-        dt: float,
-        silent: BoolArray | None = None,
-    ) -> tuple[Mixture, int]:
-        rows = np.arange(len(mixture.mu)) if silent is None else np.flatnonzero(~silent)
-        if len(rows):
-            chain = self._transition(dt)
-            mixed = mixtures.mix(*take(mixture, rows), self._prior, self.slices, chain, DROPPED)
-            mixture = replace_rows(mixture, rows, Mixture(*mixed))
-        return self.predict_unchanged(mixture, before, after, dt)
+    def switch_behaviours(self, mixture: Mixture, dt: float) -> Mixture:
+        if not len(mixture.mu):
+            return mixture
+        chain = self._transition(dt)
+        return Mixture(*mixtures.mix(*mixture, self._prior, self.slices, chain, DROPPED))
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         parts = mu.reshape(len(mu), mu.shape[1] // self.K, self.K)

@@ -17,7 +17,7 @@
 Every component carries five states behind the obstacle's own:
 
 s         scale of the horizontal distances, against sonar ranges
-psi       rad by which the told heading lies to starboard of the sonar's
+psi       rad by which the heading of nav lies to starboard of the sonar's
 b_N, b_E  m/s, minus the drift of the navigation to north and east
 tau       s by which poses come late
 
@@ -56,7 +56,7 @@ GOOD = np.array([0.003, np.radians(0.1), 0.003, 0.003, 0.01])
 SURE = 0.9
 """Probability of its existence from which a track sends messages."""
 SIGNIFICANT = 3.0
-"""Standard deviations from nothing at which an error is said."""
+"""Standard deviations from zero from which an error is reported."""
 DRIFTS, TURNED, LATE = 0.03, np.radians(1.0), 0.1
 """m/s, rad and s from which an error matters."""
 SLOWEST = 0.2
@@ -81,8 +81,8 @@ class NavigationErrors(NamedTuple):
         first = self.first_ns or stamp_ns
         return NavigationErrors(self.mean, self.covariance + np.diag(walk * dt), first)
 
-    def told(self, L: FloatArray, eta: FloatArray) -> NavigationErrors:
-        """Return the same with messages L (T, 5, 5), eta (T, 5)."""
+    def with_messages(self, L: FloatArray, eta: FloatArray) -> NavigationErrors:
+        """Return the estimate with messages L (T, 5, 5), eta (T, 5)."""
         information, vector = L.sum(axis=0), eta.sum(axis=0)
         known = np.eye(5) + self.covariance @ information
         mean = np.linalg.solve(known, self.mean + self.covariance @ vector)
@@ -182,32 +182,33 @@ def messages(
     return L, eta
 
 
-def told(mixture: Mixture, L: FloatArray, eta: FloatArray) -> Mixture:
-    """Return obstacles that took in messages L (T, 5, 5), eta (T, 5) of others."""
+def apply_messages(mixture: Mixture, L: FloatArray, eta: FloatArray) -> Mixture:
+    """Return obstacles after messages L (T, 5, 5), eta (T, 5) of others."""
     given = np.asarray(L.any(axis=(1, 2)))[:, None]
     live = np.nonzero((mixture.mu > 0.0) & given)
     if not len(live[0]):
         return mixture
     x, P, mu = (part[live] for part in mixture)
-    own, column = P[:, NAV, NAV], x[:, NAV, None]
-    L, eta = L[live[0]], eta[live[0], :, None]
-    known = np.eye(5) + L @ own
-    y = eta - L @ column
-    solved = solve(known, np.concatenate([y, L @ P[:, NAV]], axis=2))
+    x1, P1, log = mixture.x.copy(), mixture.P.copy(), np.full(mixture.mu.shape, -np.inf)
+    x1[live], P1[live], evidence = _with_information(x, P, L[live[0]], eta[live[0]])
+    log[live] = np.log(mu) + evidence
+    return Mixture(x1, P1, mixtures.weights(log, mixture.mu)[0])
+
+
+def _with_information(
+    x: FloatArray, P: FloatArray, L: FloatArray, eta: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return means (M, n) and covariances (M, n, n) of components given information L (M, 5, 5)
+    and eta (M, 5), about 0, on the errors e of the navigation, and the log (M,) of its evidence,
+    the mean of exp(e' eta - e' L e / 2)."""
+    mean, eta = x[:, NAV, None], eta[..., None]
+    known = np.eye(5) + L @ P[:, NAV, NAV]
+    solved = solve(known, np.concatenate([eta - L @ mean, L @ P[:, NAV]], axis=2))
     gain = P[..., NAV] @ solved
-    size = np.linalg.slogdet(known)[1]
-    # x'eta - x'L x/2 + y'(I + P L)^-1 P y/2, all of one row.
-    fit = transpose(column) @ (eta + y) + transpose(y) @ own @ solved[..., :1]
-    log = 0.5 * (fit[:, 0, 0] - size)
-    mixed = [part.copy() for part in mixture]
-    mixed[0][live], mixed[1][live] = x + gain[..., 0], symmetrise(P - gain[..., 1:])
-    weight = np.full(mixture.mu.shape, -np.inf)
-    weight[live] = np.log(mu) + log
-    top = weight.max(axis=1, keepdims=True)
-    given = np.isfinite(top[:, 0])
-    scaled = np.exp(weight[given] - top[given])
-    mixed[2][given] = scaled / scaled.sum(axis=1, keepdims=True)
-    return Mixture(*mixed)
+    after = x + gain[..., 0]
+    fit = transpose(mean) @ solved[..., :1] + transpose(eta) @ after[:, NAV, None]
+    evidence = 0.5 * (fit[:, 0, 0] - np.linalg.slogdet(known)[1])
+    return after, symmetrise(P - gain[..., 1:]), evidence
 
 
 def under_two_assumptions(
@@ -229,21 +230,16 @@ def under_two_assumptions(
     Lam = np.where(doubtful, 1.0 / np.where(narrow > 0.0, narrow, 1.0), 0.0)
     Lam = Lam - np.where(doubtful, 1.0 / np.where(wide > 0.0, wide, 1.0), 0.0)
     live = np.nonzero((mu > NEGLIGIBLE) & sure[:, None])
-    own, column, cross = P[live][:, NAV, NAV], x[live][:, NAV, None], P[live][..., NAV]
-    known = np.eye(5) + Lam[:, None] * own
-    solved = solve(known, Lam[:, None] * np.concatenate([column, transpose(cross)], axis=2))
-    gain = cross @ solved
-    size = np.linalg.slogdet(known)[1]
-    fit = (transpose(column) @ solved[..., :1])[:, 0, 0]
+    L = np.broadcast_to(np.diag(Lam), (len(live[0]), 5, 5))
     odds = np.log(prior / (1.0 - prior)) if prior < 1.0 else np.inf
     odds += 0.5 * np.log(wide[doubtful] / narrow[doubtful]).sum()
-    both = [np.concatenate([part, part], axis=1) for part in mixture]
-    both[0][live] -= gain[..., 0]
-    both[1][live] = symmetrise(P[live] - gain[..., 1:])
+    both = Mixture(*(np.concatenate([part, part], axis=1) for part in mixture))
+    both.x[live], both.P[live], evidence = _with_information(
+        x[live], P[live], L, np.zeros((len(L), 5))
+    )
     log = np.full((T, 2 * K), -np.inf)
-    log[:, K:] = np.log(np.maximum(mu, 1e-300))
-    log[live] = np.log(mu[live]) + min(odds, 700.0) - 0.5 * (size + fit)
-    weight = np.exp(log - log.max(axis=1, keepdims=True))
-    weight[:, K:] *= mu > 0.0
-    weight /= weight.sum(axis=1, keepdims=True)
-    return Mixture(both[0], both[1], weight), np.where(sure, weight[:, :K].sum(axis=1), np.nan)
+    with np.errstate(divide='ignore'):
+        log[:, K:] = np.log(mu)
+    log[live] = np.log(mu[live]) + min(odds, 700.0) + evidence
+    weight, _ = mixtures.weights(log, both.mu)
+    return both._replace(mu=weight), np.where(sure, weight[:, :K].sum(axis=1), np.nan)

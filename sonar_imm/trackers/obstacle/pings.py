@@ -211,10 +211,10 @@ class Ping:
     """One ping on its way through the stages. What a stage tells later ones stands in a slot that
     no other stage writes: `before` and `dt` (s) the sonar in the ping before and how long ago that
     was, and in a ping that takes time where the obstacles were `met`, by `predict`; `match` by
-    `associate`; `heard`, what was known of the navigation before the update, by `heed`; `stays`
-    (T,) the tracks that do not end, and `over` (T,) those that are remembered if so, by `judge`.
-    sweep: of a ping that takes time; untimed: s that it took where nobody says when it met
-    what."""
+    `associate`; `navigation_before`, marginals of its errors before the update, by
+    `note_navigation`; `stays` (T,) the tracks that do not end, and `over` (T,) those that are
+    remembered if so, by `judge`. sweep: of a ping that takes time; untimed: s that it took where
+    nobody says when it met what."""
 
     stamp_ns: int
     sonar: Sonar
@@ -226,7 +226,7 @@ class Ping:
     before: Sonar = field(init=False)
     dt: float = field(init=False)
     match: Match = field(init=False)
-    heard: tuple[FloatArray, FloatArray] = field(init=False)
+    navigation_before: tuple[FloatArray, FloatArray] = field(init=False)
     stays: BoolArray = field(init=False)
     over: BoolArray = field(init=False)
 

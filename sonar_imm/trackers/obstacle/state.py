@@ -35,7 +35,7 @@ from ...estimation.arrays import append, BoolArray, FloatArray, take
 from ...estimation.association import TENTATIVE, TrackRules, Tracks
 from ...estimation.consistency import NisMemory
 from .beam import MissEvidence
-from .births import Brood
+from .births import SeedBatches
 from .bodies import Bodies, with_common_errors
 from .clutter import Clutter
 from .config import ObstacleConfig
@@ -69,7 +69,7 @@ class Known(NamedTuple):
     that are not in view any more; repairs: covariances repaired so far; broken: tracks ended so
     far because their numbers were not finite; alike: whether most obstacles move alike
     (`filters.moving_alike`), pings_alike: pings so far in which they did; innovations: of
-    confirmed obstacles; brood: echoes that may become tracks; clutter: false echoes so far;
+    confirmed obstacles; seeds: echoes that may become tracks; clutter: false echoes so far;
     scales: of the variances of the echoes; untimed: s that the pings took that are the most wrong
     for it, and m by which they are, where their echoes have no times; navigation: its errors."""
 
@@ -83,7 +83,7 @@ class Known(NamedTuple):
     alike: bool = False
     pings_alike: int = 0
     innovations: NisMemory = NisMemory()
-    brood: Brood = ()
+    seeds: SeedBatches = ()
     clutter: Clutter = Clutter.none()
     scales: Scales = Scales.none()
     untimed: tuple[float, float] = (0.0, 0.0)

@@ -19,14 +19,14 @@ how an echo of a fixed obstacle must move, and that depends on how far above or 
 lies. The tracker follows each obstacle in sonar coordinates and learns its vertical offset on the
 way (`filters`). Navigation and pings arrive in any order (`pings`). A ping goes through
 
-    predict -> recall -> associate -> heed -> update -> tell -> carry -> judge -> remember -> end
-    -> begin -> watch
+    predict -> recall -> associate -> note navigation -> update -> share navigation ->
+    complete scan -> judge -> remember -> end -> begin -> watch
 
 A ping of a sonar that turns takes time: each obstacle is predicted to the instant at which the
-beam meets it, and carried on to the end of the ping after its update.
+beam meets it, and predicted on to the end of the ping after its update.
 
-An echo that may be nobody's begins as a seed (`births`); `associate` makes tracks of those that
-the ping may meet again, and weighs all joint events of tracks and echoes (`events`).
+An echo that may belong to no track becomes a seed (`births`); `associate` makes tracks of those
+that the ping may show again, and weighs all joint events of tracks and echoes (`events`).
 
 Each stage is a pure function of what is `Known` and of the ping. The tuple of stages is built once
 from the parameters; a feature that is off has none. So a late message is put in its place by
@@ -44,7 +44,7 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate, places
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import FloatArray, replace_rows, take
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import (
@@ -56,7 +56,7 @@ from ...measurements import (
     Navigation,
 )
 from .avoidance import closest_approach
-from .births import grown, reconsidered, sown
+from .births import add_seeds, start_banks, with_clutter_density
 from .bodies import with_common_errors
 from .config import ObstacleConfig
 from .events import associate, claims, compare, learnt, updated
@@ -65,11 +65,11 @@ from .filters import behaviour_columns, build_filter, Mixture, moving_alike
 from .memory import Memory
 from .mixtures import moment_match
 from .navigation_errors import (
+    apply_messages,
     marginals,
     messages,
     NavigationErrors,
     SURE,
-    told,
     under_two_assumptions,
 )
 from .pings import joined, Mount, Ping
@@ -122,10 +122,10 @@ class ObstacleTracker:
             self._predict_misses if evidence else None,
             self._recall,
             self._associate,
-            self._heed if shared else None,
+            self._note_navigation if shared else None,
             self._update,
-            self._tell if shared else None,
-            self._carry,
+            self._share_navigation if shared else None,
+            self._complete_scan,
             self._weigh_misses if evidence else None,
             self._judge,
             self._remember if remembers else None,
@@ -190,7 +190,7 @@ class ObstacleTracker:
             'pings_moving_alike': known.pings_alike,
             'covariance_repairs': known.repairs,
             'landmarks': len(known.memory),
-            'seeds': sum(len(seeds.classes) for seeds in known.brood),
+            'seeds': sum(len(seeds.classes) for seeds in known.seeds),
             'clutter_a_ping': known.clutter.a_ping(),
             **dict(
                 zip(('scale_range', 'scale_bearing'), known.scales.factor(self.config).tolist())
@@ -285,8 +285,11 @@ class ObstacleTracker:
         silent = known.stamp_ns - known.life.last_hit_ns > nanoseconds(SILENT)
         mixture = known.obstacles.mixture
         if ping.sweep is None:
-            steps = ping.before, ping.sonar, ping.dt
-            mixture, repairs = self.filter.advance(mixture, *steps, silent)
+            active = np.flatnonzero(~silent)
+            switched = self.filter.switch_behaviours(take(mixture, active), ping.dt)
+            mixture, repairs = self.filter.predict_unchanged(
+                replace_rows(mixture, active, switched), ping.before, ping.sonar, ping.dt
+            )
         else:
             where = self.filter.whereabouts(mixture, ping.before)
             met = ping.sweep.met(*where, ping.dt)
@@ -327,9 +330,9 @@ class ObstacleTracker:
         compared, repairs = compare(known.obstacles, ping, filter_, ping.met, widest)
         density = known.clutter.density(ping.echoes.z, config)
         expected = density * (1.0 + claims(known.obstacles, compared, density, filter_))
-        brood = reconsidered(known.brood, known.clutter, config)
+        seeds = with_clutter_density(known.seeds, known.clutter, config)
         room = config.max_tracks - T
-        brood, banks = grown(brood, ping, expected, known.navigation, filter_, room)
+        seeds, banks = start_banks(seeds, ping, expected, known.navigation, filter_, room)
         for mixture, bodies, existence, met, repaired in banks:
             new = begun(mixture, bodies, existence)
             known = known.joined(known.life.born(len(new.nis), ping.stamp_ns, RULES), new)
@@ -338,7 +341,7 @@ class ObstacleTracker:
             repairs += repaired + more
             ping.met = joined(ping.met, met)
         ping.match = associate(known.obstacles, compared, density, filter_)
-        return known._replace(brood=brood, repairs=known.repairs + repairs)
+        return known._replace(seeds=seeds, repairs=known.repairs + repairs)
 
     def _update(self, known: Known, ping: Ping) -> Known:
         """Update obstacles, existence, and what is known of false echoes and of variances."""
@@ -353,26 +356,26 @@ class ObstacleTracker:
             scales=scales,
         )
 
-    def _heed(self, known: Known, ping: Ping) -> Known:
-        """Note what is known of the errors of the navigation before the update."""
-        ping.heard = marginals(known.obstacles.mixture)
+    def _note_navigation(self, known: Known, ping: Ping) -> Known:
+        """Keep the marginals of the errors of the navigation as they are before the update."""
+        ping.navigation_before = marginals(known.obstacles.mixture)
         return known
 
-    def _tell(self, known: Known, ping: Ping) -> Known:
-        """Tell all other obstacles what the update of each said of these errors."""
+    def _share_navigation(self, known: Known, ping: Ping) -> Known:
+        """Send all other obstacles the information on these errors that each gained."""
         mixture = known.obstacles.mixture
         chance = known.obstacles.existence.probability()
         trust = np.where(known.confirmed & (chance > SURE), chance, 0.0)
-        L, eta = messages(ping.heard, marginals(mixture), trust)
+        L, eta = messages(ping.navigation_before, marginals(mixture), trust)
         if not L.any():
             return known
         if len(L) > 1:
-            mixture = told(mixture, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
-        known = known._replace(navigation=known.navigation.told(L, eta))
+            mixture = apply_messages(mixture, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
+        known = known._replace(navigation=known.navigation.with_messages(L, eta))
         return known.with_columns(mixture=mixture)
 
-    def _carry(self, known: Known, ping: Ping) -> Known:
-        """Carry the obstacles of a ping that takes time on to its end."""
+    def _complete_scan(self, known: Known, ping: Ping) -> Known:
+        """Predict the obstacles to the end of a ping that takes time."""
         if ping.met is None:
             return known
         met = ping.met
@@ -417,10 +420,12 @@ class ObstacleTracker:
         return known.only(ping.stays)
 
     def _begin(self, known: Known, ping: Ping) -> Known:
-        """Sow a seed at each echo."""
+        """Add a seed for each echo."""
         match = ping.match
         false = 1.0 - match.beta.sum(axis=0)
-        return known._replace(brood=sown(known.brood, ping, false, match.density, self.config))
+        return known._replace(
+            seeds=add_seeds(known.seeds, ping, false, match.density, self.config)
+        )
 
     def _watch(self, known: Known, ping: Ping) -> Known:
         """Count what users are warned of."""

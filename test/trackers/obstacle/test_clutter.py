@@ -25,7 +25,14 @@ from scipy.stats import multivariate_normal
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections
-from sonar_imm.trackers.obstacle.births import BEHAVIOURS, level, met, Seeds, sown, unmet
+from sonar_imm.trackers.obstacle.births import (
+    add_seeds,
+    association_ratios,
+    BEHAVIOURS,
+    level_places,
+    Seeds,
+    with_miss,
+)
 from sonar_imm.trackers.obstacle.clutter import Clutter
 from sonar_imm.trackers.obstacle.existence import (
     detection,
@@ -183,28 +190,32 @@ def ping_of(z, stamp_ns=SECOND, dt=0.5):
 
 
 def test_a_seed_is_as_probable_as_births_beside_clutter():
-    (seeds,) = sown((), ping_of([[60.0, 0.1], [30.0, 0.0]]), np.array([1.0, 0.25]), 0.02, CONFIG)
+    (seeds,) = add_seeds(
+        (), ping_of([[60.0, 0.1], [30.0, 0.0]]), np.array([1.0, 0.25]), 0.02, CONFIG
+    )
     born = 0.02 * 0.5 / (100.0 * np.radians(45.0))
     assert_allclose(seeds.classes.sum(axis=1), [1.0, 0.25] * np.array(born / (born + 0.02)))
     assert_allclose(seeds.classes[0] / seeds.classes[0].sum(), PRIOR)
     pd = np.array([0.9, 0.5, 0.2])
     q = seeds.classes[0]
-    left = unmet(seeds, CONFIG).classes[0]
+    left = with_miss(seeds, CONFIG).classes[0]
     assert_allclose(left, q * (1.0 - pd) / (1.0 - q.sum() + (q * (1.0 - pd)).sum()))
     late = ping_of([[60.0, 0.1]], stamp_ns=4 * SECOND)
-    assert len(sown((seeds,), late, np.ones(1), 0.02, CONFIG)) == 1  # after 2.5 s it goes
+    assert len(add_seeds((seeds,), late, np.ones(1), 0.02, CONFIG)) == 1  # after 2.5 s it goes
     soon = ping_of([[60.0, 0.1]], stamp_ns=3 * SECOND)
-    assert len(sown((seeds,), soon, np.ones(1), 0.02, CONFIG)) == 2
+    assert len(add_seeds((seeds,), soon, np.ones(1), 0.02, CONFIG)) == 2
 
 
 def test_a_seed_is_met_as_the_closed_mixture_around_its_place_says():
-    (seeds,) = sown((), ping_of([[60.0, 0.1]]), np.ones(1), 0.02, CONFIG)
+    (seeds,) = add_seeds((), ping_of([[60.0, 0.1]]), np.ones(1), 0.02, CONFIG)
     assert isinstance(seeds, Seeds)
     dt, d = 1.0, 60.0
     z = np.array([[60.9, 0.105], [95.0, -0.2]])
     expected = np.array([0.5, 0.02])
-    place, _ = level(z, SONAR)
-    found = met(seeds, ping_of(z, SECOND + round(dt * SECOND)), place, expected, CONFIG)
+    place, _ = level_places(z, SONAR)
+    found = association_ratios(
+        seeds, ping_of(z, SECOND + round(dt * SECOND)), place, expected, CONFIG
+    )
     # In the axes of the seed: the sonar has not moved.
     off = [60.9 * np.cos(0.005) - d, 60.9 * np.sin(0.005)]
     R_r, R_b = CONFIG.range_std**2, np.radians(CONFIG.bearing_std_deg) ** 2

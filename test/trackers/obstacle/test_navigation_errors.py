@@ -122,11 +122,11 @@ def test_messages_and_what_they_tell_equal_the_joint_gaussian():
     L, eta = navigation_errors.messages(marginals(before), marginals(after), np.ones(3))
     assert_allclose(L, data['message_information'], rtol=1e-8, atol=1e-8)
     assert_allclose(eta, data['message_vector'], rtol=1e-8, atol=1e-8)
-    got = navigation_errors.told(after, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
+    got = navigation_errors.apply_messages(after, L.sum(axis=0) - L, eta.sum(axis=0) - eta)
     assert_allclose(got.x[:, 0][:, states], data['together_mean'], rtol=1e-9, atol=1e-9)
     block = got.P[:, 0][:, states[:, None], states]
     assert_allclose(block, data['together_cov'], rtol=1e-9, atol=1e-10)
-    common = NavigationErrors(data['common_mean'], data['common_covariance']).told(L, eta)
+    common = NavigationErrors(data['common_mean'], data['common_covariance']).with_messages(L, eta)
     assert_allclose(common.mean, data['together_mean'][0, 2:], rtol=1e-9, atol=1e-9)
     assert_allclose(common.covariance, data['together_cov'][0, 2:, 2:], rtol=1e-8, atol=1e-10)
 
@@ -141,7 +141,7 @@ def test_weights_of_components_that_are_told_are_their_evidence():
     B = rng.normal(size=(5, 5))
     R, z = B @ B.T + np.eye(5), rng.normal(size=5)
     L = np.linalg.inv(R)
-    got = navigation_errors.told(Mixture(x, P, mu), L[None], (L @ z)[None])
+    got = navigation_errors.apply_messages(Mixture(x, P, mu), L[None], (L @ z)[None])
     weight = np.empty(3)
     for k in range(3):
         S = P[0, k][NAV, NAV] + R

@@ -14,6 +14,7 @@
 
 """Sonars that turn: each obstacle at the instant at which the beam met it."""
 
+from attrs import evolve
 from helpers.obstacle_runs import run, SECOND
 import numpy as np
 from numpy.testing import assert_allclose
@@ -151,6 +152,27 @@ def test_a_row_without_a_time_has_that_of_its_neighbours():
         last(lambda *scan, lost=lost: spoilt(*scan, lost), noise=1.0) for lost in (False, True)
     )
     assert_allclose(places_of(whole), places_of(holed), atol=0.3)
+
+
+def test_some_rows_of_a_scan_may_have_elevations():
+    """Here those of one obstacle, whose height they show."""
+
+    def with_elevation(start, times, places):
+        (ping,) = as_scan(start, times, places)
+        deepest = np.array(list(OBSTACLES)) == 'below'
+        drop = OBSTACLES['below'][2] - np.array([vehicle(t)[0][2] for t in times])
+        elevation = np.where(deepest, np.arcsin(drop / places[:, 0]), np.nan)
+        yield evolve(ping, elevation=elevation)
+
+    def height_std(estimate):
+        sure = estimate.extras['track_state'] > 0
+        x, y, _ = OBSTACLES['below']
+        row = np.hypot(*(places_of(estimate) - [x, y]).T).argmin()
+        return np.sqrt(estimate.covariance[sure][row, 2, 2])
+
+    some, none = (last(kind, noise=1.0) for kind in (with_elevation, as_scan))
+    assert len(places_of(some)) == len(places_of(none)) == len(OBSTACLES)
+    assert height_std(some) < 0.8 * height_std(none)
 
 
 def spoilt(start, times, places, lost):
