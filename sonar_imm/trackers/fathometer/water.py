@@ -38,6 +38,7 @@ from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.onset import OnsetChain, OnsetState
 from ...measurements import Trace
 from .config import FathometerConfig
+from .noise import stated_sigma
 
 LOOKS = 10, 12, 15, 20, 25, 30, 40, 50, 60
 """Numbers of traces at which the tables are made, the last of them for good."""
@@ -278,7 +279,8 @@ class Water:
         self._count += 1
         if self._count <= LOOKS[-1]:
             self._traces = np.vstack([self._traces.reshape(-1, self.cells), amplitude])
-        early, stated = self._count < LOOKS[0], self._stated(trace)
+        early = self._count < LOOKS[0]
+        stated = stated_sigma(trace, self.depth, self.config.noise_sigma)
         if early and stated is None:
             scale = np.full(self.cells, CAUTION * envelopes.quietest(amplitude))
         elif early or self._count in LOOKS:
@@ -315,15 +317,6 @@ class Water:
             return np.array(trace.amplitude[-self.cells :], np.float64)
         nothing = {'left': np.nan, 'right': np.nan}
         return np.asarray(np.interp(depth, trace.depth, trace.amplitude, **nothing))
-
-    def _stated(self, trace: Trace) -> FloatArray | None:
-        """The noise (n,) that a trace or the parameters state; None where they do not."""
-        if self.config.noise_sigma:
-            return np.full(self.cells, self.config.noise_sigma)
-        if trace.sigma is None:
-            return None
-        known = np.isfinite(trace.sigma)
-        return np.interp(self.depth, trace.depth[known], trace.sigma[known])
 
     def _look(self, stated: FloatArray | None, *, early: bool) -> FloatArray:
         """Make the tables from the traces so far, and follow these again; the noise and scatter
