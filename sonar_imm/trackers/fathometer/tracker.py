@@ -508,7 +508,7 @@ class FathometerTracker:
         self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self._own)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
-        self._multiples = self._multiples.after(seen_as(reflectors, ids, self._settled, records))
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, records))
         estimates = [*self._smoothed(step), newest]
         self._follow_datum()
         return estimates
@@ -581,7 +581,7 @@ class FathometerTracker:
         if self._own.multiples == 'mark':
             assert self._lattice is not None
             span = self._lattice.step * self._lattice.cells
-            seen = seen_as(reflectors, ids, self._settled, records)
+            seen = seen_as(reflectors, ids, records)
             multiple = self._multiples.probabilities(seen, self._settled, span)
         return write_estimate(
             reflectors,
