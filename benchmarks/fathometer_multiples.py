@@ -41,7 +41,7 @@ def drawn(rng: np.random.Generator, walk: float) -> tuple[np.ndarray, np.ndarray
     """Depths (T, K) as they are found and sign (K,) of the amplitudes; multiples come last."""
     while True:
         first = np.cumsum(np.append(rng.uniform(8.0, 14.0), rng.uniform(2.0, 8.0, PRIMARIES - 1)))
-        ways = ways_above(first, np.ones(PRIMARIES), PRIMARIES)
+        ways = ways_above(np.ones(PRIMARIES), PRIMARIES)
         ends = (first[ways.member] * ways.factor).sum(axis=1)
         free = np.flatnonzero((ends > first[-1] + 1.0) & (ends < DEEPEST))
         if len(free) < 2:

@@ -56,6 +56,8 @@ __all__ = [
 
 _QUIET = 0.1
 """Quantile of the traces that is noise at every depth."""
+_QUIET_OF_RMS = math.sqrt(-math.log1p(-_QUIET))
+"""That quantile of a Rayleigh distribution of rms one."""
 _STEADY = 0.6
 _RING, _FEW_VALUES, _ZEROS = 0.1, 4096, 0.05
 _RUNNING, _POOLED, _LEAST_POOLED, _ENOUGH = 31, 41, 200, 60
@@ -85,7 +87,7 @@ def converter_step(traces: FloatArray) -> float:
 
 def quietest(trace: FloatArray) -> float:
     """Noise, rms, of one trace (n,): of its quietest tenth, at least 1e-3 of its maximum."""
-    quiet = float(np.nanquantile(trace, _QUIET)) / math.sqrt(-math.log1p(-_QUIET))
+    quiet = float(np.nanquantile(trace, _QUIET)) / _QUIET_OF_RMS
     return max(quiet, 0.5 * converter_step(trace), 1e-3 * float(np.nanmax(trace)))
 
 
@@ -111,8 +113,7 @@ def first_noise(traces: FloatArray) -> FloatArray:
         quiet = _quiet(windows.transpose(0, 2, 1).reshape(-1, traces.shape[1]))
     else:
         quiet = median_filter(_quiet(traces), _RUNNING, mode='nearest')
-    quiet = quiet / math.sqrt(-math.log1p(-_QUIET))
-    quiet = np.minimum.accumulate(quiet[::-1])[::-1]
+    quiet = np.minimum.accumulate((quiet / _QUIET_OF_RMS)[::-1])[::-1]
     loudest = float(np.median(np.nanmax(traces, axis=1)))
     return np.maximum(quiet, max(0.5 * converter_step(traces), 1e-3 * loudest))
 

@@ -60,7 +60,8 @@ ComplexArray = NDArray[np.complexfloating]
 PROCESSORS = ('conventional', 'mvdr', 'white_noise')
 OUTPUTS = ('coherence', 'correlation', 'printed')
 
-_MAD_OF_UNIT_NORMAL = 0.6744897501960817
+MAD_OF_UNIT_NORMAL = 0.6744897501960817
+"""Median absolute deviation of a normal number of standard deviation one."""
 _LOADINGS = (1e-6, 1e2)
 _RUNNING = 31
 
@@ -339,7 +340,7 @@ def noise_sigma(b: FloatArray) -> float:
     finite = b[np.isfinite(b)]
     if not len(finite):
         return float('nan')
-    return float(np.median(np.abs(finite - np.median(finite)))) / _MAD_OF_UNIT_NORMAL
+    return float(np.median(np.abs(finite - np.median(finite)))) / MAD_OF_UNIT_NORMAL
 
 
 def _form(left: ComplexArray, R: ComplexArray, right: ComplexArray) -> ComplexArray:

@@ -38,14 +38,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ..estimation.arrays import BoolArray, FloatArray, IntArray
+from .spectra import ComplexArray
 
 __all__ = ['apply_response', 'correct_phones', 'fit_phones', 'LEAST_DELAY', 'PhoneFit']
-
-ComplexArray = NDArray[np.complexfloating]
 
 LEAST_DELAY = 1.0 / 60.0
 """Periods of the highest frequency that a delay has at least: less is as good as none."""
@@ -69,9 +67,6 @@ class PhoneFit(NamedTuple):
     sign: IntArray
     delay: FloatArray
     share: FloatArray
-
-    def of(self, keep: BoolArray) -> PhoneFit:
-        return PhoneFit(self.gain[:, keep], self.sign[keep], self.delay[keep], self.share[keep])
 
 
 def correct_phones(

@@ -43,8 +43,9 @@ import numpy as np
 
 from .arrays import FloatArray
 from .onset_kernels import onset_pass
+from .particles import normalise
 
-__all__ = ['OnsetChain', 'OnsetState', 'onset_pass']
+__all__ = ['OnsetChain', 'OnsetState']
 
 WALK = (0.75, 0.15), (0.2, 0.6), (0.05, 1.5)
 """Share and standard deviation, m, of the ways the onset goes from trace to trace."""
@@ -68,6 +69,11 @@ class OnsetState:
         """The most probable onset, -1 where there is probably none."""
         best = int(np.argmax(self.onset))
         return -1 if best == len(self.onset) - 1 else best
+
+    @property
+    def ring_length(self) -> int:
+        """The most probable length of the transmit pulse, samples."""
+        return int(np.argmax(self.ring))
 
 
 @define(eq=False, slots=False)
@@ -143,9 +149,4 @@ class OnsetChain:
         found, ring = np.empty(self.cells), np.empty(len(before.ring))
         a = self.temper
         onset_pass(a * quiet, a * loud, a * onset, *prior, rates, self.window, found, ring)
-        return OnsetState(_normalised(found), _normalised(ring))
-
-
-def _normalised(log_weight: FloatArray) -> FloatArray:
-    weight = np.exp(log_weight - log_weight.max())
-    return np.asarray(weight / weight.sum())
+        return OnsetState(normalise(found)[0], normalise(ring)[0])

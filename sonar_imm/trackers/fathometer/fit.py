@@ -124,7 +124,7 @@ class Fit:
         return sentences
 
 
-def left_negative(
+def has_negative_residual(
     reflectors: Reflectors, response: Response, pulse: Pulse, config: FathometerConfig
 ) -> bool:
     """Whether a negative echo is left where no reflector is, that no side lobe explains."""

@@ -44,9 +44,7 @@ MOST_WAYS = 200
 _NEAR = 6.0
 
 
-def seen_as(
-    reflectors: Reflectors, ids: IdArray, config: FathometerConfig, records: int = 1
-) -> Seen:
+def seen_as(reflectors: Reflectors, ids: IdArray, records: int = 1) -> Seen:
     """What `multiples` needs to know of a record, `records` after the one before."""
     sign = np.sign(reflectors.amplitude)
     datum = reflectors.datum_std**2
@@ -97,7 +95,7 @@ class Multiples:
         datum = np.array([record.datum for record in past])
         time = np.cumsum([record.records for record in past])
         for target in range(1, K):
-            ways = ways_above(record.depth, record.sign, target)
+            ways = ways_above(record.sign, target)
             off = _offsets(depth[-1:], variance[-1:], datum[-1:], ways, target)
             reach = _NEAR * np.sqrt(off[1][0]) + config.depth_std
             near = np.flatnonzero(np.abs(off[0][0]) <= reach)
@@ -115,8 +113,8 @@ class Multiples:
         return found
 
 
-def ways_above(depth: FloatArray, sign: FloatArray, target: int) -> Ways:
-    """Pairs and triples of the reflectors above `target`; depth (K,) ascending, sign (K,)."""
+def ways_above(sign: FloatArray, target: int) -> Ways:
+    """Pairs and triples of the reflectors above `target`; sign (K,) by ascending depth."""
     member, factor, datum = _combinations(target)
     signs = sign[member]
     product = -signs[:, 0] * signs[:, 1] * np.where(factor[:, 2] != 0.0, signs[:, 2], 1.0)

@@ -23,12 +23,22 @@ from scipy.ndimage import median_filter
 
 from ...acoustics import fathometer
 from ...estimation.arrays import FloatArray
-from ...measurements import Rejection
+from ...measurements import Rejection, Trace
 
 LEAST_NOISE_SAMPLES = 50
 OWN_SOUND = 1.5
 """How much louder than further away noise near an array is that hears itself."""
-_MEDIAN_OF_UNIT_NORMAL = 0.6744897501960817
+
+
+def stated_sigma(trace: Trace, depth: FloatArray, noise_sigma: float) -> FloatArray | None:
+    """Return the noise (n,) at `depth` (n,), m, that is configured (`noise_sigma`, 0 for none) or
+    else that the trace states; None where neither is."""
+    if noise_sigma:
+        return np.full(len(depth), noise_sigma)
+    if trace.sigma is None:
+        return None
+    known = np.isfinite(trace.sigma)
+    return np.interp(depth, trace.depth[known], trace.sigma[known])
 
 
 def measured_sigma(quiet: FloatArray) -> float:
@@ -79,5 +89,5 @@ def _own_sound(noise: FloatArray, whole: float, width: int) -> FloatArray:
     """Noise (K,) of as many cells from the array on as it is louder than `whole`, from the values
     (n,) of the mirror window, nearest first: never louder again further away."""
     spread = median_filter(np.abs(noise), size=min(width, len(noise)), mode='reflect')
-    local = np.minimum.accumulate(spread / _MEDIAN_OF_UNIT_NORMAL)
+    local = np.minimum.accumulate(spread / fathometer.MAD_OF_UNIT_NORMAL)
     return np.asarray(local[: int(np.argmax(np.append(local, 0.0) < OWN_SOUND * whole))])

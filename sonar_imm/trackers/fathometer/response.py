@@ -50,7 +50,7 @@ from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError, small_text
 from .config import FathometerConfig
-from .noise import LEAST_NOISE_SAMPLES, measured_sigma, mirror_sigma
+from .noise import LEAST_NOISE_SAMPLES, measured_sigma, mirror_sigma, stated_sigma
 from .water import SeenFloor, Water
 
 MAX_CELLS = 100_000
@@ -250,21 +250,16 @@ def trace_response(
         water.begin(trace)
     if water.active:
         return _envelope_response(trace, lattice, config, reference_depth, water)
-    noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
     if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
         quiet = np.isfinite(trace.amplitude)
     if config.remove_background:
         amplitude = amplitude - np.median(amplitude[quiet])
-    sigma = np.full(len(depth), config.noise_sigma)
-    if not config.noise_sigma:
-        if trace.sigma is not None:
-            finite = np.isfinite(trace.sigma)
-            sigma = np.interp(depth, trace.depth[finite], trace.sigma[finite])
-        else:
-            sigma[:] = measured_sigma(amplitude[quiet])
-            noise_unknown = config.noise_from_mirror
+    sigma, noise_unknown = stated_sigma(trace, depth, config.noise_sigma), False
+    if sigma is None:
+        sigma = np.full(len(depth), measured_sigma(amplitude[quiet]))
+        noise_unknown = config.noise_from_mirror
     return Response(
         trace.stamp_ns,
         trace.frame_id,

@@ -69,7 +69,7 @@ from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, GeodeticFix, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .datum import DatumError
-from .fit import Fit, left_negative
+from .fit import Fit, has_negative_residual
 from .multiples import Multiples, seen_as
 from .phones import PhoneFaults
 from .pressure import (
@@ -312,7 +312,7 @@ class FathometerTracker:
                 self._begin_anew(wider)
                 if self._water.active:
                     own = wider.depth
-                    self._water.widen(float(own[0]), float(own[-1]))
+                    self._water = self._water.widened(float(own[0]), float(own[-1]))
             assert self._padded is not None
             reference = math.nan if depth is None else depth
             response = trace_response(item, self._padded, self._own, reference, self._water)
@@ -502,13 +502,13 @@ class FathometerTracker:
             order=float(self._own.order_min + int(np.argmax(pmf))),
         )
         positive = self._settled.polarity == 'positive'
-        negative = positive and left_negative(
+        negative = positive and has_negative_residual(
             reflectors, response, response.pulse or self.pulse, self._own
         )
         self.counts['foreign_hydrophones_left_out'] += self._phones.add(response, self._own)
         self._fit.add(step.ok, reflectors, response, float(pmf[-1]), negative)
         newest = self._write(reflectors, ids, pmf, response, self._ids, records)
-        self._multiples = self._multiples.after(seen_as(reflectors, ids, self._settled, records))
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, records))
         estimates = [*self._smoothed(step), newest]
         self._follow_datum()
         return estimates
@@ -581,7 +581,7 @@ class FathometerTracker:
         if self._own.multiples == 'mark':
             assert self._lattice is not None
             span = self._lattice.step * self._lattice.cells
-            seen = seen_as(reflectors, ids, self._settled, records)
+            seen = seen_as(reflectors, ids, records)
             multiple = self._multiples.probabilities(seen, self._settled, span)
         return write_estimate(
             reflectors,

@@ -38,15 +38,16 @@ from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.onset import OnsetChain, OnsetState
 from ...measurements import Trace
 from .config import FathometerConfig
+from .noise import stated_sigma
 
-LOOKS = 10, 12, 15, 20, 25, 30, 40, 50, 60
+TABLE_COUNTS = 10, 12, 15, 20, 25, 30, 40, 50, 60
 """Numbers of traces at which the tables are made, the last of them for good."""
 CAUTION = 1.15
 """By how much the noise is taken to be greater: that of stacked traces is no Rayleigh."""
 SCATTER_MEMORY = 0.9
 UNKNOWN_PULSE, LEAD = 2.0, 2.4
 """Samples of a pulse that is not known; pulses from the onset to the reflector, likewise."""
-LEAST_SAMPLES, DEAF, NEAR, LOUD = 20, 0.25, 10.0, 3.0
+LEAST_SAMPLES, MASKED, NEAR, LOUD = 20, 0.25, 10.0, 3.0
 STILL_RECORDS, MOVED, MOVED_SAMPLES = 60, 0.5, 3.0
 """Traces in which a first return that never moves is doubted, and by how much, in m and samples,
 what is below moves then."""
@@ -100,70 +101,75 @@ class SeenFloor:
         return np.minimum(bottom, 1.0), above
 
 
-class Look(NamedTuple):
-    """What T traces say together: noise (n,), rms; loudest: what loud traces reach; in samples the
-    transmit pulse at a first look (-1: there can be none), the standard deviation of the pulse
-    (NaN when it is not known), the lead from the onset to the reflector and its spread, and by
-    trace the onset (T,), -1 for none; state: of the chain at the end."""
+class LineTables(NamedTuple):
+    """Tables made from T traces together. In samples: ring, pulse, lead, lead_std and onset."""
 
     noise: FloatArray
+    """(n,) rms by depth."""
     loudest: float
+    """Amplitude that loud traces reach."""
     ring: int
+    """Transmit pulse by `envelopes.transmit_samples`, -1 where there can be none."""
     pulse: float
+    """Standard deviation of the pulse, NaN when it is not known."""
     lead: float
+    """From the onset to the reflector."""
     lead_std: float
     onset: IntArray
+    """(T,) by trace, -1 for none."""
     state: OnsetState
+    """State of the chain after the last trace."""
 
 
-def look(
+def measure_line(
     traces: FloatArray,
     step: float,
     jump: float = 0.005,
     fish_rate: float = 0.001,
-    told: tuple[FloatArray, float] | None = None,
+    stated: tuple[FloatArray, float] | None = None,
     least: FloatArray | float = 0.0,
     top: float = 0.0,
-) -> Look:
+) -> LineTables:
     """Make the tables of the traces (T, n), samples `step` m apart. jump, fish_rate: see
-    `OnsetChain`; told: noise (n,) and pulse, in samples, where the traces are too few to tell;
+    `OnsetChain`; stated: noise (n,) and pulse, in samples, where the traces are too few to tell;
     least: noise that there is at least; top: of the first sample below the transmitter, m: far
     from it what is loud there is no transmit pulse but a floor that is cut."""
     ring = envelopes.transmit_samples(traces) if top < NEAR else -1
-    first = told[0] if told else np.maximum(envelopes.first_noise(traces), least)
+    first = stated[0] if stated else np.maximum(envelopes.first_noise(traces), least)
     loudest = float(np.quantile(np.nanmax(traces, axis=1), 0.9))
-    whole, cells = first, seen_cells(first, loudest)
+    whole, cells = first, quiet_cells(first, loudest)
     traces, first = traces[:, :cells], first[:cells]
 
-    def chained(noise: FloatArray, pulse: float) -> tuple[IntArray, IntArray, OnsetState]:
+    def run_chain(noise: FloatArray, pulse: float) -> tuple[IntArray, IntArray, OnsetState]:
         chain = OnsetChain(step, traces.shape[1], step * pulse, ring, jump, fish_rate)
         state, found = chain.start(), []
         for trace in traces:
             state = chain.update(state, *envelopes.log_likelihoods(trace, noise, loudest))
-            found.append((state.found, int(np.argmax(state.ring))))
+            found.append((state.found, state.ring_length))
         onset, ended = np.array(found).T
         return onset, ended, state
 
-    if told:
-        onset, _, state = chained(first, told[1])
-        return Look(whole, loudest, ring, told[1], LEAD * told[1], told[1], onset, state)
-    onset, ended, _ = chained(first, UNKNOWN_PULSE)
+    if stated:
+        pulse = stated[1]
+        onset, _, state = run_chain(first, pulse)
+        return LineTables(whole, loudest, ring, pulse, LEAD * pulse, pulse, onset, state)
+    onset, ended, _ = run_chain(first, UNKNOWN_PULSE)
     pulse, *_ = envelopes.pulse_and_lead(traces, onset)
     known = pulse if pulse > 0.0 else UNKNOWN_PULSE
     noise = envelopes.water_noise(traces, first, int(np.median(ended)), onset, known)
-    onset, _, state = chained(noise, known)
+    onset, _, state = run_chain(noise, known)
     _, lead, spread = envelopes.pulse_and_lead(traces, onset)
     if not lead >= 0.0:
         lead, spread = LEAD * known, known
     noise = np.append(noise, whole[cells:])
-    return Look(noise, loudest, ring, pulse, lead, spread, onset, state)
+    return LineTables(noise, loudest, ring, pulse, lead, spread, onset, state)
 
 
-def seen_cells(noise: FloatArray, loudest: float) -> int:
-    """How many samples from the first on a floor can be seen in, noise (n,): before those in which
+def quiet_cells(noise: FloatArray, loudest: float) -> int:
+    """Count the samples, from the first on, in which a floor stands out of the noise (n,): before
     it reaches a quarter of the loudest. What lies there is the gain of the recorder."""
-    deaf = np.flatnonzero(noise > DEAF * loudest)
-    cells = int(deaf[0]) if len(deaf) else len(noise)
+    masked = np.flatnonzero(noise > MASKED * loudest)
+    cells = int(masked[0]) if len(masked) else len(noise)
     return cells if cells >= LEAST_SAMPLES else len(noise)
 
 
@@ -182,18 +188,8 @@ class Water:
 
     STATE: ClassVar = (
         *('active', 'first', 'step', 'cells', 'top', '_traces', '_count', '_noise', '_loudest'),
-        *(
-            '_pulse',
-            '_lead',
-            '_lead_std',
-            '_ring',
-            '_state',
-            '_scatter',
-            '_seen',
-            '_noted',
-            '_dry',
-            '_beside',
-        ),
+        *('_pulse', '_lead', '_lead_std', '_ring', '_state', '_scatter', '_seen', '_noted'),
+        *('_dry', '_beside'),
     )
 
     config: FathometerConfig
@@ -249,8 +245,8 @@ class Water:
         if not good:
             raise ValueError('the water is of no line')
 
-    def widen(self, first: float, last: float) -> None:
-        """Look at the line anew, at the depths from `first` to `last`, m, too."""
+    def widened(self, first: float, last: float) -> Water:
+        """Return the start of the same line at the depths from `first` to `last`, m, too."""
         step, low = self.step, max(first, self.config.blanking)
         above = max(0, math.ceil((self.first - low) / step - 1e-6))
         cells = max(self.cells, math.floor((last - self.first) / step + 1e-6) + 1)
@@ -258,8 +254,7 @@ class Water:
         fresh.active, fresh.step = True, step
         fresh.first, fresh.cells = self.first - above * step, cells + above
         fresh.top = self.top - above * step
-        for name in self.STATE:
-            setattr(self, name, getattr(fresh, name))
+        return fresh
 
     @property
     def depth(self) -> FloatArray:
@@ -276,27 +271,28 @@ class Water:
         and scatter that it is seen against; and its floor."""
         amplitude = self._aligned(trace)
         self._count += 1
-        if self._count <= LOOKS[-1]:
+        if self._count <= TABLE_COUNTS[-1]:
             self._traces = np.vstack([self._traces.reshape(-1, self.cells), amplitude])
-        early, stated = self._count < LOOKS[0], self._stated(trace)
+        early = self._count < TABLE_COUNTS[0]
+        stated = stated_sigma(trace, self.depth, self.config.noise_sigma)
         if early and stated is None:
             scale = np.full(self.cells, CAUTION * envelopes.quietest(amplitude))
-        elif early or self._count in LOOKS:
-            scale = self._look(stated, early=early)
+        elif early or self._count in TABLE_COUNTS:
+            scale = self._make_tables(stated, early=early)
         else:
             scale = self._follow(amplitude)
-        if self._count == LOOKS[-1]:
+        if self._count == TABLE_COUNTS[-1]:
             self._traces = np.empty((0, self.cells))
         ring, posterior = 0, np.empty(0)
         if self._state is not None:
-            ring, posterior = int(np.argmax(self._state.ring)), self._state.onset
+            ring, posterior = self._state.ring_length, self._state.onset
             self._note(amplitude, ring)
         with np.errstate(invalid='ignore'):
+            # A missing sample is zero as well.
             b = np.nan_to_num(envelopes.to_normal(np.maximum(amplitude, 0.0) / scale))
         b[:ring] = 0.0
         if len(posterior):
             b[len(posterior) :] = 0.0
-        b[np.isnan(amplitude)] = 0.0
         floor = SeenFloor(
             posterior,
             self.first,
@@ -316,37 +312,26 @@ class Water:
         nothing = {'left': np.nan, 'right': np.nan}
         return np.asarray(np.interp(depth, trace.depth, trace.amplitude, **nothing))
 
-    def _stated(self, trace: Trace) -> FloatArray | None:
-        """The noise (n,) that a trace or the parameters state; None where they do not."""
-        if self.config.noise_sigma:
-            return np.full(self.cells, self.config.noise_sigma)
-        if trace.sigma is None:
-            return None
-        known = np.isfinite(trace.sigma)
-        return np.interp(self.depth, trace.depth[known], trace.sigma[known])
-
-    def _look(self, stated: FloatArray | None, *, early: bool) -> FloatArray:
+    def _make_tables(self, stated: FloatArray | None, *, early: bool) -> FloatArray:
         """Make the tables from the traces so far, and follow these again; the noise and scatter
         (n,) of the newest. stated (n,): noise, all that is known `early`, and the least later on:
         recorders cut off what is quiet."""
-        config, told = self.config, None
+        config, known = self.config, None
         if early and stated is not None:
             gaussian = config.pulse == 'gaussian'
-            told = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
+            known = stated, max(config.pulse_width / self.step if gaussian else UNKNOWN_PULSE, 1.0)
         least = 0.0 if stated is None else stated
         chances = config.bottom_jump, config.fish_rate
         # Who says where to look has cut off the transmit pulse.
         top = math.inf if config.blanking else self.top
-        found = look(self._traces, self.step, *chances, told, least, top)
-        self._noise, self._loudest, self._ring, self._pulse = found[:4]
-        self._lead, self._lead_std = found[4:6]
-        if not self._pulse > 0.0:
-            self._pulse = UNKNOWN_PULSE
-        self._state = found.state
+        found = measure_line(self._traces, self.step, *chances, known, least, top)
+        self._noise, self._loudest, self._ring = found.noise, found.loudest, found.ring
+        self._pulse = found.pulse if found.pulse > 0.0 else UNKNOWN_PULSE
+        self._lead, self._lead_std, self._state = found.lead, found.lead_std, found.state
         self._scatter, self._seen = np.zeros(self.cells), 0.0
         scale = self._noise
         for each, onset in zip(self._traces, found.onset.tolist()):
-            scale = self._against(each, onset)
+            scale = self._update_scatter(each, onset)
         return CAUTION * scale
 
     def _chain(self) -> OnsetChain:
@@ -363,9 +348,9 @@ class Water:
         seen = trace[:cells], self._noise[:cells]
         logs = envelopes.log_likelihoods(*seen, self._loudest)
         self._state = self._chain().update(self._state, *logs)
-        return CAUTION * self._against(trace, self._state.found)
+        return CAUTION * self._update_scatter(trace, self._state.found)
 
-    def _against(self, trace: FloatArray, onset: int) -> FloatArray:
+    def _update_scatter(self, trace: FloatArray, onset: int) -> FloatArray:
         """Noise and scatter (n,) of a trace (n,) whose floor begins at `onset`, by the scatter of
         those before it; this one's is remembered."""
         power = np.square(self._noise)
@@ -406,12 +391,12 @@ class Water:
         if self._state is None:
             return []
         found, known = [], self._noted
-        if ring := int(np.argmax(self._state.ring)):
+        if ring := self._state.ring_length:
             found.append(
                 f'the first {self.first + self.step * ring:.1f} m hold the transmit pulse and '
                 'were not looked at'
             )
-        if known >= LOOKS[0] and self._dry > 0.5 * known:
+        if known >= TABLE_COUNTS[0] and self._dry > 0.5 * known:
             found.append(
                 'no water is seen above the first return in '
                 f'{100.0 * self._dry / known:.0f} % of the records: the file begins in the '

@@ -19,9 +19,9 @@ not go with the depth of the water that the headers state, that is said, and the
 to be given. Where delay or interval change along the line, so do the depths of the traces.
 
 Traces that are never negative are envelopes. For them the pulse and the noise are measured as the
-tracker does (`water.look`), from six hundred traces all along the line at most, and written beside
-the bag, where the tracker finds them. Where a gain that grows with time raises the noise with the
-depth, each trace states it by depth. Places become the topic ``/position``.
+tracker does (`measure_line`), from six hundred traces all along the line at most, and written
+beside the bag, where the tracker finds them. Where a gain that grows with time raises the noise
+with the depth, each trace states it by depth. Places become the topic ``/position``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sonar_imm.acoustics.envelopes import is_envelope
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.trackers.fathometer.response import envelope_parameters
-from sonar_imm.trackers.fathometer.water import look
+from sonar_imm.trackers.fathometer.water import measure_line
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import SegyOptions
@@ -71,16 +71,16 @@ def convert_segy(path: str | Path, out: str | Path, **values: Any) -> Conversion
     usual = max(windows, key=lambda window: len(window.rows))
     if not all(window.spacing > 0.0 for window in windows):
         raise BagError(f'{path} states no sample interval; say --sample-spacing')
-    if line.amplitude[:, usual.samples].shape[1] < 2:
+    amplitude = line.amplitude[usual.rows.start : usual.rows.stop, usual.samples]
+    if amplitude.shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
     _note_windows(report, windows, how)
-    amplitude = line.amplitude[:, usual.samples]
     if not how.sample_spacing:
         offset = usual.depth(line)[0] - how.depth_offset
         stated = line.water_depth[usual.rows]
-        if doubt := doubted_spacing(amplitude[usual.rows], usual.spacing, offset, stated):
+        if doubt := doubted_spacing(amplitude, usual.spacing, offset, stated):
             report.notes['sample_interval'] = doubt
-    own, sigma = _instrument(report, amplitude[usual.rows], usual.spacing, how.stack)
+    own, sigma = _instrument(report, amplitude, usual.spacing, how.stack)
     if own and how.first_sample:
         # The transmit pulse is left out: what comes first may be a shallow floor.
         own['blanking'] = max(
@@ -226,8 +226,8 @@ def measured_instrument(
     """Standard deviation of the pulse, m, and noise (n,), rms, of envelopes (T, n) with samples
     `spacing` m apart, of which `stack` successive ones are averaged; None when too few traces have
     a floor that stands free."""
-    seen = look(_stretches(_stacked(amplitude, stack)), spacing)
-    return (spacing * seen.pulse, seen.noise) if seen.pulse > 0.0 else None
+    tables = measure_line(_stretches(_stacked(amplitude, stack)), spacing)
+    return (spacing * tables.pulse, tables.noise) if tables.pulse > 0.0 else None
 
 
 def _stretches(amplitude: FloatArray) -> FloatArray:
@@ -255,11 +255,11 @@ def doubted_spacing(
         return f'the sample interval of the headers makes the traces end at {span:g} m'
     if np.count_nonzero(stated > 0.0) < _LEAST_ARRIVALS or not is_envelope(amplitude):
         return None
-    seen = look(amplitude, spacing)
-    known = (stated > 0.0) & (seen.onset >= 0)
+    tables = measure_line(amplitude, spacing)
+    known = (stated > 0.0) & (tables.onset >= 0)
     if np.count_nonzero(known) < _LEAST_ARRIVALS:
         return None
-    sample = offset / spacing + seen.onset[known] + seen.lead
+    sample = offset / spacing + tables.onset[known] + tables.lead
     fits = float(np.median(stated[known] / sample))
     if fits / _NEAR <= spacing <= fits * _NEAR:
         return None

@@ -54,13 +54,13 @@ def drawn(rng, records, walk=0.0, std=0.03):
 
 def test_the_ways_are_pairs_and_triples_above():
     depth, sign = np.array([10.0, 14.0, 20.0]), np.array([1.0, -1.0, 1.0])
-    ways = ways_above(depth, sign, 2)
+    ways = ways_above(sign, 2)
     ends = (depth[ways.member] * ways.factor).sum(axis=1)
     assert sorted(ends) == pytest.approx([18.0, 20.0, 24.0, 28.0])  # 2 x 14 - 10 and three pairs
     by_end = dict(zip(np.round(ends), ways.sign, strict=True))
     assert by_end == {20.0: -1.0, 24.0: 1.0, 28.0: -1.0, 18.0: -1.0}
     assert sorted(ways.datum) == [0.0, 1.0, 1.0, 1.0]
-    assert len(ways_above(depth, sign, 0).sign) == 0
+    assert len(ways_above(sign, 0).sign) == 0
 
 
 @pytest.mark.parametrize('walk, records', [(0.0, 20), (0.05, 20), (0.05, 5)])
@@ -95,7 +95,7 @@ def test_all_ways_share_one_prior():
         p = after(depth, config)[-1]
         return p / (1.0 - p)
 
-    ways = [len(ways_above(d[0], np.ones(d.shape[1]), d.shape[1] - 1).sign) for d in (few, many)]
+    ways = [len(ways_above(np.ones(d.shape[1]), d.shape[1] - 1).sign) for d in (few, many)]
     assert ways == [1, 10]
     assert odds(few) / odds(many) == pytest.approx(10.0, rel=0.05)
 
