@@ -30,6 +30,7 @@ from ...acoustics.sounding import ErrorBudget, GeometryDoubt
 from ...parameters import live
 from ..model_checks import chain_problems
 from ..shared_parameters import MountingParameters
+from .terrain import KINDS
 
 DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
@@ -51,7 +52,6 @@ SPEED_STD, SPEED_STD_OF_NONE = 2.0, 15.0
 """m/s, of a sound speed that a snapshot states, and of one that nobody does."""
 BEND_STD = 0.5
 """m/s, of the mean sound speed below the array: what bends a ray."""
-TERRAIN_MODELS = 9
 STEEP_DEG = 60.0
 """An array that looks down by so much runs angle models."""
 OF_OTHER_SETS = (
@@ -440,6 +440,6 @@ class BathymetryConfig(MountingParameters):
         if self.model_set == 'angle_two_rw':
             return 2
         if self.is_terrain:
-            return TERRAIN_MODELS
+            return len(KINDS)
         smooth = 2 if self.model_set == 'scatter_bank' else 0
         return smooth + len(self.sigmas_used)

@@ -158,27 +158,23 @@ class Swath:
 
     def distance(self, floor: Floor) -> FloatArray:
         """Horizontal distance (T,) of the floor from the array, m; NaN where it is not known."""
-        if self.looks is None:
-            aside = np.abs(floor.xyz[:, 1])
-        else:
-            aside = np.linalg.norm(floor.xyz[:, :2] - self.looks.position[:, :2], axis=1)
-        return np.where(np.isfinite(floor.angle), aside, np.nan)
+        return np.where(np.isfinite(floor.angle), self._from_array(floor)[1], np.nan)
 
     def uncertainties(self, floor: Floor, budget: ErrorBudget) -> tuple[FloatArray, FloatArray]:
         """Vertical and horizontal variance (T,) of the soundings, m^2."""
-        assert self.looks is not None
-        offset = floor.xyz - self.looks.position
-        distance = np.linalg.norm(offset[:, :2], axis=1)
-        return sounding.uncertainties(
-            floor.variance, -offset[:, 2], distance, budget, self.sound_speed
-        )
+        depth, distance = self._from_array(floor)
+        return sounding.uncertainties(floor.variance, depth, distance, budget, self.sound_speed)
 
     def doubt(self, floor: Floor, doubt: GeometryDoubt) -> tuple[FloatArray, FloatArray]:
         """Vertical and horizontal variance (T,) m^2 of the floor that all pings have in common."""
+        return sounding.geometry_variance(
+            *self._from_array(floor), np.nan_to_num(floor.angle), doubt
+        )
+
+    def _from_array(self, floor: Floor) -> tuple[FloatArray, FloatArray]:
+        """Depth of the floor below the array and its horizontal distance from it (T,), m."""
         offset = floor.xyz if self.looks is None else floor.xyz - self.looks.position
-        distance = np.linalg.norm(offset[:, :2], axis=1)
-        angle = np.nan_to_num(floor.angle)
-        return sounding.geometry_variance(-offset[:, 2], distance, angle, doubt)
+        return -offset[:, 2], np.linalg.norm(offset[:, :2], axis=1)
 
     def _launch(self, depth: FloatArray) -> FloatArray:
         """r sin(phi) (T,) of floors `depth` (T,) below the array."""
@@ -305,8 +301,8 @@ def spacing_of(
 
 class BinLikelihood(NamedTuple):
     """The likelihood of a ping; which bins (T,) stand 20 dB above the noise, or, where that is not
-    known, above the quietest tenth of the bins; and the direction sine (T,) from which each is
-    loudest, NaN for silent ones."""
+    known, above the quietest tenth of the bins; and, for `terrain`, the direction sine (T,) from
+    which each is loudest, NaN for silent ones."""
 
     likelihood: PingLikelihood
     loud: BoolArray
@@ -374,7 +370,8 @@ def _drifting(geometry: Geometry, echo: BoolArray, config: BathymetryConfig) -> 
 class _Parts(NamedTuple):
     """What the likelihood is made of, see `PingLikelihood`; noise (T,) with what of the echo is
     not the same at all staves; sine (T,) from which a bin is loudest, by a phase that rises from
-    stave to stave; loudness (T,): power of a bin in powers of all that is no floor."""
+    stave to stave, NaN for models that do not use it; loudness (T,): power of a bin in powers of
+    all that is no floor."""
 
     form: ComplexArray
     base: FloatArray
@@ -399,7 +396,9 @@ def _in_white_noise(
     spacing = swath.geometry.spacing
     above_noise = variances.mean_power(iq) / noise
     signal, noise = _split(_signal(snapshot, noise, np.ones(T)), noise, config)
-    gamma, sine = coherence.coherence(iq, abs(spacing))
+    gamma, sine = np.ones(T), np.full(T, np.nan)
+    if config.shadow_gate or config.is_terrain:
+        gamma, sine = coherence.coherence(iq, abs(spacing))
     return _Parts(
         form=laplace.form_coefficients(iq, signal, noise),
         base=np.zeros(T),
@@ -432,6 +431,7 @@ def _beside_surface(
     step = 2.0 * math.pi * spacing
     R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
     form = interference.interference_form(iq, R)
+    sine = coherence.coherence(iq, abs(spacing))[1] if config.is_terrain else np.full(T, np.nan)
     return _Parts(
         form=-signal[:, None] * form.beam,
         base=form.base,
@@ -440,7 +440,7 @@ def _beside_surface(
         noise=noise,
         log_determinant=form.log_determinant,
         coherence=interference.coherence_beside(form, abs(spacing)),
-        sine=coherence.coherence(iq, abs(spacing))[1],
+        sine=sine,
         loudness=form.base / P,
     )
 

@@ -191,14 +191,14 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     config, models, likelihood = seen.config, seen.models, seen.likelihood
     if favour is not None:
         models = evolve(models, favour=favour)
+    smooth = config.smoothing_used == 'states'
     if config.is_terrain:
         peak = seen.swath.height_from(seen.loudest)
-        smooth = config.smoothing_used == 'states'
         track = run_terrain(models, likelihood, peak, smooth=smooth, temper=1.0 / seen.alike)
-        track = with_constants(track, likelihood)
+        track = _with_constants(track, likelihood)
     elif config.runs_on_grid:
         cells = grid_cells(config, models)
-        track = run_grid(models, likelihood, cells, smooth=config.smoothing_used == 'states')
+        track = run_grid(models, likelihood, cells, smooth=smooth)
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
         track = run_particles(models, likelihood, config.particles_per_model, entropy)
@@ -250,7 +250,7 @@ def run_particles(
             )
             if watch is not None:
                 watch(first + b, particles)
-    return with_constants(track, ping)
+    return _with_constants(track, ping)
 
 
 def filter_bins(
@@ -303,18 +303,18 @@ def run_grid(
         kept = filter_scatter(p, moves, ping, window, track, smooth)
         if smooth:
             smooth_scatter(kept, window, moves, ping, track)
-        return with_constants(track, ping)
+        return _with_constants(track, ping)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:
         smooth_ping(kept, window, motion, ping, track)
-    return with_constants(track, ping)
+    return _with_constants(track, ping)
 
 
 def _empty(T: int, M: int, n: int) -> Track:
     return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
 
 
-def with_constants(track: Track, ping: PingLikelihood) -> Track:
+def _with_constants(track: Track, ping: PingLikelihood) -> Track:
     """The same with log likelihoods of the samples, not only of what depends on the state."""
     constant = np.where(ping.echo, ping.constant, 0.0)
     return track._replace(log_likelihood=track.log_likelihood + constant)

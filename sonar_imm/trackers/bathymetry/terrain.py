@@ -45,6 +45,7 @@ BIN = 0.05
 FEWER_FLOWS = 0.1
 """Of those between level and steady floor."""
 _ROUNDS = 2000
+"""At most, for the fixed point of the flows, which takes about 100 to 250."""
 MOST_LEFT = 0.5
 """A model is left over a bin with at most this probability, however wide the bin."""
 
@@ -111,7 +112,9 @@ def terrain_of(width: float) -> Terrain:
     flows[level, steady] = flows[steady, level] = FEWER_FLOWS
     x = np.sqrt(left)
     for _ in range(_ROUNDS):
-        x = 0.5 * (x + left / (flows @ x))
+        before, x = x, 0.5 * (x + left / (flows @ x))
+        if np.array_equal(x, before):
+            break
     transition = flows * x[:, None] * x / stationary[:, None]
     np.fill_diagonal(transition, 1.0 - transition.sum(axis=1))
     return Terrain(
