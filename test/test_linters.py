@@ -1,16 +1,10 @@
 # Copyright 2026 The sonar_imm developers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 
 """The linters of ament, where they are installed (a ROS 2 machine: `rosdep install -t test`).
 
@@ -25,10 +19,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = [
-    str(ROOT / name) for name in ('benchmarks', 'docs', 'msg_adapters', 'sonar_imm', 'test')
-]
-SOURCES = [*FOLDERS, str(ROOT / 'setup.py')]
+NAMES = 'benchmarks docs examples msg_adapters sonar_imm sonar_imm_tools test setup.py'
+SOURCES = [str(ROOT / name) for name in NAMES.split()]
 
 
 @pytest.mark.linter
