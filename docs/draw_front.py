@@ -54,15 +54,15 @@ BLUE, RED, INK, GREY = '#0072B2', '#D55E00', '#1b2733', '#98a4af'
 def main() -> None:
     plt.rcParams.update({'font.size': 13, 'axes.spines.top': False, 'axes.spines.right': False})
     for system, (bag, *options) in BAGS.items():
-        figure, ax = plt.subplots(figsize=(5.0, 4.2), layout='constrained')
+        figure, ax = plt.subplots(figsize=(4.0, 3.6), layout='constrained')
         with tempfile.TemporaryDirectory() as folder:
             command = [Path(sys.executable).with_name('sonar-imm'), 'track', f'bags/{bag}']
             subprocess.run([*command, f'{folder}/out', *options], check=True, cwd=ROOT)
             rows = np.genfromtxt(f'{folder}/out/estimate.csv', delimiter=',', names=True)
             DRAW[system](ax, json.loads(Path(f'{folder}/out/run.json').read_text()), rows)
         columns = 2 if system == 'bathymetry' else 1
-        ax.legend(frameon=False, fontsize=12, ncols=columns, loc=LEGEND[system])
-        figure.savefig(ROOT / 'docs' / 'images' / f'front_{system}.png', dpi=110)
+        ax.legend(frameon=False, fontsize=11, ncols=columns, loc=LEGEND[system])
+        figure.savefig(ROOT / 'docs' / 'images' / f'front_{system}.png', dpi=130)
 
 
 def draw_dive(ax: Axes, run: dict[str, Any], rows: np.ndarray) -> None:
@@ -114,7 +114,7 @@ def draw_swath(ax: Axes, run: dict[str, Any], rows: np.ndarray) -> None:
     low = ax.inset_axes((0.0, 0.0, 1.0, 0.22), sharex=ax)
     low.fill_between(rows['range'], rows['rough'], color=RED, alpha=0.7, lw=0, step='mid')
     low.set(ylim=(0.0, 1.3), yticks=[])
-    low.set_title('probability of rough floor', fontsize=12, color=RED, pad=2)
+    low.set_title('probability of rough floor', fontsize=11, color=RED, pad=2)
 
 
 def draw_layers(ax: Axes, run: dict[str, Any], rows: np.ndarray) -> None:
