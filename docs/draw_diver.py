@@ -23,7 +23,6 @@ Needs matplotlib, which nothing else here does. Run it from the project root.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -39,6 +38,7 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_paper import track, tuned  # noqa: E402
+from benchmarks.study import write_json  # noqa: E402
 from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker  # noqa: E402
@@ -101,7 +101,7 @@ def main() -> None:
             label: float(np.sqrt(np.mean(squared(runs, path))))
             for label, (_, runs) in {'fixes': (PALE, z), **tracks}.items()
         }
-    FIGURES.write_text(json.dumps(found, indent=2) + '\n', encoding='utf-8')
+    write_json(FIGURES, found)
     print(found)
 
 
@@ -121,7 +121,7 @@ def draw_front() -> None:
         'NEES low': metrics['consistency']['nees_position']['low'],
         'NEES high': metrics['consistency']['nees_position']['high'],
     }
-    FRONT.write_text(json.dumps(shown, indent=2) + '\n', encoding='utf-8')
+    write_json(FRONT, shown)
     print(shown)
     figure, (top, bottom) = plt.subplots(
         2, 1, figsize=(9.0, 8.2), layout='constrained', height_ratios=(1.0, 1.25)

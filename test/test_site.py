@@ -97,7 +97,6 @@ def test_files_and_tests_named_on_pages_exist() -> None:
 
 
 def test_no_page_is_long() -> None:
-    """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
     words = {
         path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
         for path in (ROOT / 'docs').rglob('*.md')
@@ -125,19 +124,6 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
         '//d.org/d.css',
         'https://e.org/e.png',
     ]
-
-
-def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
-    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
-    assert made.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n'
-        '<small>*Read on 2026-11-20:* `sonar-imm bench`</small>\n\nAfter.\n'
-    )
-    text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
-    text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')
-    shown = made.captioned(text, '../')
-    assert '[tune.json](../results/tune.json)' in shown
-    assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
 
 
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
