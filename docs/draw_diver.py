@@ -21,7 +21,6 @@ Needs matplotlib, which nothing else here does. Run it from the project root.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import sys
 
@@ -36,6 +35,7 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_paper import track, tuned  # noqa: E402
+from benchmarks.study import write_json  # noqa: E402
 from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig  # noqa: E402
@@ -82,7 +82,7 @@ def main() -> None:
             label: float(np.sqrt(np.mean(squared(runs, path))))
             for label, (_, runs) in {'fixes': (PALE, z), **tracks}.items()
         }
-    FIGURES.write_text(json.dumps(found, indent=2) + '\n', encoding='utf-8')
+    write_json(FIGURES, found)
     print(found)
 
 

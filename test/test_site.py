@@ -14,7 +14,6 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 from __future__ import annotations
 
 import importlib
-import json
 import re
 import sys
 from typing import Any
@@ -97,7 +96,6 @@ def test_files_and_tests_named_on_pages_exist() -> None:
 
 
 def test_no_page_is_long() -> None:
-    """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
     words = {
         path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
         for path in (ROOT / 'docs').rglob('*.md')
@@ -127,19 +125,6 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
     ]
 
 
-def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
-    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
-    assert made.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n'
-        '<small>*Read on 2026-11-20:* `sonar-imm bench`</small>\n\nAfter.\n'
-    )
-    text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
-    text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')
-    shown = made.captioned(text, '../')
-    assert '[tune.json](../results/tune.json)' in shown
-    assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
-
-
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
     page = (
         '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n'
@@ -156,31 +141,3 @@ def test_the_search_needs_no_server() -> None:
     (script,) = config['extra']['polyfills']
     assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
     assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
-
-
-def test_the_numbers_of_the_front_are_those_of_the_results() -> None:
-    """In the order of README.md, each rounded as there."""
-
-    def result(name: str, *path: str) -> float:
-        value = json.loads((ROOT / f'docs/results/{name}.json').read_text(encoding='utf-8'))
-        for key in path:
-            value = value[key]
-        return value
-
-    paper = 'RMSE of position, m'
-    numbers = [
-        result('diver_accuracy', 'the whole tracker, by default', 'table1', 'RMSE'),
-        result('diver_paper', paper, 'raw fix', 'Table 1 legs'),
-        result('diver_paper', paper, 'IMM CV+CV, tuned', 'Table 1 legs'),
-        result('obstacle_accuracy', 'approach', 'approach, gaussian_sum', 'RMSE 20 m'),
-        result('obstacle_accuracy', 'calm', 'calm, gaussian_sum', 'RMSE 20 m'),
-        result('bathymetry_accuracy', 'methods', 'defaults', 'all'),
-        result('bathymetry_accuracy', 'methods', 'music', 'all'),
-        100.0 * result('fathometer_pulse', 'table', 'drift, processor, both', 'P'),
-    ]
-    table = (ROOT / 'README.md').read_text(encoding='utf-8').partition('measured (simulated')[2]
-    shown = re.findall(r'(\d+(?:\.\d+)?) (?:m;|m at 20|m \||m if|% of)', table)
-    assert shown == [
-        f'{value:.{len(text.partition(".")[2])}f}' for value, text in zip(numbers, shown)
-    ]
-    assert len(shown) == len(numbers)
