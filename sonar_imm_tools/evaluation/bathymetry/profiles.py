@@ -120,8 +120,8 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
 
 def rough_models(names: tuple[str, ...]) -> BoolArray:
     """Return which models (M,) mean rough floor. Beside a constant slope it is the random walk,
-    beside `steady` floor the rough `KINDS` and what scatters or walks, in a bank, whose noise grows
-    from model to model, the upper half. A single model never does."""
+    beside `steady` floor the rough `KINDS` and what scatters or walks; in a bank, whose noise
+    grows from model to model, the upper half. A single model never does."""
     if 'steady' in names:
         rough = {kind.name for kind in KINDS if kind.rough}
         return np.array([name in rough or name.startswith(('scatter', 'rw')) for name in names])
