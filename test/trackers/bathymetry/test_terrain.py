@@ -346,7 +346,7 @@ def test_what_favours_a_model_counts_once():
     ping = look(Ping(TERRAIN, floor(0.0, ranges=ranges), None))
     peak = ping.swath.height_from(ping.loudest)
     models = of_several(terrain_of(0.05), 0.0, 1.0)
-    favour = np.ones((60, 9))
+    favour = np.ones((60, len(models.names)))
     favour[30, models.rough] = 4.0
     plain, leaning = (
         run_terrain(each, ping.likelihood, peak, smooth=True)
