@@ -123,8 +123,8 @@ def rough_models(names: tuple[str, ...]) -> BoolArray:
     beside `steady` floor the rough `KINDS` and what scatters or walks; in a bank, whose noise
     grows from model to model, the upper half. A single model never does."""
     if 'steady' in names:
-        rough = {kind.name for kind in KINDS if kind.rough}
-        return np.array([name in rough or name.startswith(('scatter', 'rw')) for name in names])
+        known = {kind.name for kind in KINDS if kind.rough}
+        return np.array([name in known or name.startswith(('scatter', 'rw')) for name in names])
     if 'ncs' in names:
         return np.array([name == 'rw' for name in names])
     rough = np.arange(len(names)) >= len(names) // 2
