@@ -28,7 +28,7 @@ from ... import SECOND
 from ...offline.run_folder import read_measurements, SOUNDINGS
 from ...recordings.export.points import Points, read_points
 from ...survey.chart import Chart, chart_of
-from ...survey.line import budget_of
+from ...survey.line import budget_of, without_far
 from ..plotting import (
     add_band,
     add_image,
@@ -303,7 +303,7 @@ def points_of(folder: Path) -> Points | None:
     """The soundings of a run; None without any."""
     if not (folder / SOUNDINGS).is_file():
         return None
-    points = read_points(folder / SOUNDINGS)
+    points = without_far(read_points(folder / SOUNDINGS))
     return points if len(points) else None
 
 
