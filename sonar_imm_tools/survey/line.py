@@ -33,6 +33,7 @@ import numpy as np
 
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+from sonar_imm.intake.leaps import FASTEST, NEAR
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 
@@ -45,8 +46,8 @@ BASIS = 9
 DIRECTION_SECONDS, SPEED_SECONDS = 1.0, 5.0
 """Pings this near share their direction, and their speed: a keel point moves by D times pitch."""
 LEAST_NOISE = 0.01**2
-FASTEST, APART = 50.0, 100.0
-"""m/s, m: no ship goes faster, and from ping to ping its soundings move by no more besides."""
+SLACK = 10.0
+"""Metres by which a sounding may lie farther from the middle of its ping than ranges reach."""
 STATED = (
     'attitude_std_deg',
     'heading_std_deg',
@@ -165,7 +166,7 @@ def without_far(points: Points) -> Points:
     ping = np.repeat(np.arange(len(start)), np.diff(start, append=len(stamp_ns)))
     *middle, reach = _medians(np.column_stack([xy, slant]), ping, start).T
     places = np.column_stack(middle)
-    near = np.hypot(*(xy - places[ping]).T) <= slant + reach[ping] + APART
+    near = np.hypot(*(xy - places[ping]).T) <= slant + reach[ping] + SLACK
     near &= _reached((stamp_ns[start] - stamp_ns[0]) * 1e-9, places, np.bincount(ping))[ping]
     if near.all():
         return points
@@ -180,7 +181,7 @@ def _reached(seconds: FloatArray, places: FloatArray, soundings: IntArray) -> Bo
 
     def leaps(one: int | IntArray, other: int | IntArray) -> Any:
         apart = np.linalg.norm(places[other] - places[one], axis=-1)
-        return apart > APART + FASTEST * np.abs(seconds[other] - seconds[one])
+        return apart > NEAR + FASTEST * np.abs(seconds[other] - seconds[one])
 
     pings = np.arange(len(places))
     first = np.flatnonzero(np.append(True, leaps(pings[:-1], pings[1:])))
