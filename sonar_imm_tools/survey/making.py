@@ -120,7 +120,7 @@ def _has_soundings(recording: Path) -> bool:
 
 def _is_results(folder: Path) -> bool:
     """Whether `track` made a folder, which has a run.json then."""
-    there = any(os.path.lexists(folder / name) for name in (RUN, CSV))
+    there = any(os.path.lexists(folder / name) for name in (RUN, CSV, PARQUET[CSV]))
     return there or marked(folder).get('kind') == RESULTS
 
 
