@@ -323,10 +323,10 @@ class DepthSlices:
     def visible(
         self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, BoolArray]:
-        """Probability (T, K) that the beam holds each component, and which targets (T,) lie
-        ahead; pose: of the sonar, or of one for each target, see `unscented.points`. widest:
-        azimuth and range from which there were echoes, where these are more than the parameters
-        say."""
+        """Probability (T, K, E) that the beam holds each component, by parts of its height, and
+        which targets (T,) lie ahead; pose: of the sonar, or of one for each target, see
+        `unscented.points`. widest: azimuth and range from which there were echoes, where these are
+        more than the parameters say."""
         x, P, mu = mixture
         m = unscented.points(x, *pose, self.cone)
         vertical, horizontal, reach = self._beam

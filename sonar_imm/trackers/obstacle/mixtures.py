@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.covariance import are_sound, LIMIT, with_jitter
@@ -31,6 +31,11 @@ SMEAR = math.radians(1.2)
 """Standard deviation of the edges of the beam, rad; in range, as a share of the reach."""
 UNSEEN = 0.01
 """Least probability to be in the beam: nothing is ever certain to be unseen."""
+PARTS = 5
+PART = ndtri((np.arange(PARTS) + 0.5) / PARTS)
+"""Middles of equally probable parts of a normal distribution of variance 1."""
+WITHIN = math.sqrt(1.0 - float(np.mean(np.square(PART))))
+"""Standard deviation that is left within a part."""
 OPENS = 1e-6
 """Least weight of a component that opens a gate."""
 
@@ -282,17 +287,20 @@ def visible(
     horizontal: float,
     reach: float,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability (T, K) that a beam of these half widths and that reach holds
-    components at m (T, K, 3), seen from the sonar, with covariances P (T, K, n, n), at least
-    `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
+    """Return the probability (T, K, E) that a beam of these half widths and that reach holds the
+    `PARTS` by height of components at m (T, K, 3), seen from the sonar, with covariances P (T, K,
+    n, n), at least `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
     x, y, z = np.moveaxis(m, -1, 0)
     d = np.sqrt(x * x + y * y + z * z)
     smear = SMEAR * SMEAR
     up, side = np.arcsin(z / d), np.arctan2(np.abs(y), x)
-    rise = 1.0 / np.sqrt(smear + P[..., 2, 2] / (d * d))
-    inside = ndtr((vertical - up) * rise) - ndtr((-vertical - up) * rise)
-    inside *= ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
-    inside *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
+    std = np.sqrt(smear + P[..., 2, 2] / (d * d))
+    above, below = ((edge - up) / std for edge in (vertical, -vertical))
+    above, below = (edge[..., None] - PART for edge in (above, below))
+    inside = ndtr(above / WITHIN) - ndtr(below / WITHIN)
+    level = ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
+    level *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
+    inside *= level[..., None]
     mean = np.einsum('tk,tka->ta', mu, m)
     ahead = mean[:, 0] > AHEAD * np.sqrt((mean * mean).sum(axis=1))
     return UNSEEN + (1.0 - UNSEEN) * inside, ahead
