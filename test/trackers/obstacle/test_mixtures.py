@@ -145,7 +145,9 @@ def numpy_advance(x, P, motion, j, before, after, noise, model):
             J[:, i] = (ahead - back) / 2e-5
         G = np.zeros((5, 2))
         G[:2], G[3:] = motion.push[j] * J, np.eye(2)
-        covariance += motion.noise[j] * G @ G.T
+        square = x[own[3:]] @ x[own[3:]] + np.trace(C[3:, 3:])
+        share = np.clip(square / motion.slow[j], 0.01, 1.0) if motion.slow[j] else 1.0
+        covariance += share * motion.noise[j] * G @ G.T
     return mean, covariance
 
 
