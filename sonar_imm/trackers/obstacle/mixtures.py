@@ -77,6 +77,10 @@ def mix(
     brings its own, any other its prior, uncorrelated. Slices and components below the weight
     `floor` are dropped.
 
+    Moments are those of what was of the behaviour before and of what came to it, each of share s
+    weighed by s^2. By s, the little that comes in every step, of an e as unknown as that of a new
+    obstacle, would keep a behaviour that is still improbable from ever knowing its e.
+
     :param prior: (C,) variance of e before anything is known, 0 for a behaviour without e.
     """
     T, C, n = x.shape
@@ -94,6 +98,10 @@ def mix(
     mu1[:, :inside] = np.where(mixed, total, 0.0).reshape(T, inside)
     share = W / np.where(total > 0.0, total, 1.0)[:, :, None]
     share = np.where((total > 0.0)[:, :, None], share, np.eye(M))
+    kept = share * np.eye(M)
+    came = share - kept
+    share = kept * kept.sum(axis=2, keepdims=True) + came * came.sum(axis=2, keepdims=True)
+    share = share / share.sum(axis=2, keepdims=True)
     x1, P1 = x.copy(), P.copy()
     xs, Ps = x[:, :inside].reshape(T, slices, M, n), P[:, :inside].reshape(T, slices, M, n, n)
     mean, spread = np.empty(xs.shape), np.empty(Ps.shape)
