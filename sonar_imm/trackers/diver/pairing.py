@@ -39,7 +39,7 @@ from .known import Known
 from .models import ModelSet
 from .pairs import Association, Groups, LEAVE, Pairs
 from .scan import Group
-from .ways import has_ways, is_alone
+from .ways import has_ways, is_alone, with_ways
 
 MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
 """Minimum probability of a model that opens the gate. A single assignment needs rare models, or
@@ -72,14 +72,17 @@ def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group]
     min_probability = MIN_MODEL_PROBABILITY[pairing]
 
     def associate(known: Known, group: Group) -> Known:
-        pairs = compare(known, group, models, min_probability)
+        pairs = compared = compare(known, group, models, min_probability)
+        several = has_ways(group, models) and not compared.in_parts
+        if several:
+            pairs = with_ways(known, group, compared, models)
         associate_pairs = by_density if group.target_id is None else associate_by_id
         group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
-        if has_ways(group, models) and not is_alone(group):
+        if several and not is_alone(group):
             openers = links.openers(known, group.association)
             if openers.any():
                 # With the bursts that may begin, which a first pass has found missing fixes for.
-                pairs = compare(known, group, models, min_probability, openers)
+                pairs = with_ways(known, group, compared, models, openers)
                 if pairs.ways is not None:
                     group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
         return known
