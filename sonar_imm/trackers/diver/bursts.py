@@ -16,7 +16,9 @@ lasts. Each fix is weighed in several *ways*, and each way leaves a row of its o
 - an outlier: the row does not change;
 - an offset begins: the last two components b of the state get a prior, and the fix measures p + b;
 - from a row with an offset of this sensor: the offset stays, ends (b is nil again), or another one
-  begins.
+  begins;
+- from a row whose offset *turns*: the fix has it or not, at even odds. Two sensors that report as
+  one have such fixes (`disagreement`).
 
 An offset begins only where the target cannot have come to, so rows of clean data are never
 divided. A row with an offset has a second reading: the target is where the fixes are, and the
@@ -65,6 +67,9 @@ PLAIN_LOST = math.log(1e-12)
 JUMP_FLOOR = math.log(1e-3)
 """Log odds that an established track was wrong before, when a burst begins."""
 
+SILENT = 20
+"""Number of fixes in a row at one of two places after which the other one is given up."""
+
 JUMP_SURE = 0.99
 """Probability of this reading at which the track moves to the fixes."""
 
@@ -106,13 +111,14 @@ def begin_rows(
     rows = known.rows.with_tail(TAIL).select(row)
     opens, outliers = way == OPEN, way == OUTLIER
     sensor, key = group.number, dict(rows.key)
-    plain = opens | (way == LEAVE)
+    without = (way == LEAVE) & key['turns']
+    plain = opens | (way == LEAVE) & ~without
     key['offset'] = np.where(opens, sensor, np.where(plain, -1, key['offset']))
     key['since'] = np.where(opens, known.stamp_ns, np.where(plain, 0, key['since']))
     before = key['taken'] + key['fixes'] + key['others']
     key['taken'] = np.where(plain, before + ~opens, key['taken'])
-    key['fixes'] = np.where(opens, 1, np.where(plain, 0, key['fixes']))
-    key['others'] = np.where(plain, 0, key['others'])
+    key['fixes'] = np.where(opens, 1, np.where(plain | without, 0, key['fixes']))
+    key['others'] = np.where(plain, 0, key['others'] + without)
     key['took'] = np.where(outliers, key['took'], known.stamp_ns)
     key['aside'] = outliers & (key['offset'] < 0)
     late, velocities = key['delay'][:, sensor], [part.outputs[2:4] for part in models.parts]
@@ -172,13 +178,14 @@ def count_fixes(rows: Rows, sensor: int, used: BoolArray, stamp_ns: int) -> Rows
     own = key['offset'] == sensor
     key['took'] = np.where(used, stamp_ns, key['took'])
     key['fixes'] = key['fixes'] + (used & own)
-    key['others'] = key['others'] + (used & bursting & ~own)
+    others = np.where(used & own & key['turns'], 0, key['others'])
+    key['others'] = others + (used & bursting & ~own)
     key['taken'] = key['taken'] + (used & ~bursting)
     key['aside'] = key['aside'] & ~used
     return rows.replace(key=key)
 
 
-MERGED = ('scale', 'delay', 'start', 'side', 'offset', 'since', 'aside', 'link')
+MERGED = ('scale', 'delay', 'start', 'side', 'offset', 'since', 'aside', 'turns', 'link')
 """Assumptions that rows which are merged have in common."""
 
 
@@ -268,9 +275,9 @@ def reading_weights(rows: Rows, end: float) -> FloatArray:
     offset says."""
     key = rows.key
     odds = jump_log_odds(key['taken'], key['others'], key['fixes'], end)
-    # A linked track is the other reading of its row.
-    two = (rows.key['offset'] >= 0) & (rows.key['link'] == 0)
-    return np.where(two, 1.0 / (1.0 + np.exp(-odds)), 0.0)
+    # A linked track is the other reading of its row. Neither place of two in turn is the better.
+    two = (key['offset'] >= 0) & (key['link'] == 0)
+    return np.where(two, np.where(key['turns'], 0.5, 1.0 / (1.0 + np.exp(-odds))), 0.0)
 
 
 def row_readings(rows: Rows, models: ModelSet, end: float) -> tuple[FloatArray, FloatArray]:
@@ -315,19 +322,27 @@ def move_to_fixes(rows: Rows, chosen: BoolArray) -> Rows:
     return _without_offset(moved, chosen)
 
 
+def turning(known: Known) -> BoolArray:
+    """Return the tracks (T,) whose fixes are rather those of two places in turn."""
+    rows, T = known.rows, len(known)
+    return np.asarray(rows.total(np.where(rows.key['turns'], rows.weight, 0.0), T) > 0.5)
+
+
 def jump(known: Known, group: Group) -> Known:
     """Move tracks to their fixes where the track was wrong before, almost surely.
 
-    A track without a target ID gets a new track ID. A stage of the tracker.
+    A track without a target ID gets a new track ID. Of two places in turn, the one without recent
+    fixes is given up. A stage of the tracker.
     """
     rows = known.rows
     if not rows.tail:
         return known
     sure = reading_weights(rows, group.config.burst_end) >= JUMP_SURE
-    if not sure.any():
+    there, here = (rows.key['turns'] & (rows.key[n] >= SILENT) for n in ('fixes', 'others'))
+    if not (sure | there | here).any():
         return known
     share = rows.total(np.where(sure, rows.weight, 0.0), len(known))
-    moved = move_to_fixes(rows, sure)
+    moved = _without_offset(move_to_fixes(rows, sure | there), here)
     # The path before is that of another place.
     parent = np.where(share[rows.target] > 0.5, -1, rows.parent)
     merged = without_unused_tail(merge_rows(moved.replace(parent=parent)))

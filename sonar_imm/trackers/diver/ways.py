@@ -93,6 +93,7 @@ def _add_ways(
         return pairs
     offset, aside = rows.key['offset'][row], rows.key['aside'][row]
     own = offset == sensor
+    turns = own & rows.key['turns'][row]
     scaled = group.R[fix] * scale_of(rows.key, sensor)[row, None, None]
     z = group.z[fix]
     excess, wide = _excess(*_row_fixes(pairs.expected, rows, row, nil=True), z, scaled)
@@ -116,13 +117,14 @@ def _add_ways(
     used[far & free & ~aside] = math.log1p(-2.0 * e)
     used[free & aside] = math.log(USED_AGAIN)
     used[far & other] = math.log1p(-e)
-    used[own] = math.log1p(-end)
-    again = math.log(ANEW_SHARE * end), -np.inf, math.log(OPEN_AGAIN)
-    opens = np.select([own, other, aside], again, math.log(e))
-    outliers = np.select([own, aside], [-np.inf, math.log(AGAIN)], math.log(e))
+    used[own] = np.where(turns, math.log(0.5), math.log1p(-end))[own]
+    again = -np.inf, math.log(ANEW_SHARE * end), -np.inf, math.log(OPEN_AGAIN)
+    opens = np.select([turns, own, other, aside], again, math.log(e))
+    outliers = np.select([own & ~turns, aside], [-np.inf, math.log(AGAIN)], math.log(e))
     opens = np.where(far, opens, -np.inf)
     outliers = np.where(single & (far | aside), outliers, -np.inf)
     leaves = np.where(own, math.log(LEAVE_SHARE * end), -np.inf)
+    leaves[turns] = math.log(0.5)
     log, variance = np.full(len(row), -np.inf), np.zeros(len(row))
     some = np.flatnonzero(np.isfinite(opens) | np.isfinite(outliers))
     std = np.maximum(config.burst_std, WIDER * wide[some])
