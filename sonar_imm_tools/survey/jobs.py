@@ -136,6 +136,7 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     seconds = (line.stamp_ns[-1] - line.stamp_ns[0]) * 1e-9
     count = max(1, math.ceil(seconds / LONGEST_SECONDS))
     edges = line.stamp_ns[0] + (np.arange(1, count) * seconds / count * 1e9).astype(np.int64)
+    place.with_suffix('.json').unlink(missing_ok=True)
     for k, rows in enumerate(
         np.split(np.arange(len(line)), np.searchsorted(line.stamp_ns, edges))
     ):
@@ -238,7 +239,8 @@ def make_tile(job: TileJob) -> None:
     )
     number = np.array([part[0] for part in job.parts])
     nodes = evolve(nodes, seen_line=number[nodes.seen_line])
-    _save(job.place, asdict(nodes, recurse=False))
+    job.place.with_suffix('.json').unlink(missing_ok=True)
+    save_arrays(job.place, asdict(nodes, recurse=False))
     write_json(job.place.with_suffix('.json'), job.signature)
 
 
@@ -255,6 +257,7 @@ def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    path.with_suffix('.json').unlink(missing_ok=True)  # no signature beside what it is not of
     with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.save(file, _table(columns))
 
@@ -276,7 +279,7 @@ def _line(table: np.ndarray, sound_speed: float) -> Line:
 
 
 def _store(path: Path, line: Line) -> None:
-    _save(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
+    save_arrays(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
 
 
 def _stat(path: Path) -> tuple[int, int]:
@@ -286,7 +289,8 @@ def _stat(path: Path) -> tuple[int, int]:
     return sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
 
 
-def _save(path: Path, arrays: Mapping[str, Any]) -> None:
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write named arrays as one npz."""
     with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.savez(file, **arrays)
 
