@@ -217,7 +217,11 @@ def known(path: Path | None) -> dict[str, Any]:
 def made() -> dict[str, str]:
     """Return the command, the day and the commit of the numbers that this process makes."""
     spec = sys.modules['__main__'].__spec__
-    program = ['-m', spec.name] if spec else [os.path.relpath(sys.argv[0], ROOT)]
+    program = (
+        ['-m', spec.name.removesuffix('.__main__')]
+        if spec
+        else [os.path.relpath(sys.argv[0], ROOT)]
+    )
     commit = _git('rev-parse', '--short=8', 'HEAD')
     if _git('status', '--porcelain', '--untracked-files=no', '--', ':!docs/results'):
         commit += ' with changes'

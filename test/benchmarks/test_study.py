@@ -128,7 +128,9 @@ def test_every_study_of_the_docs_is_there():
             names.add(words[2])
     assert names
     for name in names:
-        text = (ROOT / (name.replace('.', '/') + '.py')).read_text(encoding='utf-8')
+        path = ROOT / name.replace('.', '/')
+        path = path / '__main__.py' if path.is_dir() else path.with_suffix('.py')
+        text = path.read_text(encoding='utf-8')
         assert 'study(' in text or 'write_json(' in text, f'{name} does not use the harness'
 
 

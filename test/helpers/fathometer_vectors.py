@@ -6,10 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""What of the acceptance vectors is no recording: how far our numbers are from theirs.
-
-`benchmarks.fathometer_acceptance` prints it with the rest.
-"""
+"""What of the acceptance vectors is no recording: how far our numbers are from theirs."""
 
 from __future__ import annotations
 
@@ -23,7 +20,6 @@ import numpy as np
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import gaussian_walk, SetModel, Sets
 from sonar_imm.measurements import Pressure
 from sonar_imm.trackers.fathometer.pressure import PressureStream
@@ -52,25 +48,6 @@ def exact_hmm_model() -> SetModel:
         gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
         amplitude_std=3.0,
     )
-
-
-def exact_hmm(folder: Path, seed: int) -> dict[str, float]:
-    """Total variation of the PMF and error of the log evidence, with 20,000 particles."""
-    model = exact_hmm_model()
-    with np.load(folder / 'fathometer' / 'exact_hmm.npz') as file:
-        records, exact = file['B'], file['exP']
-    sets, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
-    for name, b in enumerate(records):
-        record = sets.record(b, (seed, name))
-        propagated = sets.propagate(before or sets.start(record), record)
-        step = sets.move(sets.resample(sets.weigh(propagated, record), record), record)
-        before = step.after
-        off.append(0.5 * np.abs(sets.summarise(step).pmf - exact[name]).sum())
-        evidence += step.log_evidence
-    return {
-        'exact_hmm: PMF, total variation': float(np.mean(off)),
-        'exact_hmm: log evidence': abs(evidence - EXACT_LOG_EVIDENCE),
-    }
 
 
 class SignedSet(NamedTuple):
@@ -109,30 +86,14 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
         yield SignedSet(model, sets, v['response'][k], log_likelihood, amplitude)
 
 
-def signed_likelihood(folder: Path) -> dict[str, float]:
-    """Largest error of the finite ones; how many of all are rejected as they should not be, or not
-    as they should."""
-    worst, wrong = 0.0, 0
-    for row in signed_sets(folder):
-        single = SetFilter(row.model, 1)
-        step = single.weigh(Weighted(row.sets, np.zeros(1)), single.record(row.response, (0, 0)))
-        found = step.after.log_weight
-        wrong += np.isfinite(row.log_likelihood) != np.isfinite(found[0])
-        if np.isfinite(row.log_likelihood):
-            worst = max(worst, abs(found[0] - row.log_likelihood))
-    return {
-        'signed_likelihood: error': float(worst),
-        'signed_likelihood: wrongly rejected or not': float(wrong),
-    }
-
-
-def sediment(folder: Path) -> dict[str, float]:
+def sediment(folder: Path) -> float:
+    """Largest error of the thickness, m."""
     with np.load(folder / 'fathometer_sea' / 'sediment.npz') as file:
         found = [
             sediment_thickness(file['two_way_time_below_bottom'], float(speed), float(gradient))
             for speed, gradient in zip(file['sound_speed'], file['gradient'])
         ]
-        return {'sediment: m': float(np.abs(np.array(found) - file['thickness']).max())}
+        return float(np.abs(np.array(found) - file['thickness']).max())
 
 
 def pressure(folder: Path) -> dict[str, float]:
@@ -171,31 +132,10 @@ def pressure(folder: Path) -> dict[str, float]:
         }
         for name, (ours, theirs) in pairs.items():
             error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
-            worst[f'pressure: {name}'] = max(worst.get(f'pressure: {name}', 0.0), error)
+            worst[name] = max(worst.get(name, 0.0), error)
     return worst
 
 
 def levelled(values: np.ndarray) -> np.ndarray:
     """Of any level: only ratios of cross-spectra count."""
     return values / np.abs(values).max()
-
-
-LIMITS = {
-    'exact_hmm: PMF, total variation': 0.008,
-    'exact_hmm: log evidence': 0.5,
-    'signed_likelihood: error': 1e-9,
-    'signed_likelihood: wrongly rejected or not': 0.0,
-    'sediment: m': 1e-9,
-    **{f'pressure: {name}': 1e-4 for name in ('R', 'gamma', 'W', 'b', 'mirror sigma', 'pulse')},
-}
-
-
-def rows(folder: Path, seeds: int) -> dict[str, list[float]]:
-    """Errors by name, of each seed where there are some."""
-    found: dict[str, list[float]] = {}
-    for seed in range(seeds):
-        for name, value in exact_hmm(folder, seed).items():
-            found.setdefault(name, []).append(value)
-    for name, value in (signed_likelihood(folder) | sediment(folder) | pressure(folder)).items():
-        found[name] = [value]
-    return found
