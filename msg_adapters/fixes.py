@@ -288,6 +288,14 @@ def read_beacon(message: Any, **_: Any) -> RelativeFix:
     return _fix(message, offset, target_id=int(message.beacon_id))
 
 
+RELATIVE_DRIVERS = {
+    'seatrac_interfaces/msg/ModemRec': read_modem,
+    'acomms_msgs/msg/UsblData': read_usbl_data,
+    'stonefish_ros2/msg/BeaconInfo': read_beacon,
+}
+"""Messages of single drivers and simulators for the input `relative`, with their readers."""
+
+
 def write_relative(fix: RelativeFix, make: Make) -> Any:
     """Write a PoseWithCovarianceStamped in forward, port, up; its covariance starts with -1 when
     the fix has none."""
