@@ -31,7 +31,6 @@ RESULTS = ROOT / 'docs' / 'results'
 
 TABLES = {
     'README': 'README.md',
-    'health': 'docs/health.md',
     'fathometer': 'docs/fathometer.md',
 }
 """By template of `docs/templates/tables`: the page whose table it writes."""

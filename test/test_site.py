@@ -14,7 +14,6 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 from __future__ import annotations
 
 import importlib
-import json
 import re
 import sys
 from typing import Any
@@ -142,17 +141,3 @@ def test_the_search_needs_no_server() -> None:
     (script,) = config['extra']['polyfills']
     assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
     assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
-
-
-def test_the_numbers_below_the_picture_of_the_front_are_those_of_the_run() -> None:
-    run = json.loads((ROOT / 'docs/results/diver_front.json').read_text(encoding='utf-8'))
-    caption = (ROOT / 'README.md').read_text(encoding='utf-8').partition('A simulated dive')[2]
-    caption = ' '.join(caption.partition('\n\n')[0].split())
-    assert f'middle one of {run["seeds"]}' in caption
-    for name in ('raw fixes, RMSE m', 'track, RMSE m'):
-        assert f'{run[name]:.2f} m'.lstrip('0') in caption
-    assert f'{100 * run["truth inside 95 % ellipse"]:.0f} % of the time' in caption
-    nees, low, high = (f'{run[name]:.2f}' for name in ('NEES', 'NEES low', 'NEES high'))
-    assert f'NEES {nees}, where {low} to {high} is consistent' in caption
-    assert ('wider than they need be' in caption) == (run['NEES'] < run['NEES low'])
-    assert run['NEES'] < run['NEES high'], 'too narrow: no picture for the front'

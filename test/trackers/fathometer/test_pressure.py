@@ -14,6 +14,7 @@ from pathlib import Path
 from attrs import evolve
 from helpers import fathometer_vectors
 from helpers.fathometer_runs import run
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -212,8 +213,7 @@ def test_a_long_block_is_taken_in_pieces_with_the_same_result(monkeypatch):
 
 @pytest.fixture(scope='module')
 def vectors():
-    with np.load(VECTORS / 'fathometer_sea' / 'pressure.npz') as file:
-        return {name: file[name] for name in file}
+    return load_vectors('fathometer_sea/pressure')
 
 
 def collected(vectors, record):
