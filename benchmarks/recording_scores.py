@@ -10,13 +10,13 @@
 alone, a constant velocity, and a peer.
 
     export SONAR_IMM_DATA=../shared/data
-    python -m benchmarks.recording_scores --out docs/results/recording_scores.json
+    python -m benchmarks.recording_scores --no-thinning --out docs/results/recording_scores.json
+    python -m benchmarks.recording_scores --recordings --out docs/results/recording_thinned.json
 
-The peer, `plain CV Kalman`, is that of `real_boats`. Tags are
-compared with GPS 3.4 s later, boats with GNSS within 20 m of a track; `seen` is the share of what
-there was to see that has a confirmed track, `ids` counts their identities. Of raw arrivals the
-tables hold pings of three or more. `thinned` is the RMSE with fewer receivers, chosen in eight
-ways.
+The peer, `plain CV Kalman`, is that of `real_boats`. Tags are compared with GPS 3.4 s later, boats
+with GNSS within 20 m of a track; `seen` is the share of what there was to see that has a confirmed
+track, `ids` counts their identities. Of raw arrivals the tables hold pings of three or more.
+`thinned` is the RMSE with fewer receivers, chosen in eight ways.
 """
 
 from __future__ import annotations
