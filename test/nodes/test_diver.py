@@ -92,6 +92,18 @@ def test_nothing_is_shown_of_tentative_tracks_and_of_none(rig):
     assert len(odometry) == len(probabilities) == 1
 
 
+def test_a_message_that_the_tracker_cannot_use_is_known_as_such(rig):
+    """Of two publishers, the one with a clock half a minute behind is of no use."""
+    node = rig[1]
+    for second in range(100, 110):
+        for behind in (0, 30):
+            values = {'stamp_ns': (second - behind) * 10**9, 'frame_id': 'map'}
+            fix = Fix(position=(1.0, second + behind, 0.0), covariance=np.eye(2), **values)
+            node.receive('fix', write_fix(fix, make))
+    assert [stamp.used for stamp in node._meter.stamps['fix']] == [True, False] * 10
+    assert {stamp.frame_id for stamp in node._meter.stamps['fix']} == {'map'}
+
+
 def test_a_diver_is_tracked_from_fixes(rig):
     bench, node, odometry, probabilities = rig
     publisher = bench.peer.create_publisher(
