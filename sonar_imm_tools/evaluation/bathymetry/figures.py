@@ -28,7 +28,7 @@ from ... import SECOND
 from ...offline.run_folder import read_measurements, RunFolder
 from ...recordings.export.points import Points, read_points
 from ...survey.chart import Chart, chart_of
-from ...survey.line import budget_of
+from ...survey.line import budget_of, without_far
 from ..plotting import (
     add_band,
     add_image,
@@ -302,7 +302,7 @@ def verdict_figure(profile: Profile, rough: FloatArray) -> go.Figure:
 def points_of(folder: Path) -> Points | None:
     """The soundings of a run; None without any."""
     place = RunFolder(folder).soundings()
-    points = read_points(place) if place else ()
+    points = without_far(read_points(place)) if place else ()
     return points or None
 
 
