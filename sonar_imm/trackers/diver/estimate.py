@@ -151,6 +151,7 @@ def health(known: Known, waiting: int) -> dict[str, float]:
         'broken_tracks': known.counts.get('broken', 0),
         'covariance_repairs': known.counts.get('repairs', 0),
         'not_started': known.counts.get('not_started', 0),
+        'names_without_track': known.counts.get('names_without_track', 0),
         'fixes_mean_nis': known.memory['fixes'].together.mean_nis,
         'fixes_lag_1': known.memory['fixes'].together.lag_1,
         'arrivals_mean_nis': known.memory['arrivals'].mean,
