@@ -104,15 +104,17 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
     if not len(tracks):
         return known
     fix = association.fix[tracks]
-    turning = bursts.turning(known)[tracks]
     scale = (
         estimated_scales(known.rows, group.number)[tracks]
         if len(models.scales) > 1
         else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
-    # Of two places in turn, the innovations tell nothing about covariances.
-    tentative = (known.life.status == TENTATIVE)[tracks] | turning
+    # Of two places in turn, and of late stamps on a bend, innovations do not show covariances.
+    key = known.rows.key
+    other = np.where(key['turns'] | key['delay'].any(axis=1), known.rows.weight, 0.0)
+    explained = known.rows.total(other, len(known)) > 0.5
+    tentative = ((known.life.status == TENTATIVE) | explained)[tracks]
     before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
@@ -124,8 +126,6 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
         before,
     )
     after = after.with_scale(scale, tentative)
-    if turning.any():
-        after = FixConsistency(stated=before.stated, assumed=before.assumed)
     names = 'white', 'nis', 'nis_dof', 'reported', 'lately'
     columns = {name: known[name].copy() for name in names}
     columns['white'][tracks, group.number] = white

@@ -46,7 +46,7 @@ from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .pairs import Association, Assumptions, Pairs
-from .scales import can_restore, lending, protected_rows
+from .scales import can_restore, lending, protected_rows, rescaled_rows
 from .scan import Group
 
 FEATURES = {
@@ -346,6 +346,8 @@ def update_tracks(
     rows, borrowed = restore_rows(rows, borrowed, again, bursts.ENDED, lend)
     took = association.beta.sum(axis=1) > 0.5 * exists
     rows = bursts.count_fixes(rows, sensor, took[rows.target], known.stamp_ns)
+    rescaled = rescaled_rows(rows, models.scales, sensor)
+    began = rescaled if began is None else began if rescaled is None else began.append(rescaled)
     if pairs.ways is not None or began is not None or rows.tail:
         rows, borrowed = _join_rows(rows, borrowed, began)
     return known.replace(rows=rows, borrowed=borrowed).add_counts(repairs=repairs)
