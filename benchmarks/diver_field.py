@@ -198,8 +198,8 @@ def offsets(rng: np.random.Generator, fault: str) -> FloatArray:
             one = turned(rng, 15.0, 40.0)
             off[run] = [one if fault == 'multipath' else turned(rng, 15.0, 40.0) for _ in run]
     share = {'outliers': 0.15, 'singles': 0.03}.get(fault)
-    wild = rng.uniform(size=COUNT - 20) < share if share else []
-    for k in 20 + np.flatnonzero(wild):
+    wild = np.flatnonzero(rng.uniform(size=COUNT - 20) < share) if share else np.empty(0, int)
+    for k in (20 + wild).tolist():
         off[k] = 30.0 * rng.normal(size=2) if fault == 'outliers' else turned(rng, 20.0, 60.0)
     return off
 
