@@ -195,9 +195,9 @@ def two_places(innovations: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def begin_disagreement(
     known: Known, group: Group, models: ModelSet, estimated: Sequence[BoolArray | None]
-) -> Rows | None:
+) -> list[Rows]:
     """Return rows with an offset of the sensor, for tracks whose sensors disagree, or whose sensor
-    shows two places in turn; None for none.
+    shows two places in turn, if any.
 
     A track that has a row with an offset gets none.
 
@@ -205,7 +205,7 @@ def begin_disagreement(
     """
     association, rows, T = group.association, known.rows, len(known)
     if association is None or not T:
-        return None
+        return []
     held = np.bincount(rows.target, rows.key['offset'] >= 0, T) > 0.0
     free = association.taken & ~held
     fix = association.beta.argmax(axis=1) if len(group.z) else association.fix
@@ -215,7 +215,7 @@ def begin_disagreement(
     found = free & association.hit & sensors_disagree(known['lately'], group.number) & ~turns
     track = np.flatnonzero(found | turns)
     if not len(track):
-        return None
+        return []
     # Of two places in turn, scales explain what is stated too small besides.
     usual = [s for s in models.scales if 1.0 <= s <= USUAL_SCALES[1]]
     each = [(t, s) for t in track.tolist() for s in (usual if turns[t] else [1.0])]
@@ -244,8 +244,6 @@ def begin_disagreement(
     )
     stated = known.replace(rows=started.replace(key=key, blocks=tuple(blocks)))
     weight, link = np.full(N, math.log(BEGINS)), np.zeros(len(group.z), np.int64)
-    began = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
-    if began is None:
-        return None
+    (began,) = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
     taken = np.zeros_like(began.key['taken'])
-    return evolve(began, key={**began.key, 'taken': taken}, parent=rows.parent[row])
+    return [evolve(began, key={**began.key, 'taken': taken}, parent=rows.parent[row])]

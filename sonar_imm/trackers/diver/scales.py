@@ -328,21 +328,20 @@ def protected_rows(rows: Rows) -> BoolArray:
     return protected | (weight_without_small_scales(rows) >= ROW_LOST) & is_published
 
 
-def rescaled_rows(rows: Rows, scales: Sequence[float], sensor: int) -> Rows | None:
-    """Return copies of rows with an offset at the usual scales of a sensor that they lack; None
-    for none.
+def rescaled_rows(rows: Rows, scales: Sequence[float], sensor: int) -> list[Rows]:
+    """Return copies of rows with an offset at the usual scales of a sensor that they lack, if any.
 
     Such a row keeps the scale it began with, which stood for the offset, maybe: nothing borrows
     from it. Each `RESCALED` fixes of the sensor, the heaviest rows get the copies.
     """
     if not rows.tail:
-        return None
+        return []
     key, own = rows.key, rows.key['scale'][:, sensor]
     number = np.where(key['offset'] == sensor, key['fixes'], key['others'])
     due = (key['offset'] >= 0) & (own > 0.0) & (number % RESCALED == 0) & (number > 0)
     due &= ~key['turns'] & (rows.logw > np.log(HEAVY))
     if not due.any():
-        return None
+        return []
     others = np.delete(key['scale'], sensor, axis=1), key['delay'], key['offset'], key['since']
     alike = np.column_stack([rows.target, *others])
     usual = [s for s in scales if MIN_PUBLISHED_SCALE <= s <= USUAL_SCALES[1]]
@@ -353,12 +352,12 @@ def rescaled_rows(rows: Rows, scales: Sequence[float], sensor: int) -> Rows | No
         row += [k] * len(lacking)
         scale += lacking
     if not row:
-        return None
+        return []
     new = rows.select(np.array(row))
     table = new.key['scale'].copy()
     table[:, sensor] = scale
     logw, parent = new.logw + np.log(ROW_AGAIN), rows.parent[new.parent]
-    return evolve(new, logw=logw, parent=parent, key={**new.key, 'scale': table})
+    return [evolve(new, logw=logw, parent=parent, key={**new.key, 'scale': table})]
 
 
 def can_restore(rows: Rows, borrowed: Borrowed) -> BoolArray:
