@@ -172,8 +172,7 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
 def late_sensors(known: Known) -> dict[int, tuple[float, float]]:
     """Return delay, s, and its probability by the number of each sensor whose stamps are late."""
     found, firm = {}, known.life.status != TENTATIVE
-    several = len(known.memory['sensors'].names) > 1
-    for number in range(len(known.memory['sensors'].names) if several else 0):
+    for number in np.flatnonzero(known.rows.key['delay'].any(axis=0)).tolist():
         delay, weight = delay_probabilities(known.rows, number)
         if (firm & (weight > SURELY_LATE)).any():
             track = int(np.where(firm, weight, 0.0).argmax())

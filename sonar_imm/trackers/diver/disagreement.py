@@ -13,7 +13,7 @@ the covariances that scales grant, no fix is far from the track. So if the means
 innovations of two sensors differ significantly, a row begins with scales 1 and an offset of the
 sensor that reports. Both readings of an offset are even then (`bursts`).
 
-Two sensors may report as one. If the last innovations of a sensor lie in two groups that take
+Two sensors may report as one. If the last innovations of the only sensor lie in two groups that take
 turns, rows begin whose offset turns: each fix has it or not.
 
 Source: docs/diver.md, 'Several sensors'.
@@ -212,6 +212,7 @@ def begin_disagreement(
     distance, std = two_places(known['innovations'])
     R = group.R[fix].trace(axis1=1, axis2=2) / 2.0 if len(group.z) else std
     turns = free & (distance > SEPARATE * std) & (np.square(distance) > DISAGREE * R)
+    turns &= len(known.memory['sensors'].names) == 1
     found = free & association.hit & sensors_disagree(known['lately'], group.number) & ~turns
     track = np.flatnonzero(found | turns)
     if not len(track):
