@@ -13,8 +13,8 @@ the covariances that scales grant, no fix is far from the track. So if the means
 innovations of two sensors differ significantly, a row begins with scales 1 and an offset of the
 sensor that reports. Both readings of an offset are even then (`bursts`).
 
-Two sensors may report as one. If the last innovations of the only sensor lie in two groups that take
-turns, rows begin whose offset turns: each fix has it or not.
+Two sensors may report as one. If the last innovations of the only sensor lie in two groups that
+take turns, rows begin whose offset turns: each fix has it or not.
 
 Source: docs/diver.md, 'Several sensors'.
 """
