@@ -124,12 +124,14 @@ def count_bursts(known: Known, scan: Scan) -> Known:
 
 
 def current_bursts(known: Known) -> Iterator[Burst]:
-    """Yield the burst of each confirmed track that has one, of two fixes or more."""
+    """Yield the burst of each confirmed track that has one, of two fixes or more; of three in scans
+    of several targets, where two may be false fixes."""
     rows, T = known.rows, len(known)
     if not rows.tail:
         return
-    counted = (rows.key['offset'] >= 0) & (rows.key['fixes'] >= 2) & ~rows.key['turns']
-    running = np.where(counted, rows.weight, 0.0)
+    key = rows.key
+    enough = key['fixes'] >= np.where(key['link'] != 0, 3, 2)
+    running = np.where((key['offset'] >= 0) & enough & ~key['turns'], rows.weight, 0.0)
     offset = bursts.row_offsets(rows)
     firm = known.life.status != TENTATIVE
     for track in np.flatnonzero((rows.total(running, T) > 0.5) & firm).tolist():
