@@ -441,10 +441,9 @@ def _draw_back(
 
 
 def _whitening(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return W (..., n, n) with ``W S W' = 1``, and the log determinant (...,) of `S`, which may be
-    singular.
+    """Return W (..., n, n) with ``W S W' = 1``, and the log determinant (...,) of S.
 
-    `scale` (..., n) are variances that take the units out; after that, a component with less than
+    S may be singular. `scale` (..., n) are variances that take the units out; after that, a component with less than
     `_NEGLIGIBLE` once those before it are given is a function of them, and gets that variance. A
     deviation from what they say is zero, so its huge precision does no harm.
     """
