@@ -56,12 +56,12 @@ from .jobs import (
     TileJob,
     Unit,
 )
-from .line import budget_of
+from .line import budget_of, unstated
 from .looks import Looks
 from .resuming import adjust_lines, find_misties, Misties
 
 WORK, SURVEY = '.work', 'survey.json'
-_STATED = ('soundings', 'size', 'mtime_ns', 'sha256', 'bounds')
+_STATED = ('soundings', 'far', 'size', 'mtime_ns', 'sha256', 'bounds')
 """What survey.json says of a line."""
 FINEST, COARSEST = 0.25, 16.0
 LEAST_SOUNDINGS = 5.0
@@ -121,7 +121,7 @@ def _has_soundings(recording: Path) -> bool:
 
 def _is_results(folder: Path) -> bool:
     """Whether `track` made a folder, which has a run.json then."""
-    there = any(os.path.lexists(folder / name) for name in (RUN, CSV))
+    there = any(os.path.lexists(folder / name) for name in (RUN, CSV, PARQUET[CSV]))
     return there or marked(folder).get('kind') == RESULTS
 
 
@@ -280,7 +280,7 @@ def make(
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
     work = out / WORK
     units, lines, budget = _imported(sources, work, options, run, progress)
-    warnings = _unstated(sources, lines)
+    warnings = [*_unstated(sources, lines), *_far(lines)]
     depth = float(np.median([unit.depth for unit in units]))
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
@@ -469,13 +469,31 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
 
 
 def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a warning that names the lines whose error budget is assumed."""
-    used = [source for source, line in zip(sources, lines) if not line['failure']]
-    names = [source.name for source in used if source.run is None]
-    if not names:
-        return []
-    named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
-    return [f'{counted(len(names), "line")} without {RUN} ({named}): default error budget']
+    """Return warnings that name the lines whose error budget is assumed, all of it or a part."""
+    lacking: dict[str, list[str]] = {}
+    for source, line in zip(sources, lines):
+        if not line['failure'] and (missing := unstated(source.run)):
+            what = RUN if source.run is None else ', '.join(missing)
+            lacking.setdefault(what, []).append(source.name)
+    found = []
+    for what, names in lacking.items():
+        named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
+        kind = 'error budget' if what == RUN else 'values'
+        found.append(f'{counted(len(names), "line")} without {what} ({named}): default {kind}')
+    return found
+
+
+def _far(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return warnings that name the lines of which soundings are left out."""
+    found = []
+    for line in lines:
+        if far := line['far']:
+            says = 'lies far away and is' if far == 1 else 'lie far away and are'
+            found.append(
+                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
+                'the others can have seen them'
+            )
+    return found
 
 
 def _warnings_of(found: Adjustment) -> list[str]:

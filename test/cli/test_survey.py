@@ -350,7 +350,7 @@ def test_an_adjustment_that_cannot_be_read_is_made_again(lines, tmp_path, made, 
 def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
     shutil.copytree(lines, tmp_path / 'runs')
     (tmp_path / 'runs' / 'line_001' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
-    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 1
+    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 0
     error = capsys.readouterr().err
     assert 'line_001: ' in error and 'no column' in error and 'Traceback' not in error
     survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
@@ -418,7 +418,7 @@ def test_recordings_of_soundings_are_lines_too(lines, made, tmp_path, capsys):
     shutil.rmtree(runs / 'line_003')
     record(lines / 'line_003', runs / 'line_003', '/a/soundings', '/b/soundings')
     capsys.readouterr()
-    assert run('survey', runs, tmp_path / 'again') == 1
+    assert run('survey', runs, tmp_path / 'again') == 0
     assert 'has the topics /a/soundings and /b/soundings' in capsys.readouterr().err
 
 
