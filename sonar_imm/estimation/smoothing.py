@@ -444,7 +444,7 @@ def _whitening(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray
     """Return W (..., n, n) with ``W S W' = 1``, and the log determinant (...,) of S.
 
     S may be singular. `scale` (..., n) are variances that take the units out; after that, a
-    component with less than `_NEGLIGIBLE` once those before it are given is a function of them, and
+    component with less than `_NEGLIGIBLE` once those before it are given is a function of them and
     gets that variance. A deviation from what they say is zero, so its huge precision does no harm.
     """
     root = np.sqrt(np.where(scale > 0.0, scale, 1.0))
