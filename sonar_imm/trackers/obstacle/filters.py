@@ -281,10 +281,7 @@ class DepthSlices:
         if last is not sonar:
             m = geometry.predict(m, sonar.pose, last.pose)
         other = np.full(len(m), DOUBT)
-        vertical, *others = self._beam
-        edge, soft = (1.0 + EDGE) * vertical, SOFT * vertical
-        beam = edge, soft, *others
-        return Mixture(*mixtures.weight_by_beam(*mixture, m, other, 1.0 - other, *beam)[:3])
+        return Mixture(*self._weighed(mixture, m, other, 1.0 - other, 1.0 + EDGE)[:3])
 
     def apply_miss(
         self, mixture: Mixture, p: FloatArray, sonar: Sonar
@@ -292,11 +289,16 @@ class DepthSlices:
         """After a ping without an echo of the targets, which each give one with the probability
         p (T,) inside the beam; and the probability (T,) beforehand that the beam held them."""
         m = unscented.points(mixture.x, *sonar.pose, self.cone)
-        vertical, *others = self._beam
-        edge, soft = (1.0 - EDGE) * vertical, SOFT * vertical
-        beam = edge, soft, *others
-        *after, inside = mixtures.weight_by_beam(*mixture, m, np.ones(len(p)), -p, *beam)
+        *after, inside = self._weighed(mixture, m, np.ones(len(p)), -p, 1.0 - EDGE)
         return Mixture(*after), inside
+
+    def _weighed(
+        self, mixture: Mixture, m: FloatArray, floor: FloatArray, slope: FloatArray, edge: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """See `mixtures.weight_by_beam`, with a beam `edge` times as high."""
+        vertical = self._beam.vertical
+        beam = self._beam._replace(vertical=edge * vertical)
+        return mixtures.weight_by_beam(*mixture, m, floor, slope, beam, SOFT * vertical)
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
@@ -333,9 +335,8 @@ class DepthSlices:
         more than the parameters say."""
         x, P, mu = mixture
         m = unscented.points(x, *pose, self.cone)
-        vertical, horizontal, reach = self._beam
-        edges = max(horizontal, widest[0]), max(reach, widest[1])
-        return mixtures.visible(m, P, mu, vertical, *edges)
+        sides = map(max, self._beam[1:], widest)
+        return mixtures.visible(m, P, mu, mixtures.Beam(self._beam.vertical, *sides))
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -518,11 +519,11 @@ def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> Float
     return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)
 
 
-def beam_of(config: ObstacleConfig) -> tuple[float, float, float]:
-    """Half height and half width, rad, and reach of the beam, m."""
+def beam_of(config: ObstacleConfig) -> mixtures.Beam:
+    """Return the beam of the parameters."""
     fov = config.vertical_fov_deg, config.horizontal_fov_deg
-    vertical, horizontal = np.radians(0.5 * np.array(fov))
-    return float(vertical), float(horizontal), config.max_range
+    vertical, horizontal = (math.radians(0.5 * angle) for angle in fov)
+    return mixtures.Beam(vertical, horizontal, config.max_range)
 
 
 def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
