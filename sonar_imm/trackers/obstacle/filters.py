@@ -90,20 +90,23 @@ NOWHERE = np.full(3, np.nan)
 
 
 class Sonar(NamedTuple):
-    """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
-    when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
-    reference: how far below the navigation reference, whose altitude it is, the sonar lies, m.
-    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown. velocity: (3,)
-    m/s of the sonar now, NED; turn: (3,) rad/s, rate at which it turns, in its own axes."""
+    """The sonar during a ping."""
 
     pose: Pose
+    """At the transmission."""
     altitude: float = np.nan
+    """m above the sea floor, of the navigation reference; NaN when unknown."""
     late: Pose | None = None
+    """For two-way timing, `late_by` seconds later; None otherwise."""
     late_by: float = 0.0
     reference: float = 0.0
+    """m by which the sonar lies below the navigation reference."""
     course: Annotated[FloatArray, '3'] = NOWHERE
+    """(3,) m/s of the vehicle along its course, NED; NaN when unknown."""
     velocity: Annotated[FloatArray, '3'] = np.zeros(3)
+    """(3,) m/s of the sonar now, NED."""
     turn: Annotated[FloatArray, '3'] = np.zeros(3)
+    """(3,) rad/s at which it turns, in its own axes."""
 
     def seabed_below(self) -> float:
         """Return the depth of the sea floor below the sonar, m, NaN when unknown."""

@@ -48,27 +48,29 @@ beyond 78."""
 
 
 class Landmark(NamedTuple):
-    """An obstacle that is not in view, as it was at `stamp_ns`, when its track ended.
-
-    seen_ns: last echo; classes (C,): its existence by class of detectability (`existence`), at
-    that time; sonar: pose then, NED and FRD; which (k,): the
-    components that are kept, of the filter's, with their x (k, n), P (k, n, n) and weights mu
-    (k,); body: number of echoes with an extent, and their standard deviations (2,) m; place (3,)
-    m, covariance (3, 3) and low, high, the 90 % band of its height, all in the world, ENU."""
+    """An obstacle that is not in view, as it was when its track ended."""
 
     track_id: int
     stamp_ns: int
+    """When its track ended."""
     seen_ns: int
+    """Its last echo."""
     classes: Annotated[FloatArray, 'C']
+    """(C,) existence by class of detectability (`existence`)."""
     sonar: Pose
+    """NED and FRD."""
     which: Annotated[np.ndarray, 'k']
+    """(k,) the components that are kept, of the filter's."""
     x: Annotated[FloatArray, 'kn']
     P: Annotated[FloatArray, 'knn']
     mu: Annotated[FloatArray, 'k']
     body: tuple[float, FloatArray]
+    """Number of echoes with an extent, and their standard deviations (2,) m."""
     place: Annotated[FloatArray, '3']
+    """(3,) m, ENU, with its covariance (3, 3)."""
     covariance: Annotated[FloatArray, '33']
     low: float
+    """m, 90 % band of its height, up to `high`."""
     high: float
 
     def mixture(self, K: int) -> Mixture:
