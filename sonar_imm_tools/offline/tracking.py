@@ -323,6 +323,12 @@ class OfflineRun:
         known = getattr(self.tracker, 'known', None)
         return {} if known is None else {'landmarks': known()}
 
+    def array(self) -> dict[str, Any]:
+        """What the echoes show of the staves of an array; nothing of other sensors, or of too few
+        pings."""
+        found: dict[str, Any] = getattr(self.tracker, 'array', dict)()
+        return {'array': found} if found else {}
+
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
         return {'mounting': self._intake.mounting} if self._intake.mounting else {}
@@ -402,6 +408,7 @@ def write_run(
         **offline.target_names(),
         **offline.mounting(),
         **offline.landmarks(),
+        **offline.array(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)
