@@ -8,8 +8,9 @@
 
 """What the last pings say of a sonar: its noise, its staves and the sign of its phases.
 
-Of a ping by itself: `residual_ratio` compares what is left beside the echo with the noise that is
-stated, and `sign_evidence` whether a floor explains the echoes better with the phase turned round.
+Of a ping by itself: `LoudBins`; `residual_ratio` compares what is left beside the echo with the
+noise that is stated, and `sign_evidence` whether a floor explains the echoes better with the phase
+turned round.
 Of the last pings: sentences for `BathymetryTracker.warnings`, stave by stave.
 """
 
@@ -42,6 +43,24 @@ DECIDED, MOST_TRIED = 20.0, 20
 OPEN_STD = 3.0
 """m, at least, of the height before the first bin while the sign is looked for."""
 MOST_OF_BIN = 20.0
+
+
+class LoudBins(NamedTuple):
+    """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
+    of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
+    where layover is ignored; how many bins from the depth of the floor on are usable, and how many
+    of these are passed over; `coherence.common_mode`; whether there were too few staves for the
+    two surfaces of a bin; `variances.bins_alike`."""
+
+    bins: int
+    silent: int
+    decorrelation: float
+    array_error: float = math.nan
+    beyond: int = 0
+    beyond_silent: int = 0
+    common_mode: float = 0.0
+    unresolved: bool = False
+    alike: float = 1.0
 
 
 class Sign(NamedTuple):

@@ -40,7 +40,7 @@ from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
 from .filter_kernels import filter_block, normals
-from .findings import residual_ratio
+from .findings import LoudBins, residual_ratio
 from .grid_kernels import (
     filter_ping,
     filter_scatter,
@@ -75,6 +75,8 @@ DETECTABLE = 1.5
 
 LOUD = 4.0
 """So many times the noise is much power, in a bin of which two waves leave only noise."""
+LEAST_STD = 0.02
+"""Of a state by particles, in the standard deviation of one snapshot."""
 JUST_GATED = 0.4
 """Probability of a second surface where one cannot be measured: no sounding, and not two."""
 # Random numbers are drawn for so many at a time, which still fit into the cache.
@@ -127,24 +129,6 @@ class Look:
         """What all pings have in common, with the line that phases of staves leave."""
         doubt = self.config.doubt(self.snapshot.sound_speed)
         return evolve(doubt, sine=self.staves.sine_std)
-
-
-class LoudBins(NamedTuple):
-    """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
-    of their power that differs from stave to stave, NaN without any; `layover.array_error`, NaN
-    where layover is ignored; how many bins from the depth of the floor on are usable, and how many
-    of these are passed over; `coherence.common_mode`; whether there were too few staves for the
-    two surfaces of a bin; `variances.bins_alike`."""
-
-    bins: int
-    silent: int
-    decorrelation: float
-    array_error: float = math.nan
-    beyond: int = 0
-    beyond_silent: int = 0
-    common_mode: float = 0.0
-    unresolved: bool = False
-    alike: float = 1.0
 
 
 class Answer(NamedTuple):
@@ -223,6 +207,13 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     else:
         entropy = config.seed, seen.ping.snapshot.stamp_ns, int(seen.swath.side == 'port')
         track = run_particles(models, likelihood, config.particles_per_model, entropy)
+        # Where one particle has all the weight, they say nothing of how sure it is.
+        least = models.least_variance
+        if seen.swath.geometry.of_heights:
+            angle, snr = floor_of(seen, track).angle, likelihood.signal / likelihood.noise
+            one = seen.swath.snapshot_std(angle, snr, seen.staves.count)
+            least = np.fmax(least, np.square(LEAST_STD * one))
+        np.maximum(track.covariance[:, 0, 0], least, out=track.covariance[:, 0, 0])
     if config.smoothing_used == 'modes':
         smoothed = smooth_modes(track.probability, models.transition, likelihood.echo)
         track = track._replace(probability=smoothed)

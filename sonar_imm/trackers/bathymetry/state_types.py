@@ -15,8 +15,8 @@ from ...acoustics.geometry import Pose
 from ...intake.stream import STREAM_TYPES
 from ...measurements import Altitude, Navigation, Snapshot
 from ..navigation import NavigationBuffer
-from .findings import Sign
-from .ping import LoudBins, Ping, PosedPing
+from .findings import LoudBins, Sign
+from .ping import Ping, PosedPing
 from .tracker import Alone
 
 STATE_TYPES = (

@@ -64,6 +64,7 @@ from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 from .findings import (
     FEWEST_PINGS,
+    LoudBins,
     noise_warnings,
     Sign,
     sign_evidence,
@@ -80,7 +81,6 @@ from .ping import (
     floor_of,
     Look,
     look,
-    LoudBins,
     Ping,
     PosedPing,
     run,
