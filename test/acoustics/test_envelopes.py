@@ -8,8 +8,7 @@
 
 """Envelopes of profilers: noise, pulse and normal numbers, against vectors and closed forms."""
 
-from pathlib import Path
-
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -28,13 +27,10 @@ from sonar_imm.acoustics.envelopes import (
     water_noise,
 )
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
-
 
 @pytest.fixture(scope='module')
 def vectors():
-    with np.load(VECTORS / 'floor.npz') as file:
-        return {name: file[name] for name in file}
+    return load_vectors('fathometer_in_the_field/floor')
 
 
 def test_tables_of_the_vectors(vectors):
@@ -53,8 +49,8 @@ def test_tables_of_the_vectors(vectors):
 
 
 def test_normal_numbers_of_the_vectors():
-    with np.load(VECTORS / 'scalars.npz') as file:
-        x, expected = file['x'], file['gaussian']
+    scalars = load_vectors('fathometer_in_the_field/scalars')
+    x, expected = scalars['x'], scalars['gaussian']
     b = to_normal(x)
     assert b == pytest.approx(expected, abs=1e-6) and b.min() >= -3.0903
     assert np.diff(b[x > 6.0]) == pytest.approx(np.sqrt(2.0) * np.diff(x[x > 6.0]))

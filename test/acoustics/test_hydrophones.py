@@ -8,15 +8,13 @@
 
 """Hydrophones that differ: against vectors, and each fault in a record of its own."""
 
-from pathlib import Path
-
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
 from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
 from sonar_imm.acoustics.hydrophones import apply_response, correct_phones, fit_phones
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
 M, SPACING, SPEED = 16, 0.25, 1500.0
 WAVE, PLACES = SPEED / SPACING, np.arange(M)
 FREQUENCY = np.arange(100.0, 2801.0, 10.0)
@@ -24,8 +22,7 @@ FREQUENCY = np.arange(100.0, 2801.0, 10.0)
 
 @pytest.fixture(scope='module')
 def vectors():
-    with np.load(VECTORS / 'phones.npz') as file:
-        return {name: file[name] for name in file}
+    return load_vectors('fathometer_in_the_field/phones')
 
 
 @pytest.fixture(scope='module')

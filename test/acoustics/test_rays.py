@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-from pathlib import Path
-
+from helpers.vector_files import load_vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -15,13 +14,11 @@ import pytest
 
 from sonar_imm.acoustics.rays import launch_table, look_up, profile_of, profile_problem, trace
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'rays.npz'
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
 
 
 def cases():
-    with np.load(VECTORS) as archive:
-        case = dict(archive)
+    case = load_vectors('bathymetry_sea/rays')
     for number, row in enumerate(case.pop('profile')):
         chosen = case['profile_id'] == number
         yield (

@@ -6,8 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-from pathlib import Path
-
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -15,12 +14,9 @@ from sonar_imm.acoustics import array, geometry, sounding
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.acoustics.sounding import ErrorBudget
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'pose_table.npz'
-
 
 def rows():
-    with np.load(VECTORS) as archive:
-        table = dict(archive)
+    table = load_vectors('bathymetry_sea/pose_table')
     s_att, s_head, *rest = table.pop('tpu')
     budget = ErrorBudget(
         attitude=np.radians(s_att),
@@ -107,9 +103,7 @@ def test_the_budget_is_finite_straight_below_and_infinite_where_the_depth_says_n
 
 
 def test_what_the_geometry_leaves_open_is_that_of_the_vectors():
-    file = Path(__file__).parents[1] / 'vectors' / 'bathymetry_by_default' / 'array.npz'
-    with np.load(file) as archive:
-        case = dict(archive)
+    case = load_vectors('bathymetry_by_default/array')
     elevation = np.arcsin(15.0 / case['r'])
     parts = {
         'variance': (0.2, 0.01, 2.0),

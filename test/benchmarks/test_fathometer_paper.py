@@ -8,6 +8,7 @@
 
 """The fathometer tracker as printed: its model of sets, and what a bootstrap filter costs."""
 
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -17,7 +18,6 @@ from benchmarks.fathometer_paper import (
     ENVELOPE,
     PENALTY,
     score,
-    VECTORS,
 )
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
@@ -26,8 +26,7 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 @pytest.fixture(scope='module')
 def drift():
     """(trace, true depths) of the first 60 records of the vectors."""
-    with np.load(VECTORS) as file:
-        kept = {name: file[name] for name in file}
+    kept = load_vectors('fathometer/mvdr_traces')
     strength = kept['reflector_amplitude']
     there = strength > 0.4 * strength.max(axis=0)
     sigma = np.broadcast_to(np.ravel(kept['sigma']), len(strength))

@@ -10,8 +10,8 @@
 
 import itertools
 import math
-from pathlib import Path
 
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -25,13 +25,10 @@ from sonar_imm.estimation.onset import (
 )
 from sonar_imm.estimation.onset_kernels import FADED, NO_FLOOR
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer_in_the_field'
-
 
 @pytest.fixture(scope='module')
 def vectors():
-    with np.load(VECTORS / 'floor.npz') as file:
-        return {name: file[name] for name in file}
+    return load_vectors('fathometer_in_the_field/floor')
 
 
 def test_posterior_of_the_vectors(vectors):

@@ -9,15 +9,15 @@
 """The filter for sets against an exact one, and what each ingredient is good for."""
 
 import math
-from pathlib import Path
 
 from attrs import evolve
+from helpers.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from helpers.set_cycle import cycle
+from helpers.vector_files import load_vectors
 import numpy as np
 from oracles.set_particles import propagate, propose, start, weigh
 import pytest
 
-from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from sonar_imm.estimation.set_filter import (
     LagSmoother,
     levelled,
@@ -36,13 +36,10 @@ from sonar_imm.estimation.set_model import (
 )
 from sonar_imm.estimation.set_shifts import Shift, ShiftPath
 
-VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
-
 
 @pytest.fixture(scope='module')
 def exact():
-    with np.load(VECTORS / 'exact_hmm.npz') as file:
-        return {name: file[name] for name in file}
+    return load_vectors('fathometer/exact_hmm')
 
 
 @pytest.fixture(scope='module')

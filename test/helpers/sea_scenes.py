@@ -8,15 +8,13 @@
 
 """The traces of `vectors/fathometer_sea`: records a second apart, and what was there."""
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from helpers.vector_files import load_vectors
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import Trace
-
-SEA = Path(__file__).parents[1] / 'vectors' / 'fathometer_sea'
 
 
 class Scene(NamedTuple):
@@ -49,8 +47,7 @@ class Score(NamedTuple):
 
 
 def sea_scene(name):
-    with np.load(SEA / f'{name}.npz') as file:
-        found = {key: file[key] for key in file}
+    found = load_vectors(f'fathometer_sea/{name}')
     return Scene(
         found['depth'].astype(float),
         found['amplitude'].astype(float),

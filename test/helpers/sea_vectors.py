@@ -9,17 +9,13 @@
 """The reference vectors of a diver at sea, group by group."""
 
 from functools import cache
-from pathlib import Path
 
-import numpy as np
-
-FILE = Path(__file__).resolve().parents[1] / 'vectors/diver_sea/diver_sea.npz'
+from helpers.vector_files import load_vectors
 
 
 @cache
 def _all():
-    with np.load(FILE, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return load_vectors('diver_sea/diver_sea')
 
 
 def vectors(group):

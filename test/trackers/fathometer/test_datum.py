@@ -8,9 +8,8 @@
 
 """The depth of the array that is wrong: found from its reflectors, counted in, and followed."""
 
-from pathlib import Path
-
 from helpers.fathometer_runs import run
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -19,7 +18,6 @@ from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.datum import DatumError, found_std
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer_in_the_field'
 LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
 STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
 FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
@@ -49,13 +47,13 @@ def scene(error, seed, records=36, floor=None):
 
 
 def test_errors_of_the_vectors():
-    with np.load(VECTORS / 'scalars.npz') as file:
-        for change, found in (
-            ('change', 'found'),
-            ('change_waves', 'found_waves'),
-            ('change_fault', 'found_fault'),
-        ):
-            assert found_std(file[change][-40:]) == pytest.approx(float(file[found]), abs=1e-9)
+    scalars = load_vectors('fathometer_in_the_field/scalars')
+    for change, found in (
+        ('change', 'found'),
+        ('change_waves', 'found_waves'),
+        ('change_fault', 'found_fault'),
+    ):
+        assert found_std(scalars[change][-40:]) == pytest.approx(float(scalars[found]), abs=1e-9)
 
 
 def test_what_is_found_of_an_error_a_slope_and_a_fault():

@@ -8,10 +8,9 @@
 
 """The fathometer tracker as its users see it: measurements in, estimates out."""
 
-from pathlib import Path
-
 from attrs import evolve
 from helpers.fathometer_runs import run
+from helpers.vector_files import load_vectors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -25,14 +24,12 @@ from sonar_imm.trackers.fathometer.response import lattice_of_trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer'
 RECORD_NS = 90 * 10**9
 
 
 @pytest.fixture(scope='module')
 def vectors():
-    with np.load(VECTORS / 'mvdr_traces.npz') as file:
-        found = {name: file[name] for name in file}
+    found = load_vectors('fathometer/mvdr_traces')
     amplitude = found['reflector_amplitude']
     found['present'] = amplitude > 0.4 * amplitude.max(axis=0)
     return found

@@ -8,9 +8,8 @@
 
 """The floor of profiler lines in the tracker: labels, depth, the transmit pulse, and sentences."""
 
-from pathlib import Path
-
 from attrs import evolve
+from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
@@ -20,7 +19,6 @@ from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 from sonar_imm.trackers.fathometer.water import SeenFloor, Water
 
-VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer_in_the_field'
 FEW = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max': 6}
 
 
@@ -30,8 +28,7 @@ def run(traces, **options):
 
 
 def test_labels_of_the_vectors():
-    with np.load(VECTORS / 'floor.npz') as file:
-        v = {name: file[name] for name in file}
+    v = load_vectors('fathometer_in_the_field/floor')
     for k, row in enumerate(v['posterior_records']):
         floor = SeenFloor(
             v['posterior'][k], 0.0, float(v['step']), float(v['pulse']), 0.45, 0.1, 1.0
