@@ -192,6 +192,12 @@ class FathometerConfig(StampParameters):
     record_distance: float = parameter(0.0, 'm',
         'distance from record to record that they are meant for instead, where positions tell how '
         'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
+    common_jump_probability: float = parameter(0.05, '',
+        'probability that from a record to the next all reflectors jump by the same distance, as '
+        'over a fault of the floor, or where the depth of the array or the window of a trace '
+        'changes unsaid; 0: they never do. With heave there are no jumps', range=(0.0, 0.5))
+    common_jump_std: float = parameter(1.5, 'm',
+        'standard deviation of such a jump, which is cut at 2.67 of it', range=(0.01, 100.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('auto', '',
