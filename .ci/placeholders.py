@@ -31,10 +31,10 @@ def placeholders(root: Path = ROOT) -> Iterator[str]:
             yield f'package.xml: {maintainer.get("email")} reaches nobody'
     if not any(url.get('type') == 'repository' for url in manifest.iter('url')):
         yield 'package.xml: no <url type="repository">'
-    if not re.search(
-        '^repository-code:', (root / 'CITATION.cff').read_text(encoding='utf-8'), re.MULTILINE
-    ):
-        yield 'CITATION.cff: no repository-code'
+    citation = (root / 'CITATION.cff').read_text(encoding='utf-8')
+    for name in ('repository-code', 'date-released'):
+        if not re.search(f'^{name}:', citation, re.MULTILINE):
+            yield f'CITATION.cff: no {name}'
     if re.search('^Forthcoming$', (root / 'CHANGELOG.rst').read_text('utf-8'), re.MULTILINE):
         yield 'CHANGELOG.rst: the newest entries have no version and no date (Forthcoming)'
 

@@ -17,31 +17,19 @@ fixes state a sixth of their variance. The best in hindsight is the least RMSE o
 two heading sets and five constant velocities, each alone, told the true covariance and without a
 gate. `ratio` is the RMSE of `model_set: families`, told what the fixes state, over that. NEES is
 of the position, 2 is due; fixes before the tenth do not count.
-
-*tag*: the fixes of a towed tag as they are, against GPS 3.4 s later (`real_recordings`).
-
-*usbl*: a swimmer heard every 2 s to .9 m, of whose fixes one in twenty misses by 40 m on each
-axis, with and without a name in them. `coverage` is the share inside the 95 % ellipse.
-
-*wild*: fixes every second, of which 3 % are wild by 20 to 60 m. *stated*: fixes stated at .3 m
-that are 1.5 m, before and after the advice of the warning is followed. *cost*: a step of a single
-diver, processor time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 import json
-import re
-from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.real_recordings import load, TAG, tag_scores
 from benchmarks.recordings import DATA
 from benchmarks.study import final_estimates, Parts, rms, study
-from sonar_imm.measurements import Fix, NOBODY
+from sonar_imm.measurements import Fix
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SINGLES: dict[str, dict[str, Any]] = {
@@ -246,28 +234,26 @@ def paths(seeds: int) -> dict[str, Path]:
     return {**found, **recorded()}
 
 
-def fixes_of(path: Path, factor: float, name: int | None = None) -> list[Fix]:
-    """The fixes with their covariances times `factor`, with a name if one is given."""
-    target = NOBODY if name is None else name
+def fixes_of(path: Path, factor: float) -> list[Fix]:
+    """The fixes with their covariances times `factor`."""
     return [
         Fix(
             stamp_ns=round((100.0 + t) * 1e9),
             position=np.array([*z, 0.0]),
             covariance=R * factor,
             frame_id='map',
-            target_id=target,
         )
         for t, z, R in zip(path.t, path.z, path.R)
     ]
 
 
 def followed(
-    path: Path, config: DiverConfig, factor: float = 1.0, name: int | None = None
+    path: Path, config: DiverConfig, factor: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, DiverTracker]:
     """Errors (k, 2) of the first track after each fix, NaN without one, their NEES (k,), and the
     tracker."""
     tracker = DiverTracker(config)
-    final = final_estimates(tracker, fixes_of(path, factor, name))
+    final = final_estimates(tracker, fixes_of(path, factor))
     error, squared = np.full((len(path.t), 2), np.nan), np.full(len(path.t), np.nan)
     for row, stamp in enumerate(sorted(final)):
         each = final[stamp]
@@ -303,112 +289,8 @@ def scores(path: Path) -> dict[str, Any]:
     }
 
 
-def tag() -> dict[str, dict[str, float]]:
-    """The towed tag: its fixes, with what a user knows and with nothing."""
-    from pathlib import Path as FilePath
-    import tempfile
-
-    from sonar_imm_tools.recordings.convert import convert_fixes
-
-    found = {}
-    with tempfile.TemporaryDirectory() as folder:
-        bag = FilePath(folder) / 'fixes'
-        source = DATA / 'yaps_ssu1'
-        convert_fixes(source / 'fixes.csv', bag, truth=source / 'gps_truth.csv')
-        items, truth = load(bag)
-    known = DiverConfig(model_set='families', **TAG)
-    for name, config in {
-        'told nothing': DiverConfig(model_set='families'),
-        'what a user knows': known,
-        'heading_speed, told nothing': DiverConfig(model_set='heading_speed'),
-    }.items():
-        tracker = DiverTracker(config)
-        final = final_estimates(tracker, items)
-        plain, lagged, median, nees, compared = tag_scores(
-            [final[k] for k in sorted(final)], truth
-        )
-        found[name] = {
-            'rmse_m': plain,
-            'rmse_lag_m': lagged,
-            'median_m': median,
-            'nees': nees,
-            'compared': float(compared),
-            'tracks': float(tracker._stream.state.life.next_id - 1),
-        }
-    return found
-
-
-def swimmer(rng: np.random.Generator, every: float, std: float) -> Path:
-    """A swimmer in legs at .7 m/s for ten minutes."""
-    truth = integrated(*legs(rng, 600.0, 0.7, 25.0, 60.0))[:: round(10 * every)]
-    R = np.tile(np.eye(2) * std**2, (len(truth), 1, 1))
-    return Path(
-        every * np.arange(len(truth)), truth, truth + std * rng.normal(size=truth.shape), R
-    )
-
-
-def usbl(seed: int) -> Path:
-    """A transponder heard every 2 s, one fix in twenty wild."""
-    rng = np.random.default_rng([seed, 5])
-    path = swimmer(rng, 2.0, 0.9)
-    wild = rng.uniform(size=len(path.t)) < 0.05
-    path.z[wild] += 40.0 * rng.normal(size=(int(wild.sum()), 2))
-    return path
-
-
-def wild(seed: int) -> Path:
-    """Fixes every second, 3 % wild by 20 to 60 m."""
-    rng = np.random.default_rng([seed, 6])
-    path = swimmer(rng, 1.0, 1.0)
-    rows = np.flatnonzero(rng.uniform(size=len(path.t)) < 0.03)
-    angle, far = rng.uniform(-np.pi, np.pi, len(rows)), rng.uniform(20.0, 60.0, len(rows))
-    path.z[rows] += np.column_stack([far * np.cos(angle), far * np.sin(angle)])
-    return path
-
-
-def robust(path: Path, factor: float = 1.0, name: int | None = None, **values: Any) -> dict:
-    """RMSE, coverage and NEES of a tracker that is told nothing but `values`."""
-    error, squared, tracker = followed(path, DiverConfig(**values), factor, name)
-    error, squared = error[FIRST:], squared[FIRST:]
-    there = np.isfinite(squared)
-    warnings = ' '.join(tracker.warnings())
-    return {
-        'rmse_m': rms(np.hypot(*error[there].T)),
-        'coverage': float(np.mean(squared[there] <= INSIDE)),
-        'nees': float(np.mean(squared[there])),
-        'followed': float(np.mean(there)),
-        'tracks': float(tracker._stream.state.life.next_id - 1),
-        'warns': float('times as large as reported' in warnings),
-        'advice': float((re.findall(r'small by a factor ([\d.e+]+)', warnings) or ['nan'])[0]),
-    }
-
-
-def mean_over(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means of all numbers; the advice of those runs that gave one."""
-    out = {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
-    advised = [run['advice'] for run in runs if np.isfinite(run['advice'])]
-    return {**out, 'advice': float(np.mean(advised)) if advised else None}
-
-
-def cost() -> dict[str, float]:
-    """Processor time of a step in microseconds, the least of three runs."""
-    items = fixes_of(swimmer(np.random.default_rng(0), 1.0, 1.0), 1.0)
-    found: dict[str, float] = {}
-    for model_set in ('heading_speed', 'families'):
-        times = []
-        for _ in range(3):
-            tracker = DiverTracker(DiverConfig(model_set=model_set, max_tracks=1))
-            tracker.warm()
-            start = process_time()
-            for item in items:
-                tracker.process(item)
-            times.append((process_time() - start) / len(items) * 1e6)
-        found[f'{model_set}_us'] = min(times)
-    return {**found, 'ratio': found['families_us'] / found['heading_speed_us']}
-
-
-def main(seeds: int = 2, runs: int = 20) -> Parts:
-    yield {'seeds': seeds, 'runs': runs}
+def main(seeds: int = 2) -> Parts:
+    yield {'seeds': seeds}
     rows = []
     for name, path in paths(seeds).items():
         rows.append(scores(path))
@@ -424,22 +306,6 @@ def main(seeds: int = 2, runs: int = 20) -> Parts:
             'most_nees': float(np.max(due)),
         }
     }
-    if DATA.is_dir():
-        yield {'tag': tag()}
-    for number, label in ((None, 'without a name'), (7, 'with a name')):
-        for model_set in ('families', 'heading_speed'):
-            found = [robust(usbl(seed), name=number, model_set=model_set) for seed in range(runs)]
-            yield {'usbl': {f'{model_set}, {label}': mean_over(found)}}
-    found = [robust(wild(seed), model_set='families') for seed in range(runs)]
-    yield {'wild': {'families': mean_over(found)}}
-    given, advised = [], []
-    for seed in range(runs):
-        path = swimmer(np.random.default_rng([seed, 7]), 1.0, 1.5)
-        given.append(robust(path, 0.04, model_set='families'))
-        scale = given[-1]['advice'] if np.isfinite(given[-1]['advice']) else 1.0
-        advised.append(robust(path, 0.04, model_set='families', covariance_scale=scale))
-    yield {'cost': cost()}
-    yield {'stated': {'as stated': mean_over(given), 'advice followed': mean_over(advised)}}
 
 
 if __name__ == '__main__':

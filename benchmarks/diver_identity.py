@@ -10,45 +10,47 @@
 
     python -m benchmarks.diver_identity --out docs/results/diver_identity.json
 
-`buddies` is the scene of `diver_named`, `crossing` that of `diver_crossing`; `harbour`: eight
-boats on legs of 10 to 30 s at 3 m/s, 2 m on each axis, a scan each 2 s, P_D .9, 20 false fixes in
-a square of 400 m.
+`buddies`: two divers swim legs the same way, 2 m apart, at .75 m/s for 120 s. A sonar sees them
+without names: a scan per second, .5 m on each axis, P_D .9, two false fixes in a square of 120 m.
+The transponder of the first is heard from the 20th second on, every four seconds, good to 2 m.
+`crossing`: two pairs that cross within a metre (`simulate diver --scenario crossing`), a scan per
+second, .7 m on each axis, P_D .7, ten false fixes in a square of 160 m. `harbour`: eight boats on
+legs of 10 to 30 s at 3 m/s, 2 m on each axis, a scan each 2 s, P_D .9, 20 false fixes in a square
+of 400 m.
 
-All are told the detection probability, the density of false fixes and the speed of the boats;
-everything else is at its default, `model_set: families` too. In `untold` nobody is told anything.
-Counted are confirmed tracks: GOSPA (10 m, 2; of boats 20 m), `with switches` half of the cutoff
-for each identity switch; switches for each hour of the scene; false tracks for each hour;
-`identities kept` as in `diver_crossing`, `named m` the error of the rows with a name against the
-diver of that name in the last minute; `clutter` the density of false fixes that was learnt at the
-end, over the true one. CPU of a scan is that of this process. In `single` a diver is alone:
-`clean` a swimmer heard every second to 1 m, `usbl` and `wild` as in `diver_families`. `cost` is
-of four divers 10 m apart, .7 m on each axis, and two false fixes in a square of 160 m. `recorded`
-are the boats of `real_recordings`.
+In `untold` nothing is configured, in `table` the detection probability, the density of false fixes
+and the speed of the boats (`--told`). Counted are confirmed tracks: GOSPA (10 m, 2; of boats
+20 m), `with switches` half of the cutoff for each identity switch; switches and false tracks for
+each hour. An identity is kept where both divers of a pair have the same track in scans 90 to 97 as
+in scans 32 to 39. `named m` is the error of the rows with a name against the diver of that name in
+the last minute; `clutter` the density of false fixes that was learnt at the end, over the true
+one. CPU of a scan is that of this process.
 """
 
 from __future__ import annotations
 
-from itertools import product
+from collections.abc import Iterable
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.diver_crossing import identities_kept, true_paths
-from benchmarks.diver_families import mean_over, robust, swimmer, usbl, wild
-from benchmarks.diver_named import FALSE, HALF, measured, named_errors, P_DETECTION, truth_of
-from benchmarks.real_recordings import boat_scores
-from benchmarks.recordings import autoferry, DATA
-from benchmarks.study import final_estimates, Parts, rms, study, truths
+from benchmarks.study import Parts, rms, study, truths
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
+from sonar_imm_tools.evaluation.diver.matching import match
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import Series, series_of, Truth
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda')
 SCENES = ('buddies', 'crossing', 'harbour')
-ALONE = ('clean', 'usbl', 'usbl, named', 'wild')
+CUTOFF = 10.0
+BEFORE, AFTER = slice(32, 40), slice(90, 98)
+HALF, FALSE, SCAN_STD, NAMED_STD, P_DETECTION = 60.0, 2.0, 0.5, 2.0, 0.9
+NAMED_FROM, EVERY = 20, 4
 HOUR = 3600.0
 LEGS: dict[str, Any] = {
     'motion': 'legs',
@@ -59,16 +61,99 @@ LEGS: dict[str, Any] = {
 """Scenes of several targets on straight legs."""
 
 
+def true_paths(scene: Scene) -> Truth:
+    tables = [table for true in scene.truth for table in true.tables('map')]
+    rows = [
+        Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns, frame_id='map')
+        for table in tables
+    ]
+    return Truth.from_series(series_of(rows))
+
+
+def identities_kept(series: Series, truth: Truth) -> list[bool]:
+    """For each pair whether both divers have the same track before and after they crossed."""
+    followed = match(series.confirmed(), truth, cutoff=CUTOFF).followed_by
+    before, after = ([_usual(row[when]) for row in followed] for when in (BEFORE, AFTER))
+    same = [first == last and first >= 0 for first, last in zip(before, after)]
+    return [same[k] and same[k + 1] for k in range(0, len(same), 2)]
+
+
+def _usual(ids: np.ndarray) -> int:
+    found, counts = np.unique(ids[ids >= 0], return_counts=True)
+    return int(found[counts.argmax()]) if len(found) else -1
+
+
+def buddies(seed: int) -> tuple[TrueTrack, TrueTrack]:
+    """The paths of two divers who swim the same way 2 m apart."""
+    values: dict[str, Any] = {
+        'duration': 120.0,
+        'speed': 0.75,
+        'start': [-20.0, 0.0],
+        'turn_deg': 60.0,
+    }
+    first = truths(simulate(scenario('table1', values), seed), TrueTrack)[0]
+    aside = first.position + [0.0, 2.0, *([0.0] * (first.position.shape[1] - 2))]
+    return first, TrueTrack(2, first.stamp_ns, aside, first.velocity)
+
+
+def measured(truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | Fixes]:
+    """Scans without names, and fixes of the first diver with its name, in order."""
+    rng = np.random.default_rng([seed, 7])
+    measurements: list[Fix | Fixes] = []
+    for k, stamp in enumerate(truth[0].stamp_ns.tolist()):
+        there = np.array([path.position[k, :2] for path in truth])
+        there = there[rng.uniform(size=len(there)) < P_DETECTION]
+        seen = there + rng.normal(scale=SCAN_STD, size=there.shape)
+        false = rng.uniform(-HALF, HALF, (rng.poisson(FALSE), 2))
+        both = np.concatenate([seen, false])
+        measurements.append(
+            Fixes(
+                stamp_ns=stamp,
+                position=np.column_stack([both, np.zeros(len(both))]),
+                covariance=np.tile(np.eye(2) * SCAN_STD**2, (len(both), 1, 1)),
+                frame_id='map',
+            )
+        )
+        if k < NAMED_FROM or (k - NAMED_FROM) % EVERY:
+            continue
+        place = truth[0].position[k, :2] + rng.normal(scale=NAMED_STD, size=2)
+        measurements.append(
+            Fix(
+                stamp_ns=stamp + 300_000_000,
+                position=[*place, 0.0],
+                covariance=np.eye(2) * NAMED_STD**2,
+                target_id=truth[0].track_id,
+                frame_id='map',
+            )
+        )
+    return measurements
+
+
+def named_errors(made: Iterable[Estimate], truth: Iterable[TrueTrack]) -> list[float]:
+    """Errors in m of the rows with a name, against the diver of that name."""
+    paths = {path.track_id: path for path in truth}
+    error = []
+    for estimate in made:
+        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
+            own = paths[int(estimate.extras['target_id'][row])]
+            at = [
+                np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
+                for axis in (0, 1)
+            ]
+            error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
+    return error
+
+
 def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], float]:
     """The measurements, the truth, what the tracker is told, and the cutoff of GOSPA in m."""
     if name == 'buddies':
-        truth = truth_of('buddies', seed)
-        items: list[Any] = list(measured('buddies', truth, seed))
+        truth = buddies(seed)
+        items: list[Any] = list(measured(truth, seed))
         stated = {
             'detection_probability': P_DETECTION,
             'clutter_density': FALSE / (2.0 * HALF) ** 2,
         }
-        return items, Scene((), truth), stated, 10.0
+        return items, Scene((), truth), stated, CUTOFF
     if name == 'harbour':
         values = LEGS | {
             'divers': 8,
@@ -89,7 +174,7 @@ def scene_of(name: str, seed: int) -> tuple[list[Any], Scene, dict[str, Any], fl
     else:
         values = {'detection_probability': 0.7, 'clutter': 10.0}
         scene = simulate(scenario('crossing', values), seed)
-        stated, cutoff = {}, 10.0
+        stated, cutoff = {}, CUTOFF
     half = values.get('clutter_range', 80.0)
     stated |= {
         'detection_probability': values['detection_probability'],
@@ -153,76 +238,19 @@ def case(name: str, runs: int, nothing_stated: bool = False, **settings: Any) ->
     }
 
 
-def single(scene: str, association: str, runs: int) -> dict[str, float]:
-    """The scores of a diver who is alone, as `diver_families` counts them."""
-    made = {'clean': lambda seed: swimmer(np.random.default_rng(seed), 1.0, 1.0), 'wild': wild}
-    name = 7 if scene == 'usbl, named' else None
-    path = made.get(scene, usbl)
-    found = [robust(path(seed), name=name, association=association) for seed in range(runs)]
-    kept = 'rmse_m', 'coverage', 'nees', 'followed', 'tracks'
-    return {key: value for key, value in mean_over(found).items() if key in kept}
-
-
-def recorded(sensor: str, association: str) -> dict[str, float]:
-    """The scores of two boats recorded in clutter (`real_recordings`), nothing stated but how good
-    the sensor is."""
-    items, truth = autoferry(sensor)
-    fix_std = 4.0 if sensor == 'radar' else 2.0
-    tracker = DiverTracker(DiverConfig(fix_std=fix_std, association=association))
-    found = boat_scores(final_estimates(tracker, items), truth)
-    return dict(zip(('GOSPA', 'missed', 'false', 'tracks', 'RMSE'), map(float, found)))
-
-
-def cost(association: str, minutes: int = 10) -> dict[str, float]:
-    """What an hour of four divers in clutter costs, from the first minutes of it."""
-    values = LEGS | {
-        'divers': 4,
-        'speed': 0.75,
-        'turn_deg': 60.0,
-        'duration': 60.0 * minutes,
-        'step': 1.0,
-        'spacing': 10.0,
-        'fix_std': 0.7,
-        'clutter': 2.0,
-        'clutter_range': 80.0,
-    }
-    scene = simulate(scenario('table1', values), 3)
-    tracker, rows = DiverTracker(DiverConfig(association=association)), 0
-    tracker.warm()
-    tracker.reset()
-    begin = time.process_time()
-    for item in scene.measurements:
-        tracker.process(item.measurement)
-        rows += len(tracker._stream.state.life)
-    seconds, count = time.process_time() - begin, len(scene.measurements)
-    return {'CPU s per hour': seconds / count * HOUR, 'rows': rows / count}
-
-
 def main(
-    runs: int = 3,
-    nothing_stated: int = 10,
+    runs: int = 10,
     scenes: tuple[str, ...] = SCENES,
     associations: tuple[str, ...] = ASSOCIATIONS,
+    told: bool = False,
 ) -> Parts:
-    yield {'runs': runs, 'untold_runs': nothing_stated}
     for name in scenes:
         for association in associations:
-            found = case(name, runs, association=association)
-            yield {'table': {f'{name}, {association}': found}}
-    for name in scenes:
-        for association in associations:
-            count = runs if name == 'harbour' else nothing_stated
-            found = case(name, count, nothing_stated=True, association=association)
-            yield {'untold': {f'{name}, {association}': {'runs': count, **found}}}
-    for scene in ALONE:
-        for association in associations:
-            yield {'single': {f'{scene}, {association}': single(scene, association, runs)}}
-    if (DATA / 'autoferry').is_dir():
-        for sensor, association in product(('radar', 'lidar'), associations):
-            yield {'recorded': {f'{sensor}, {association}': recorded(sensor, association)}}
-    for association in associations:
-        yield {'cost': {association: cost(association)}}
+            count = min(runs, 3) if name == 'harbour' else runs
+            found = case(name, count, nothing_stated=not told, association=association)
+            table = 'table' if told else 'untold'
+            yield {table: {f'{name}, {association}': {'runs': count, **found}}}
 
 
 if __name__ == '__main__':
-    study(main)
+    study(main, scenes={'choices': list(SCENES)})

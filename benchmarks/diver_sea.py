@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from attrs import evolve
 import numpy as np
 
 from benchmarks.study import final_estimates, Parts, study, truths
@@ -79,7 +78,7 @@ def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any
         made = simulate(scenario(name, scene), seed)
         values = {key: v(made) if callable(v) else v for key, v in config.items()}
         # What is assumed of instruments is judged in the table of what is not stated.
-        exact = not any(values.get(name) for name in (*OFF, 'bearing_bias_std_deg'))
+        exact = not any(values.get(name) for name in OFF)
         values = {'model_set': 'heading_speed', **values}
         values |= {'systematic_errors': 'exact'} if exact else {}
         rows.append(score(made, DiverConfig(max_tracks=1, **values)))
@@ -174,21 +173,6 @@ def depth_cells() -> Cells:
     return cells
 
 
-def fix_cells() -> Cells:
-    fixes: Values = {'sensor': 'positions', 'fix_std': 1.0, 'swell_height': 1.0}
-    return [
-        (
-            f'diver at {where}',
-            column,
-            'multistatic',
-            {**fixes, 'depth': depth, 'fix_height_std': std},
-            {'model_set': 'families', 'dimensions': 3},
-        )
-        for where, depth in {'U(1, 19) m': (1.0, 19.0), '25 m': (25.0, 25.0)}.items()
-        for column, std in {'z not stated': 0.0, 'z to 2 m': 2.0, 'z to .5 m': 0.5}.items()
-    ]
-
-
 def systematic_cells() -> Cells:
     off: dict[str, Values] = {
         'receivers': {'receiver_position_std': 1.0},
@@ -206,27 +190,6 @@ def systematic_cells() -> Cells:
             'estimate': {**stated, 'systematic_errors': 'estimate'},
         }.items():
             cells.append((row, column, 'multistatic', scene, config))
-    return cells
-
-
-def bearing_cells() -> Cells:
-    everywhere = {'coverage_sector': (0.0, 0.0, 0.0, 360.0, 0.0, 1e6)}
-    cells: Cells = []
-    for name, what, known in (
-        ('usbl', 'from a vessel that circles', scenario('usbl', {'divers': 1}).instruments()),
-        ('random_heading', 'from a sonar that stands', everywhere),
-    ):
-        for bias in (0.0, 1.0, 2.0, 4.0):
-            stated = {'bearing_bias_std_deg': bias or 2.0}
-            ways: dict[str, dict[str, Any]] = {
-                'ignore': {},
-                'consider': stated,
-                'estimate': {**stated, 'systematic_errors': 'estimate'},
-            }
-            for column, values in ways.items():
-                scene = {'divers': 1, 'bearing_bias_std_deg': bias}
-                config = {'model_set': 'families', **known, **values}
-                cells.append((f'{what}, off by {bias:g} degrees', column, name, scene, config))
     return cells
 
 
@@ -294,51 +257,9 @@ def warned(name: str, config: Values, runs: int) -> dict[str, Any]:
     }
 
 
-ASSUMED = 'assumed'
-SHARES = (0.0, 0.5, 1.0, 2.0, 2.5, 3.0)
-
-
-def assumed(scene: Values, runs: int) -> dict[str, dict[str, float]]:
-    """What it would do to the first minute of `runs` scenes of fixes, by default, to take errors
-    that last for so many of the stated standard deviations: the covariance of every estimate with
-    that added, as for arrivals (`trackers.diver.offsets`). Mean NEES, runs with `GOOD_NEES` at
-    most, and how many times as long the axes of an ellipse are."""
-    found: dict[float, list[list[float]]] = {share: [] for share in SHARES}
-    for seed in range(runs):
-        made = simulate(scenario('lasting_errors', {'duration': FIRST, **scene}), seed)
-        std = float(np.sqrt(made.measurements[0].measurement.covariance[0, 0]))
-        final = final_estimates(
-            DiverTracker(DiverConfig()), (i.measurement for i in made.measurements)
-        )
-        for share in SHARES:
-            more = (share * std) ** 2
-            wide = {
-                stamp: evolve(each, covariance=each.covariance + more * np.diag([1.0, 1.0, 0, 0]))
-                for stamp, each in final.items()
-            }
-            longer = [
-                np.linalg.det(wide[s].covariance[0, :2, :2])
-                / np.linalg.det(each.covariance[0, :2, :2])
-                for s, each in final.items()
-                if len(each)
-            ]
-            nees = float(np.nanmean(score_of(wide, made)[:, 1]))
-            found[share].append([nees, float(np.mean(np.power(longer, 0.25)))])
-    return {
-        f'{share:g} of the stated': {
-            'NEES': float(np.mean([nees for nees, _ in each])),
-            'NEES good': sum(nees <= GOOD_NEES for nees, _ in each),
-            'axes': float(np.mean([axes for _, axes in each])),
-        }
-        for share, each in found.items()
-    }
-
-
 TABLES = {
     'depth': depth_cells,
-    'fixes': fix_cells,
     'systematic': systematic_cells,
-    'bearings': bearing_cells,
     'lasting': lasting_cells,
 }
 
@@ -346,10 +267,6 @@ TABLES = {
 def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:
     yield {'runs': runs}
     for name in table or TABLES:
-        if name == ASSUMED:
-            yield {name: {'errors that last': assumed({}, runs)}}
-            yield {name: {'nothing lasts': assumed({'fix_bias_std': 0.0}, runs)}}
-            continue
         if name == UNTOLD:
             for scene_name, config in STATED.items():
                 for column, given in {'nothing stated': {}, 'stated': config}.items():
@@ -368,12 +285,8 @@ if __name__ == '__main__':
         shown=lambda row: (
             {key: value for key, value in row.items() if key != 'NEES'}
             if 'warn' in row
-            else {
-                c: f'{v["NEES"]:.2f} ({v["NEES good"]}, x {v["axes"]:.1f})' for c, v in row.items()
-            }
-            if 'axes' in next(iter(row.values()))
             else {column: text_of(found) for column, found in row.items()}
         ),
-        table={'action': 'append', 'choices': [*TABLES, UNTOLD, ASSUMED]},
+        table={'action': 'append', 'choices': [*TABLES, UNTOLD]},
         only={'help': 'columns or rows whose name holds this'},
     )

@@ -28,13 +28,22 @@ from typing import Any
 from attrs import evolve
 import yaml
 
-from benchmarks.image_tracks import detected
 from benchmarks.study import known, Parts, study
-from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
+from sonar_imm.measurements import (
+    Arrivals,
+    Detections,
+    Fix,
+    Measurement,
+    Snapshot,
+    SonarImage,
+    Trace,
+)
 from sonar_imm.nodes.diagnostics import Finding, Hysteresis, WARN
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.own_files import own_parameters
+from sonar_imm_tools.simulation.obstacle.simulator import ObstacleScenario
 
 FIRST_SEED = 70_000
 """Bounds were looked for with seeds from 1000 on: these are others."""
@@ -71,6 +80,18 @@ def misstated(measurement: Any, factor: float) -> Any:
         if value is not None:
             changes[name] = value * (factor if name == 'sigma' else factor**2)
     return evolve(measurement, **changes) if changes else measurement
+
+
+def detected(setting: ObstacleScenario, given: list[Measurement]) -> list[Measurement]:
+    """The measurements of a scene with detections in place of its images."""
+    feeder = setting.feeder_instruments()
+    detector = ImageDetector(
+        DetectorConfig(
+            beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
+        )
+    )
+    found = [detector.process(item) if isinstance(item, SonarImage) else item for item in given]
+    return [item for item in found if item is not None]
 
 
 def scene_of(bag: Path) -> tuple[str, str, dict[str, Any]]:

@@ -136,6 +136,13 @@ SCENES: dict[str, tuple[Sequence[tuple[str, dict[str, Any]]], Fault | None]] = {
     'swaying': ([('swaying', clutter.BOTH_SIDES)], None),
     'moving .3-1.5 m/s': ([('mover', {})], None),
     'moving .1-.3 m/s': ([('mover', {'obstacle_speed': [0.1, 0.3]})], None),
+    '.1-.3 m/s beside 3 fixed': (
+        [
+            ('approach', {**FOUR, 'obstacles': 3}),
+            ('mover', {'obstacle_speed': [0.1, 0.3], 'first_range': 78.0, 'last_range': -6.0}),
+        ],
+        None,
+    ),
     'scan of 9 s': ([('approach', {**SLOW, 'detection_probability': 1.0})], scanned),
 }
 

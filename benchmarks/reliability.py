@@ -277,7 +277,7 @@ def forget_the_bad(name: str, file: Path) -> None:
     """Take those rows out of the file of a part that fell short, so that they are tried again."""
     if not file.is_file():
         return
-    part = json.loads(file.read_text(encoding='utf-8'))
+    part = _part(file)
     good: Part
     if isinstance(part, Mapping):
         good = {system: row for system, row in part.items() if not shortfall(name, row)}
@@ -291,7 +291,7 @@ def run(name: str, folder: Path) -> None:
     """Let the program of a part measure what is not there yet; says when it fails."""
     file = folder / f'{name}.json'
     forget_the_bad(name, file)
-    if name in WHOLE and file.is_file() and json.loads(file.read_text()).keys() == SYSTEMS.keys():
+    if name in WHOLE and known(file).keys() == SYSTEMS.keys():
         return
     print(f'{name} ...', flush=True)
     environment = dict(os.environ, SONAR_IMM_FIGURES=str(folder))
@@ -323,11 +323,15 @@ def note(name: str, folder: Path, seconds: float) -> None:
 def parts_of(folder: Path) -> dict[str, Part]:
     """What is in a folder, and under ``run`` how it came there."""
     files = {name: folder / f'{name}.json' for name in ('run', *PARTS)}
-    return {
-        name: json.loads(file.read_text(encoding='utf-8'))
-        for name, file in files.items()
-        if file.is_file()
-    }
+    return {name: _part(file) for name, file in files.items() if file.is_file()}
+
+
+def _part(file: Path) -> Any:
+    """What is in the file of a part; lists are of tests, the rest of studies."""
+    part = json.loads(file.read_text(encoding='utf-8'))
+    if isinstance(part, dict):
+        part.pop('made', None)
+    return part
 
 
 def _about(run: Mapping[str, Row]) -> str:
@@ -359,8 +363,7 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
         head, *body = table_of(name, parts[name])
         lines = [head, ['---'] * len(head), *body]
         text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-        source = f'<!-- numbers: {RESULT.name}; made by benchmarks.reliability -->'
-        return f'{found.group(1)}{source}\n{text}\n{found.group(3)}'
+        return f'{found.group(1)}{text}\n{found.group(3)}'
 
     return _BLOCK.sub(table, text)
 

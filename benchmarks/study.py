@@ -31,6 +31,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from datetime import date
+from functools import cache
 from importlib import import_module
 import inspect
 from itertools import groupby
@@ -39,6 +41,8 @@ import math
 from multiprocessing import get_context
 import os
 from pathlib import Path
+import shlex
+import subprocess
 import sys
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -61,7 +65,8 @@ from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.scenes import write_scene
 
-ENTRY = str(Path(__file__).parent / 'entry')
+ROOT = Path(__file__).resolve().parents[1]
+ENTRY = str(ROOT / 'benchmarks' / 'entry')
 """Where the models of `diver_paper` are registered, as those of an installed package are."""
 if ENTRY not in sys.path:
     sys.path.append(ENTRY)
@@ -192,18 +197,48 @@ def markdown(table: Mapping[str, Row], digits: int = 3) -> str:
 
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
-    """Write `content`, and the folders to it; nothing without a path."""
+    """Write `content` with how it was made, and the folders to it; nothing without a path."""
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+        text = json.dumps({'made': made(), **content}, indent=1)
+        path.write_text(text + '\n', encoding='utf-8')
 
 
 def known(path: Path | None) -> dict[str, Any]:
-    """What is in the file of an earlier run; nothing when there is none."""
+    """What is in the file of an earlier run but how it was made; nothing when there is none."""
     if path is None or not path.is_file():
         return {}
     content: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+    content.pop('made', None)
     return content
+
+
+@cache
+def made() -> dict[str, str]:
+    """Return the command, the day and the commit of the numbers that this process makes."""
+    spec = sys.modules['__main__'].__spec__
+    program = (
+        ['-m', spec.name.removesuffix('.__main__')]
+        if spec
+        else [os.path.relpath(sys.argv[0], ROOT)]
+    )
+    commit = _git('rev-parse', '--short=8', 'HEAD')
+    if _git('status', '--porcelain', '--untracked-files=no', '--', ':!docs/results'):
+        commit += ' with changes'
+    return {
+        'command': shlex.join(['python', *program, *sys.argv[1:]]),
+        'date': date.today().isoformat(),
+        'commit': commit or 'not known',
+    }
+
+
+def _git(*arguments: str) -> str:
+    """Give what git says of the source tree; nothing where there is no git, or no history."""
+    try:
+        found = subprocess.run(['git', *arguments], cwd=ROOT, capture_output=True, text=True)
+    except OSError:
+        return ''
+    return found.stdout.strip() if found.returncode == 0 else ''
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:

@@ -78,7 +78,6 @@ def main() -> None:
         draw_profile(ping, truth, runs)
         draw_clouds()
     draw_sensitivity()
-    draw_labels()
     draw_ledge()
 
 
@@ -243,32 +242,6 @@ def draw_sensitivity() -> None:
     right.set(xlabel='sigma of the rough walk [m]', ylabel='RMSE of the height [m]', ylim=(0, 0.4))
     right.legend(fontsize=8)
     save(figure, 'bathymetry_sensitivity.png')
-
-
-def draw_labels() -> None:
-    """Overlap over roughness, range and correlation, and how often a label is right."""
-    result = json.loads((ROOT / 'docs' / 'results' / 'bathymetry_labels.json').read_text())
-    colours = {'two walks': AMBER, 'height_bank': RED, 'scatter_bank': BLUE}
-    figure, axes = plt.subplots(1, 4, figsize=(10, 2.8), layout='constrained')
-    stds = (0.2, 0.3, 0.5)
-    for axis, place in zip(axes, ('20-26 m', '40-50 m', '58-68 m')):
-        for name, colour in colours.items():
-            for kind, style in (('white', '-'), ('.3 m', '--'), ('1 m', ':')):
-                rows = [result['cells'][f'{place}, {std:g} m, {kind}'] for std in stds]
-                axis.plot(stds, [row[name] for row in rows], style, color=colour, linewidth=1.2)
-        axis.set(title=place, ylim=(-0.03, 1.03), xlabel='std of roughness [m]')
-    axes[0].set_ylabel('overlap')
-    for kind, style in (('white', '-'), ('correlated over .3 m', '--'), ('over 1 m', ':')):
-        axes[0].plot([], [], style, color=INK, label=kind)
-    axes[0].legend(fontsize=7, loc='lower right')
-    axes[3].plot([0, 1], [0, 1], color='0.8', linewidth=0.8)
-    for name, colour in colours.items():
-        rows = result['calibration'][name].values()
-        stated, right = [row['said'] for row in rows], [row['right'] for row in rows]
-        axes[3].plot(stated, right, 'o-', color=colour, markersize=3, linewidth=1.0, label=name)
-    axes[3].set(title='detectable bins', xlabel='probability of rough floor', ylabel='share rough')
-    axes[3].legend(fontsize=7, loc='upper left')
-    save(figure, 'bathymetry_labels.png', tight=False)
 
 
 def draw_profile(ping, truth, runs) -> None:

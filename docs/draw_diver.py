@@ -8,8 +8,6 @@
 
 """Draw the pictures of the diver: python docs/draw_diver.py
 
-diver_front.png   for README.md: the dive whose error is the median of 21, with its numbers, which
-                  go to docs/results/diver_front.json as well
 diver_paper.png   the paper's Figures 3 and 4, and diver_multistatic.png its Figures 6 and 7; their
                   numbers go to docs/results/diver_figures.json
 
@@ -23,10 +21,8 @@ Needs matplotlib, which nothing else here does. Run it from the project root.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import sys
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -39,22 +35,10 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_paper import track, tuned  # noqa: E402
+from benchmarks.study import write_json  # noqa: E402
 from sonar_imm.acoustics.localisation import localise  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
-from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker  # noqa: E402
-from sonar_imm_tools.evaluation.diver.figures import (  # noqa: E402
-    headings_together,
-    model_label,
-    model_order,
-    outlines,
-)
-from sonar_imm_tools.evaluation.diver.scoring import fix_series, score  # noqa: E402
-from sonar_imm_tools.evaluation.diver.series import (  # noqa: E402
-    Series,
-    series_of,
-    Truth,
-    TruthPath,
-)
+from sonar_imm.trackers.diver.tracker import DiverConfig  # noqa: E402
 from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
     RECEIVERS,
     scenario,
@@ -63,14 +47,12 @@ from sonar_imm_tools.simulation.diver.simulator import (  # noqa: E402
 )
 
 IMAGES = ROOT / 'docs' / 'images'
-FRONT = ROOT / 'docs' / 'results' / 'diver_front.json'
 FIGURES = ROOT / 'docs' / 'results' / 'diver_figures.json'
 DIVES = {
     'of Table 1': ('table1', 100, 'diver_paper.png', 3),
     'before a multistatic sonar': ('multistatic_fixes', 20, 'diver_multistatic.png', 6),
 }
 """Scenario, runs, picture and its number in the paper. A fix of a ping takes long to compute."""
-FRONT_SEEDS = range(1, 22)
 BLUE, RED, INK, PALE, GREY = '#0072B2', '#D55E00', '#1b2733', '#b8c0c8', '#8593a1'
 SEED = 1
 RANGE_STD, BEARING_STD = 0.1, np.radians(2.0)
@@ -78,7 +60,6 @@ RANGE_STD, BEARING_STD = 0.1, np.radians(2.0)
 
 def main() -> None:
     plt.rcParams.update({'font.size': 11, 'axes.spines.top': False, 'axes.spines.right': False})
-    draw_front()
     found = {}
     for name, (at, count, file, picture) in DIVES.items():
         path = simulate(scenario(at), SEED).truth[0].position[:, :2]
@@ -101,85 +82,8 @@ def main() -> None:
             label: float(np.sqrt(np.mean(squared(runs, path))))
             for label, (_, runs) in {'fixes': (PALE, z), **tracks}.items()
         }
-    FIGURES.write_text(json.dumps(found, indent=2) + '\n', encoding='utf-8')
+    write_json(FIGURES, found)
     print(found)
-
-
-def draw_front() -> None:
-    """A typical dive: map and probabilities of the headings, with what was measured."""
-    dives = {seed: typical(seed) for seed in FRONT_SEEDS}
-    errors = {seed: metrics['position']['rmse_m'] for seed, (*_, metrics) in dives.items()}
-    seed = sorted(errors, key=errors.__getitem__)[len(errors) // 2]
-    series, truth, fixes, metrics = dives[seed]
-    shown = {
-        'seed': seed,
-        'seeds': len(dives),
-        'raw fixes, RMSE m': metrics['raw_fix']['rmse_m'],
-        'track, RMSE m': metrics['position']['rmse_m'],
-        'truth inside 95 % ellipse': metrics['consistency']['coverage']['95'],
-        'NEES': metrics['consistency']['nees_position']['mean'],
-        'NEES low': metrics['consistency']['nees_position']['low'],
-        'NEES high': metrics['consistency']['nees_position']['high'],
-    }
-    FRONT.write_text(json.dumps(shown, indent=2) + '\n', encoding='utf-8')
-    print(shown)
-    figure, (top, bottom) = plt.subplots(
-        2, 1, figsize=(9.0, 8.2), layout='constrained', height_ratios=(1.0, 1.25)
-    )
-    top.plot(*fixes.state[:, :2].T, 'x', color=GREY, ms=6, mew=1.2, label='raw fixes')
-    outline = outlines(series.state[:, :2], series.covariance[:, :2, :2])
-    shapes = outline[np.isfinite(outline[:, 0])].reshape(-1, 40, 2)
-    top.fill(*shapes.transpose(2, 1, 0), facecolor=BLUE, alpha=0.3, lw=0)
-    top.plot(*truth.paths[0].state[:, :2].T, color=INK, lw=1.4, ls='--', label='truth')
-    top.plot(*series.state[:, :2].T, color=BLUE, lw=2, label='track with 95 % ellipses')
-    top.set(
-        title=f'raw fixes: {metrics["raw_fix"]["rmse_m"]:.2f} m RMS from the truth, '
-        f'track: {metrics["position"]["rmse_m"]:.2f} m',
-        xlabel='east, m',
-        ylabel='north, m',
-        aspect='equal',
-        adjustable='datalim',
-    )
-    top.legend(frameon=False, ncols=3, loc='lower center')
-    draw_headings(bottom, series, truth)
-    figure.savefig(IMAGES / 'diver_front.png', dpi=100)
-
-
-def typical(seed: int) -> tuple[Series, Truth, Series, dict[str, Any]]:
-    """Track, truth, fixes and scores of one dive of Table 1 with the default parameters."""
-    scene = simulate(scenario('table1'), seed)
-    tracker = DiverTracker(DiverConfig())
-    fixes = [item.measurement for item in scene.measurements]
-    found = [estimate for fix in fixes for estimate in tracker.process(fix)]
-    series, raw = series_of(found), fix_series(fixes)
-    (true,) = scene.truth
-    state = np.column_stack([true.position[:, :2], true.velocity])
-    truth = Truth((TruthPath(true.track_id, true.stamp_ns, state),))
-    return series.confirmed(), truth, raw, score(series, truth, fixes=raw)
-
-
-def draw_headings(ax: Axes, series: Series, truth: Truth) -> None:
-    """The probability of each heading over time, and the true course."""
-    names, values = headings_together(series.model_names, series.probabilities)
-    order = model_order(names)
-    time = (series.stamp_ns - series.scan_ns[0]) / 1e9
-    image = ax.pcolormesh(
-        time, np.arange(len(order)), values[:, order].T, cmap='Blues', vmin=0, vmax=1
-    )
-    path = truth.paths[0]
-    course = np.degrees(np.arctan2(path.state[:, 3], path.state[:, 2])) % 360.0
-    headings = sum(name.startswith('heading_') for name in names)
-    first = len(order) - headings
-    when = (path.stamp_ns - series.scan_ns[0]) / 1e9
-    ax.plot(when, first + course * headings / 360.0, '.', color=RED, ms=4, label='true course')
-    ax.set(
-        title='probability of each motion model',
-        xlabel='time, s',
-        yticks=np.arange(len(order))[::2],
-        yticklabels=[model_label(names[k]) for k in order][::2],
-    )
-    ax.legend(frameon=False, loc='lower right', bbox_to_anchor=(1.0, 0.99), borderaxespad=0.0)
-    ax.figure.colorbar(image, ax=ax, label='probability', pad=0.02)
 
 
 def observe(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

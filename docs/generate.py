@@ -6,9 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Write what follows from the code: `config/<system>.yaml` and `docs/parameters/<system>.md`.
+"""Write what follows from the code and from the results of studies.
 
-Run it with ``make docs``; a test compares the files with what the code says now.
+These are `config/<system>.yaml`, `docs/parameters/<system>.md` and the pages with measured numbers
+(`result_pages.py`). Run it with ``make generate``; a test compares the files with what is there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import json
 from pathlib import Path
+import sys
 import textwrap
 
 import yaml
@@ -26,6 +28,9 @@ from sonar_imm.trackers import System, SYSTEMS
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / 'docs'))
+
+from result_pages import pages  # noqa: E402
 
 YAML_HEAD = """\
 # Parameters of {name}_node with their defaults; every line may be left out.
@@ -163,7 +168,7 @@ def generated() -> dict[str, str]:
         tracker=markdown_table(detector),
         node=markdown_table(spec for spec in node if spec not in shared),
     )
-    return files
+    return files | pages()
 
 
 def matter_table(name: str, specs: Sequence[ParameterSpec]) -> str:

@@ -75,11 +75,6 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Called by mkdocs with each page: show where the numbers of its tables come from."""
-    return captioned(markdown, '../' * page.file.src_uri.count('/'))
-
-
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     """Called by mkdocs with each page as HTML: cells know the head of their column."""
     return re.sub(r'<table>.*?</table>', labelled, html, flags=re.DOTALL)
@@ -95,47 +90,6 @@ def labelled(found: re.Match[str]) -> str:
         return re.sub(r'<td', lambda _: f'<td data-label="{next(named, "")}"', row.group())
 
     return f'{head}</thead>' + re.sub(r'<tr>.*?</tr>', cells, body, flags=re.DOTALL)
-
-
-MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
-"""Above a table: where its numbers come from."""
-
-
-def caption(mark: str, up: str) -> str:
-    """What is shown below a table for its mark; `up` leads from the page to docs/."""
-    kind, _, rest = mark.partition(';')
-    if kind == 'none':
-        return ''
-    if kind.startswith('read '):
-        return f'<small>*Read on {kind.split()[1]}:* `{rest.strip()}`</small>'
-    sources = json.loads((ROOT / 'docs/results/sources.json').read_text(encoding='utf-8'))
-    named = dict.fromkeys(
-        name for name in re.findall(r'[a-z_0-9]+\.json', mark) if name in sources
-    )
-    lines = '<br>'.join(
-        f'*Values of {sources[name]["date"]}, [{name}]({up}results/{name}):* '
-        f'`{sources[name]["command"]}`'
-        for name in named
-    )
-    return f'<small>{lines}</small>' if lines else ''
-
-
-def captioned(markdown: str, up: str) -> str:
-    """A page with a caption below each table that has a `MARK`, in its place."""
-    on_one_line = MARK.sub(
-        lambda found: f'<!-- numbers: {" ".join(found[1].split())} -->', markdown
-    )
-    out: list[str] = []
-    waiting = ''
-    for line in [*on_one_line.splitlines(), '']:
-        if found := MARK.match(line):
-            waiting = caption(found.group(1), up)
-            continue
-        if waiting and out and out[-1].startswith('|') and not line.startswith('|'):
-            out += ['', waiting]
-            waiting = ''
-        out.append(line)
-    return '\n'.join(out)
 
 
 def on_post_build(config: Any) -> None:

@@ -146,10 +146,11 @@ def on_a_grid(
     `Rejection` when nobody said.
     """
     if not (image_far_range > image_near_range and image_fov_deg > 0.0):
+        missing = 'image_far_range', 'image_fov_deg'
         raise Rejection(
             'no_geometry',
-            'the image does not say its ranges and directions: set image_far_range and '
-            'image_fov_deg',
+            f'the image does not say its ranges and directions: set {" and ".join(missing)}',
+            missing,
         )
     if image_first_beam == 'starboard':
         pixels = pixels[:, ::-1]

@@ -14,7 +14,6 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 from __future__ import annotations
 
 import importlib
-import json
 import re
 import sys
 from typing import Any
@@ -97,7 +96,6 @@ def test_files_and_tests_named_on_pages_exist() -> None:
 
 
 def test_no_page_is_long() -> None:
-    """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
     words = {
         path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
         for path in (ROOT / 'docs').rglob('*.md')
@@ -127,19 +125,6 @@ def test_what_comes_from_another_server_is_seen(made: Any) -> None:
     ]
 
 
-def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
-    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
-    assert made.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n'
-        '<small>*Read on 2026-11-20:* `sonar-imm bench`</small>\n\nAfter.\n'
-    )
-    text = '<!-- numbers: bathymetry_sea.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
-    text = text.replace('{row}>> a |', '{row}>> a & tune.json>x |')
-    shown = made.captioned(text, '../')
-    assert '[tune.json](../results/tune.json)' in shown
-    assert '<!--' not in shown and '[bathymetry_sea.json](../results/bathymetry_sea.json)' in shown
-
-
 def test_on_a_phone_each_cell_has_the_head_of_its_column(made: Any) -> None:
     page = (
         '<p><table>\n<thead>\n<tr>\n<th>a</th>\n<th style="x">b <code>c</code></th>\n'
@@ -156,17 +141,3 @@ def test_the_search_needs_no_server() -> None:
     (script,) = config['extra']['polyfills']
     assert 'iframe-worker' in script, 'else the plugin loads one of this name from afar'
     assert 'offline' in config['plugins'] and (ROOT / 'docs' / script).is_file()
-
-
-def test_the_numbers_below_the_picture_of_the_front_are_those_of_the_run() -> None:
-    run = json.loads((ROOT / 'docs/results/diver_front.json').read_text(encoding='utf-8'))
-    caption = (ROOT / 'README.md').read_text(encoding='utf-8').partition('A simulated dive')[2]
-    caption = ' '.join(caption.partition('\n\n')[0].split())
-    assert f'middle one of {run["seeds"]}' in caption
-    for name in ('raw fixes, RMSE m', 'track, RMSE m'):
-        assert f'{run[name]:.2f} m'.lstrip('0') in caption
-    assert f'{100 * run["truth inside 95 % ellipse"]:.0f} % of the time' in caption
-    nees, low, high = (f'{run[name]:.2f}' for name in ('NEES', 'NEES low', 'NEES high'))
-    assert f'NEES {nees}, where {low} to {high} is consistent' in caption
-    assert ('wider than they need be' in caption) == (run['NEES'] < run['NEES low'])
-    assert run['NEES'] < run['NEES high'], 'too narrow: no picture for the front'

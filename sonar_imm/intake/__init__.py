@@ -10,7 +10,8 @@
 
 A measurement passes, in this order,
 
-    transforms -> frame -> repeats (`Intake`) -> type, frame and order of stamps (`stream`)
+    transforms -> frame -> leaps -> repeats (`Intake`)
+    -> type, frame and order of stamps (`stream`)
 
 `Intake` refuses by a `Rejection`, which a user is shown. The streams belong to the trackers, which
 place some measurements before they know their frame, and which alone know what they use; they
@@ -54,6 +55,7 @@ from ..measurements import (
     VesselFix,
 )
 from ..parameters import Config
+from .leaps import DEGREE, LeapFilter, Place
 from .stream import KnownFrames
 
 __all__ = ['Intake', 'KnownFrames', 'RepeatFilter', 'TransformTree']
@@ -68,8 +70,6 @@ LAST_VALUES = 5
 """Values of a source by which it is told whether it holds each for a while."""
 USUAL_HOLD = 1.5
 """Part of the longest of the last times for which a value is expected to be held at most."""
-DEGREE = 111e3
-"""Metres of a degree of latitude."""
 
 
 class Intake:
@@ -79,8 +79,9 @@ class Intake:
     STATE: what it remembers, as of `trackers.Tracker`; the frames are remembered by the tracker.
     """
 
-    STATE = ('repeats', 'transforms')
+    STATE = ('leaps', 'repeats', 'transforms')
 
+    leaps: LeapFilter
     repeats: RepeatFilter
     transforms: TransformTree
 
@@ -89,6 +90,7 @@ class Intake:
         is used decides."""
         self.tracker = tracker
         self.frame_id = frame_id
+        self.leaps = LeapFilter()
         self.repeats = RepeatFilter(
             getattr(tracker.config, 'repeat_time', 0.0), getattr(tracker.config, 'fix_std', 1.0)
         )
@@ -102,7 +104,8 @@ class Intake:
     def admit(self, measurement: Any) -> Any:
         """The measurement as the tracker is to have it: in the frame of the tracks, and without
         rows that came before. None for transforms, which are kept here. Raises `Rejection` for
-        one in a frame that has nothing to do with that of the tracks, and for a repeated one."""
+        one in a frame that has nothing to do with that of the tracks, for a vessel that cannot
+        have come where it is, and for a repeated one."""
         if isinstance(measurement, StaticTransforms):
             self.transforms.add(measurement)
             self._mount()
@@ -120,6 +123,7 @@ class Intake:
             raise Rejection(refusal.reason, sentence) from None
         if not isinstance(measurement, frames.kinds):
             frames.settle(measurement)
+        self.leaps.check(measurement)
         return self.repeats.fresh(measurement)
 
     def reconfigure(self, config: Config) -> None:
@@ -130,6 +134,7 @@ class Intake:
         """Forget all measurements, here and in the tracker; what is known of frames that are fixed
         to each other stays."""
         self.tracker.reset()
+        self.leaps.reset()
         self.repeats.reset()
 
     def restored(self) -> None:
@@ -516,5 +521,5 @@ def _after(yaw: float, q: FloatArray) -> FloatArray:
     return np.array([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
 
 
-STATE_TYPES = (Pose, Source)
+STATE_TYPES = (Place, Pose, Source)
 """The classes that a saved state of the intake may hold, see `trackers.state_file`."""

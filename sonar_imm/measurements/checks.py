@@ -21,11 +21,12 @@ from ..texts import in_one_line
 
 class Rejection(ValueError):
     """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
-    tells the user, on one line."""
+    tells the user, on one line; `missing`: parameters with which it could be used."""
 
-    def __init__(self, reason: str, sentence: str):
+    def __init__(self, reason: str, sentence: str, missing: tuple[str, ...] = ()):
         self.reason = reason
         self.sentence = in_one_line(sentence)
+        self.missing = missing
         super().__init__(self.sentence)
 
 

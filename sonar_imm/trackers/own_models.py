@@ -51,12 +51,14 @@ class DiverModels(Protocol):
 
 class BehaviourStep(NamedTuple):
     """A step on each horizontal axis: ``e' = keep e + w``, ``w ~ N(0, noise)``, and the obstacle
-    goes by ``step e + push w`` metres."""
+    goes by ``step e + push w`` metres. Where the square of e, on both axes together, is less than
+    `slow`, the noise is less in proportion."""
 
     keep: float
     step: float
     push: float
     noise: float
+    slow: float = 0.0
 
 
 class ObstacleBehaviour(Protocol):
@@ -73,7 +75,7 @@ class ObstacleBehaviour(Protocol):
     share: float
 
     def step(self, dt: float) -> BehaviourStep:
-        """Over dt >= 0 seconds; a tuple of the four numbers will do."""
+        """Over dt >= 0 seconds; a tuple of the first four numbers will do."""
         ...
 
 
@@ -130,8 +132,10 @@ def obstacle_behaviour(name: str, config: Config) -> ObstacleBehaviour:
     made = _made('behaviours', name, config, ('std', 'velocity', 'share', 'step'))
     try:
         step = np.array(BehaviourStep(*made.step(1.0)), np.float64)
-        if not (np.isfinite(step).all() and step[3] >= 0.0 and 0.0 < made.std < np.inf):
-            raise ValueError('a step has to be finite, its noise at least 0, and std above 0')
+        if not (np.isfinite(step).all() and step[3:].min() >= 0.0 and 0.0 < made.std < np.inf):
+            raise ValueError(
+                'a step has to be finite, its noise and slow at least 0, and std above 0'
+            )
         if not 0.0 < made.share < np.inf or not _WORD.fullmatch(name):
             raise ValueError('share has to be above 0, and the name of letters, digits and _')
     except Exception as error:

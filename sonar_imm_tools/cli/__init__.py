@@ -42,7 +42,7 @@ COMMANDS = {
     'simulate': 'Write a bag of simulated measurements with truth.',
     'convert': 'Turn other formats (CSV, JSON, ...) into a bag.',
     'info': 'Show what is in a bag, which tracker fits, what is wrong with it.',
-    'track': 'Track a recorded bag offline: estimates as bag and CSV.',
+    'track': 'Track a recorded bag offline: estimates as bag and table.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'export': 'Write soundings, horizons, tracks or obstacles for other programs.',
     'survey': 'Make one chart of many survey lines, adjusted where they cross.',
@@ -232,7 +232,7 @@ def missing_package(name: str) -> str | None:
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
-        'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
+        'pyarrow': "pyarrow, which knows Parquet, is not here: pip install 'sonar_imm[parquet]'",
         'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",
     }
     return remedies.get(name)

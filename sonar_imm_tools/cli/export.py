@@ -85,7 +85,7 @@ def command(
     .geojson (lines and points with uncertainty and model), .csv and .parquet; --crs and
     --origin say where they lie where the run does not.
     """
-    from ..offline.run_folder import RunFolder, SOUNDINGS
+    from ..offline.run_folder import RunFolder
     from ..recordings.sources import BagError
 
     kind = out.suffix.lower().lstrip('.')
@@ -102,7 +102,7 @@ def command(
     asked = _Asked(run, folder, folder.read_run(), out, kind, epsg, origin)
     if as_map:
         result, text = _export_map(asked)
-    elif kind == 'csv' and (run / SOUNDINGS).is_file():
+    elif kind == 'csv' and folder.soundings():
         result, text = _export_soundings(asked, cell)
     elif kind in TRACK_FORMATS and asked.record['system'] != 'fathometer':
         result, text = _export_tracks(asked)
@@ -130,18 +130,19 @@ Told = tuple[dict[str, Any], str]
 
 
 def _export_soundings(asked: _Asked, cell: float) -> Told:
-    from ..offline.run_folder import SOUNDINGS
+    from ..offline.run_folder import RUN
     from ..recordings.export.points import read_points, write_las, write_table, write_xyz
     from ..recordings.sources import BagError
     from ..survey.chart import chart_of, OF_ONE_RUN, write_geotiff
-    from ..survey.line import budget_of
+    from ..survey.line import budget_of, unstated, without_far
 
-    if not (asked.run / SOUNDINGS).is_file():
+    if (place := asked.folder.soundings()) is None:
         raise BagError(
             f'{asked.run} holds no soundings: the recording has no navigation, or is of another '
             'system'
         )
-    points = read_points(asked.run / SOUNDINGS).moved(asked.origin)
+    whole_run = read_points(place).moved(asked.origin)
+    points = without_far(whole_run)
     result: dict[str, Any] = {'soundings': len(points)}
     shape = ''
     with whole(asked.out) as unfinished:
@@ -150,12 +151,18 @@ def _export_soundings(asked: _Asked, cell: float) -> Told:
             write_geotiff(unfinished, chart, asked.epsg, OF_ONE_RUN)
             result |= dict(zip(('rows', 'columns'), chart.shape))
             shape = f' in {result["rows"]} by {result["columns"]} cells'
+            if missing := unstated(asked.record):
+                result['assumed'] = missing
+                shape += f'; {RUN} does not state {", ".join(missing)}: default values'
         elif asked.kind == 'xyz':
             write_xyz(unfinished, points)
         elif asked.kind == 'csv':
             write_table(unfinished, points)
         else:
             write_las(unfinished, points, asked.epsg)
+    if far := len(whole_run) - len(points):
+        result['far'] = far
+        shape += f'; {far} far away left out: no ship that sees the others can have seen them'
     return result, f'{len(points)} soundings{shape}'
 
 

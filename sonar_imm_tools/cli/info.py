@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ def _print(found: dict[str, Any]) -> None:
         say(f'problem: {problem}')
     for number, (system, named) in enumerate(found['topic_options'].items()):
         purpose = 'or as something else' if number else 'to track it'
-        say(f'{purpose}: {track_line(found["bag"], system, named)}')
+        line = track_line(found['bag'], system, named, found['missing'][system])
+        say(f'{purpose}: {line}')
     if not found['systems']:
         images = any(topic['type'].endswith('SonarImage') for topic in found['topics'])
         hint = '; of amplitude and phase sonar-imm convert interferometer makes snapshots'
@@ -79,10 +81,13 @@ def _scans(scans: dict[str, int] | None) -> str:
     return f', {scans["count"]} scans, up to {scans["most"]} per scan'
 
 
-def track_line(bag: str, system: str, named: dict[str, str]) -> str:
-    """The command that tracks the recording, with --topic where the names do not fit."""
+def track_line(bag: str, system: str, named: dict[str, str], missing: Sequence[str] = ()) -> str:
+    """The command that tracks the recording, with --topic where the names do not fit, and with
+    --set for `missing` parameters, whose values only the user knows."""
     from ..recordings.sources import quoted
 
-    topics = [f' --topic {quoted(f"{name}={topic}")}' for name, topic in named.items()]
+    words = [f'--topic {quoted(f"{name}={topic}")}' for name, topic in named.items()]
+    for name in missing:
+        words.append(f'--set {name}={"DEGREES" if name.endswith("_deg") else "METRES"}')
     path = f'./{bag}' if bag.startswith('-') else bag
-    return f'sonar-imm track {quoted(path)} OUT_DIR --system {system}{"".join(topics)}'
+    return ' '.join([f'sonar-imm track {quoted(path)} OUT_DIR --system {system}', *words])

@@ -128,5 +128,3 @@ def command(
         lines = len(content['lines']) - len(failed)
         left = f', {counted(len(failed), "line")} left out' if failed else ''
         say(f'{out}: {counted(lines, "line")} in {counted(len(content["tiles"]), "tile")}{left}')
-    if failed:
-        raise click.exceptions.Exit(1)

@@ -31,12 +31,17 @@ from sonar_imm.trackers import SYSTEMS
 from ..recordings.reader import BagError, BagReader
 from .jobs import as_they_end, cluster, processes, sentence_of
 from .run_folder import (
+    AS_CSV,
+    AS_PARQUET,
+    CSV,
     finite,
+    NO_TABLE,
     PARQUET,
     read_json,
     RUN,
     run_record,
     RunFolder,
+    SOUNDINGS,
     summaries,
     SUMMARY,
 )
@@ -63,7 +68,7 @@ class Job:
     overwrite: bool = False
     resume: bool = False
     strict: bool = False
-    parquet: bool = False
+    tables: str = AS_CSV
     version: str = __version__
 
 
@@ -95,13 +100,13 @@ def track(job: Job, advance: Callable[[int], Advance] | None = None) -> Outcome:
         offline = OfflineRun(reader, SYSTEMS[job.system], job.config, job.options)
         overwrite = job.overwrite
         if job.resume and not overwrite:
-            if (run := _same_run(folder, offline)) is not None and _complete(job):
+            if (run := _same_run(folder, offline)) is not None and _complete(job, run):
                 remove_leftovers(job.folder)
                 return _outcome(job, KEPT, run)
-            overwrite = True  # it is not finished, or the same without Parquet
+            overwrite = True  # it is not finished, or the same without these tables
         with folder.fresh(overwrite=overwrite, inputs=[job.bag]) as unfinished:
             advanced = advance(offline.total) if advance else lambda count: None
-            run = write_run(unfinished, offline, advanced, parquet=job.parquet)
+            run = write_run(unfinished, offline, advanced, tables=job.tables)
         return _outcome(job, TRACKED, run)
 
 
@@ -133,13 +138,12 @@ def _differences(name: str, old: Any, new: Any) -> str:
     return f'{name} ({", ".join(keys[:3])}{", ..." if len(keys) > 3 else ""})'
 
 
-def _complete(job: Job) -> bool:
-    """Whether the Parquet files are there, where they are wanted."""
-    return not job.parquet or all(
-        (job.folder / parquet).is_file()
-        for table, parquet in PARQUET.items()
-        if (job.folder / table).is_file()
-    )
+def _complete(job: Job, run: Mapping[str, Any]) -> bool:
+    """Whether the tables are there that are wanted."""
+    names = [CSV, *([SOUNDINGS] if 'soundings' in run else [])]
+    if job.tables == AS_PARQUET:
+        names = [PARQUET[name] for name in names]
+    return job.tables == NO_TABLE or all((job.folder / name).is_file() for name in names)
 
 
 def _outcome(job: Job, state: str, run: Mapping[str, Any]) -> Outcome:

@@ -47,6 +47,8 @@ class _Found:
     refused: dict[tuple[str, str], Counter[str]] = field(factory=dict)
     doubts: Counter[str] = field(factory=Counter)
     examples: dict[str, str] = field(factory=dict)
+    missing: dict[str, tuple[str, ...]] = field(factory=dict)
+    """By system: parameters without which it cannot use the topic."""
     fixes: list[tuple[int, float, float]] = field(factory=list)
 
 
@@ -61,7 +63,7 @@ def inspect(
     topics: one entry per topic with count, rate, frames, scans, the tracker inputs it suits and
     its problems. problems: of the recording as a whole. systems: topics by input for each tracker,
     the best fitting one first. topic_options: topic by input that has to be named to the tracker;
-    nothing where the names say enough.
+    nothing where the names say enough. missing: parameters that have to be told to each tracker.
     """
     found = {topic.name: _Found(topic) for topic in bag.topics}
     for item in bag.messages():
@@ -71,6 +73,10 @@ def inspect(
     first = min((entry.logs[0] for entry in found.values() if entry.logs), default=0)
     last = max((entry.logs[-1] for entry in found.values() if entry.logs), default=0)
     systems, options = _systems(bag, list(found.values()))
+    missing = {
+        system: sorted({n for each in found.values() for n in each.missing.get(system, ())})
+        for system in systems
+    }
     return {
         'bag': str(bag.path),
         'duration_s': (last - first) / SECOND,
@@ -78,6 +84,7 @@ def inspect(
         'topics': topics,
         'systems': systems,
         'topic_options': options,
+        'missing': missing,
         'problems': list(bag.problems),
     }
 
@@ -103,6 +110,9 @@ def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> No
         except Rejection as rejection:
             found.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1
             found.examples.setdefault(rejection.reason, rejection.sentence)
+            if rejection.missing:
+                found.good[system, entry.name] += 1
+                found.missing[system] = rejection.missing
 
 
 def _usable_stamp(message: Any) -> int | None:

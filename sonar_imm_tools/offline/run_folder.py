@@ -16,11 +16,12 @@ run.json       input, parameters, versions; a folder without it is unfinished
 metrics.json   and report.html, once evaluated
 .sonar_imm     shows that sonar_imm made the folder; only then `--overwrite` replaces it
 
-With ``--parquet`` there are estimate.parquet and soundings.parquet beside the CSV. A run is
-written elsewhere and moved to its folder when it is finished, see `sonar_imm.files`.
+With ``--parquet`` there are estimate.parquet and soundings.parquet in place of the CSV, with
+``--no-table`` neither. A run is written elsewhere and moved to its folder when it is finished, see
+`sonar_imm.files`.
 
-The bag and the CSV hold nothing that depends on the time of the run: the same command writes the
-same bytes. Times and versions are in run.json.
+Bag and tables hold nothing that depends on the time of the run: the same command writes the same
+bytes. Times and versions are in run.json.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ import math
 import os
 from pathlib import Path
 import platform
-from typing import Any, Protocol
+from typing import Any, IO
 
 import numba
 import numpy as np
@@ -59,7 +60,7 @@ from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 
-from ..recordings.csv_writer import CsvWriter
+from ..recordings.csv_writer import CsvWriter, ROWS_IN_A_BLOCK
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
@@ -75,6 +76,8 @@ BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
 )
 PARQUET = {CSV: 'estimate.parquet', SOUNDINGS: 'soundings.parquet'}
 """The same tables as Parquet."""
+AS_CSV, AS_PARQUET, NO_TABLE = 'csv', 'parquet', 'none'
+"""What tables a run gets."""
 SUMMARY, SHARD_SUMMARY = 'summary.json', 'summary-{}-of-{}.json'
 """In a folder of several runs, which are below it: where they are, see `batch`."""
 _RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
@@ -83,9 +86,6 @@ KIND = 'results'
 """What the marker of a run says."""
 MOST_JSON = 1 << 26
 """Characters of a run.json or summary.json."""
-
-
-ROWS_IN_A_GROUP = 65536
 
 _KINDS = {
     'system': str,
@@ -97,44 +97,74 @@ _KINDS = {
 _NAMES = {str: 'a text', dict: 'a mapping'}
 
 
-class Table(Protocol):
-    """What rows can be appended to; use it in a ``with`` statement."""
+class Table:
+    """A table whose rows come stamp by stamp; use it in a ``with`` statement. Rows are held until
+    there are enough for a block."""
 
-    def __enter__(self) -> Table: ...
+    rows_in_a_block: int
 
-    def __exit__(self, kind: object, *_: object) -> None: ...
-
-    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
-        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
-        ...
-
-
-class CsvTable:
-    """A table as CSV, one line per row; floats as the shortest text that reads back exactly."""
-
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, file: IO[Any]):
         self._path = path
-        self._file = path.open('w', encoding='utf-8', newline='')
-        self._writer = CsvWriter(self._file)
-        self._names: list[str] | None = None
+        self._file = file
+        self._held: list[dict[str, np.ndarray]] = []
+        self._rows_held = 0
+        self._types: dict[str, np.dtype] = {}
 
-    def __enter__(self) -> CsvTable:
+    def __enter__(self) -> Table:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        with naming(self._path):
-            self._file.close()
+        with naming(self._path), self._file:
+            if kind is None:
+                self._write_held()
+            self._finish()
 
     def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
         """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
-        if self._names is None:
-            self._names = list(columns)
-            self._writer.write(['stamp_ns', *columns])
-        elif self._names != list(columns):
+        rows = len(next(iter(columns.values()), ()))
+        found = {'stamp_ns': np.full(rows, stamp_ns, np.int64)}
+        found |= {name: np.array(column) for name, column in columns.items()}
+        if self._types and list(self._types) != list(found):
             raise ValueError('the columns change from one estimate to another')
-        with naming(self._path):
-            rows = zip(*(column.tolist() for column in columns.values()))
-            self._writer.write_numbers((stamp_ns, *row) for row in rows)
+        types = {name: column.dtype for name, column in found.items()}
+        if types != self._types or self._rows_held >= self.rows_in_a_block:
+            with naming(self._path):
+                self._write_held()
+        self._types = types
+        self._held.append(found)
+        self._rows_held += rows
+
+    def _write_held(self) -> None:
+        if self._held:
+            self._write(
+                {name: np.concatenate([rows[name] for rows in self._held]) for name in self._types}
+            )
+        self._held, self._rows_held = [], 0
+
+    def _write(self, columns: dict[str, np.ndarray]) -> None:
+        """Write a block of rows."""
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        """Write what stands at the end."""
+
+
+class CsvTable(Table):
+    """A table as CSV, one line per row; floats as the shortest text that reads back exactly."""
+
+    rows_in_a_block = ROWS_IN_A_BLOCK
+
+    def __init__(self, path: Path):
+        file = path.open('w', encoding='utf-8', newline='')
+        super().__init__(path, file)
+        self._writer = CsvWriter(file)
+        self._has_names = False
+
+    def _write(self, columns: dict[str, np.ndarray]) -> None:
+        if not self._has_names:
+            self._writer.write(columns)
+            self._has_names = True
+        self._writer.write_columns(list(columns.values()))
 
 
 def require_parquet() -> None:
@@ -142,68 +172,42 @@ def require_parquet() -> None:
     import pyarrow.parquet  # noqa: F401
 
 
-class ParquetTable:
+class ParquetTable(Table):
     """A table as Parquet, with the types of the columns: stamp_ns is int64.
 
-    notes: texts kept in the metadata of the file, by name. Rows are held until there are enough
-    for a row group. Raises ModuleNotFoundError without pyarrow.
+    notes: texts kept in the metadata of the file, by name. Raises ModuleNotFoundError without
+    pyarrow.
     """
+
+    rows_in_a_block = 65536
 
     def __init__(self, path: Path, notes: Mapping[str, str] | None = None):
         import pyarrow
         import pyarrow.parquet
 
+        super().__init__(path, path.open('wb'))  # pyarrow opens only names that are UTF-8
         self._arrow = pyarrow
-        self._path = path
         self._notes = dict(notes or {})
         self._writer: Any = None
-        self._file: Any = None
-        self._held: list[dict[str, np.ndarray]] = []
-        self._rows_held = 0
-        self._types: dict[str, np.dtype] = {}
 
-    def __enter__(self) -> ParquetTable:
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        with naming(self._path):
-            if kind is None:
-                self._write_group()
-            if self._writer is not None:
-                self._writer.close()
-                self._file.close()
-
-    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
-        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
-        rows = len(next(iter(columns.values()), ()))
-        found = {'stamp_ns': np.full(rows, stamp_ns, np.int64)}
-        found |= {name: np.array(column) for name, column in columns.items()}
-        if not self._types:
-            self._types = {name: column.dtype for name, column in found.items()}
-        elif list(self._types) != list(found):
-            raise ValueError('the columns change from one estimate to another')
-        self._held.append(found)
-        self._rows_held += rows
-        if self._rows_held >= ROWS_IN_A_GROUP:
-            self._write_group()
-
-    def _write_group(self) -> None:
-        arrow = self._arrow
-        types = self._types or {'stamp_ns': np.dtype(np.int64)}
+    def _write(self, columns: dict[str, np.ndarray]) -> None:
+        table = self._arrow.table(columns)
         if self._writer is None:
-            fields = [(name, arrow.from_numpy_dtype(dtype)) for name, dtype in types.items()]
-            schema = arrow.schema(fields, metadata=self._notes)
-            # The library names only files whose names are UTF-8.
-            self._file = self._path.open('wb')
-            self._writer = arrow.parquet.ParquetWriter(self._file, schema)
-        if not self._held:
-            return
-        columns = [
-            np.concatenate([rows[name] for rows in self._held]).astype(dtype, copy=False)
-            for name, dtype in types.items()
-        ]
-        self._held, self._rows_held = [], 0
-        self._writer.write_table(arrow.table(columns, schema=self._writer.schema))
+            table = table.replace_schema_metadata(self._notes)
+            floats = [name for name, column in columns.items() if column.dtype.kind == 'f']
+            self._writer = self._arrow.parquet.ParquetWriter(
+                self._file,
+                table.schema,
+                compression='zstd',
+                use_dictionary=[name for name in columns if name not in floats],
+                use_byte_stream_split=floats,
+            )
+        self._writer.write_table(table.cast(self._writer.schema))
+
+    def _finish(self) -> None:
+        if self._writer is None:
+            self._write({'stamp_ns': np.empty(0, np.int64)})
+        self._writer.close()
 
 
 class RunFolder:
@@ -289,43 +293,41 @@ class RunFolder:
         estimates: Iterable[Estimate],
         system: str,
         *,
-        parquet: Mapping[str, str] | None = None,
+        tables: str = AS_CSV,
+        notes: Mapping[str, str] | None = None,
     ) -> dict[str, int]:
-        """Write bag and CSV while the estimates come; gives the number of estimates and rows, and
-        of soundings where there are any. parquet: what the metadata of Parquet files say, which
-        are written beside the CSV then."""
+        """Write bag and tables while the estimates come; gives the number of estimates and rows,
+        and of soundings where there are any. notes: what the metadata of Parquet files say."""
         written = {'estimates': 0, 'rows': 0}
         with contextlib.ExitStack() as stack:
+
+            def table(name: str) -> list[Table]:
+                if tables == NO_TABLE:
+                    return []
+                if tables == AS_CSV:
+                    return [stack.enter_context(CsvTable(self.path / name))]
+                return [stack.enter_context(ParquetTable(self.path / PARQUET[name], notes))]
+
             bag = stack.enter_context(BagWriter(self.path / BAG))
-            tables = self._tables(stack, CSV, parquet)
-            chart: list[Table] = []
+            bins, chart = table(CSV), []
             for estimate in estimates:
                 bag.write(
                     f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
                 )
-                columns = estimate.columns()
-                for table in tables:
-                    table.write(estimate.stamp_ns, columns)
+                for each in bins:
+                    each.write(estimate.stamp_ns, estimate.columns())
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
                 if (soundings := soundings_of(estimate)) is None:
                     continue
-                chart = chart or self._tables(stack, SOUNDINGS, parquet)
+                if 'soundings' not in written:
+                    written['soundings'], chart = 0, table(SOUNDINGS)
                 message = write_soundings(soundings, ros_message)
                 bag.write(f'/{system}/soundings', message, estimate.stamp_ns)
-                for table in chart:
-                    table.write(soundings.stamp_ns, soundings.columns)
-                written['soundings'] = written.get('soundings', 0) + len(soundings)
+                for each in chart:
+                    each.write(soundings.stamp_ns, soundings.columns)
+                written['soundings'] += len(soundings)
         return written
-
-    def _tables(
-        self, stack: contextlib.ExitStack, name: str, parquet: Mapping[str, str] | None
-    ) -> list[Table]:
-        """The table `name` as CSV and, where wanted, as Parquet."""
-        tables: list[Table] = [CsvTable(self.path / name)]
-        if parquet is not None:
-            tables.append(ParquetTable(self.path / PARQUET[name], parquet))
-        return [stack.enter_context(table) for table in tables]
 
     def write_json(self, name: str, content: Any) -> Path:
         """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
@@ -369,6 +371,14 @@ class RunFolder:
         bag = self.read_run()['bag']
         if bag and place.is_relative_to(os.path.realpath(bag)):
             raise BagError(f'{out} is in the recording of {self.path}; choose another name')
+
+    def soundings(self) -> Path | None:
+        """Where the soundings of the run are: in its table, or in its bag where it has none. None
+        for a run without soundings."""
+        places = [self.path / name for name in (PARQUET[SOUNDINGS], SOUNDINGS)]
+        if 'soundings' in self.read_run():
+            places.append(self.path / BAG)
+        return next((place for place in places if place.exists()), None)
 
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""

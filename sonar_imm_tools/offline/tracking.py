@@ -43,7 +43,7 @@ from ..recordings.sources import TARGET_NAMES
 from ..recordings.topics import fitting_topics
 from .initial import Initial, target_numbers
 from .jobs import processes
-from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
+from .run_folder import AS_CSV, fingerprint, finite, RUN, run_record, RunFolder
 
 TO_THE_END = 2**62
 AHEAD = 4
@@ -371,10 +371,10 @@ def write_run(
     offline: OfflineRun,
     advance: Callable[[int], None] = lambda count: None,
     *,
-    parquet: bool = False,
+    tables: str = AS_CSV,
 ) -> dict[str, Any]:
-    """Track into a fresh folder; gives the content of run.json, which is written last. parquet:
-    write the tables as Parquet too. Raises `BagError` when all was refused."""
+    """Track into a fresh folder; gives the content of run.json, which is written last. tables: as
+    `RunFolder.write_estimates` has it. Raises `BagError` when all was refused."""
     begin = time.perf_counter()
     system, path = offline.system.name, offline.bag.path
     recipe = offline.recipe()
@@ -385,15 +385,17 @@ def write_run(
         'parameters': json.dumps(finite(recipe['parameters'])),
     }
     written = folder.write_estimates(
-        offline.estimates(advance), system, parquet=notes if parquet else None
+        offline.estimates(advance), system, tables=tables, notes=notes
     )
     if not written['estimates'] and (failure := offline.failure()):
         raise BagError(f'{path}: {failure}')
+    seconds = time.perf_counter() - begin
     run = run_record(
         bag=str(path.resolve()),
         **recipe,
         messages=offline.messages,
         **written,
+        written_bytes=sum(f.stat().st_size for f in folder.path.rglob('*') if f.is_file()),
         counts=offline.outcomes(),
         refused=offline.refusals(),
         warnings=offline.warnings(),
@@ -402,7 +404,11 @@ def write_run(
         **offline.target_names(),
         **offline.mounting(),
         **offline.landmarks(),
-        timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
+        timings={
+            'wall_s': seconds,
+            'mb_per_s': recipe['bag_bytes'] / seconds * 1e-6,
+            **offline.timings(),
+        },
     )
     folder.write_json(RUN, run)
     return run

@@ -25,6 +25,7 @@ import numpy as np
 
 from msg_adapters.inputs import InputTopic
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.intake.leaps import FASTEST, NEAR
 from sonar_imm.measurements import Rejection, VesselFix
 
 from .. import SECOND
@@ -46,8 +47,6 @@ PAUSE = 30 * 24 * JUMP
 """Tables may pause for longer than `JUMP`; a longer pause than this is told."""
 MOST_OFF = 0.1
 """Of more records than this share that seem off, it is the order of the file that is another."""
-FASTEST, NEAR = 100.0, 1000.0
-"""No ship is faster, m/s, or jumps further, m."""
 NEIGHBOURS = 5
 _OF_TABLES = re.compile('--(?=(column|time-zone|time-unit|time-offset|date-order|ignore)( |$))')
 MOST_NAMED = 20

@@ -20,6 +20,7 @@ other. ``order='stamp'`` sorts by header stamp instead, and holds the whole sele
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from heapq import merge
 from itertools import islice
@@ -188,11 +189,11 @@ class BagReader:
         self, source: Source, topics: Collection[str] | None
     ) -> Iterator[tuple[Source, RawMessage]]:
         """Read one source up to its end or, where nothing else helps, its first damage."""
-        given = 0
+        given: Counter[str] = Counter()
         try:
             for item in source.messages(topics):
                 yield source, item
-                given += 1
+                given[item.topic] += 1
         except GeneratorExit:
             raise
         except Exception as error:  # rosbags raises nearly anything on damaged files
@@ -205,8 +206,19 @@ class BagReader:
                 return
             self._sources.append(rest)
             self.add_problem(rest.damage)
-            for item in islice(rest.messages(topics), given, None):
+            for item in islice(rest.messages(topics), given.total(), None):
                 yield rest, item
+            return
+        stated: Counter[str] = Counter()
+        for topic in source.topics():
+            if topics is None or topic.name in topics:
+                stated[topic.name] += topic.count
+        for name, count in stated.items():
+            if given[name] != count:
+                self.add_problem(
+                    f'topic {name} holds {given[name]} messages; the index of {self.path} says '
+                    f'{count}'
+                )
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'

@@ -27,7 +27,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
 from sonar_imm.parameters import ConfigError, small_text, yaml_tree
-from sonar_imm.texts import in_one_line
+from sonar_imm.texts import in_one_line, visible
 
 from .mcap_records import (
     Channel,
@@ -41,6 +41,8 @@ from .mcap_records import (
 )
 from .messages import decode_cdr, typestore
 
+MOST_MESSAGES = 1 << 48
+"""Messages of a topic: nobody counts further."""
 MOST_LINES = 4000
 """Lines of a definition without its comments; those that are in use have some hundreds."""
 SUFFIXES = ('.mcap', '.db3', '.bag')
@@ -160,8 +162,9 @@ class RosbagsSource:
     def _trouble(self) -> str:
         """What of the metadata is of a wrong kind, empty when nothing is; rosbags does not ask."""
         links = self._reader.connections
-        if not all(isinstance(link.msgcount, int) for link in links):
-            return 'a message count that is no number'
+        for link in links:
+            if not (isinstance(link.msgcount, int) and 0 <= link.msgcount < MOST_MESSAGES):
+                return f'a message count of {visible(str(link.msgcount)[:40])}'
         if not all(
             isinstance(link.topic, str) and isinstance(link.msgtype, str) for link in links
         ):
@@ -232,13 +235,20 @@ class ScanSource:
         return None
 
     @property
+    def is_short(self) -> bool:
+        """Whether the index speaks of more messages than there are."""
+        return (self._scan.stated or 0) > self._scan.counts.total()
+
+    @property
     def damage(self) -> str:
         """What is lost, and what is not, as a sentence."""
-        count, stated = sum(self._scan.counts.values()), self._scan.stated
-        if not self._scan.lost:
+        count, stated = self._scan.counts.total(), self._scan.stated
+        if not self._scan.lost and not self.is_short:
             return (
                 f'{self._file} is damaged beside its messages; all {count} messages were recovered'
             )
+        if not self._scan.lost:
+            return f'{self._file} holds {count} messages; its index says {stated}'
         of = f' of {stated}' if stated is not None else ''
         return (
             f'{self._file} {self._scan.lost}; {count}{of} messages were recovered, the rest is '
@@ -363,7 +373,8 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
         return scan, [scan.damage]
     if source.unordered:
         source.close()
-        return ScanSource(file), []
+        scan = ScanSource(file)
+        return scan, [scan.damage] if scan.is_short else []
     return source, []
 
 

@@ -140,6 +140,15 @@ class Adjustment:
         ]
 
 
+@frozen(eq=False)
+class Rounds:
+    """What the first R rounds have solved: the rms of looks before each (R,), and the unknowns
+    (P,) after the last."""
+
+    rms: FloatArray
+    value: FloatArray
+
+
 def adjust(
     statistics: Callable[[FloatArray], Sequence[Looks]],
     count: int,
@@ -149,18 +158,21 @@ def adjust(
     sound_speed: float = 1500.0,
     states: bool = True,
     note: Callable[[int, float], None] = lambda number, rms: None,
+    solved: Rounds | None = None,
+    keep: Callable[[Rounds], None] = lambda solved: None,
 ) -> Adjustment:
     """Adjust `count` lines in three rounds.
 
     statistics: the looks of each line, at places corrected by (L, 6). fixed: lines whose offset is
-    known to be 0. note: called after each round with its number and the rms of looks.
+    known to be 0. note: called after each round with its number and the rms of looks. keep: called
+    with what has been solved so far, from which another call goes on as `solved`.
     Raises ValueError where no two lines see the same cell.
     """
     unknowns = _Unknowns.of(count, priors or Priors(), fixed)
-    corrections = np.zeros((count, len(PARAMETERS)))
-    history: list[float] = []
-    value = np.zeros(len(unknowns.owner))
-    for number in range(ROUNDS + 1):
+    solved = solved or Rounds(np.zeros(0), np.zeros(len(unknowns.owner)))
+    history, value = solved.rms.tolist(), solved.value
+    corrections = unknowns.totals(value)
+    for number in range(len(history), ROUNDS + 1):
         found = Crossing.of(statistics(corrections), sound_speed)
         equations = _Equations(found, unknowns, corrections, budget)
         history.append(found.rms())
@@ -170,6 +182,7 @@ def adjust(
             value = equations.solve(states, value)
             corrections = unknowns.totals(value)
             del found, equations  # before the next ones are made
+            keep(Rounds(np.array(history), value))
     # The last step moved no place by much: the equations of the last statistics are those of it.
     equations.reweight(equations.J, value)
     covariance, information = equations.covariance(states)

@@ -33,7 +33,7 @@ from ..offline.run_folder import fingerprint, finite
 from ..recordings.export.points import read_points
 from ..recordings.sources import BagError
 from .grid import grid_of_looks, HALO, Soundings
-from .line import budget_of, joined_lines, Line, line_of
+from .line import budget_of, joined_lines, Line, line_of, without_far
 from .looks import Looks, looks_of
 
 TILE = 64
@@ -132,10 +132,11 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     used = ('x', 'y', 'z', 'vertical_uncertainty', 'range', 'beam_angle', 'side')
     if not all(np.isfinite(points[name]).all() for name in used):
         raise BagError(f'{source.table} has soundings that are not finite')
-    line = line_of(points, budget, sound_speed)
+    line = line_of(without_far(points), budget, sound_speed)
     seconds = (line.stamp_ns[-1] - line.stamp_ns[0]) * 1e-9
     count = max(1, math.ceil(seconds / LONGEST_SECONDS))
     edges = line.stamp_ns[0] + (np.arange(1, count) * seconds / count * 1e9).astype(np.int64)
+    place.with_suffix('.json').unlink(missing_ok=True)
     for k, rows in enumerate(
         np.split(np.arange(len(line)), np.searchsorted(line.stamp_ns, edges))
     ):
@@ -143,6 +144,7 @@ def import_line(source: Source, place: Path, options: Options) -> dict[str, Any]
     info |= {
         'sha256': fingerprint(source.table)['bag_sha256'],
         'soundings': len(line),
+        'far': len(points) - len(line),
         'pieces': count,
         'depth': float(np.median(-line.z)),
         'bounds': [*line.xy.min(axis=0).tolist(), *line.xy.max(axis=0).tolist()],
@@ -155,7 +157,7 @@ def _known_line(place: Path) -> dict[str, Any] | None:
     """Return what an earlier command kept of a line, None where nothing can be used."""
     known = kept(place.with_suffix('.json'))
     info = known.get('info') if isinstance(known, dict) else None
-    whole = {'size', 'mtime_ns', 'sha256', 'soundings', 'pieces', 'depth', 'bounds'}
+    whole = {'size', 'mtime_ns', 'sha256', 'soundings', 'far', 'pieces', 'depth', 'bounds'}
     return known if isinstance(info, dict) and whole <= info.keys() and 'wanted' in known else None
 
 
@@ -237,7 +239,8 @@ def make_tile(job: TileJob) -> None:
     )
     number = np.array([part[0] for part in job.parts])
     nodes = evolve(nodes, seen_line=number[nodes.seen_line])
-    _save(job.place, asdict(nodes, recurse=False))
+    job.place.with_suffix('.json').unlink(missing_ok=True)
+    save_arrays(job.place, asdict(nodes, recurse=False))
     write_json(job.place.with_suffix('.json'), job.signature)
 
 
@@ -254,6 +257,7 @@ def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _save_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    path.with_suffix('.json').unlink(missing_ok=True)  # no signature beside what it is not of
     with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.save(file, _table(columns))
 
@@ -275,7 +279,7 @@ def _line(table: np.ndarray, sound_speed: float) -> Line:
 
 
 def _store(path: Path, line: Line) -> None:
-    _save(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
+    save_arrays(path, {'table': _table(_columns(line)), 'sound_speed': line.sound_speed})
 
 
 def _stat(path: Path) -> tuple[int, int]:
@@ -285,7 +289,8 @@ def _stat(path: Path) -> tuple[int, int]:
     return sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
 
 
-def _save(path: Path, arrays: Mapping[str, Any]) -> None:
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write named arrays as one npz."""
     with whole(path, follow=False) as unfinished, unfinished.open('wb') as file:
         np.savez(file, **arrays)
 

@@ -33,6 +33,7 @@ import numpy as np
 
 from sonar_imm.acoustics.sounding import ErrorBudget, uncertainties
 from sonar_imm.estimation.arrays import BoolArray, FloatArray, IntArray
+from sonar_imm.intake.leaps import FASTEST, NEAR
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 
@@ -45,6 +46,8 @@ BASIS = 9
 DIRECTION_SECONDS, SPEED_SECONDS = 1.0, 5.0
 """Pings this near share their direction, and their speed: a keel point moves by D times pitch."""
 LEAST_NOISE = 0.01**2
+SLACK = 10.0
+"""Metres by which a sounding may lie farther from the middle of its ping than ranges reach."""
 STATED = (
     'attitude_std_deg',
     'heading_std_deg',
@@ -53,7 +56,7 @@ STATED = (
     'sound_speed_std',
     'sound_speed',
 )
-"""Parameters of a run that a survey needs."""
+"""Parameters of a run that a survey uses."""
 
 
 @frozen(eq=False)
@@ -148,6 +151,65 @@ def line_of(points: Points, budget: ErrorBudget, sound_speed: float = 1500.0) ->
     )
 
 
+def without_far(points: Points) -> Points:
+    """Return the soundings without those that lie where the sonar cannot have seen them from.
+
+    A sounding lies no farther from the middle of its ping than the slant ranges reach, and pings
+    no farther from one another than a ship goes meanwhile. Most soundings are right.
+    """
+    if not len(points):
+        return points
+    rows = np.argsort(points.stamp_ns, kind='stable')
+    stamp_ns, slant = points.stamp_ns[rows], points['range'][rows]
+    xy = np.column_stack([points['x'], points['y']])[rows]
+    start = np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[0] - 1))
+    ping = np.repeat(np.arange(len(start)), np.diff(start, append=len(stamp_ns)))
+    *middle, reach = _medians(np.column_stack([xy, slant]), ping, start).T
+    places = np.column_stack(middle)
+    near = np.hypot(*(xy - places[ping]).T) <= slant + reach[ping] + SLACK
+    near &= _reached((stamp_ns[start] - stamp_ns[0]) * 1e-9, places, np.bincount(ping))[ping]
+    if near.all():
+        return points
+    kept = np.sort(rows[near])
+    columns = {name: column[kept] for name, column in points.columns.items()}
+    return Points(points.stamp_ns[kept], columns)
+
+
+def _reached(seconds: FloatArray, places: FloatArray, soundings: IntArray) -> BoolArray:
+    """Return which pings (P,), in the order of their times, a ship can have gone through that went
+    through the longest stretch without a leap; places (P, 2)."""
+
+    def leaps(one: int | IntArray, other: int | IntArray) -> Any:
+        apart = np.linalg.norm(places[other] - places[one], axis=-1)
+        return apart > NEAR + FASTEST * np.abs(seconds[other] - seconds[one])
+
+    pings = np.arange(len(places))
+    first = np.flatnonzero(np.append(True, leaps(pings[:-1], pings[1:])))
+    last = np.append(first[1:], len(places)) - 1
+    best = int(np.add.reduceat(soundings, first).argmax())
+    reached = np.zeros(len(first), np.bool_)
+    reached[best] = True
+    for ways, enter, leave in (
+        (range(best + 1, len(first)), first, last),
+        (range(best - 1, -1, -1), last, first),
+    ):
+        here = leave[best]
+        for k in ways:
+            if not leaps(here, enter[k]):
+                reached[k], here = True, leave[k]
+    return np.asarray(np.repeat(reached, last - first + 1))
+
+
+def _medians(values: FloatArray, ping: IntArray, start: IntArray) -> FloatArray:
+    """Return the medians (P, k) of values (n, k) of each ping, which begins at `start`."""
+    count = np.bincount(ping)
+    columns = []
+    for column in values.T:
+        ordered = column[np.lexsort((column, ping))]
+        columns.append(0.5 * (ordered[start + (count - 1) // 2] + ordered[start + count // 2]))
+    return np.column_stack(columns)
+
+
 def joined_lines(parts: Sequence[Line]) -> Line:
     """Soundings of several lines, one line after the other."""
     arrays = [field.name for field in fields(Line) if field.name != 'sound_speed']
@@ -158,20 +220,27 @@ def joined_lines(parts: Sequence[Line]) -> Line:
 
 
 def budget_of(run: Mapping[str, Any] | None) -> tuple[ErrorBudget, float]:
-    """Return the error budget and the sound speed, m/s, of a run; the defaults where there is no
-    run.json (None).
+    """Return the error budget and the sound speed, m/s, of a run; the defaults of what it does not
+    state (`unstated`), and of all where there is no run.json (None).
 
-    Raises `ConfigError` where its parameters are missing or are not what they must be.
+    Raises `ConfigError` where it states no sound speed, or a parameter is not what it must be.
     """
     if run is None:
         return BathymetryConfig().budget(), BathymetryConfig().sound_speed
     stated = run.get('parameters')
     if not isinstance(stated, Mapping):
         raise ConfigError('it has no parameters')
-    if missing := [name for name in STATED if name not in stated]:
-        raise ConfigError(f'its parameters lack {", ".join(missing)}; track the recording again')
-    config = BathymetryConfig.from_mapping({name: _number(name, stated[name]) for name in STATED})
+    if 'sound_speed' not in stated:
+        raise ConfigError('its parameters lack sound_speed; track the recording again')
+    values = {name: _number(name, stated[name]) for name in STATED if name in stated}
+    config = BathymetryConfig.from_mapping(values)
     return config.budget(), config.sound_speed
+
+
+def unstated(run: Mapping[str, Any] | None) -> list[str]:
+    """Return the parameters of `STATED` for which `budget_of` takes the defaults."""
+    stated = {} if run is None else run['parameters']
+    return [name for name in STATED if name not in stated]
 
 
 def _number(name: str, value: Any) -> float:

@@ -38,7 +38,7 @@ from ..offline.run_folder import KIND as RESULTS
 from ..recordings.export.points import TOPIC, topics_of_soundings
 from ..recordings.reader import BagReader
 from ..recordings.sources import BagError, is_recording
-from .adjustment import adjust, Adjustment, Crossing, Mistie, misties
+from .adjustment import Adjustment
 from .chart import MOST_CELLS
 from .grid import HALO, Nodes
 from .jobs import (
@@ -56,11 +56,12 @@ from .jobs import (
     TileJob,
     Unit,
 )
-from .line import budget_of
+from .line import budget_of, unstated
 from .looks import Looks
+from .resuming import adjust_lines, find_misties, Misties
 
 WORK, SURVEY = '.work', 'survey.json'
-_STATED = ('soundings', 'size', 'mtime_ns', 'sha256', 'bounds')
+_STATED = ('soundings', 'far', 'size', 'mtime_ns', 'sha256', 'bounds')
 """What survey.json says of a line."""
 FINEST, COARSEST = 0.25, 16.0
 LEAST_SOUNDINGS = 5.0
@@ -120,7 +121,7 @@ def _has_soundings(recording: Path) -> bool:
 
 def _is_results(folder: Path) -> bool:
     """Whether `track` made a folder, which has a run.json then."""
-    there = any(os.path.lexists(folder / name) for name in (RUN, CSV))
+    there = any(os.path.lexists(folder / name) for name in (RUN, CSV, PARQUET[CSV]))
     return there or marked(folder).get('kind') == RESULTS
 
 
@@ -259,8 +260,8 @@ class Survey:
     tiles: Mapping[Tile, Path]
     adjustment: Adjustment | None
     rms_before: float
-    before: Mapping[tuple[int, int], Mistie]
-    after: Mapping[tuple[int, int], Mistie]
+    before: Misties
+    after: Misties
     crossing_cells: int
     warnings: Sequence[str]
 
@@ -279,41 +280,47 @@ def make(
     """Do all jobs; out: the folder of the survey, whose ``.work`` they fill. Raises `BagError`."""
     work = out / WORK
     units, lines, budget = _imported(sources, work, options, run, progress)
-    warnings = _unstated(sources, lines)
+    warnings = [*_unstated(sources, lines), *_far(lines)]
     depth = float(np.median([unit.depth for unit in units]))
     coarse = options.resolution or 2.0 ** math.floor(math.log2(max(0.05 * depth, FINEST)))
     cell = max(STATISTICS_CELL, 2.0 * min(coarse, COARSEST))
 
-    places = [work / 'looks' / f'{unit.file.stem}.npy' for unit in units]
-
     def statistics(corrections: FloatArray) -> Sequence[Looks]:
+        # Those of a round take the place of those of the round before, not of the reported ones.
+        folder = work / ('adjusted' if corrections.any() else 'looks')
+        places = [folder / f'{unit.file.stem}.npy' for unit in units]
         calls = [(unit, corrections[unit.number], cell, p) for unit, p in zip(units, places)]
         _all(run, line_statistics, calls, progress, 'statistics', units)
         return KeptLooks(places, cell)
 
+    made_of = [unit.signature for unit in units], cell
     none = np.zeros((len(units), 6))
     looks = statistics(none)
-    before, cells = misties(looks)
+    before, cells, rms = find_misties(
+        looks, made_of, work / 'misties.json', rms=not options.adjusted
+    )
     found: Adjustment | None = None
-    after: dict[tuple[int, int], Mistie] = {}
+    after: Misties = {}
     if options.adjusted:
         fixed = [unit.number for unit in units if unit.line in options.fixed]
         try:
-            found = adjust(
+            found = adjust_lines(
                 statistics,
-                len(units),
+                units,
                 budget,
-                fixed=fixed,
-                note=lambda k, left: progress.say(f'round {k}: misties {left:.3f} m rms'),
+                fixed,
+                cell,
+                work / 'adjustment.npz',
+                lambda k, left: progress.say(f'round {k}: misties {left:.3f} m rms'),
             )
         except ValueError as error:
             raise BagError(f'the lines cannot be adjusted: {error}') from None
         warnings += _warnings_of(found)
         looks = statistics(found.corrections)
-        after, _ = misties(looks)
+        after, _, _ = find_misties(
+            looks, (*made_of, found.corrections), work / 'adjusted_misties.json'
+        )
         rms = found.rms[0]
-    else:
-        rms = Crossing.of(looks).rms() if cells else 0.0
     tiles = plan_tiles(looks, options.resolution)
     extent_of(tiles)
     corrections = none if found is None else found.corrections
@@ -342,7 +349,7 @@ def _imported(
         work / 'lines' / hashlib.sha256(os.fsencode(source.name)).hexdigest()[:16]
         for source in sources
     ]
-    for folder in ('lines', 'looks', 'soundings', 'tiles'):
+    for folder in ('lines', 'looks', 'adjusted', 'soundings', 'tiles'):
         (work / folder).mkdir(parents=True, exist_ok=True)
     infos: list[dict[str, Any]] = [{} for _ in sources]
     failures = [source.failure for source in sources]
@@ -462,13 +469,31 @@ def _neighbours(tiles: Sequence[Tile]) -> dict[str, list[str]]:
 
 
 def _unstated(sources: Sequence[Source], lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a warning that names the lines whose error budget is assumed."""
-    used = [source for source, line in zip(sources, lines) if not line['failure']]
-    names = [source.name for source in used if source.run is None]
-    if not names:
-        return []
-    named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
-    return [f'{counted(len(names), "line")} without {RUN} ({named}): default error budget']
+    """Return warnings that name the lines whose error budget is assumed, all of it or a part."""
+    lacking: dict[str, list[str]] = {}
+    for source, line in zip(sources, lines):
+        if not line['failure'] and (missing := unstated(source.run)):
+            what = RUN if source.run is None else ', '.join(missing)
+            lacking.setdefault(what, []).append(source.name)
+    found = []
+    for what, names in lacking.items():
+        named = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
+        kind = 'error budget' if what == RUN else 'values'
+        found.append(f'{counted(len(names), "line")} without {what} ({named}): default {kind}')
+    return found
+
+
+def _far(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return warnings that name the lines of which soundings are left out."""
+    found = []
+    for line in lines:
+        if far := line['far']:
+            says = 'lies far away and is' if far == 1 else 'lie far away and are'
+            found.append(
+                f'{line["name"]}: {counted(far, "sounding")} {says} left out: no ship that sees '
+                'the others can have seen them'
+            )
+    return found
 
 
 def _warnings_of(found: Adjustment) -> list[str]:

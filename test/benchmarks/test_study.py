@@ -9,6 +9,7 @@
 """The harness of the studies: options from parameters, tables as they come, one file."""
 
 from collections.abc import Sequence
+from datetime import date
 import json
 import math
 import os
@@ -40,7 +41,7 @@ def run(monkeypatch, main, *words, **options):
 def test_parts_become_one_file_and_tables(monkeypatch, tmp_path, capsys):
     file = tmp_path / 'folder' / 'numbers.json'
     run(monkeypatch, numbers, '--runs', 2, '--cases', 'a', 'c', '--fast', '--out', file)
-    assert json.loads(file.read_text()) == {
+    assert study.known(file) == {
         'runs': 2,
         'fast': True,
         'table': {'a': {'error': 0.25, 'n': 2}, 'c': {'error': 0.25, 'n': 2}},
@@ -118,13 +119,27 @@ def test_a_fresh_process_is_another_one_and_its_errors_arrive():
 
 @pytest.mark.skipif(not (ROOT / 'docs').is_dir(), reason='reads the source tree')
 def test_every_study_of_the_docs_is_there():
-    sources = json.loads((ROOT / 'docs' / 'results' / 'sources.json').read_text())
-    commands = [row['command'].split() for row in sources.values()]
-    names = [words[2] for words in commands if words[:2] == ['python', '-m']]
+    names = set()
+    for path in (ROOT / 'docs' / 'results').glob('*.json'):
+        made = json.loads(path.read_text(encoding='utf-8'))['made']
+        assert made.keys() == {'command', 'date', 'commit'}, path
+        words = made['command'].split()
+        if words[:2] == ['python', '-m']:
+            names.add(words[2])
     assert names
     for name in names:
-        text = (ROOT / (name.replace('.', '/') + '.py')).read_text(encoding='utf-8')
-        assert 'study(' in text, f'{name} does not use the harness'
+        path = ROOT / name.replace('.', '/')
+        path = path / '__main__.py' if path.is_dir() else path.with_suffix('.py')
+        text = path.read_text(encoding='utf-8')
+        assert 'study(' in text or 'write_json(' in text, f'{name} does not use the harness'
+
+
+def test_a_file_says_how_it_was_made(tmp_path):
+    study.write_json(tmp_path / 'numbers.json', {'n': 1})
+    content = json.loads((tmp_path / 'numbers.json').read_text())
+    assert list(content) == ['made', 'n']
+    assert content['made']['command'].startswith('python ')
+    assert content['made']['commit'] and content['made']['date'] <= date.today().isoformat()
 
 
 # -- many seeds of one scene ----------------------------------------------------------------------

@@ -13,6 +13,7 @@ import os
 import shutil
 
 import pytest
+import rasterio
 
 from sonar_imm.files import mark
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
@@ -130,7 +131,7 @@ def test_each_damaged_line_is_named_and_left_out_and_the_chart_is_that_of_the_ot
     runs = tmp_path / 'runs'
     shutil.copytree(good, runs)
     names = damage(runs)
-    assert run('survey', runs, tmp_path / 'out', '--resolution', 2, '--jobs', jobs) == 1
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 2, '--jobs', jobs) == 0
     said = capsys.readouterr()
     left_out = [line for line in said.err.splitlines() if line.startswith('left out: ')]
     assert {line.split(': ')[1] for line in left_out} == names and len(left_out) == len(names)
@@ -155,6 +156,54 @@ def test_lines_that_were_not_tracked_here_are_named_where_a_budget_is_assumed(
     assert sentence in capsys.readouterr().err
     assert json.loads((tmp_path / 'out' / 'survey.json').read_text())['warnings'] == [sentence]
     assert sentence in (tmp_path / 'out' / 'report.html').read_text()
+
+
+def test_parameters_that_a_run_does_not_state_are_the_default_ones_and_said(
+    good, tmp_path, capsys
+):
+    """What a run does not state is assumed and named; a sound speed never is."""
+    runs = tmp_path / 'runs'
+    shutil.copytree(good, runs)
+    (runs / 'line_001' / 'run.json').write_text(
+        json.dumps({**RECORD, 'parameters': {'sound_speed': 1500.0, 'heave_std': 0.05}})
+    )
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 2) == 0
+    lacking = 'attitude_std_deg, heading_std_deg, position_std, sound_speed_std'
+    sentence = f'1 line without {lacking} (line_001): default values'
+    assert sentence in capsys.readouterr().err
+    assert json.loads((tmp_path / 'out' / 'survey.json').read_text())['warnings'] == [sentence]
+    assert run('export', runs / 'line_001', tmp_path / 'out.tif') == 0
+    assert f'run.json does not state {lacking}: default values' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('which', ['one', 'ping', 'end'])
+def test_soundings_far_away_are_left_out_and_said(good, tmp_path, capsys, which):
+    """One of a ping, a ping, and the first pings: the navigation stood at 0, 0."""
+    runs = tmp_path / 'runs'
+    shutil.copytree(good, runs)
+    path = runs / 'line_001' / 'soundings.csv'
+    head, *rows = path.read_text().splitlines()
+    x = head.split(',').index('px')
+    stamps = [row.split(',')[0] for row in rows]
+    pings = sorted(set(stamps))
+    chosen = {
+        'one': [len(rows) // 2],
+        'ping': [n for n, stamp in enumerate(stamps) if stamp == pings[len(pings) // 2]],
+        'end': [n for n, stamp in enumerate(stamps) if stamp in pings[:3]],
+    }[which]
+    for n in chosen:
+        values = rows[n].split(',')
+        values[x] = '3e6'
+        rows[n] = ','.join(values)
+    path.write_text('\n'.join([head, *rows]) + '\n')
+    assert run('survey', runs, tmp_path / 'out', '--resolution', 2) == 0
+    far = f'{len(chosen)} soundings lie' if len(chosen) > 1 else '1 sounding lies'
+    assert f'line_001: {far} far away and' in capsys.readouterr().err
+    with rasterio.open(tmp_path / 'out' / 'survey.tif') as chart:
+        assert max(chart.shape) < 2000
+    assert run('export', runs / 'line_001', tmp_path / 'out.xyz') == 0
+    assert f'{len(chosen)} far away left out' in capsys.readouterr().out
+    assert len((tmp_path / 'out.xyz').read_text().splitlines()) == len(rows) - len(chosen)
 
 
 def test_a_run_whose_table_is_gone_keeps_its_own_budget(good, tmp_path):

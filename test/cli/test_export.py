@@ -43,6 +43,23 @@ def test_a_run_holds_the_soundings_of_both_sides(tracked):
     assert all(np.isfinite(column).all() for column in points.columns.values())
 
 
+@pytest.mark.parametrize('tables', ['--parquet', '--no-table'])
+def test_soundings_are_the_same_from_any_table(tables, tracked, tmp_path):
+    pytest.importorskip('pyarrow')
+    again = ('--set', 'particles_per_model=30', tables)
+    assert run('track', tracked.parent / 'bag', tmp_path / 'runs' / 'line', *again) == 0
+    assert not list((tmp_path / 'runs').rglob('*.csv'))
+    for folder, name in ((tracked, 'a.csv'), (tmp_path / 'runs' / 'line', 'b.csv')):
+        assert run('export', folder, tmp_path / name) == 0
+    assert (tmp_path / 'a.csv').read_bytes() == (tmp_path / 'b.csv').read_bytes()
+    assert run('survey', tmp_path / 'runs', tmp_path / 'chart') == 0
+    (line,) = json.loads((tmp_path / 'chart' / 'survey.json').read_text())['lines']
+    assert line['soundings'] == len(read_points(tracked / 'soundings.csv'))
+    assert not json.loads((tmp_path / 'chart' / 'survey.json').read_text())['warnings']
+    assert run('evaluate', tmp_path / 'runs' / 'line') == 0
+    assert 'soundings in cells of' in (tmp_path / 'runs' / 'line' / 'report.html').read_text()
+
+
 def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):
     laspy, rasterio = pytest.importorskip('laspy'), pytest.importorskip('rasterio')
     place = ('--epsg', '32632', '--origin', '500000,6000000,1.5')

@@ -157,6 +157,29 @@ def test_a_laser_scan_with_odometry_is_tracked_as_info_says(tmp_path, capsys):
     assert '/odom as nav' in refusal and '/scan as detections' in refusal
 
 
+def test_what_only_the_user_knows_of_an_image_is_asked_in_the_command(tmp_path, capsys):
+    """A picture of ranges by beams states neither; with both told, the command works."""
+    shade = np.random.default_rng(1).rayleigh(12, (20, 100, 60))
+    shade[:, 40:43, 30:32] += 200.0
+    with BagReader(ROOT / 'bags' / 'obstacle_movers') as reader:
+        navs = [(item.message, item.log_ns) for item in reader.messages(['/nav'])][:100]
+    with BagWriter(tmp_path / 'bag') as writer:
+        for nav, log_ns in navs:
+            writer.write('/odom', nav, log_ns)
+        for (nav, log_ns), pixels in zip(navs[::5], np.minimum(shade, 255).astype(np.uint8)):
+            image = ros_message(
+                'sensor_msgs/msg/Image',
+                header=nav.header,
+                **{'height': 100, 'width': 60, 'encoding': 'mono8', 'is_bigendian': 0},
+                **{'step': 60, 'data': pixels.ravel()},
+            )
+            writer.write('/sonar/image', image, log_ns)
+    (command,) = recommended(tmp_path / 'bag', capsys)
+    told = command.replace('=METRES', '=40').replace('=DEGREES', '=90')
+    assert told != command
+    assert run(told, tmp_path / 'out', capsys)['rows'] > 0
+
+
 def test_a_type_that_nobody_hears_names_what_would_do(tmp_path, capsys):
     types, kind = get_typestore(Stores.ROS2_JAZZY), 'usbl_msgs/msg/Target'
     types.register(get_types_from_msg('std_msgs/Header header\nfloat64 range', kind))

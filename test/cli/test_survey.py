@@ -24,7 +24,7 @@ from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.recordings.export.points import read_points, write_table
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
-from sonar_imm_tools.survey import jobs, making
+from sonar_imm_tools.survey import adjustment, jobs, resuming
 from sonar_imm_tools.survey.making import plan_tiles
 
 rasterio = pytest.importorskip('rasterio')
@@ -259,28 +259,98 @@ def test_resume_makes_only_what_changed(lines, tmp_path, monkeypatch):
     assert run('survey', runs, out, '--overwrite', '--adjust') == 0
 
 
-def test_a_survey_that_was_interrupted_is_taken_up_again(lines, tmp_path, made, monkeypatch):
-    """A power cut while tiles are made."""
-    real, count = making.make_tile, []
+WORK = ('statistics', 'solve', 'covariance', 'misties', 'tile')
 
-    def dies(job):
-        count.append(job)
-        if len(count) == 2:
-            raise KeyboardInterrupt
-        return real(job)
 
-    monkeypatch.setattr(making, 'make_tile', dies)
-    assert run('survey', lines, tmp_path / 'out', '--adjust') == 130
-    assert not (tmp_path / 'out' / 'survey.json').exists()
-    monkeypatch.setattr(making, 'make_tile', real)
-    assert run('survey', lines, tmp_path / 'out', '--adjust', '--resume') == 0
-    assert products(tmp_path / 'out') == products(made)
+class Work:
+    """Counts what is made; `dies` interrupts one kind of work at its nth time."""
+
+    def __init__(self, monkeypatch):
+        self.made, self.dies = dict.fromkeys(WORK, 0), ('', 0)
+        equations = adjustment._Equations
+        for kind, place, name in (
+            ('statistics', jobs, 'looks_of'),
+            ('solve', equations, 'solve'),
+            ('covariance', equations, 'covariance'),
+            ('misties', resuming, 'misties'),
+            ('tile', jobs, 'grid_of_looks'),
+        ):
+            monkeypatch.setattr(place, name, self.counted(kind, getattr(place, name)))
+
+    def counted(self, kind, real):
+        def work(*arguments, **named):
+            if self.dies == (kind, self.made[kind] + 1):
+                raise KeyboardInterrupt
+            self.made[kind] += 1
+            return real(*arguments, **named)
+
+        return work
+
+    def taken(self):
+        """What was made since it was last asked."""
+        made, self.made = self.made, dict.fromkeys(WORK, 0)
+        return made
+
+
+NOTHING = dict.fromkeys(WORK, 0)
+
+
+@pytest.mark.parametrize(
+    'dies', [('statistics', 6), ('solve', 3), ('covariance', 1), ('misties', 2), ('tile', 2)]
+)
+def test_a_survey_that_was_interrupted_makes_nothing_again(
+    lines, tmp_path, made, monkeypatch, dies
+):
+    """A power cut in the first round of the adjustment, before the third is solved, after it,
+    before the last misties, while tiles are made."""
+    work, out = Work(monkeypatch), tmp_path / 'out'
+    work.dies = dies
+    assert run('survey', lines, out, '--adjust') == 130
+    assert not (out / 'survey.json').exists()
+    before, work.dies = work.taken(), ('', 0)
+    assert run('survey', lines, out, '--adjust', '--resume') == 0
+    assert products(out) == products(made)
+    after = work.taken()
+    tiles = len(list((out / '.work' / 'tiles').glob('*.npz')))
+    whole = {'statistics': 4 * 4, 'solve': 3, 'covariance': 1, 'misties': 2, 'tile': tiles}
+    assert {kind: before[kind] + after[kind] for kind in WORK} == whole
+    assert run('survey', lines, out, '--adjust', '--resume') == 0
+    assert products(out) == products(made) and work.taken() == NOTHING
+
+
+def test_another_line_makes_only_the_adjustment_again(lines, tmp_path, monkeypatch):
+    runs, out = tmp_path / 'runs', tmp_path / 'out'
+    shutil.copytree(lines, runs)
+    assert run('survey', runs, out, '--adjust') == 0
+    table = runs / 'line_003' / 'soundings.csv'
+    table.write_text('\n'.join(table.read_text().splitlines()[:-200]) + '\n')
+    work = Work(monkeypatch)
+    assert run('survey', runs, out, '--adjust', '--resume') == 0
+    made = work.taken()
+    # As reported the other three lines are what they were; each round moves all four.
+    assert made.pop('tile') > 0
+    assert made == {'statistics': 1 + 3 * 4, 'solve': 3, 'covariance': 1, 'misties': 2}
+    assert run('survey', runs, tmp_path / 'anew', '--adjust') == 0
+    assert products(out) == products(tmp_path / 'anew')
+
+
+def test_an_adjustment_that_cannot_be_read_is_made_again(lines, tmp_path, made, monkeypatch):
+    out = tmp_path / 'out'
+    shutil.copytree(made, out)
+    kept = out / '.work' / 'adjustment.npz'
+    kept.write_bytes(kept.read_bytes()[:-100])
+    (out / '.work' / 'misties.json').write_text('[]')
+    work = Work(monkeypatch)
+    assert run('survey', lines, out, '--adjust', '--resume') == 0
+    assert products(out) == products(made)
+    again = {'statistics': 3 * 4, 'solve': 3, 'covariance': 1, 'misties': 1, 'tile': 0}
+    assert work.taken() == again
 
 
 def test_a_broken_line_is_named_and_the_rest_is_made(lines, tmp_path, capsys):
     shutil.copytree(lines, tmp_path / 'runs')
     (tmp_path / 'runs' / 'line_001' / 'soundings.csv').write_text('stamp_ns,x\n1,2\n')
-    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 1
+    assert run('survey', tmp_path / 'runs', tmp_path / 'out', '--resolution', 2) == 0
     error = capsys.readouterr().err
     assert 'line_001: ' in error and 'no column' in error and 'Traceback' not in error
     survey = json.loads((tmp_path / 'out' / 'survey.json').read_text())
@@ -348,7 +418,7 @@ def test_recordings_of_soundings_are_lines_too(lines, made, tmp_path, capsys):
     shutil.rmtree(runs / 'line_003')
     record(lines / 'line_003', runs / 'line_003', '/a/soundings', '/b/soundings')
     capsys.readouterr()
-    assert run('survey', runs, tmp_path / 'again') == 1
+    assert run('survey', runs, tmp_path / 'again') == 0
     assert 'has the topics /a/soundings and /b/soundings' in capsys.readouterr().err
 
 

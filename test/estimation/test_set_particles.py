@@ -11,13 +11,13 @@
 import math
 
 from attrs import evolve
+from helpers.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from helpers.set_cycle import cycle
 from helpers.vector_files import load_vectors
 import numpy as np
 from oracles.set_particles import propagate, propose, start, weigh
 import pytest
 
-from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from sonar_imm.estimation.set_filter import (
     LagSmoother,
     levelled,

@@ -441,8 +441,8 @@ FORMATS = [
         'GeoJSON: points, lines with `coordTimes` or `times`', 'dive.geojson', geojson, 'diver'
     ),
     Format(
-        'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM; USRTH, PSIMSSB (C, H) of a '
-        'USBL',
+        'NMEA 0183: GGA, RMC, GLL, GNS, GST, HDT, THS, ZDA, TLL, TTM; USRTH, PSIMSSB (C, H), '
+        'PSIMSNS of a USBL',
         'gps.log',
         nmea,
         'diver',

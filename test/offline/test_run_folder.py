@@ -10,6 +10,7 @@
 
 import csv
 import json
+import re
 
 from helpers.dive_bags import write_dive
 from helpers.dive_scenes import single_run, START_NS
@@ -22,7 +23,6 @@ from sonar_imm_tools.offline.run_folder import (
     fingerprint,
     finite,
     ParquetTable,
-    ROWS_IN_A_GROUP,
     RunFolder,
 )
 from sonar_imm_tools.recordings.reader import BagError
@@ -206,7 +206,7 @@ def test_parquet_has_the_columns_types_and_numbers_of_the_csv(tmp_path):
     assert read.schema.metadata[b'system'] == b'diver'
 
 
-@pytest.mark.parametrize('rows, count', [(0, 0), (0, 3), (1, 5), (ROWS_IN_A_GROUP - 1, 3)])
+@pytest.mark.parametrize('rows, count', [(0, 0), (0, 3), (1, 5), (65535, 3)])
 def test_parquet_of_few_and_of_many_rows(tmp_path, rows, count):
     parquet = pytest.importorskip('pyarrow.parquet')
     with ParquetTable(tmp_path / 'table.parquet') as table:
@@ -221,23 +221,45 @@ def test_parquet_of_few_and_of_many_rows(tmp_path, rows, count):
         assert groups == (1 if rows == 1 else 2)
 
 
-def test_track_writes_parquet_beside_csv(tmp_path, capsys):
+def test_track_writes_the_table_that_is_asked_for(tmp_path, capsys):
     parquet = pytest.importorskip('pyarrow.parquet')
     bags = [str(write_dive(tmp_path / name, count=30)) for name in 'ab']
     out = tmp_path / 'out'
     assert main(['track', *bags, str(out)]) == 0
+    with (out / 'a' / 'estimate.csv').open(newline='') as file:
+        positions = [float(row['px']) for row in csv.DictReader(file)]
     assert main(['track', *bags, str(out), '--parquet']) == 0  # the same runs lack the files
     assert ' 2 tracked, 0 kept' in capsys.readouterr().out
     assert main(['track', *bags, str(out), '--parquet']) == 0
     assert ' 0 tracked, 2 kept' in capsys.readouterr().out
     first, second = (out / name / 'estimate.parquet' for name in 'ab')
     assert first.read_bytes() == second.read_bytes()
+    assert not (out / 'a' / 'estimate.csv').exists()
     read = parquet.read_table(first)
-    with (out / 'a' / 'estimate.csv').open(newline='') as file:
-        assert [float(row['px']) for row in csv.DictReader(file)] == read['px'].to_pylist()
+    assert positions == read['px'].to_pylist()
     run = json.loads((out / 'a' / 'run.json').read_text())
     assert json.loads(read.schema.metadata[b'parameters']) == run['parameters']
     assert read.schema.metadata[b'sonar_imm'].decode() == run['versions']['sonar_imm']
+    assert main(['track', *bags, str(out), '--no-table']) == 0
+    assert ' 0 tracked, 2 kept' in capsys.readouterr().out
+    assert main(['track', bags[0], str(out / 'c'), '--no-table']) == 0
+    assert {path.name for path in (out / 'c').iterdir()} == {'.sonar_imm', 'estimate', 'run.json'}
+    assert main(['track', bags[0], str(out / 'd'), '--no-table', '--parquet']) == 2
+    assert 'exclude each other' in capsys.readouterr().err
+
+
+def test_a_run_says_how_large_it_is_and_how_fast_it_was(tmp_path, capsys):
+    bag, out = write_dive(tmp_path / 'a', count=30), tmp_path / 'out'
+    assert main(['track', str(bag), str(out)]) == 0
+    run = json.loads((out / 'run.json').read_text())
+    there = sum(path.stat().st_size for path in out.rglob('*') if path.is_file())
+    own = sum((out / name).stat().st_size for name in ('run.json', '.sonar_imm'))
+    assert there - own <= run['written_bytes'] <= there
+    read = run['timings']['mb_per_s'] * run['timings']['wall_s']
+    assert read == pytest.approx(run['bag_bytes'] * 1e-6)
+    assert re.search(
+        r'^  0\.\d+ MB read at \S+ MB/s, 0\.\d+ MB written$', capsys.readouterr().out, re.M
+    )
 
 
 def test_without_pyarrow_it_is_said_at_once(tmp_path, capsys, monkeypatch):

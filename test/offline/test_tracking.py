@@ -203,6 +203,6 @@ def test_wild_fixes_are_not_believed_with_and_without_names(tmp_path, name):
 @pytest.mark.parametrize('name', ['', 'Diver 1'])
 def test_fixes_that_scatter_five_times_too_far_are_named_before_the_fiftieth(tmp_path, name):
     _, inside, _, early = tracked(tmp_path, name=name, std=STD / 5.0, wild=0.0)
-    # Over 20 runs .80 (docs/results/families.md).
+    # Over 20 runs .80.
     assert inside > 0.7
     assert any('as large as reported' in text for text in early)

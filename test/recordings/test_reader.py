@@ -18,6 +18,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 import yaml
 
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings import mcap_records
 from sonar_imm_tools.recordings.messages import ros_message, typestore
 from sonar_imm_tools.recordings.reader import BagError, BagReader
 from sonar_imm_tools.recordings.writer import BagWriter
@@ -390,7 +392,14 @@ class TestTypes:
 @pytest.mark.parametrize(
     'place, value, sentence',
     [
-        (('topics_with_message_count', 0, 'message_count'), 'many', 'count that is no number'),
+        (('topics_with_message_count', 0, 'message_count'), 'many', 'message count of many'),
+        (('topics_with_message_count', 0, 'message_count'), -5, 'message count of -5'),
+        (
+            ('topics_with_message_count', 0, 'message_count'),
+            10**20,
+            'count of 100000000000000000000',
+        ),
+        (('topics_with_message_count', 0, 'message_count'), 1e20, 'message count of 1e+20'),
         (('topics_with_message_count', 0, 'topic_metadata', 'name'), [5], 'is no text'),
         (('topics_with_message_count', 0, 'topic_metadata', 'name'), 5, 'is no text'),
         (('files',), 'none', 'a list of files that is none'),
@@ -409,3 +418,46 @@ def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(
     items, problems = read(path)
     assert len(items) == 3
     assert sentence in problems[0]
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('held', [0, 4])
+def test_an_index_that_speaks_of_more_messages_is_told(
+    tmp_path, fix_message, storage, held, capsys
+):
+    path = tmp_path / 'bag'
+    writer = Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()])
+    with writer:
+        link = writer.add_connection('/fix', FIX, typestore=typestore())
+        for i in range(held):
+            writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
+    text = (path / 'metadata.yaml').read_text()
+    (path / 'metadata.yaml').write_text(
+        text.replace(f'message_count: {held}', 'message_count: 101')
+    )
+    sentence = f'topic /fix holds {held} messages; the index of {path} says 101'
+    assert sentence in read(path)[1]
+    with pytest.raises(BagError, match='says 101'):
+        read(path, strict=True)
+    codes = (1, 1) if not held else (0, 0)
+    commands = (['info', str(path)], ['track', str(path), str(tmp_path / 'out')])
+    for words, code in zip(commands, codes):
+        assert main(words) == code
+        assert f'problem: {sentence}' in capsys.readouterr().out
+
+
+def test_statistics_of_a_file_that_speak_of_more_messages_are_told(tmp_path):
+    with Writer(tmp_path / 'none', version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection('/fix', FIX, typestore=typestore())
+    file = storage_file(tmp_path / 'none')
+    content = bytearray(file.read_bytes())
+    with file.open('rb') as opened:
+        summary = mcap_records.footer_of(opened, len(content)).summary
+        for at, code, length in mcap_records.records(opened, summary, len(content)):
+            if code == mcap_records.STATISTICS:  # of the file, then of its channel
+                begin = at + mcap_records.RECORD.size
+                struct.pack_into('<Q', content, begin, 101)
+                struct.pack_into('<Q', content, begin + length - 8, 101)
+    file.write_bytes(content)
+    items, (problem,) = read(file)
+    assert not items and 'holds 0 messages' in problem and 'says 101' in problem

@@ -17,12 +17,14 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import re
 import shutil
 import signal
 import subprocess
 import threading
 import time
 
+from helpers.source import ROOT
 import pytest
 import yaml
 
@@ -145,6 +147,30 @@ def test_launched_nodes_get_ready_in_their_namespace_and_end_on_ctrl_c(ros2, dom
     rest = output.rest()
     assert 'process has died' not in rest
     assert rest.count('process has finished cleanly') == len(nodes)
+
+
+def test_the_launch_file_of_the_tutorial_runs(ros2, domain, tmp_path):
+    """Its obstacle node hears what the page renames, with the parameters of the page."""
+    packages = pytest.importorskip('ament_index_python.packages')
+    try:
+        packages.get_package_prefix('tf2_ros')
+    except LookupError as error:
+        pytest.skip(f'not on the ament path: {error}')
+    page = (ROOT / 'docs/tutorials/ros_avoidance.md').read_text(encoding='utf-8')
+    (text,) = re.findall(r'^```xml\n(.*?)^```$', page, re.MULTILINE | re.DOTALL)
+    (parameters,) = re.findall(r"<<'EOF'\n(/\*\*:\n.*?)^EOF$", page, re.MULTILINE | re.DOTALL)
+    file, params_file = tmp_path / 'avoidance.launch.xml', tmp_path / 'my_obstacle.yaml'
+    params_file.write_text(parameters)
+    file.write_text(text.replace('/home/auv/my_obstacle.yaml', str(params_file)))
+    with started([ros2, 'launch', file], domain) as output:
+        output.wait_for(
+            lambda line, topic: 'ready, hears' in line and topic in line,
+            ['/sonar/targets', '/ekf/odometry'],
+        )
+        words = [ros2, 'param', 'get', '/obstacle', 'safety_radius']
+        told = subprocess.run(words, env=domain, capture_output=True, text=True, timeout=60.0)
+        assert '4.0' in told.stdout
+    assert 'process has died' not in output.rest()
 
 
 class Output:

@@ -97,9 +97,10 @@ CODE = '''
 
         def __init__(self, config):
             self.std, self.noise = 0.5 * config.max_speed, config.speed_noise**2
+            self.slow = (0.3 * config.max_speed) ** 2
 
         def step(self, dt):
-            return 1.0, dt, dt / 2.0, self.noise * dt
+            return 1.0, dt, dt / 2.0, self.noise * dt, self.slow
 
 
     class NoStart(Turns):

@@ -64,7 +64,7 @@ def spawn_at_fixes(known: Known, group: Group) -> Known:
     """Add a birth for each unassociated fix. A stage of the tracker."""
     association = group.association
     assert association is not None
-    marks = links.birth_marks(known, group)
+    marks = links.birth_marks(group)
     for d in np.flatnonzero(association.free).tolist():
         existence = math.nan if association.existence is None else float(association.existence[d])
         name = NOBODY if group.target_id is None else int(group.target_id[d])

@@ -82,6 +82,9 @@ def count_bursts(known: Known, scan: Scan) -> Known:
     if not scan.fixes or not len(known):
         return known
     counts: BurstCounts = known.memory['bursts']
+    if bursts.turning(known).any():
+        # What was taken for outliers is the other place.
+        counts = BurstCounts(taken=counts.taken)
     rows, T = known.rows, len(known)
     hit, before, since = known['nis_dof'] > 0, known['strange'], np.zeros(T, np.int64)
     taken = [group.association.taken for group in scan.fixes if group.association is not None]
@@ -108,7 +111,8 @@ def current_bursts(known: Known) -> Iterator[Burst]:
     rows, T = known.rows, len(known)
     if not rows.tail:
         return
-    running = np.where((rows.key['offset'] >= 0) & (rows.key['fixes'] >= 2), rows.weight, 0.0)
+    counted = (rows.key['offset'] >= 0) & (rows.key['fixes'] >= 2) & ~rows.key['turns']
+    running = np.where(counted, rows.weight, 0.0)
     offset = bursts.row_offsets(rows)
     firm = known.life.status != TENTATIVE
     for track in np.flatnonzero((rows.total(running, T) > 0.5) & firm).tolist():
@@ -123,6 +127,11 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
     apart = False
     rows, sensors = known.rows, known.memory['sensors']
     readings = bursts.reading_weights(rows, config.burst_end)
+    apart_in_turns = np.flatnonzero(bursts.turning(known) & (known.life.status != TENTATIVE))
+    offset = bursts.row_offsets(rows)
+    for track in apart_in_turns.tolist():
+        own = known.row_indices(track)
+        found.append(_places_apart(offset[own[rows.logw[own].argmax()]]))
     for burst in current_bursts(known):
         row, distance = burst.row, np.hypot(*burst.offset)
         others, fixes = (int(rows.key[name][row]) for name in ('others', 'fixes'))
@@ -138,6 +147,15 @@ def warnings(known: Known, config: DiverConfig) -> list[str]:
             'holds both'
         )
     return [*known.memory['bursts'].warnings(apart), *found]
+
+
+def _places_apart(offset: np.ndarray) -> str:
+    """Return the sentence about two places in turn, apart by `offset` (2,)."""
+    return (
+        f'fixes fall in two groups {np.hypot(*offset):.2g} m apart ({offset[0]:.2g} m east, '
+        f'{offset[1]:.2g} m north) that take turns, a constant offset: two sensors on one topic? '
+        'The estimate holds both places. Give each sensor its own frame, or correct one'
+    )
 
 
 def _sensors_apart(sensors: Sensors, number: int, offset: np.ndarray) -> str:

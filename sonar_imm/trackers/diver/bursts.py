@@ -13,18 +13,20 @@ Multipath, a wrong baseline or a sensor that is off give fixes at the target plu
 lasts. Each fix is weighed in several *ways*, and each way leaves a row of its own:
 
 - used as it is;
-- nobody's: an outlier, the row does not change;
+- an outlier: the row does not change;
 - an offset begins: the last two components b of the state get a prior, and the fix measures p + b;
-- from a row with an offset of this sensor: the offset stays, ends (b is nil again), or begins
-  anew.
+- from a row with an offset of this sensor: the offset stays, ends (b is nil again), or another one
+  begins;
+- from a row whose offset *turns*: the fix has it or not, at even odds. Two sensors that report as
+  one have such fixes (`disagreement`).
 
-An offset begins only where the target cannot have come to (`Row.far`), so rows of clean data are
-never divided. A row with an offset has a second reading: the target is where the fixes are, and
-the track was wrong before. Both readings have the same filter; `jump_log_odds` weighs them, and
-both are published. Rows of the same assumptions are merged.
+An offset begins only where the target cannot have come to, so rows of clean data are never
+divided. A row with an offset has a second reading: the target is where the fixes are, and the
+track was wrong before. Both readings have the same filter; `jump_log_odds` weighs them, and both
+are published. Rows of the same assumptions are merged.
 
-`add_ways` extends the comparison of fixes with rows, `finish_update` adds the new rows after the
-update. All other stages see rows of a table.
+`ways` extends the comparison of fixes with rows; the functions of this module make the rows that
+the ways lead to, and end them. All other stages see rows of a table.
 
 Source: docs/diver.md, 'Bursts'.
 """
@@ -44,7 +46,7 @@ from ...estimation.rows import Borrowed, reduce_targets, ROW_LOST, Rows
 from ...measurements import NOBODY
 from .known import Known, repair_covariances, row_outputs
 from .models import ModelSet, NO_OFFSET
-from .pairs import LEAVE, NOBODYS, OPEN, Ways
+from .pairs import LEAVE, OPEN, OUTLIER, Ways
 from .scan import Group
 from .sensors import scale_of
 
@@ -65,6 +67,9 @@ PLAIN_LOST = math.log(1e-12)
 JUMP_FLOOR = math.log(1e-3)
 """Log odds that an established track was wrong before, when a burst begins."""
 
+SILENT = 20
+"""Number of fixes in a row at one of two places after which the other one is given up."""
+
 JUMP_SURE = 0.99
 """Probability of this reading at which the track moves to the fixes."""
 
@@ -81,9 +86,6 @@ def jump_log_odds(
     """
     stay = math.log1p(-end)
     return np.asarray(stay * (np.minimum(before, JUMP_FLOOR / stay) + others - fixes))
-
-
-# -- comparison ----------------------------------------------------------------------------------
 
 
 # -- after the update ----------------------------------------------------------------------------
@@ -107,25 +109,25 @@ def begin_rows(
         return None
     row, fix, way = ways.row[kept], ways.fix[kept], ways.way[kept]
     rows = known.rows.with_tail(TAIL).select(row)
-    opens, nobodys = way == OPEN, way == NOBODYS
-    sensor = known.memory['sensors'].number(group.sensor)
-    key = dict(rows.key)
-    plain = opens | (way == LEAVE)
+    opens, outliers = way == OPEN, way == OUTLIER
+    sensor, key = group.number, dict(rows.key)
+    without = (way == LEAVE) & key['turns']
+    plain = opens | (way == LEAVE) & ~without
     key['offset'] = np.where(opens, sensor, np.where(plain, -1, key['offset']))
     key['since'] = np.where(opens, known.stamp_ns, np.where(plain, 0, key['since']))
     before = key['taken'] + key['fixes'] + key['others']
     key['taken'] = np.where(plain, before + ~opens, key['taken'])
-    key['fixes'] = np.where(opens, 1, np.where(plain, 0, key['fixes']))
-    key['others'] = np.where(plain, 0, key['others'])
-    key['took'] = np.where(nobodys, key['took'], known.stamp_ns)
-    key['aside'] = nobodys & (key['offset'] < 0)
+    key['fixes'] = np.where(opens, 1, np.where(plain | without, 0, key['fixes']))
+    key['others'] = np.where(plain, 0, key['others'] + without)
+    key['took'] = np.where(outliers, key['took'], known.stamp_ns)
+    key['aside'] = outliers & (key['offset'] < 0)
     late, velocities = key['delay'][:, sensor], [part.outputs[2:4] for part in models.parts]
     started = _with_prior(rows.blocks, plain, np.where(opens, ways.variance[kept], 0.0))
     key['link'] = np.where(opens, link[fix], np.where(plain, 0, key['link']))
     rows = rows.replace(
         blocks=tuple(bank.move_along(b, v, -late) for b, v in zip(started, velocities))
     )
-    each = np.flatnonzero(~nobodys)
+    each = np.flatnonzero(~outliers)
     R = group.R[fix[each]] * scale_of(key, sensor)[each, None, None]
     factor = np.where(opens, 1.0, 0.0)
     compared = [
@@ -136,7 +138,7 @@ def begin_rows(
     blocks, factors = [], []
     for block, part, pairs, mask in zip(rows.blocks, models.parts, compared, estimated):
         ratio = np.exp(pairs.log - whole)
-        none = nobodys.astype(np.float64)
+        none = outliers.astype(np.float64)
         wide = with_tail_mask(mask, TAIL)
         done = bank.update(block, pairs, each, ratio, none, part.measured, wide, factor)
         blocks.append(bank.move_along(done[0], part.outputs[2:4], late))
@@ -176,13 +178,14 @@ def count_fixes(rows: Rows, sensor: int, used: BoolArray, stamp_ns: int) -> Rows
     own = key['offset'] == sensor
     key['took'] = np.where(used, stamp_ns, key['took'])
     key['fixes'] = key['fixes'] + (used & own)
-    key['others'] = key['others'] + (used & bursting & ~own)
+    others = np.where(used & own & key['turns'], 0, key['others'])
+    key['others'] = others + (used & bursting & ~own)
     key['taken'] = key['taken'] + (used & ~bursting)
     key['aside'] = key['aside'] & ~used
     return rows.replace(key=key)
 
 
-MERGED = ('scale', 'delay', 'start', 'side', 'offset', 'since', 'aside', 'link')
+MERGED = ('scale', 'delay', 'start', 'side', 'offset', 'since', 'aside', 'turns', 'link')
 """Assumptions that rows which are merged have in common."""
 
 
@@ -250,19 +253,18 @@ def drop_rows(rows: Rows, borrowed: Borrowed, stays: BoolArray) -> tuple[Rows, B
     return evolve(rows.select(left), parent=rows.parent[left]), borrowed
 
 
-# -- links ---------------------------------------------------------------------------------------
-
-
 def end_rows(rows: Rows, ended: BoolArray) -> Rows:
     """Return the rows with the offsets of `ended` rows (N,) ended."""
     if not ended.any():
         return without_unused_tail(rows)
-    key = {
-        name: np.where(ended, ENDED[name], column) if name in ENDED else column
-        for name, column in rows.key.items()
-    }
-    blocks = _with_prior(rows.blocks, ended, np.zeros(len(rows)))
-    return without_unused_tail(merge_rows(rows.replace(key=key, blocks=blocks)))
+    return without_unused_tail(merge_rows(_without_offset(rows, ended)))
+
+
+def _without_offset(rows: Rows, chosen: BoolArray) -> Rows:
+    """Return the rows with the offset of the `chosen` rows (N,) set to zero."""
+    ended = {name: np.where(chosen, value, rows.key[name]) for name, value in ENDED.items()}
+    blocks = _with_prior(rows.blocks, chosen, np.zeros(len(rows)))
+    return rows.replace(blocks=blocks, key={**rows.key, **ended})
 
 
 # -- two readings --------------------------------------------------------------------------------
@@ -273,9 +275,9 @@ def reading_weights(rows: Rows, end: float) -> FloatArray:
     offset says."""
     key = rows.key
     odds = jump_log_odds(key['taken'], key['others'], key['fixes'], end)
-    # A linked track is the other reading of its row.
-    two = (rows.key['offset'] >= 0) & (rows.key['link'] == 0)
-    return np.where(two, 1.0 / (1.0 + np.exp(-odds)), 0.0)
+    # A linked track is the other reading of its row. Neither place of two in turn is the better.
+    two = (key['offset'] >= 0) & (key['link'] == 0)
+    return np.where(two, np.where(key['turns'], 0.5, 1.0 / (1.0 + np.exp(-odds))), 0.0)
 
 
 def row_readings(rows: Rows, models: ModelSet, end: float) -> tuple[FloatArray, FloatArray]:
@@ -314,26 +316,33 @@ def move_to_fixes(rows: Rows, chosen: BoolArray) -> Rows:
         P[chosen, :2] += P[chosen, -TAIL:]
         P[chosen, :, :2] += P[chosen, :, -TAIL:]
         blocks.append(Gaussians(x, P))
-    key = dict(rows.key)
-    key['taken'] = np.where(chosen & (key['offset'] >= 0), key['fixes'], key['taken'])
-    for name in ('offset', 'since', 'fixes', 'others'):
-        key[name] = np.where(chosen, NO_OFFSET[name], key[name])
-    return rows.replace(blocks=_with_prior(blocks, chosen, np.zeros(len(rows))), key=key)
+    off = chosen & (rows.key['offset'] >= 0)
+    taken = np.where(off, rows.key['fixes'], rows.key['taken'])
+    moved = rows.replace(blocks=tuple(blocks), key={**rows.key, 'taken': taken})
+    return _without_offset(moved, chosen)
+
+
+def turning(known: Known) -> BoolArray:
+    """Return the tracks (T,) whose fixes are rather those of two places in turn."""
+    rows, T = known.rows, len(known)
+    return np.asarray(rows.total(np.where(rows.key['turns'], rows.weight, 0.0), T) > 0.5)
 
 
 def jump(known: Known, group: Group) -> Known:
     """Move tracks to their fixes where the track was wrong before, almost surely.
 
-    A track without a target ID gets a new track ID. A stage of the tracker.
+    A track without a target ID gets a new track ID. Of two places in turn, the one without recent
+    fixes is given up. A stage of the tracker.
     """
     rows = known.rows
     if not rows.tail:
         return known
     sure = reading_weights(rows, group.config.burst_end) >= JUMP_SURE
-    if not sure.any():
+    there, here = (rows.key['turns'] & (rows.key[n] >= SILENT) for n in ('fixes', 'others'))
+    if not (sure | there | here).any():
         return known
     share = rows.total(np.where(sure, rows.weight, 0.0), len(known))
-    moved = move_to_fixes(rows, sure)
+    moved = _without_offset(move_to_fixes(rows, sure | there), here)
     # The path before is that of another place.
     parent = np.where(share[rows.target] > 0.5, -1, rows.parent)
     merged = without_unused_tail(merge_rows(moved.replace(parent=parent)))
@@ -343,10 +352,7 @@ def jump(known: Known, group: Group) -> Known:
 
 def without_offsets(rows: Rows) -> Rows:
     """Return the rows with all offsets ended: pings do not have them."""
-    if not rows.tail:
-        return rows
-    ended = {name: np.full(len(rows), value) for name, value in ENDED.items()}
-    return merge_rows(rows.with_tail(0).replace(key={**rows.key, **ended}))
+    return end_rows(rows, np.ones(len(rows), np.bool_)) if rows.tail else rows
 
 
 def _heaviest(rows: Rows, counted: BoolArray, most: int) -> BoolArray:

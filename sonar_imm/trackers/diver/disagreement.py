@@ -13,6 +13,9 @@ the covariances that scales grant, no fix is far from the track. So if the means
 innovations of two sensors differ significantly, a row begins with scales 1 and an offset of the
 sensor that reports. Both readings of an offset are even then (`bursts`).
 
+Two sensors may report as one. If the last innovations of a sensor lie in two groups that take
+turns, rows begin whose offset turns: each fix has it or not.
+
 Source: docs/diver.md, 'Several sensors'.
 """
 
@@ -26,16 +29,24 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import TENTATIVE
+from ...estimation.bank import Gaussians
 from ...estimation.rows import combine_fixes, Rows
 from . import bursts
 from .innovations import FixConsistency, whiten_innovations
 from .known import Feature, Known
-from .models import ModelSet
+from .models import ModelSet, USUAL_SCALES
 from .offsets import RecentPairs
 from .pairs import OPEN, Ways
 from .scales import estimated_scales, weight_without_small_scales
 from .scan import Group
 from .sensors import MOST_SENSORS
+
+RECENT, LEAST_GROUP = 16, 4
+"""Number of innovations that are compared with two places in turn, and minimum number of either,
+and of changes between them."""
+
+SEPARATE = 4.5
+"""Minimum distance of two places, in standard deviations of the innovations of one."""
 
 FEATURES = {
     'nis': Feature(math.nan),
@@ -43,6 +54,7 @@ FEATURES = {
     'white': Feature(math.nan, (MOST_SENSORS, 2)),
     'reported': Feature(math.nan, (3,)),
     'lately': Feature(0.0, (MOST_SENSORS, 4)),
+    'innovations': Feature(math.nan, (RECENT, 2)),
 }
 """nis, nis_dof: of this scan, NaN and 0 without a hit.
 
@@ -52,6 +64,8 @@ reported: covariance (xx, xy, yy) of the last fix, m^2, times the estimated scal
 
 lately: number of the last innovations of each sensor, and sums of their x, y, m, and variance,
 m^2.
+
+innovations: last innovations, m, those of outliers too.
 """
 
 LATELY, ENOUGH = 10.0, 3.4
@@ -76,20 +90,29 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
             .of(group.number)
             .with_covariances(group.is_stated, group.config.has_usual_fix_std),
         )
+    taken = np.flatnonzero(association.taken)
+    if not len(taken):
+        return known
+    count = len(known.rows)
+    seen = combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
+    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
+    new = group.z[association.beta[taken].argmax(axis=1)] - mean[taken]
+    last = known['innovations'].copy()
+    last[taken] = np.concatenate([last[taken, 1:], new[:, None]], axis=1)
+    known = known.with_columns(innovations=last)
     tracks = np.flatnonzero(association.hit)
     if not len(tracks):
         return known
     fix = association.fix[tracks]
-    count = len(known.rows)
-    seen = combine_fixes([(h[:count], S[:count]) for h, S in pairs.expected], known.rows.mu)
-    mean, covariance = known.rows.combine(*seen, weight_without_small_scales(known.rows))
+    turning = bursts.turning(known)[tracks]
     scale = (
         estimated_scales(known.rows, group.number)[tracks]
         if len(models.scales) > 1
         else np.ones(len(tracks))
     )
     R = group.R[fix] * scale[:, None, None]
-    tentative = (known.life.status == TENTATIVE)[tracks]
+    # Of two places in turn, the innovations tell nothing about covariances.
+    tentative = (known.life.status == TENTATIVE)[tracks] | turning
     before: FixConsistency = known.memory['fixes'].of(group.number)
     white, after = whiten_innovations(
         mean[tracks],
@@ -101,6 +124,8 @@ def record_innovations(known: Known, group: Group, models: ModelSet) -> Known:
         before,
     )
     after = after.with_scale(scale, tentative)
+    if turning.any():
+        after = FixConsistency(stated=before.stated, assumed=before.assumed)
     names = 'white', 'nis', 'nis_dof', 'reported', 'lately'
     columns = {name: known[name].copy() for name in names}
     columns['white'][tracks, group.number] = white
@@ -145,42 +170,82 @@ def sensors_disagree(lately: FloatArray, sensor: int) -> BoolArray:
     return np.asarray((enough & (apart > DISAGREE * spread)).any(axis=1))
 
 
+def two_places(innovations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance (T,), m, of two places that innovations (T, n, 2) take in turns, and the
+    standard deviation (T,), m, at one of them along it; 0 and infinite for other innovations."""
+    apart = np.zeros(len(innovations)), np.full(len(innovations), np.inf)
+    whole = np.flatnonzero(np.isfinite(innovations).all(axis=(1, 2)))
+    v = innovations[whole]
+    v = v - v.mean(axis=1, keepdims=True)
+    axis = np.linalg.eigh(np.swapaxes(v, 1, 2) @ v)[1][..., -1]
+    along = (v @ axis[..., None])[..., 0]
+    middle = 0.5 * (along.min(axis=1) + along.max(axis=1))
+    second = along > middle[:, None]
+    count = second.sum(axis=1)
+    changes = (second[:, 1:] != second[:, :-1]).sum(axis=1)
+    least = np.minimum(np.minimum(count, along.shape[1] - count), changes)
+    own = np.flatnonzero(least >= LEAST_GROUP)
+    along, second, count = along[own], second[own], count[own, None]
+    high = np.where(second, along, 0.0).sum(axis=1, keepdims=True) / count
+    low = np.where(second, 0.0, along).sum(axis=1, keepdims=True) / (along.shape[1] - count)
+    within = np.square(along - np.where(second, high, low)).mean(axis=1)
+    apart[0][whole[own]], apart[1][whole[own]] = (high - low)[:, 0], np.sqrt(within)
+    return apart
+
+
 def begin_disagreement(
     known: Known, group: Group, models: ModelSet, estimated: Sequence[BoolArray | None]
 ) -> Rows | None:
-    """Return rows with an offset of the sensor, for tracks whose sensors disagree; None for none.
+    """Return rows with an offset of the sensor, for tracks whose sensors disagree, or whose sensor
+    shows two places in turn; None for none.
 
     A track that has a row with an offset gets none.
 
     estimated: as for `fixes.update_tracks`.
     """
     association, rows, T = group.association, known.rows, len(known)
-    if association is None or not T or len(known.memory['sensors'].names) < 2:
+    if association is None or not T:
         return None
-    found = sensors_disagree(known['lately'], group.number) & association.hit
-    if not found.any():
+    held = np.bincount(rows.target, rows.key['offset'] >= 0, T) > 0.0
+    free = association.taken & ~held
+    fix = association.beta.argmax(axis=1) if len(group.z) else association.fix
+    distance, std = two_places(known['innovations'])
+    R = group.R[fix].trace(axis1=1, axis2=2) / 2.0 if len(group.z) else std
+    turns = free & (distance > SEPARATE * std) & (np.square(distance) > DISAGREE * R)
+    found = free & association.hit & sensors_disagree(known['lately'], group.number) & ~turns
+    track = np.flatnonzero(found | turns)
+    if not len(track):
         return None
-    held = rows.key['offset'] >= 0
-    found &= ~(np.bincount(rows.target, held, T) > 0.0)
+    # Of two places in turn, scales explain what is stated too small besides.
+    usual = [s for s in models.scales if 1.0 <= s <= USUAL_SCALES[1]]
+    each = [(t, s) for t in track.tolist() for s in (usual if turns[t] else [1.0])]
+    track, scale = (np.array(column) for column in zip(*each))
     heaviest = np.lexsort((rows.logw, rows.target))[np.cumsum(np.bincount(rows.target)) - 1]
-    row = heaviest[found]
-    if not len(row):
-        return None
-    track, N = np.flatnonzero(found), len(row)
-    scale = np.where(rows.key['scale'] > 0.0, 1.0, 0.0)
+    row, turn = heaviest[track], turns[track]
+    started = rows.select(row)
+    key = dict(started.key)
+    key['scale'] = np.where(key['scale'] > 0.0, 1.0, 0.0)
+    key['scale'][:, group.number] = scale
+    key |= {'delay': np.zeros_like(key['delay']), 'turns': turn}
+    # The track lies between the two places.
+    blocks, wider = [], np.where(turn, 0.25 * distance[track] ** 2, 0.0)
+    for block in started.blocks:
+        P = block.P.copy()
+        P[:, [0, 1], [0, 1]] += wider[:, None, None]
+        blocks.append(Gaussians(block.x, P))
+    N = len(row)
     ways = Ways(
-        row,
-        association.fix[track],
+        np.arange(N),
+        fix[track],
         np.full(N, OPEN),
-        np.full(N, group.config.burst_std**2),
+        np.maximum(group.config.burst_std, np.where(turn, distance[track], 0.0)) ** 2,
         np.zeros(N),
         np.ones((T, len(group.z))),
     )
-    stated = known.replace(
-        rows=rows.replace(key={**rows.key, 'scale': scale, 'delay': 0.0 * scale})
-    )
+    stated = known.replace(rows=started.replace(key=key, blocks=tuple(blocks)))
     weight, link = np.full(N, math.log(BEGINS)), np.zeros(len(group.z), np.int64)
     began = bursts.begin_rows(stated, group, ways, weight, link, models, estimated)
     if began is None:
         return None
-    return evolve(began, key={**began.key, 'taken': np.zeros_like(began.key['taken'])})
+    taken = np.zeros_like(began.key['taken'])
+    return evolve(began, key={**began.key, 'taken': taken}, parent=rows.parent[row])

@@ -175,7 +175,8 @@ def warnings(known: Known, config: DiverConfig, models: ModelSet) -> list[str]:
         ]
     memory, tracked = known.memory, bool((known.life.status != TENTATIVE).any())
     exceeds, largest = memory['excess'] >= ENOUGH, max(config.covariance_scales)
-    starving = polling.warnings(memory['single'], config)
+    two_places = bursts.turning(known).any()
+    starving = [] if two_places else polling.warnings(memory['single'], config)
     # Of tracks that starve, nothing else is told by the fixes.
     fixes = memory['fixes'].warnings(config.fix_bias_std > 0.0, largest, memory['sensors'].names)
     of_scans = [

@@ -6,19 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""Association of fixes with tracks, and the update by fixes.
+"""Comparison of fixes with tracks, and the update by fixes.
 
 `compare` computes the density of each fix under each row it may belong to: all models of the row,
-with the covariance scale of the row. The densities of a track select the association:
-
-- `associate_by_id`: the ID selects the track of a fix; the fix still has to pass the gate.
-- `associate_jipda`: exact probabilities of all joint events (`estimation.jipda`), with a
-  probability of existence for each track.
-- `associate_gnn`: the most likely assignment; hits and misses are counted.
-
-For families, gating uses the predictive density of the mixture instead of a chi-square test. A fix
-passes if a detection at this place is more probable than a missed target and a false fix
-(`gate_log_density`).
+with the covariance scale of the row. The densities of a track select the association (`pairing`).
 
 `update_tracks` updates the rows with all associated fixes, in proportion to the association
 probabilities. The likelihood of the fixes weights the rows. Rows of negligible weight are not
@@ -55,11 +46,7 @@ from .disagreement import begin_disagreement, record_innovations
 from .known import Feature, Known, repair_covariances
 from .models import ModelSet
 from .pairs import Association, Assumptions, Pairs
-from .scales import (
-    can_restore,
-    lending,
-    protected_rows,
-)
+from .scales import can_restore, lending, protected_rows
 from .scan import Group
 
 FEATURES = {
@@ -90,12 +77,10 @@ def compare(
     group: Group,
     models: ModelSet,
     min_probability: float,
-    openers: BoolArray | None = None,
 ) -> Pairs:
     """Compare the fixes of a group with rows near them, or with the tracks of the same ID.
 
-    :param min_probability: minimum model probability, see `MIN_MODEL_PROBABILITY`.
-    :param openers: (T,) see `ways.add_ways`.
+    :param min_probability: minimum model probability, see `pairing.MIN_MODEL_PROBABILITY`.
     """
     among = Assumptions.from_rows(known.rows, known.borrowed, group.number)
     expected = _predict_fixes(known, among, group.number, models)
@@ -104,13 +89,6 @@ def compare(
         _compare_part(known, group, among, part, expected, min_probability if by_nis else None)
         for part in _parts(among.target, len(group.z))
     ]
-    if len(each) == 1:
-        assumption, fix, log, whole, nis = each[0]
-        pairs = Pairs(among, assumption, fix, expected, log, whole, nis)
-        if not ways.has_ways(group, models):
-            return pairs
-        pairs = ways.add_ways(known, group, pairs, models, openers)
-        return ways.with_groups(known, pairs)
     assumption, fix, log, whole, nis = zip(*each)
     return Pairs(
         among,
@@ -120,6 +98,7 @@ def compare(
         np.concatenate(log),
         np.concatenate(whole),
         np.concatenate(nis) if by_nis else None,
+        in_parts=len(each) > 1,
     )
 
 
@@ -251,9 +230,6 @@ def gate_log_density(group: Group) -> FloatArray:
     false fix are equally probable."""
     p = group.config.detection_probability
     return np.asarray(np.log(group.clutter) + (math.log1p(-p) - math.log(p)))
-
-
-# -- association ---------------------------------------------------------------------------------
 
 
 # -- update --------------------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def links_of_fixes(known: Known, group: Group) -> IntArray:
     association = group.association
     if is_alone(group) or association is None:
         return np.zeros(len(group.z), np.int64)
-    marks = birth_marks(known, group)
+    marks = birth_marks(group)
     tentative = np.flatnonzero(known.life.status == TENTATIVE)
     if not len(tentative):
         return marks
@@ -86,10 +86,9 @@ def links_of_fixes(known: Known, group: Group) -> IntArray:
     return np.where(association.free, marks, ids)
 
 
-def birth_marks(known: Known, group: Group) -> IntArray:
+def birth_marks(group: Group) -> IntArray:
     """Return a number (D,) below -1 for the track that each fix may begin."""
-    sensor = group.number
-    return -2 - np.arange(len(group.z)) - sensor * 10**6
+    return -2 - np.arange(len(group.z)) - group.number * 10**6
 
 
 def resolve_links(known: Known, begun: Mapping[int, int]) -> Known:

@@ -96,6 +96,7 @@ NO_OFFSET: dict[str, int | bool] = {
     'fixes': 0,
     'others': 0,
     'aside': False,
+    'turns': False,
     'link': 0,
 }
 """Assumptions of a new row about offsets (`bursts`).
@@ -103,7 +104,9 @@ NO_OFFSET: dict[str, int | bool] = {
 offset: number of the sensor whose fixes are off, -1 for none; since: stamp of the first of them;
 took: stamp of the last fix that the row used, 0 for none; taken: number of fixes before;
 fixes: number of fixes of the sensor since; others: of other sensors; aside: whether its last fix
-was an outlier; link: ID of the track that the row excludes, 0 for none.
+was an outlier; turns: whether each fix may have the offset or not (`fixes` and `others` then count
+the last fixes in a row with and without it); link: ID of the track that the row excludes, 0 for
+none.
 """
 
 

@@ -37,9 +37,9 @@ from . import links
 from .fixes import compare, gate_log_density
 from .known import Known
 from .models import ModelSet
-from .pairs import Association, Groups, LEAVE, Pairs
+from .pairs import Association, Groups, LEAVE, OPEN, Pairs
 from .scan import Group
-from .ways import has_ways, is_alone
+from .ways import has_ways, is_alone, with_ways
 
 MIN_MODEL_PROBABILITY = {'gnn': 1e-6, 'jipda': 0.01}
 """Minimum probability of a model that opens the gate. A single assignment needs rare models, or
@@ -72,14 +72,17 @@ def association_stage(models: ModelSet, pairing: str) -> Callable[[Known, Group]
     min_probability = MIN_MODEL_PROBABILITY[pairing]
 
     def associate(known: Known, group: Group) -> Known:
-        pairs = compare(known, group, models, min_probability)
+        pairs = compared = compare(known, group, models, min_probability)
+        several = has_ways(group, models) and not compared.in_parts
+        if several:
+            pairs = with_ways(known, group, compared, models)
         associate_pairs = by_density if group.target_id is None else associate_by_id
         group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
-        if has_ways(group, models) and not is_alone(group):
+        if several and not is_alone(group):
             openers = links.openers(known, group.association)
             if openers.any():
                 # With the bursts that may begin, which a first pass has found missing fixes for.
-                pairs = compare(known, group, models, min_probability, openers)
+                pairs = with_ways(known, group, compared, models, openers)
                 if pairs.ways is not None:
                     group.pairs, group.association = pairs, associate_pairs(known, group, pairs)
         return known
@@ -226,9 +229,13 @@ def _associate_groups(
     gate = groups.log - np.log(np.maximum(groups.weight, 1e-300))[:, None]
     passes = gate > gate_log_density(group)
     tied = np.bincount(of, minlength=T) > 1
-    # Openings have no gate.
+    # Openings have no gate, those from a burst neither.
     plain = passes[:T] | (pairs.direct < 1.0) | ~tied[:, None]
     possible = np.concatenate([may & plain, passes[T:]])
+    of_row, ways = _groups_of_rows(pairs, groups), pairs.ways
+    if ways is not None:
+        opens = ways.way == OPEN
+        possible[of_row[ways.row[opens]], ways.fix[opens]] = True
     r, p = before[of], detected[of]
     alive = r * groups.weight
     missed = alive * (1.0 - p)
@@ -240,21 +247,32 @@ def _associate_groups(
     beta = np.zeros(may.shape)
     np.add.at(beta, of, found.pair)
     total = np.bincount(of, none, minlength=T).astype(np.float64)
-    held = found.held + _leaving(pairs, groups, found.pair, T)
+    held = found.held + _leaving(pairs, groups, of_row, found.pair, T)
     exists = np.minimum(total + beta.sum(axis=1), 1.0)
     return _Linked(beta, total, exists, found.pair, none, np.minimum(held, 1.0))
 
 
-def _leaving(pairs: Pairs, groups: Groups, beta: FloatArray, targets: int) -> FloatArray:
-    """Return the probability (T,) that a burst which excludes the track has ended."""
+def _groups_of_rows(pairs: Pairs, groups: Groups) -> IntArray:
+    """Return the group (N,) of each row."""
+    among = pairs.among
+    of_row = np.empty(int(among.row.max()) + 1, np.int64)
+    of_row[among.row[among.has_row]] = groups.of[among.has_row]
+    return of_row
+
+
+def _leaving(
+    pairs: Pairs, groups: Groups, of_row: IntArray, beta: FloatArray, targets: int
+) -> FloatArray:
+    """Return the probability (T,) that a burst which excludes the track has ended.
+
+    of_row: (N,) group of each row.
+    """
     out = np.zeros(targets)
     ways = pairs.ways
     if ways is None:
         return out
     leave = np.flatnonzero(ways.way == LEAVE)
     among = pairs.among
-    of_row = np.empty(int(among.row.max()) + 1, np.int64)
-    of_row[among.row[among.has_row]] = groups.of[among.has_row]
     logw = np.empty(len(of_row))
     logw[among.row[among.has_row]] = among.logw[among.has_row]
     at, fix = of_row[ways.row[leave]], ways.fix[leave]

@@ -84,7 +84,7 @@ class Assumptions(NamedTuple):
         )
 
 
-OPEN, NOBODYS, LEAVE = range(3)
+OPEN, OUTLIER, LEAVE = range(3)
 """Ways of a fix: an offset begins, the fix is an outlier, an offset ends."""
 
 
@@ -96,7 +96,7 @@ class Ways(NamedTuple):
     fix: IndexArray
     """(E,) index of the fix."""
     way: IntArray
-    """(E,) `OPEN`, `NOBODYS` or `LEAVE`."""
+    """(E,) `OPEN`, `OUTLIER` or `LEAVE`."""
     variance: FloatArray
     """(E,) variance of a new offset, m^2."""
     log: FloatArray
@@ -143,6 +143,8 @@ class Pairs(NamedTuple):
     """Further ways of the fixes; None for none."""
     groups: Groups | None = None
     """Groups of assumptions; None if no row is linked."""
+    in_parts: bool = False
+    """True if the table was too large to be compared at once: such fixes have no further ways."""
 
     @property
     def direct(self) -> FloatArray | float:

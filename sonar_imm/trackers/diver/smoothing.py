@@ -31,7 +31,7 @@ from .tracker import DiverTracker
 
 LONGEST_GAP = 5
 """Maximum number of prediction steps without a measurement inside a pass of several models. Longer
-gaps made estimates worse (tag of docs/real_recordings.md, received every 29 s)."""
+gaps made estimates worse (tag of docs/results/recordings.md, received every 29 s)."""
 
 
 class _Scan(NamedTuple):

@@ -9,7 +9,7 @@
 
 """Ways of a fix: used as it is, an outlier, or of an offset that begins, stays or ends.
 
-`add_ways` extends the comparison of fixes with rows, see `bursts`.
+`with_ways` extends the comparison of fixes with rows, see `bursts`.
 
 Source: docs/diver.md, 'Bursts'.
 """
@@ -28,7 +28,7 @@ from ...estimation.rows import combine_fixes, log_sum, Rows
 from .config import DiverConfig
 from .known import Known, row_outputs
 from .models import ModelSet
-from .pairs import Groups, LEAVE, NOBODYS, OPEN, Pairs, Ways
+from .pairs import Groups, LEAVE, OPEN, OUTLIER, Pairs, Ways
 from .scan import Group
 from .sensors import scale_of
 
@@ -39,8 +39,7 @@ LEAVE_SHARE, ANEW_SHARE = 0.8, 0.2
 """Shares of `burst_end`: the offset ends, or another one begins."""
 
 AGAIN, USED_AGAIN, OPEN_AGAIN = 0.8, 0.18, 0.02
-"""After a fix that was nobody's: probabilities that the next is nobody's, used, or begins an
-offset."""
+"""Probabilities after an outlier: the next fix is one too, is used, or begins an offset."""
 
 TAILS, TAIL_COST = (1.0, 10.0, 100.0, 1000.0), 2.3
 """Factors of the standard deviation of a new offset, and the log cost of each after the first."""
@@ -68,36 +67,42 @@ def offset_factor(rows: Rows, sensor: int) -> FloatArray | None:
     return np.where(rows.key['offset'] == sensor, 1.0, 0.0)
 
 
-def add_ways(
+def with_ways(
     known: Known,
     group: Group,
     pairs: Pairs,
     models: ModelSet,
     openers: BoolArray | None = None,
 ) -> Pairs:
-    """Add the ways of the fixes to the comparison with the rows.
+    """Add the ways of the fixes, and the groups of linked rows, to the comparison with the rows.
 
     :param openers: (T,) True for tracks of several targets on which a burst may begin; None for
         none of them.
     """
-    rows, config = known.rows, group.config
-    sensor = known.memory['sensors'].number(group.sensor)
+    return _with_groups(known, _add_ways(known, group, pairs, models, openers))
+
+
+def _add_ways(
+    known: Known, group: Group, pairs: Pairs, models: ModelSet, openers: BoolArray | None
+) -> Pairs:
+    """Return the pairs with the ways of the fixes; arguments as in `with_ways`."""
+    rows, config, sensor = known.rows, group.config, group.number
     alone = is_alone(group)
     row, fix = _candidates(known, group, openers)
     if not len(row):
         return pairs
-    key = {name: column[row] for name, column in rows.key.items()}
-    own = key['offset'] == sensor
-    scaled = group.R[fix] * scale_of(key, sensor)[:, None, None]
+    offset, aside = rows.key['offset'][row], rows.key['aside'][row]
+    own = offset == sensor
+    turns = own & rows.key['turns'][row]
+    scaled = group.R[fix] * scale_of(rows.key, sensor)[row, None, None]
     z = group.z[fix]
-    plain = _row_fixes(pairs.expected, rows, row, nil=True)
-    reach = _reach(known, group, models, row)
-    far, wide = _is_far(*plain, z, scaled, reach)
+    excess, wide = _excess(*_row_fixes(pairs.expected, rows, row, nil=True), z, scaled)
     if own.any():
-        shifted = _row_fixes(pairs.expected, rows, row, nil=False)
-        far_shifted, wide_shifted = _is_far(*shifted, z, scaled, reach)
-        far &= far_shifted | ~own
-    aside = key['aside']
+        shifted, _ = _excess(*_row_fixes(pairs.expected, rows, row, nil=False), z, scaled)
+        excess = np.where(own, np.minimum(excess, shifted), excess)
+    far = excess > 0.0
+    some = np.flatnonzero(far)
+    far[some] = excess[some] > _reach(known, group, models, row[some])
     if not alone:
         able = np.zeros(len(known), np.bool_) if openers is None else openers
         far &= able[rows.target[row]]
@@ -105,31 +110,31 @@ def add_ways(
         return pairs
     e, end = config.burst_rate, config.burst_end
     single = alone and (group.target_id is not None or len(group.z) == 1)
-    other = (key['offset'] >= 0) & ~own
+    other = (offset >= 0) & ~own
     free = ~own & ~other
     # Log prior of the fix used by the row as it is.
     used = np.zeros(len(row))
     used[far & free & ~aside] = math.log1p(-2.0 * e)
     used[free & aside] = math.log(USED_AGAIN)
     used[far & other] = math.log1p(-e)
-    used[own] = math.log1p(-end)
-    again = math.log(ANEW_SHARE * end), -np.inf, math.log(OPEN_AGAIN)
-    opens = np.select([own, other, aside], again, math.log(e))
-    nobodys = np.select([own, aside], [-np.inf, math.log(AGAIN)], math.log(e))
+    used[own] = np.where(turns, math.log(0.5), math.log1p(-end))[own]
+    again = -np.inf, math.log(ANEW_SHARE * end), -np.inf, math.log(OPEN_AGAIN)
+    opens = np.select([turns, own, other, aside], again, math.log(e))
+    outliers = np.select([own & ~turns, aside], [-np.inf, math.log(AGAIN)], math.log(e))
     opens = np.where(far, opens, -np.inf)
-    nobodys = np.where(single & (far | aside), nobodys, -np.inf)
+    outliers = np.where(single & (far | aside), outliers, -np.inf)
     leaves = np.where(own, math.log(LEAVE_SHARE * end), -np.inf)
-    asked = np.isfinite(opens) | np.isfinite(nobodys)
+    leaves[turns] = math.log(0.5)
     log, variance = np.full(len(row), -np.inf), np.zeros(len(row))
-    some = np.flatnonzero(asked)
+    some = np.flatnonzero(np.isfinite(opens) | np.isfinite(outliers))
     std = np.maximum(config.burst_std, WIDER * wide[some])
     log[some], variance[some] = _opening_density(
         pairs.expected, rows, row[some], z[some], scaled[some], std, TAILS if alone else TAILS[:1]
     )
     found = []
-    for way, prior, density in ((OPEN, opens, log), (NOBODYS, nobodys, log)):
+    for way, prior in ((OPEN, opens), (OUTLIER, outliers)):
         chosen = np.flatnonzero(np.isfinite(prior))
-        found.append((way, chosen, prior[chosen] + density[chosen]))
+        found.append((way, chosen, prior[chosen] + log[chosen]))
     chosen = np.flatnonzero(own)
     direct = _log_density(pairs.expected, rows, row[chosen], z[chosen], scaled[chosen])
     found.append((LEAVE, chosen, leaves[chosen] + direct))
@@ -187,7 +192,7 @@ def _row_fixes(
 def _reach(known: Known, group: Group, models: ModelSet, row: IndexArray) -> FloatArray:
     """Return how far (k,) the target of each row can have moved since its last fix, m."""
     config, rows = group.config, known.rows
-    if len(known.memory['sensors'].names) > 1:
+    if not len(row) or len(known.memory['sensors'].names) > 1:
         return np.zeros(len(row))
     outputs = tuple(part.outputs[velocity_outputs(models)] for part in models.parts)
     velocity, _ = row_outputs(rows.select(row), outputs)
@@ -209,16 +214,16 @@ def fastest_speed(velocity: FloatArray, config: DiverConfig) -> FloatArray:
     return np.asarray(config.speed_mean + 3.0 * config.speed_std + moving)
 
 
-def _is_far(
-    mean: FloatArray, covariance: FloatArray, z: FloatArray, R: FloatArray, reach: FloatArray
-) -> tuple[BoolArray, FloatArray]:
-    """Return whether a fix (k,) is where the target cannot be, and the standard deviation (k,) of
-    the innovation, m."""
+def _excess(
+    mean: FloatArray, covariance: FloatArray, z: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return by how much (k,) innovations exceed `REACH`, m, and their standard deviation (k,),
+    m."""
     S = covariance + R
     apart = np.hypot(*(z - mean).T)
     widest = np.sqrt(np.linalg.eigvalsh(S)[:, -1])
     determinant = np.maximum(S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2, 0.0)
-    return apart > reach + REACH * widest, determinant**0.25
+    return apart - REACH * widest, determinant**0.25
 
 
 def _log_density(
@@ -303,7 +308,7 @@ def _whole_density(
     return whole
 
 
-def with_groups(known: Known, pairs: Pairs) -> Pairs:
+def _with_groups(known: Known, pairs: Pairs) -> Pairs:
     """Return the pairs with the groups of linked rows, if there are any."""
     rows, among, T = known.rows, pairs.among, len(known)
     ids = {int(each): k for k, each in enumerate(known.life.track_id)}

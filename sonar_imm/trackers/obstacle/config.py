@@ -70,7 +70,7 @@ class ObstacleConfig(
         'behaviour moving: twice the standard deviation of the velocity along each axis before '
         'anything is known of it', range=(0.01, 50.0))
     speed_noise: float = constant(0.05, 'm/s/sqrt(s)',
-        'behaviour moving: random walk of the velocity', range=(0.0, 10.0))
+        'behaviour moving: random walk of the velocity; slow ones change less', range=(0.0, 10.0))
     behaviour_time: float = constant(1000.0, 's',
         'mean time for which an obstacle keeps its behaviour', range=(1.0, 1e6))
     seabed_std: float = constant(1.0, 'm',

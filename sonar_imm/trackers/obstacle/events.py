@@ -74,7 +74,7 @@ def compare(
         i,
         given,
         log + more,
-        (given.mu * V[t]).sum(axis=1),
+        (given.mu * V.mean(axis=2)[t]).sum(axis=1),
         bodies,
         mean,
         np.diagonal(whole, axis1=1, axis2=2),

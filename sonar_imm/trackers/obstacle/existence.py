@@ -16,8 +16,9 @@ exists and gives an echo in a share ``pd_k`` of the pings in which the beam hold
     q <- f q + (1 - f) r q0,    f = exp(-dt / CHANGES),    r = sum q.
 
 The beam holds component c with the probability V_c, and whether it does hardly changes from ping
-to ping. So misses are counted component by component since the last echo, which says that the
-beam held the obstacle then: with h the probability of a hit,
+to ping, nor does it for the upper and the lower parts of a component that reaches across an edge.
+So misses are counted part by part, c of weight w_c, since the last echo, which says that the beam
+held the obstacle then: with h the probability of a hit,
 
     s_ck <- (1 - h) s_ck (1 - pd_k V_c) / sum_c w_c s_ck (1 - pd_k V_c) + h V_c / sum_c w_c V_c.
 
@@ -42,6 +43,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, TENTATIVE
 from ...estimation.jipda import nearest_older
 from .config import LEAST_DETECTION, ObstacleConfig
+from .mixtures import PARTS
 
 CLASSES = np.array([1.0, 5.0 / 9.0, 2.0 / 9.0])
 """Shares of the stated detection probability, and how probable each is for a new obstacle."""
@@ -64,8 +66,8 @@ class Existence(NamedTuple):
 
     classes: Annotated[FloatArray, 'TC']
     """q (T, C), see the module."""
-    silence: Annotated[FloatArray, 'TKC']
-    """s (T, K, C), see the module."""
+    silence: Annotated[FloatArray, 'TKEC']
+    """s (T, K, E, C), see the module; E: `mixtures.PARTS`."""
     hits: Annotated[FloatArray, 'T']
     """Expected number of hits so far."""
     near_to: Annotated[IntArray, 'T']
@@ -78,7 +80,7 @@ class Existence(NamedTuple):
         """Return the existence of tracks of K components that begin."""
         T, C = classes.shape
         none = np.zeros((2, T), np.int64)
-        return Existence(classes, np.ones((T, K, C)), np.full(T, hits), *none)
+        return Existence(classes, np.ones((T, K, PARTS, C)), np.full(T, hits), *none)
 
     def probability(self) -> FloatArray:
         """Return the probability (T,) that each track is an obstacle."""
@@ -97,10 +99,10 @@ class Existence(NamedTuple):
 
     def visible(self, mu: FloatArray, V: FloatArray) -> FloatArray:
         """Return the probability (T, C) that the beam holds the obstacles, of weights mu (T, K)
-        and components that it holds with V (T, K)."""
-        weight = mu[:, :, None] * self.silence
-        inside = (weight * V[:, :, None]).sum(axis=1)
-        return np.asarray(inside / np.maximum(weight.sum(axis=1), 1e-300))
+        whose parts it holds with V (T, K, E)."""
+        weight = mu[:, :, None, None] * self.silence
+        inside = (weight * V[..., None]).sum(axis=(1, 2))
+        return np.asarray(inside / np.maximum(weight.sum(axis=(1, 2)), 1e-300))
 
     def with_ping(
         self, classes: FloatArray, hits: FloatArray, mu: FloatArray, V: FloatArray, p: FloatArray
@@ -109,13 +111,15 @@ class Existence(NamedTuple):
         obstacles that are detected with p (T, C) in the beam; mu, V: see `visible`."""
         r = classes.sum(axis=1)
         sure = np.minimum(SUREST / np.maximum(r, 1e-300), 1.0)
-        missed = self.silence * (1.0 - p[:, None] * V[:, :, None])
-        missed /= np.maximum((mu[:, :, None] * missed).sum(axis=1), 1e-300)[:, None]
-        held = V / np.maximum((mu * V).sum(axis=1), 1e-300)[:, None]
-        h = np.minimum(hits / np.maximum(r, 1e-300), 1.0)[:, None, None]
+        w = mu[:, :, None] / PARTS
+        missed = self.silence * (1.0 - p[:, None, None] * V[..., None])
+        total = (w[..., None] * missed).sum(axis=(1, 2), keepdims=True)
+        missed /= np.maximum(total, 1e-300)
+        held = V / np.maximum((w * V).sum(axis=(1, 2), keepdims=True), 1e-300)
+        h = np.minimum(hits / np.maximum(r, 1e-300), 1.0)[:, None, None, None]
         return self._replace(
             classes=classes * sure[:, None],
-            silence=(1.0 - h) * missed + h * held[:, :, None],
+            silence=(1.0 - h) * missed + h * held[..., None],
             hits=self.hits + hits,
         )
 

@@ -23,7 +23,8 @@ does; two more states e say how:
 fixed     nothing
 swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
           `sway_time` and has the standard deviation `sway_std`; or `WIDER` times as much
-moving    e is the velocity, m/s, a random walk of `speed_noise`; horizontal only
+moving    e is the velocity, m/s, a random walk of `speed_noise`, or of less below `SLOW`;
+          horizontal only
 others    of other packages, see `own_models`
 seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
           its own
@@ -48,7 +49,7 @@ import numpy as np
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, take
-from ..own_models import obstacle_behaviour
+from ..own_models import BehaviourStep, obstacle_behaviour
 from . import mixtures, unscented
 from .config import BEHAVIOURS, ObstacleConfig
 from .unscented import COMMON, Motion, NAV, RELATIVE, STATES, Step
@@ -71,6 +72,9 @@ WIDER, WIDE_SHARE = 2.0, 0.1
 """How much farther some of what sways does so, and their share. Nobody knows beforehand how far a
 mooring lets go: one that swings twice as far as believed is outside of the 90 % band in a third of
 all cases. Echoes soon tell the two apart, so the share hardly matters."""
+SLOW = 0.3
+"""Share of `max_speed` below which velocities change less, in proportion to the speed. Else what
+moves slowly and steadily would fit worse than a drift of the navigation, which hardly changes."""
 DROPPED = 1e-5
 """A slice that weighs less takes no further part, and a behaviour in one not in this ping."""
 DOUBT = 0.02
@@ -323,10 +327,10 @@ class DepthSlices:
     def visible(
         self, mixture: Mixture, pose: Pose, widest: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[FloatArray, BoolArray]:
-        """Probability (T, K) that the beam holds each component, and which targets (T,) lie
-        ahead; pose: of the sonar, or of one for each target, see `unscented.points`. widest:
-        azimuth and range from which there were echoes, where these are more than the parameters
-        say."""
+        """Probability (T, K, E) that the beam holds each component, by parts of its height, and
+        which targets (T,) lie ahead; pose: of the sonar, or of one for each target, see
+        `unscented.points`. widest: azimuth and range from which there were echoes, where these are
+        more than the parameters say."""
         x, P, mu = mixture
         m = unscented.points(x, *pose, self.cone)
         vertical, horizontal, reach = self._beam
@@ -372,6 +376,7 @@ class BehaviourSlices(DepthSlices):
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
         self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
+        self._slow = self._moving * (SLOW * config.max_speed) ** 2
         self._prior = self._sway**2
         self._prior += self._moving * (0.5 * config.max_speed) ** 2
         for name, own in self.own.items():
@@ -442,17 +447,18 @@ class BehaviourSlices(DepthSlices):
         config, swaying, moving = self.config, self._swaying, self._moving
         phi = math.exp(-dt / config.sway_time)
         swung = self._sway**2 * -math.expm1(-2.0 * dt / config.sway_time)
-        built_in = Motion(
+        motion = Motion(
             keep=swaying * phi + moving,
             step=swaying * (phi - 1.0) + moving * dt,
             push=swaying + moving * (0.5 * dt),
             noise=swung + moving * (config.speed_noise**2 * dt),
+            slow=self._slow,
             prior=self._prior,
         )
-        steps = built_in[:4]
         for name, own in self.own.items():
-            steps = tuple(a + self._is[name] * b for a, b in zip(steps, own.step(dt)))
-        return Motion(*steps, self._prior)
+            step = BehaviourStep(*own.step(dt))
+            motion = Motion(*(a + self._is[name] * b for a, b in zip(motion, (*step, 0.0))))
+        return motion
 
 
 def depth_span(

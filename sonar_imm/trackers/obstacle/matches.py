@@ -39,7 +39,7 @@ class Compared(NamedTuple):
     nis: FloatArray
     """(M,)"""
     visible: FloatArray
-    """(T, K) probability that the beam holds each component."""
+    """(T, K, E) probability that the beam holds each component, by parts of its height."""
     ahead: BoolArray
     """(T,)"""
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray
 from ...estimation.covariance import are_sound, LIMIT, with_jitter
@@ -31,6 +31,11 @@ SMEAR = math.radians(1.2)
 """Standard deviation of the edges of the beam, rad; in range, as a share of the reach."""
 UNSEEN = 0.01
 """Least probability to be in the beam: nothing is ever certain to be unseen."""
+PARTS = 5
+PART = ndtri((np.arange(PARTS) + 0.5) / PARTS)
+"""Middles of equally probable parts of a normal distribution of variance 1."""
+WITHIN = math.sqrt(1.0 - float(np.mean(np.square(PART))))
+"""Standard deviation that is left within a part."""
 OPENS = 1e-6
 """Least weight of a component that opens a gate."""
 
@@ -72,6 +77,10 @@ def mix(
     brings its own, any other its prior, uncorrelated. Slices and components below the weight
     `floor` are dropped.
 
+    Moments are those of what was of the behaviour before and of what came to it, each of share s
+    weighed by s^2. By s, the little that comes in every step, of an e as unknown as that of a new
+    obstacle, would keep a behaviour that is still improbable from ever knowing its e.
+
     :param prior: (C,) variance of e before anything is known, 0 for a behaviour without e.
     """
     T, C, n = x.shape
@@ -89,6 +98,10 @@ def mix(
     mu1[:, :inside] = np.where(mixed, total, 0.0).reshape(T, inside)
     share = W / np.where(total > 0.0, total, 1.0)[:, :, None]
     share = np.where((total > 0.0)[:, :, None], share, np.eye(M))
+    kept = share * np.eye(M)
+    came = share - kept
+    share = kept * kept.sum(axis=2, keepdims=True) + came * came.sum(axis=2, keepdims=True)
+    share = share / share.sum(axis=2, keepdims=True)
     x1, P1 = x.copy(), P.copy()
     xs, Ps = x[:, :inside].reshape(T, slices, M, n), P[:, :inside].reshape(T, slices, M, n, n)
     mean, spread = np.empty(xs.shape), np.empty(Ps.shape)
@@ -282,17 +295,20 @@ def visible(
     horizontal: float,
     reach: float,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the probability (T, K) that a beam of these half widths and that reach holds
-    components at m (T, K, 3), seen from the sonar, with covariances P (T, K, n, n), at least
-    `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
+    """Return the probability (T, K, E) that a beam of these half widths and that reach holds the
+    `PARTS` by height of components at m (T, K, 3), seen from the sonar, with covariances P (T, K,
+    n, n), at least `UNSEEN`; and whether (T,) the targets lie `AHEAD`."""
     x, y, z = np.moveaxis(m, -1, 0)
     d = np.sqrt(x * x + y * y + z * z)
     smear = SMEAR * SMEAR
     up, side = np.arcsin(z / d), np.arctan2(np.abs(y), x)
-    rise = 1.0 / np.sqrt(smear + P[..., 2, 2] / (d * d))
-    inside = ndtr((vertical - up) * rise) - ndtr((-vertical - up) * rise)
-    inside *= ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
-    inside *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
+    std = np.sqrt(smear + P[..., 2, 2] / (d * d))
+    above, below = ((edge - up) / std for edge in (vertical, -vertical))
+    above, below = (edge[..., None] - PART for edge in (above, below))
+    inside = ndtr(above / WITHIN) - ndtr(below / WITHIN)
+    level = ndtr((horizontal - side) / np.sqrt(smear + P[..., 1, 1]))
+    level *= ndtr((reach - d) / np.sqrt(smear * reach * reach + P[..., 0, 0]))
+    inside *= level[..., None]
     mean = np.einsum('tk,tka->ta', mu, m)
     ahead = mean[:, 0] > AHEAD * np.sqrt((mean * mean).sum(axis=1))
     return UNSEEN + (1.0 - UNSEEN) * inside, ahead

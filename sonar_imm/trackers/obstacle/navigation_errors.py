@@ -115,10 +115,12 @@ class NavigationErrors(NamedTuple):
             drift = self._significant(along)
             if abs(drift) > DRIFTS:
                 north, east = np.round(-drift * along[2:4], 2) + 0.0  # no -0.00
+                alone = '' if obstacles > 1 else ', or whether it moves'
                 sentences.append(
                     f'navigation drifts by {abs(drift):.2f} m/s against what {obstacles} '
                     f'{"obstacles show" if obstacles > 1 else "obstacle shows"} ({east:.2f} m/s '
                     f'east, {north:.2f} m/s north): allowed for; check the log or the current'
+                    f'{alone}'
                 )
             aside = self._significant(across)
             if abs(aside) > TURNED * speed:

@@ -46,25 +46,30 @@ PLACED = 3
 DELAY_STEP = 0.05
 """Seconds by which poses are shifted to see what their lateness changes."""
 
+LEAST_NOISE = 0.01
+"""Share of the noise of e that is left where e is `slow`."""
+
 NEGLIGIBLE = 1e-12
 """A component that weighs less plays no part in a quantile or a place."""
 
 
 class Motion(NamedTuple):
     """What the components do in a step, each (C,): ``e' = keep e + w``, ``w ~ N(0, noise I)``, and
-    the obstacle goes by ``step e + push w`` along north and east. prior: variance of e before
-    anything is known, 0 for a behaviour without e."""
+    the obstacle goes by ``step e + push w`` along north and east. slow: mean of e e' below which
+    the noise falls in proportion to it, 0: nowhere. prior: variance of e before anything is known,
+    0 for a behaviour without e."""
 
     keep: FloatArray
     step: FloatArray
     push: FloatArray
     noise: FloatArray
+    slow: FloatArray
     prior: FloatArray
 
     @classmethod
     def none(cls, C: int) -> Motion:
         """Return the motion of C components that all stay where they are."""
-        return cls(*np.zeros((5, C)))
+        return cls(*np.zeros((6, C)))
 
 
 class Step(NamedTuple):
@@ -320,7 +325,11 @@ def _add_behaviour(
 ) -> None:
     """Add what w brings, to e, to range and azimuth, and to both together, in place; J:
     `_slopes`."""
-    keep, push, noise = (part[component] for part in (motion.keep, motion.push, motion.noise))
+    keep, push, noise, slow = (
+        part[component] for part in (motion.keep, motion.push, motion.noise, motion.slow)
+    )
+    square = np.square(y[COMMON:]).sum(axis=0) + S[COMMON, COMMON] + S[COMMON + 1, COMMON + 1]
+    noise = noise * np.clip(square / np.maximum(slow, 1e-300), LEAST_NOISE, 1.0)
     y[COMMON:] *= keep
     S[COMMON:] *= keep
     S[:, COMMON:] *= keep

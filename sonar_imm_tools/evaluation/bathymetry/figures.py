@@ -25,10 +25,10 @@ from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.bathymetry.likelihood import spacing_of
 
 from ... import SECOND
-from ...offline.run_folder import read_measurements, SOUNDINGS
+from ...offline.run_folder import read_measurements, RunFolder
 from ...recordings.export.points import Points, read_points
 from ...survey.chart import Chart, chart_of
-from ...survey.line import budget_of
+from ...survey.line import budget_of, without_far
 from ..plotting import (
     add_band,
     add_image,
@@ -301,10 +301,9 @@ def verdict_figure(profile: Profile, rough: FloatArray) -> go.Figure:
 
 def points_of(folder: Path) -> Points | None:
     """The soundings of a run; None without any."""
-    if not (folder / SOUNDINGS).is_file():
-        return None
-    points = read_points(folder / SOUNDINGS)
-    return points if len(points) else None
+    place = RunFolder(folder).soundings()
+    points = without_far(read_points(place)) if place else ()
+    return points or None
 
 
 def track_of(run: Mapping[str, Any]) -> FloatArray:

@@ -11,7 +11,8 @@ Positions of targets are those that AIS reports (``!AIVDM``: messages 1, 2, 3, 1
 MMSI), targets with latitude and longitude (``TLL``) and tracked targets with distance and bearing
 (``TTM``), which are placed from the vessel's last position. The vessel's own position is in
 ``GGA``, ``RMC``, ``GLL`` or ``GNS``, its heading in ``HDT`` or ``THS``. Targets of the USBL of a
-vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as well.
+vessel are in ``USRTH`` and ``PSIMSSB``, and are placed from its last position as well; how the
+vessel lies is in ``PSIMSNS``.
 
 Few sentences have a whole time. In this order a time is that before the sentence (seconds since
 1970 or ISO 8601), that of its tag block (``\\c:...*hh\\``), or the vessel's clock as of the last
@@ -37,6 +38,7 @@ import numpy as np
 from msg_adapters.fixes import write_geodetic
 from msg_adapters.navigation import write_heading
 from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geometry import quaternion
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Rejection, VesselFix, VesselHeading
 
@@ -61,7 +63,7 @@ ACCURATE, INACCURATE = 5.0, 15.0
 10 m."""
 SENTENCE = re.compile(r'^(?P<before>.*?)(?P<sentence>[$!][A-Z]{4,8},.*?\*[0-9A-Fa-f]{2})\s*$')
 """A sentence, behind a time or a tag block where there is one."""
-USBL = ('USRTH', 'PSIMSSB')
+USBL = ('USRTH', 'PSIMSSB', 'PSIMSNS')
 _CLOCK = re.compile(r'\d{6}(\.\d*)?$')
 _TAG_BLOCK = re.compile(r'\\(?:[^\\]*,)?c:(\d+)[^\\]*\\\s*$')
 
@@ -291,16 +293,20 @@ def _take_own(log: _Log, sentence: Any) -> None:
         log.own[-1] = fix
 
 
-def _take_heading(log: _Log, degrees: float) -> None:
-    """degrees: clockwise from true north."""
-    log.heading, stamp_ns = degrees, _now(log)
+def _take_heading(log: _Log, degrees: float, roll: float = 0.0, pitch: float = 0.0) -> None:
+    """How the vessel lies, degrees: clockwise from true north, and the Euler angles of axes
+    forward, left, up. Raises `BadRow`."""
+    if not abs(degrees) <= 360.0:
+        raise BadRow('has no heading', 'no heading')
+    log.heading, stamp_ns = degrees % 360.0, _now(log)
     if log.headings and log.headings[-1].stamp_ns == stamp_ns:
         return
-    half = 0.5 * (0.5 * math.pi - math.radians(degrees))
+    level = [angle if abs(angle) <= 90.0 else 0.0 for angle in (roll, pitch)]
+    angles = [math.radians(angle) for angle in (*level, 90.0 - degrees)]
     log.headings.append(
         VesselHeading(
             stamp_ns=stamp_ns,
-            orientation=np.array([0.0, 0.0, math.sin(half), math.cos(half)]),
+            orientation=np.array(quaternion(*angles)),
             frame_id='vessel',
         )
     )
@@ -331,8 +337,9 @@ def _take_target(log: _Log, away: FloatArray, name: str) -> None:
 def _take_usbl(
     log: _Log, checksum: Callable[[str], int], sentence: str, stamp: int | None
 ) -> None:
-    """A target of a USBL: ``USRTH`` has its true bearing, elevation and slant range, ``PSIMSSB``
-    its place ahead and to starboard, and its depth. Raises `BadRow`."""
+    """What a USBL says: ``USRTH`` the true bearing, elevation and slant range of a target,
+    ``PSIMSSB`` its place ahead and to starboard, and its depth, ``PSIMSNS`` how the vessel lies,
+    roll positive to starboard and pitch positive with the bow up. Raises `BadRow`."""
     log.hears = True
     body, _, stated = sentence[1:].strip().rpartition('*')
     if checksum(body) != int(stated, 16):
@@ -347,13 +354,19 @@ def _take_usbl(
         away = np.array([flat * math.sin(bearing), flat * math.cos(bearing), up])
         _take_target(log, away, '')
         return
-    clock, name, status, _, system, orientation, _, *numbers = fields
+    clock = fields[0]
     if stamp is not None:
         log.clock = stamp
     elif not _CLOCK.match(clock):
         raise BadRow('has a time that cannot be read as HHMMSS', 'unreadable time')
     else:
-        _tell_time(log, Time.fromisoformat(f'{clock[:2]}:{clock[2:4]}:{clock[4:6]}'))
+        time = Time.fromisoformat(f'{clock[:2]}:{clock[2:4]}:{clock[4:6]}')
+        _tell_time(log, time.replace(microsecond=int(clock[7:13].ljust(6, '0'))))
+    if head == 'PSIMSNS':
+        roll, pitch, _, heading = (float(field or 'nan') for field in fields[4:8])
+        _take_heading(log, heading, roll, -pitch)
+        return
+    _, name, status, _, system, orientation, _, *numbers = fields
     if status != 'A':
         raise BadRow('is flagged as invalid', 'flagged invalid')
     if (system, orientation) != ('C', 'H'):

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from attrs import frozen
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.soundings import read_soundings
 from sonar_imm.estimates import PLACES
@@ -165,11 +166,11 @@ def write_table(path: Path, points: Points) -> None:
     """Points as a soundings.csv, their places exact in px py pz and coarse in x y z."""
     exact = dict(zip(PLACES, 'xyz'))
     names = list(COLUMNS)
-    values = [points[exact.get(name, name)].astype(COLUMNS[name]).tolist() for name in names]
+    values: list[NDArray] = [points[exact.get(name, name)].astype(COLUMNS[name]) for name in names]
     with path.open('w', encoding='utf-8', newline='') as file:
         writer = CsvWriter(file)
         writer.write(['stamp_ns', *names])
-        writer.write_numbers(zip(points.stamp_ns.tolist(), *values))
+        writer.write_columns([points.stamp_ns, *values])
 
 
 def write_xyz(path: Path, points: Points) -> None:

@@ -19,6 +19,14 @@ def test_all_obstacles_are_tracked_and_every_ping_is_timed():
     assert 0.0 < result['median_ms'] <= result['p99_ms']
 
 
+def test_false_echoes_are_counted_and_have_a_goal_of_their_own(monkeypatch):
+    monkeypatch.setattr(bench, '_approach', lambda *given: ([29.0, 29.5], given[1]))
+    quiet, among_false = bench.bench_ping(1), bench.bench_clutter(1)
+    assert (quiet['false'], among_false['false']) == (0, 30)
+    assert not quiet['good'] and among_false['good']
+    assert '16 obstacles and 30 false echoes per ping' in bench.BENCHES[1].sentence(among_false)
+
+
 @pytest.mark.parametrize('name', bench.VARIANTS)
 def test_each_variant_tracks_the_obstacles_too(name):
     clutter, parameters = bench.VARIANTS[name]
@@ -28,7 +36,7 @@ def test_each_variant_tracks_the_obstacles_too(name):
 
 def test_the_sentence_names_every_variant():
     result = bench.bench_variants(rounds=1, pings=12)
-    sentence = bench.BENCHES[1].sentence(result)
+    sentence = bench.BENCHES[2].sentence(result)
     assert all(name in sentence for name in bench.VARIANTS)
 
 

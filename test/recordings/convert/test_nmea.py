@@ -17,6 +17,7 @@ import numpy as np
 import pymap3d
 import pytest
 
+from sonar_imm.acoustics.geometry import rotation_of_quaternion
 from sonar_imm_tools.recordings.convert import convert_nmea
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.reader import BagReader
@@ -225,9 +226,25 @@ def test_targets_of_a_usbl_are_placed_from_the_vessel(tmp_path, sentence, east, 
     assert np.ravel(found.position) == pytest.approx([east, north, up], abs=0.05)
 
 
+def test_the_attitude_that_a_usbl_reports(tmp_path):
+    """Bow up and starboard down, with the fraction of its second."""
+    sensor = f'PSIMSNS,{BEGIN:%H%M%S}.250,M01,1,1,3.0,2.0,0.4,120.0,,1,0.0,,M01'
+    lines = [position('RMC', BEGIN), summed(sensor), psimssb(BEGIN, 10.0, 0.0)]
+    report = converted(tmp_path, lines, origin=(*PLACE,))
+    with BagReader(report.path) as bag:
+        topics = {'/heading': 'heading'}
+        (found,) = (item.measurement for item in measurements_of(bag, 'diver', topics))
+    assert found.stamp_ns % 10**9 == 250_000_000
+    bow, port = rotation_of_quaternion(found.orientation)[:, :2].T
+    assert np.degrees(np.arctan2(bow[0], bow[1])) == pytest.approx(120.0)
+    assert np.degrees(np.arcsin(bow[2])) == pytest.approx(2.0)
+    assert port[2] == pytest.approx(np.sin(np.radians(3.0)) * np.cos(np.radians(2.0)))
+
+
 @pytest.mark.parametrize(
     'sentence, words',
     [
+        (summed('PSIMSNS,095958.00,M01,1,1,3.0,2.0,0.4,,,1,0.0,,M01'), 'no heading'),
         (psimssb(BEGIN, 1.0, 1.0, status='V'), 'flagged as invalid'),
         (psimssb(BEGIN, 1.0, 1.0, system='P'), 'coordinates P, H'),
         (psimssb(BEGIN, 1.0, 1.0, turned='N'), 'coordinates C, N'),
@@ -240,7 +257,7 @@ def test_a_vessel_with_a_usbl_is_never_the_target(tmp_path, sentence, words):
 
 
 def test_sentences_that_are_not_known_are_counted_by_their_names(tmp_path):
-    lines = [position('RMC', BEGIN), summed('PSIMSNS,1,2'), summed('GPXYZ,1'), summed('PFOO,1,2')]
+    lines = [position('RMC', BEGIN), summed('GPXYZ,1'), summed('PFOO,1,2')]
     report = converted(tmp_path, lines)
     assert report.bad_rows == 0 and '1 GPXYZ' in report.notes['not used']
     assert '(' not in report.notes['not used']

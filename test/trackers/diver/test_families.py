@@ -153,7 +153,7 @@ TOLERANCE = 1e-9
 
 def test_who_stood_for_minutes_goes_on_at_a_pace_of_his_own(monkeypatch):
     """Fixes half a minute apart, worse where he goes on, as of a towed tag (docs/results/
-    real_recordings.md): who keeps the crawl that was learnt while he stood stays behind."""
+    recordings.md): who keeps the crawl that was learnt while he stood stays behind."""
 
     def errors():
         rng, tracker, out = np.random.default_rng(4), DiverTracker(config(association='gnn')), []

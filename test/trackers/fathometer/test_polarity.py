@@ -11,6 +11,7 @@
 from pathlib import Path
 
 from helpers.fathometer_runs import run
+from helpers.fathometer_vectors import signed_sets
 from helpers.sea_scenes import score_scene, sea_scene
 from helpers.set_cycle import cycle
 import numpy as np
@@ -18,7 +19,6 @@ from oracles.set_particles import weigh
 import pytest
 
 from benchmarks import fathometer_pulse
-from benchmarks.fathometer_vectors import signed_sets
 from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import SetModel
 from sonar_imm.parameters import ConfigError

@@ -14,14 +14,18 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from benchmarks.image_tracks import detected, tracked
+from benchmarks.false_warnings import detected
+from benchmarks.obstacle_sea import truth_tables
+from benchmarks.study import final_estimates, truths
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, with_common_errors
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar, View
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
-from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 OWN = np.array([0.15, 0.004]) ** 2
 Z = np.array([[40.0, 0.1]])
@@ -131,10 +135,18 @@ def image_run(setting, seed):
     """NEES of range, bearing and offset alone, of all together over 3, and coverage, of the track
     through the images of a scene."""
     scene = simulate(setting, seed)
-    given = [item.measurement for item in scene.measurements]
-    row = tracked(setting, scene, detected(setting, given))
-    alone = [row[f'NEES {name}'] for name in ('range', 'bearing', 'offset')]
-    return (*alone, row['NEES state'] / 3.0, row['cover'])
+    given = detected(setting, [item.measurement for item in scene.measurements])
+    config = ObstacleConfig(max_range=setting.max_range)
+    final = final_estimates(ObstacleTracker(config), given)
+    truth = [table for true in truths(scene, TrueObstacle) for table in truth_tables(true)]
+    metrics, found = score(series_of(final.values()), truth_of(truth), cutoff=5.0, gap=60.0)
+    variance = np.diagonal(found.series.covariance[found.row], axis1=1, axis2=2)
+    consistency = metrics['consistency']
+    return (
+        *np.mean(found.error**2 / variance, axis=0),
+        consistency['nees_state']['mean'] / 3.0,
+        consistency['band_coverage'],
+    )
 
 
 @pytest.mark.statistics

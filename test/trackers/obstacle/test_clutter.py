@@ -15,7 +15,7 @@ from helpers.obstacle_runs import followed, run, SECOND
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections
@@ -38,6 +38,7 @@ from sonar_imm.trackers.obstacle.existence import (
 )
 from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.ground import GroundMap
+from sonar_imm.trackers.obstacle.mixtures import PARTS, visible
 from sonar_imm.trackers.obstacle.pings import Echoes, Ping
 from sonar_imm.trackers.obstacle.scales import Scales
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
@@ -115,6 +116,11 @@ def test_detections_from_where_the_sonar_is_said_not_to_look_are_said():
 # -- existence ---------------------------------------------------------------------------------
 
 
+def of_all_parts(*V):
+    """V (1, K) as that of all parts."""
+    return np.repeat(np.array([V])[..., None], PARTS, axis=2)
+
+
 def test_existence_by_class():
     p = detection(np.array([10.0, 60.0]), evolve(CONFIG, detection_profile=(20.0, 1.0, 40.0, 0.5)))
     assert_allclose(p, [[0.9, 0.5, 0.2], [0.45, 0.25, 0.1]])
@@ -126,23 +132,53 @@ def test_existence_by_class():
     assert_allclose(
         later.classes[0], np.array([0.1, 0.2, 0.6]) / np.e + 0.9 * (1.0 - 1.0 / np.e) * PRIOR
     )
-    mu, V, p = np.array([[0.4, 0.6]] * 2), np.array([[0.9, 0.2]] * 2), np.full((2, 3), 0.5)
+    mu, p = np.array([[0.4, 0.6]] * 2), np.full((2, 3), 0.5)
+    V = np.repeat(of_all_parts(0.9, 0.2), 2, axis=0)
     bounded = q.with_ping(q.classes, np.array([0.5, 1.0]), mu, V, p)
     assert bounded.probability()[1] == pytest.approx(SUREST)
     assert bounded.hits.tolist() == [1.5, 2.0]
 
 
+def test_the_parts_of_a_component_are_those_of_a_normal_distribution():
+    """The beam ends 7.5 degrees up; components 50 m ahead are up to 9 m high, give or take 2 m."""
+    z = np.linspace(-9.0, 9.0, 37)
+    m = np.column_stack([np.full(37, 50.0), np.zeros(37), z])[None]
+    P = np.tile(np.diag([0.01, 1e-6, 4.0]), (1, 37, 1, 1))
+    edge = np.radians(7.5)
+    V, _ = visible(m, P, np.full((1, 37), 1.0 / 37.0), edge, 1.0, 1000.0)
+    d = np.hypot(50.0, z)
+    std, up = np.hypot(np.radians(1.2), 2.0 / d), np.arcsin(z / d)
+    whole = norm.cdf((edge - up) / std) - norm.cdf((-edge - up) / std)
+    assert_allclose(V[0].mean(axis=1), 0.01 + 0.99 * whole, atol=0.025)
+    assert (np.diff(V[0, z > 2.0], axis=1) < 0.0).all()  # the lowest part is in it the surest
+
+
+def test_misses_leave_what_may_lie_outside_the_beam():
+    """Half of a component has left the beam: as probable as the whole was, the prior of the
+    other half apart, it is still there after any number of misses."""
+    mu, V = np.ones((1, 1)), np.array([[[0.99, 0.99, 0.5, 0.0, 0.0]]])
+    existence = Existence.of(0.9 * PRIOR[None], 1)
+    for _ in range(40):
+        p = np.full((1, 3), 0.9)
+        left = 1.0 - p * existence.visible(mu, V)
+        r = existence.classes.sum()
+        q = existence.classes * left / (1.0 - r + (existence.classes * left).sum())
+        existence = existence.with_ping(q, np.zeros(1), mu, V, p)
+    assert_allclose(existence.probability(), 0.4 * 0.9 / (0.4 * 0.9 + 0.1), rtol=1e-6)
+
+
 def test_misses_count_component_by_component_since_the_last_echo():
     """Of a component that the beam always held, and one that has left it since the last echo."""
     mu, p = np.array([[0.5, 0.5]]), np.array([[0.9, 0.5, 0.2]])
-    held, left = np.array([[0.9, 0.8]]), np.array([[0.9, 0.01]])
+    held, left = of_all_parts(0.9, 0.8), of_all_parts(0.9, 0.01)
     q = Existence.of(PRIOR[None], 2).with_ping(PRIOR[None], np.ones(1), mu, held, p)
-    assert_allclose(q.silence[0, :, 0], [0.9 / 0.85, 0.8 / 0.85])
+    assert_allclose(q.silence[0, :, 2, 0], [0.9 / 0.85, 0.8 / 0.85])
     for n in range(1, 4):
-        visible = q.visible(mu, left)
+        visible_now = q.visible(mu, left)
         weight = np.array([[0.45], [0.4]]) / 0.85
-        weight = weight * (1.0 - p * left.T) ** (n - 1)
-        assert_allclose(visible[0], (weight * left.T).sum(axis=0) / weight.sum(axis=0))
+        V = left[0, :, :1]
+        weight = weight * (1.0 - p * V) ** (n - 1)
+        assert_allclose(visible_now[0], (weight * V).sum(axis=0) / weight.sum(axis=0))
         q = q.with_ping(PRIOR[None], np.zeros(1), mu, left, p)
 
 

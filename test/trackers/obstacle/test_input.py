@@ -282,8 +282,10 @@ def test_covariances_and_probabilities_stay_what_they_are(variance):
 def test_repairs_add_up_in_health(monkeypatch):
     """Variances that senders may state need none, so the filter is made to report some."""
     tracker = ObstacleTracker(ObstacleConfig())
-    advance, update = tracker.filter.advance, tracker.filter.update
-    monkeypatch.setattr(tracker.filter, 'advance', lambda *given: (advance(*given)[0], 2))
+    predict, update = tracker.filter.predict_unchanged, tracker.filter.update
+    monkeypatch.setattr(
+        tracker.filter, 'predict_unchanged', lambda *given: (predict(*given)[0], 2)
+    )
     monkeypatch.setattr(tracker.filter, 'update', lambda *given: (*update(*given)[:2], 1))
     assert tracker.health()['covariance_repairs'] == 0
     for item in pings(0.03, count=5):

@@ -45,7 +45,7 @@ def moved(data, i, x, P):
     keep, step = [(0.0, 0.0), (phi, phi - 1.0), (1.0, dt)][behaviour]
     n = len(x)
     prior = np.full(n, float(behaviour > 0))
-    motion = Motion(np.full(n, keep), np.full(n, step), np.zeros(n), np.zeros(n), prior)
+    motion = Motion(np.full(n, keep), np.full(n, step), *np.zeros((3, n)), prior)
     names = ('v0', 'w0', 'v1', 'w1')
     places = [data[name][i] for name in ('p0', 'R0', 'p1', 'R1')]
     rates = [data[name][i] for name in names]
@@ -309,6 +309,8 @@ def test_an_error_is_said_where_it_is_sure_and_matters():
         'navigation drifts by 0.05 m/s against what 3 obstacles show (0.00 m/s east, 0.05 m/s '
         'north): allowed for; check the log or the current'
     ]
+    (alone,) = drifts.warnings(north, 1)
+    assert 'against what 1 obstacle shows (' in alone and alone.endswith(', or whether it moves')
     unsure = drifts._replace(covariance=100.0 * small)
     assert unsure.warnings(north, 3) == []
     assert drifts._replace(mean=0.5 * drifts.mean).warnings(north, 3) == []
