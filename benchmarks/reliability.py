@@ -28,14 +28,16 @@ programs run, each fault on one node: file and page are written into FOLDER then
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 import json
+from operator import itemgetter
 import os
 from pathlib import Path
 import re
 import subprocess
 import sys
+import textwrap
 import time
 from typing import Any
 
@@ -85,12 +87,8 @@ def _plain(name: str, form: str = '') -> Callable[[Row], str]:
     return lambda row: format(row[name], form)
 
 
-def _failures(row: Row) -> str:
-    return str(len(row['messages']['failures']) + len(row['parameters']['failures']))
-
-
-def _of_tolerance(row: Row) -> str:
-    return f'{row["share"]:.1g}' if row['share'] else 'equal'
+def _failures(row: Row) -> int:
+    return len(row['messages']['failures']) + len(row['parameters']['failures'])
 
 
 SOAK: dict[str, Callable[[Row], str]] = {
@@ -121,21 +119,6 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
         'CPU s': _plain('cpu_s', '.2f'),
         'memory MB': _plain('memory_mb', '.0f'),
     },
-    'restart': {
-        'node': _plain('system'),
-        'killed': _plain('tried'),
-        'messages sent again': _plain('again'),
-        'estimates': _plain('estimates'),
-        'equal bit for bit': _plain('equal'),
-        'others without the file': _plain('changed_without'),
-    },
-    'damage': {
-        'what': _plain('what'),
-        'tried': _plain('tried'),
-        'said': _plain('said'),
-        'silent and not harmless': _plain('silent'),
-        'crashes, partial output': _plain('failed'),
-    },
     'flood': {
         'node': _plain('system'),
         'can, 1/s': _plain('capacity', '.0f'),
@@ -149,25 +132,69 @@ COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
     },
     'soak': SOAK,
     'soak_live': SOAK,
-    'hostile': {
-        'system': _plain('system'),
-        'messages': lambda row: str(row['messages']['cases']),
-        'read': lambda row: str(row['messages']['read']),
-        'extreme parameters': lambda row: str(row['parameters']['draws']),
-        'crashes': _failures,
-        'slowest of 1000, ms': lambda row: f'{row["messages"]["ms_p999"]:g}',
-        'memory grown, MB': lambda row: f'{row["messages"]["memory_grown_mb"]:g}',
-    },
-    'metamorphic': {
-        'system': _plain('system'),
-        'with': _plain('how'),
-        'scene': _plain('moved'),
-        'states, of the tolerance': _of_tolerance,
-        'states': _plain('states', '.1g'),
-    },
 }
-"""The columns of each table with a row for each row of the part; two have one for each fault and
-system (`table_of`)."""
+"""The columns of each table with a row for each row of the part; that of the faults has one for
+each fault and a column for each system (`table_of`)."""
+
+
+def _signals(rows: Sequence[Row]) -> str:
+    names = ', '.join(dict.fromkeys(row['signal'] for row in rows))
+    clean, tried = (sum(row[name] for row in rows) for name in ('clean', 'tried'))
+    return f'{clean} of {tried} nodes ended so: {names}.'
+
+
+def _restart(rows: Sequence[Row]) -> str:
+    killed, estimates, equal, changed = (
+        sum(row[name] for row in rows)
+        for name in ('tried', 'estimates', 'equal', 'changed_without')
+    )
+    return (
+        f'{killed} nodes killed: {equal} of {estimates} estimates are equal bit for bit; without '
+        f'the file {changed} differ.'
+    )
+
+
+def _damage(rows: Sequence[Row]) -> str:
+    each = ', '.join(f'{row["what"]} {row["tried"]} times' for row in rows)
+    tried, said, silent, failed = (
+        sum(int(row[name]) for row in rows) for name in ('tried', 'said', 'silent', 'failed')
+    )
+    return (
+        f'{each}: {said} of {tried} reported, {silent} silent and not harmless, {failed} crashes '
+        'or partial outputs.'
+    )
+
+
+def _hostile(rows: Sequence[Row]) -> str:
+    sent, read = (sum(row['messages'][name] for row in rows) for name in ('cases', 'read'))
+    draws, slowest = (
+        sum(row['parameters']['draws'] for row in rows),
+        max(row['messages']['ms_p999'] for row in rows),
+    )
+    crashes = sum(map(_failures, rows))
+    return (
+        f'{sent} messages, of which {read} could be read, and {draws} extreme parameters: '
+        f'{crashes} crashes; the slowest of 1000 messages took {slowest:g} ms.'
+    )
+
+
+def _metamorphic(rows: Sequence[Row]) -> str:
+    shares = [row['states'] / (row['tolerance'] or 1.0) for row in rows]
+    row, share = max(zip(rows, shares), key=itemgetter(1))
+    return (
+        f'{len(rows)} pairs of a way to track and a moved scene: states differ by at most '
+        f'{share:.1g} of what is tolerated ({row["system"]}, {row["how"]}, {row["moved"]}).'
+    )
+
+
+SENTENCES: dict[str, Callable[[Sequence[Row]], str]] = {
+    'signals': _signals,
+    'restart': _restart,
+    'damage': _damage,
+    'hostile': _hostile,
+    'metamorphic': _metamorphic,
+}
+"""Parts that are a sentence on the page."""
 
 
 def rows_of(part: Part) -> list[Row]:
@@ -178,38 +205,17 @@ def rows_of(part: Part) -> list[Row]:
 
 
 def table_of(name: str, part: Part) -> list[list[str]]:
-    """The cells of the table of a part, the head first."""
+    """Return the cells of the table of a part, the head first."""
     rows = rows_of(part)
-    if name in ('faults', 'signals'):
-        kind = name.removesuffix('s')
-        kinds = list(dict.fromkeys(row[kind] for row in rows))
-        text = _recovery if name == 'faults' else _clean
-        cells = {(row['system'], row[kind]): text(row) for row in rows}
-        across, down = (SYSTEMS, kinds) if name == 'faults' else (kinds, SYSTEMS)
+    if name == 'faults':
+        cells = {(row['system'], row['fault']): _recovery(row) for row in rows}
         alike: dict[tuple[str, ...], list[str]] = {}
-        for row in down:
-            pairs = ((k, row) if name == 'faults' else (row, k) for k in across)
-            alike.setdefault(tuple(cells.get(pair, '') for pair in pairs), []).append(row)
-        head = ['fault' if name == 'faults' else 'node', *across]
-        return [head, *(['; '.join(names), *each] for each, names in alike.items())]
-    if name == 'metamorphic':
-        rows = _hardest(rows)
+        for fault in dict.fromkeys(row['fault'] for row in rows):
+            of_fault = tuple(cells.get((system, fault), '') for system in SYSTEMS)
+            alike.setdefault(of_fault, []).append(fault)
+        return [['fault', *SYSTEMS], *(['; '.join(names), *each] for each, names in alike.items())]
     columns = COLUMNS[name]
     return [[*columns], *([text(row) for text in columns.values()] for row in rows)]
-
-
-def _hardest(rows: list[Row]) -> list[Row]:
-    """Of each system and way to track the scene whose states came nearest to what is tolerated."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row['system'], row['how']), []).append(row)
-    found: list[Row] = []
-    for _, group in sorted(groups.items()):
-        hardest = max(group, key=lambda row: row['states'] / (row['tolerance'] or 1.0))
-        moved = hardest['moved'] if hardest['states'] or len(group) == 1 else 'all of them'
-        share = hardest['states'] / (hardest['tolerance'] or 1.0)
-        found.append({**hardest, 'moved': moved, 'share': share})
-    return found
 
 
 def _recovery(row: Row) -> str:
@@ -219,10 +225,6 @@ def _recovery(row: Row) -> str:
         f'{n} {name.rpartition(": ")[2]}' for name, n in sorted(row['losses'].items())
     )
     return f'{recovered}; {losses}' if losses else recovered
-
-
-def _clean(row: Row) -> str:
-    return f'{row["clean"]} of {row["tried"]}'
 
 
 def short_of(parts: Mapping[str, Part]) -> list[str]:
@@ -260,7 +262,7 @@ def shortfall(name: str, row: Row) -> str:
         sentence = f'flood, {system}: recovered after {row["recovered"]:.2f} s, {lost} lost'
         return sentence if lost or late else ''
     if name == 'hostile':
-        return f'hostile, {system}: something got through' if _failures(row) != '0' else ''
+        return f'hostile, {system}: something got through' if _failures(row) else ''
     if name == 'metamorphic':
         sentence = (
             f'{system}, {row["how"]}, {row["moved"]}: the states differ by {row["states"]:g}'
@@ -360,6 +362,9 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
             return f'{found.group(1)}Not measured yet.\n{found.group(3)}'
         if name == 'run':
             return f'{found.group(1)}{_about(parts[name])}\n{found.group(3)}'
+        if name in SENTENCES:
+            sentence = textwrap.fill(SENTENCES[name](rows_of(parts[name])), 140)
+            return f'{found.group(1)}{sentence}\n{found.group(3)}'
         head, *body = table_of(name, parts[name])
         lines = [head, ['---'] * len(head), *body]
         text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
