@@ -14,8 +14,8 @@ before, has
 
     log p = m log l - l A + sum_t log(1 - r p + r p f / l)
 
-over the tracks: r the probability that a track is a diver, p that he is seen, f the density of the
-fix that is his under the whole mixture, 0 where he has none. So a missed diver costs
+over the tracks: r the probability that a track is a diver, p that it is seen, f the density of the
+fix that is its own under the whole mixture, 0 where it has none. So a missed diver costs
 log(1 - r p), a refused fix log l, and losing a track never pays. r begins at b / l
 and follows from the same terms. Where fixes come singly, r is 1 and nobody is missed.
 """
