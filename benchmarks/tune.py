@@ -70,7 +70,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
             'diver',
             'as modelled',
             {'fixes': '100', 'factor': str(factor)},
-            {'model_set': 'heading_speed'},
+            {},
             'covariance_scale',
             factor,
         )

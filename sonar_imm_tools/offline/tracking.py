@@ -326,6 +326,12 @@ class OfflineRun:
         known = getattr(self.tracker, 'known', None)
         return {} if known is None else {'landmarks': known()}
 
+    def array(self) -> dict[str, Any]:
+        """What the echoes show of the staves of an array; nothing of other sensors, or of too few
+        pings."""
+        found: dict[str, Any] = getattr(self.tracker, 'array', dict)()
+        return {'array': found} if found else {}
+
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
         return {'mounting': self._intake.mounting} if self._intake.mounting else {}
@@ -407,6 +413,7 @@ def write_run(
         **offline.target_names(),
         **offline.mounting(),
         **offline.landmarks(),
+        **offline.array(),
         timings={
             'wall_s': seconds,
             'mb_per_s': recipe['bag_bytes'] / seconds * 1e-6,
