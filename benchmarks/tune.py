@@ -104,7 +104,7 @@ ROWS: dict[str, tuple[str, str, dict[str, str], dict[str, str], str, Any]] = {
         'bathymetry',
         'paper',
         {'pings': '2', 'patch_std': '0.5'},
-        {'sigmas': '0.01,0.1'},
+        {'model_set': 'height_two_rw', 'sigmas': '0.01,0.1'},
         'sigmas',
         None,
     ),

@@ -322,6 +322,24 @@ def test_the_score_of_a_sea_without_obstacles_is_that_of_its_clutter() -> None:
     assert tracker.scores == {1: (pytest.approx(3.0 * math.log(0.02) - 0.02 * area), 0)}
 
 
+def test_an_obstacle_that_is_seen_is_better_predicted_than_one_that_is_missed() -> None:
+    """A ping in which one of two is missed has the echo of the other, and 1 - p."""
+    config = ObstacleConfig(max_range=50.0, horizontal_fov_deg=90.0, clutter_density=0.02)
+    tracker, level = obstacles.Scored(config), np.array([0.0, 0.0, 0.0, 1.0])
+    for second in range(1, 13):
+        stamp_ns, echo = second * 10**9, np.array([20.0, 30.0][: 2 if second < 12 else 1])
+        place = np.array([0.0, 0.0, -5.0])
+        tracker.process(Navigation(stamp_ns=stamp_ns, position=place, orientation=level))
+        bearing = np.array([0.2, -0.3])[: len(echo)]
+        tracker.process(Detections(stamp_ns=stamp_ns, range=echo, bearing=bearing))
+    scores = [score for score, _ in tracker.scores.values()]
+    both, one, false = scores[-2], scores[-1], 0.02 * 50.0 * 0.5 * math.pi
+    assert both > scores[0] + 10.0  # where both could only be false
+    missed = math.log(1.0 - config.detection_probability)
+    # Densities of false echoes change a little with each ping.
+    assert one == pytest.approx(0.5 * (both + false) + missed - false, abs=0.5)
+
+
 def kalman(z: np.ndarray, R: float, noise: float) -> float:
     """Log likelihood of fixes (n, 2) once a second, of one constant velocity."""
     F = np.array([[1.0, 1.0], [0.0, 1.0]])
