@@ -95,6 +95,9 @@ GONE: dict[str, str] = {
             *('ground_std', 'ground_radius', 'max_offset', 'altitude_std'),
             *('max_altitude_age', 'scale_std', 'course_window', 'landmark_time'),
             'max_navigation_gap',
+            *('sigma_reference_bin', 'rough_sigma', 'scatters', 'grid_step', 'grid_extent'),
+            *('initial_slope_std', 'redrawn_slope_std', 'multipath_level_db', 'likelihood'),
+            'max_extrapolation',
         )
     },
     **{f'parameter {name}': _LIFE for name in ('confirm_window', 'delete_misses')},
