@@ -98,6 +98,9 @@ GONE: dict[str, str] = {
             *('sigma_reference_bin', 'rough_sigma', 'scatters', 'grid_step', 'grid_extent'),
             *('initial_slope_std', 'redrawn_slope_std', 'multipath_level_db', 'likelihood'),
             'max_extrapolation',
+            *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'depth_step'),
+            *('slope_switch_probability', 'negative_probability', 'amplitude_memory'),
+            'track_memory',
         )
     },
     **{f'parameter {name}': _LIFE for name in ('confirm_window', 'delete_misses')},
@@ -148,8 +151,9 @@ GONE: dict[str, str] = {
     'parameter variant': 'was removed: the printed form is in benchmarks/bathymetry_paper.py',
     **{
         f'parameter {name}': 'was removed: the printed form is in benchmarks/fathometer_paper.py'
-        for name in ('amplitude_prior', 'proposal')
+        for name in ('amplitude_prior', 'proposal', 'output', 'envelope')
     },
+    'parameter multiples': 'was removed: they are always marked (column multiple_probability)',
     **{
         f'parameter {name}': _ROLL
         for name in ('vertical_beam_width_deg', 'fading_db', 'intensity_weight')

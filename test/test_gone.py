@@ -38,7 +38,14 @@ OF_SYSTEM = {
         ),
         'bathymetry',
     ),
-    **dict.fromkeys(('amplitude_prior', 'proposal'), 'fathometer'),
+    **dict.fromkeys(
+        (
+            *('amplitude_prior', 'proposal', 'output', 'envelope', 'multiples', 'depth_step'),
+            *('array_depth_age', 'heave_memory', 'white_noise_gain_db', 'amplitude_memory'),
+            *('slope_switch_probability', 'negative_probability', 'track_memory'),
+        ),
+        'fathometer',
+    ),
     **dict.fromkeys(
         (
             *('vertical_beam_width_deg', 'fading_db', 'intensity_weight', 'method', 'components'),

@@ -220,18 +220,14 @@ def log_likelihoods(
 
 def scatter_power(trace: FloatArray, noise: FloatArray, onset: int, pulse: float) -> FloatArray:
     """Power (n,) of volume scatter by distance in samples from four pulses below the onset on: of
-    running medians over 16 pulses, without the noise (n,). It never rises with the depth, but one
-    trace is too few to say so."""
-    n = len(trace)
+    running medians over 16 pulses, without the noise (n,), never rising with the depth."""
+    found = np.zeros(len(trace))
     first = onset + math.ceil(4.0 * pulse)
-    found = np.zeros(n)
     below = np.nan_to_num(trace[first:])
     if len(below):
-        half = max(1, int(8.0 * pulse))
-        padded = np.pad(below, half, constant_values=np.nan)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-        power = np.square(np.nanmedian(windows, axis=1)) / math.log(2.0)
-        found[: len(below)] = np.maximum(power - np.square(noise[first:]), 0.0)
+        median = median_filter(below, 2 * round(8.0 * pulse) + 1, mode='reflect')
+        power = np.square(median) / math.log(2.0) - np.square(noise[first:])
+        found[: len(below)] = np.minimum.accumulate(np.maximum(power, 0.0))
     return found
 
 

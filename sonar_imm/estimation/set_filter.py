@@ -13,7 +13,7 @@ importance sampler for sets of every size at once. A cycle takes in one record::
 
     record = filter.record(b, key)                 # tables of this record
     before = before or filter.start(record)        # sets before the first record
-    sets = filter.propagate(before, record)        # deaths, shift, walks, births
+    sets = filter.propagate(before, record)        # deaths, shift or jump, walks, births
     step = filter.weigh(sets, record)              # each set meets the record
     step = filter.resample(step, record)           # where few of the sets count
     step = filter.move(step, record)               # copies of a set differ again
@@ -97,14 +97,15 @@ _SUMS, _SHIFTED_SUMS = 5, 8
 class Passage(NamedTuple):
     """How sets change while the time of so many `records` passes: walks; most_changes, how many
     members can come and go at once; cumulative (orders, columns), the running sums of the rows of
-    the transition matrix, or of `set_model.turnover`; shift, None without one, and its tables."""
+    the transition matrix, or of `set_model.turnover`; shift, None without one; shared: tables of
+    the shift, or of the jump, None without either."""
 
     records: int
     walks: Walks
     most_changes: int
     cumulative: FloatArray
     shift: Shift | None
-    shifts: ShiftTables | None
+    shared: ShiftTables | None
 
 
 class AmplitudeModel(NamedTuple):
@@ -138,13 +139,14 @@ class Record(NamedTuple):
 
 class Weighted(NamedTuple):
     """Sets with log weights (N,) that need not be normalised: the state between records. path: of
-    their shifts, None without. log_before: log of the sum of the weights before the record, of
-    sets that were propagated."""
+    their shifts, None without. log_before: log of the sum of the weights before the record, and
+    jump (N,) by how many cells members jumped, None without, both of sets that were propagated."""
 
     sets: Sets
     log_weight: Annotated[FloatArray, 'N']
     path: ShiftPath | None = None
     log_before: float = 0.0
+    jump: Annotated[IntArray, 'N'] | None = None
 
 
 @frozen(eq=False)
@@ -152,10 +154,11 @@ class SetStep:
     """One record taken in.
 
     sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
-    noise; path: of their shifts, None without. log_evidence: log of the record's probability given
-    those before, against that of an empty record; effective: sample size; ok False when no set
-    could explain the record. after: the same sets as the next record finds them, resampled when
-    needed, with source (N,) the index into `sets` of each of them.
+    noise; path: of their shifts, jump (N,): see `Weighted`; None without. log_evidence: log of
+    the record's probability given those before, against that of an empty record; effective:
+    sample size; ok False when no set could explain the record. after: the same sets as the next
+    record finds them, resampled when needed, with source (N,) the index into `sets` of each of
+    them.
     """
 
     sets: Sets
@@ -168,15 +171,18 @@ class SetStep:
     after: Weighted
     source: Annotated[IntArray, 'N']
     resampled: bool = False
+    jump: Annotated[IntArray, 'N'] | None = None
 
 
 class Summary(NamedTuple):
     """pmf (orders,) of the order; sums (5, n), or (8, n + 2 pad) with a shift, see
-    `set_kernels.moments`; shift: its mean and standard deviation in cells, None without."""
+    `set_kernels.moments`; shift: its mean and standard deviation in cells, None without; jump: the
+    probability that members jumped, and the mean of that in cells."""
 
     pmf: FloatArray
     sums: FloatArray
     shift: tuple[float, float] | None
+    jump: tuple[float, float] = (0.0, 0.0)
 
 
 class SetFilter:
@@ -216,8 +222,10 @@ class SetFilter:
             chances, changes = turnover(chances, model.order_min, records), 2 * model.order_max
             shift = shift and evolve(shift, memory=shift.memory**records)
         walks = Walks.alike(walk, model.record_cells, wide=records > 1)
-        tables = ShiftTables.of(shift) if shift else None
-        found = Passage(records, walks, changes, np.cumsum(chances, axis=1), shift, tables)
+        shared = ShiftTables.of(shift) if shift else None
+        if model.jump and records:
+            shared = model.jump.tables()
+        found = Passage(records, walks, changes, np.cumsum(chances, axis=1), shift, shared)
         if len(self._passages) > _PASSAGES:
             self._passages = {1: self._passages[1]}
         self._passages[records] = found
@@ -275,12 +283,12 @@ class SetFilter:
         for step in steps:
             self._require_sets(step.after)
             with np.errstate(divide='ignore', invalid='ignore'):
-                self._require_sets(Weighted(step.sets, np.log(step.w), step.path))
+                self._require_sets(Weighted(step.sets, np.log(step.w), step.path, 0.0, step.jump))
             if not ((step.source >= 0) & (step.source < self.particles)).all():
                 raise ValueError('sets come from none')
 
     def _require_sets(self, weighted: Weighted) -> None:
-        model, (sets, log_weight, path, _) = self.model, weighted
+        model, (sets, log_weight, path, _, jump) = self.model, weighted
         memory = model.order_max if model.amplitude_memory > 0.0 else 0
         there = np.arange(model.order_max) < sets.order[:, None]
         if sets.cell.shape != (self.particles, model.order_max):
@@ -299,6 +307,7 @@ class SetFilter:
             and (log_weight < np.inf).all()
             and (model.shift is None or path is None or path.precision > 0.0)
             and (path is None or np.isfinite(path.pull).all())
+            and (jump is None or jump.shape == (self.particles,))
         )
         if not good:
             raise ValueError('sets are none of this model')
@@ -309,13 +318,13 @@ class SetFilter:
         needed = self.model.uniforms + passage.most_changes - self.model.most_changes
         uniform = _generator(record.key, _STEP).random((self.particles, needed))
         old = aged(self.model, before.sets, passage.records - 1)
-        sets, log_ratio = self._drawn(old, record, uniform)
+        sets, log_ratio, jump = self._drawn(old, record, uniform)
         if shift is not None:
             path = ShiftPath.begin(shift, sets.shift)
             if before.path is not None:
                 path = before.path.then(shift, before.sets.shift, sets.shift)
         _, log_before = normalise(before.log_weight)
-        return Weighted(sets, before.log_weight + log_ratio, path, float(log_before))
+        return Weighted(sets, before.log_weight + log_ratio, path, float(log_before), jump)
 
     def weigh(self, propagated: Weighted, record: Record) -> SetStep:
         """Each set meets the record."""
@@ -342,6 +351,7 @@ class SetFilter:
             ok=ok,
             after=Weighted(sets, log_weight, propagated.path),
             source=np.arange(self.particles),
+            jump=propagated.jump,
         )
 
     def resample(self, step: SetStep, record: Record) -> SetStep:
@@ -361,7 +371,7 @@ class SetFilter:
     def move(self, step: SetStep, record: Record) -> SetStep:
         """With the offset of members and shift drawn anew after resampling, so that copies of a
         set differ: a Gibbs move, see `set_shifts`. Without a shift there is none."""
-        shift, (sets, _, path, _) = self.model.shift, step.after
+        shift, (sets, _, path, *_) = self.model.shift, step.after
         if shift is None or path is None or not step.resampled:
             return step
         u = _generator(record.key, _MOVE).random((self.particles, 2))
@@ -404,40 +414,57 @@ class SetFilter:
             pmf,
             sums,
         )
+        share, mean = 0.0, 0.0
+        if step.jump is not None:
+            share = min(1.0, float(step.w[step.jump != 0].sum()))
+            mean = float((step.w * step.jump).sum()) / share if share else 0.0
         # Weights add up to one but for rounding: no probability may pass it for that.
-        return Summary(np.minimum(pmf, 1.0), sums, shift)
+        return Summary(np.minimum(pmf, 1.0), sums, shift, (share, mean))
 
-    def _drawn(self, old: Sets, record: Record, uniform: FloatArray) -> tuple[Sets, FloatArray]:
-        """Sets drawn from the proposals by uniform (N, uniforms), and log of model to proposal."""
+    def _drawn(
+        self, old: Sets, record: Record, uniform: FloatArray
+    ) -> tuple[Sets, FloatArray, IntArray | None]:
+        """Sets drawn from the proposals by uniform (N, uniforms), log of model to proposal (N,),
+        and by how many cells they jumped (N,), None where none can."""
         model, passage, walks = self.model, record.passage, record.walks
         new, log_ratio = Sets.empty(model, self.particles), np.zeros(self.particles)
         left, new.order[:] = leave(model.order_min, passage.cumulative, old, uniform)
         shape = len(model.signs) * model.record_cells, walks.probability.shape[1]
         if self._tables.running.shape != shape:
             self._tables = WalkTables.empty(*shape)
-        wanted, shifted = walked_from(model, old), model.shift is not None
-        fill_walks(walks, record.gains, model.walk_share, wanted, self._tables, all_sums=shifted)
+        fill, jump, moved = (walks, record.gains, model.walk_share), None, old
+        if model.jump and passage.shared:
+            fill_walks(*fill, np.zeros(shape[0], np.bool_), self._tables, all_sums=True)
+            jump = self._draw_shared(left, old.shift, record, uniform, log_ratio) - model.jump.pad
+            moved = old._replace(cell=(old.cell + jump[:, None]).clip(0, model.cells - 1))
+        shifted = model.shift is not None
+        fill_walks(*fill, walked_from(model, moved), self._tables, all_sums=shifted)
         if shifted:
-            new.shift[:] = self._draw_shifts(left, old.shift, record, uniform, log_ratio)
+            new.shift[:] = self._draw_shared(left, old.shift, record, uniform, log_ratio)
         drawn = 1 + passage.most_changes, uniform
         tables = walks.centre[walks.kind], self._tables
-        self._draw(left, tables, record.births, drawn, new, log_ratio)
+        self._draw(left, tables, record.births, drawn, new, log_ratio, jump)
         if model.amplitude_memory:
             new = inherited(model, old, left.parent, new)
-        return new, log_ratio
+        return new, log_ratio, jump
 
-    def _draw_shifts(
+    def _draw_shared(
         self, left: Left, old: IntArray, record: Record, drawn: FloatArray, log_ratio: FloatArray
     ) -> IntArray:
-        """The shifts (N,) plus pad of those that are left, in a record whose walks are known; old
-        (N,): of the record before. log_ratio (N,) is written."""
+        """The shifts or jumps (N,) plus pad of those that are left, in a record whose walks are
+        known; old (N,): shifts of the record before. log_ratio (N,) is written."""
         from . import set_shift_kernels as shift_kernels  # compiled where it is needed only
 
-        shift, tables = record.passage.shift, record.passage.shifts
-        assert shift and tables
+        shared, tables = record.passage.shift or self.model.jump, record.passage.shared
+        assert shared and tables
         log_sum = self._tables.log_sum.reshape(len(self.model.signs), -1)
-        known = shift.step, *tables[1:], log_sum, self.model.walk_share, drawn
-        found, slots, G = np.empty_like(old), shift_kernels.SLOTS, shift.count
+        # A jump leads beyond the lattice, and what is neighbours on the grid becomes so in memory.
+        pad, step = shared.pad if self.model.jump else 0, shared.step
+        more = pad + -(log_sum.shape[1] + 2 * pad) % step
+        log_sum = np.pad(log_sum, ((0, 0), (pad, more)), constant_values=-np.inf)
+        log_sum = np.ascontiguousarray(log_sum.reshape(len(log_sum), -1, step).swapaxes(1, 2))
+        known = step, *tables[1:], log_sum, self.model.walk_share, drawn
+        found, slots, G = np.empty_like(old), shift_kernels.SLOTS, tables.log_prior.shape[1]
 
         def work(first: int, last: int) -> None:
             key = np.full((slots, left.cell.shape[1] + 2), -1, np.int64)
@@ -456,11 +483,13 @@ class SetFilter:
         drawn: tuple[int, FloatArray],
         sets: Sets,
         log_ratio: FloatArray,
+        jump: IntArray | None = None,
     ) -> None:
-        """Let those that are left walk, and others be born, into `sets`, whose order and shift are
-        known. walks: see `set_kernels.propagate`, as what else there is."""
+        """Let those that are left jump and walk, and others be born, into `sets`, whose order and
+        shift are known. walks: see `set_kernels.propagate`, as what else there is."""
         model, (centre, tables) = self.model, walks
-        known = model.cells, model.separation, *drawn, *left, centre, *tables[:2], *births
+        jump = np.zeros(len(sets.order), np.int64) if jump is None else jump
+        known = model.cells, model.separation, *drawn, *left, jump, centre, *tables[:2], *births
         sets_of = sets.shift, sets.order, sets.cell, sets.sign
         self._split(
             lambda first, last: kernels.propagate(first, last, *known, *sets_of, log_ratio)
@@ -518,7 +547,12 @@ class LagSmoother:
         path = step.path.moved(drawn) if step.path else None
         first = steps[0]
         return evolve(
-            first, sets=first.sets.take(line), w=step.w, amplitude=first.amplitude[line], path=path
+            first,
+            sets=first.sets.take(line),
+            w=step.w,
+            amplitude=first.amplitude[line],
+            path=path,
+            jump=None if first.jump is None else first.jump[line],
         )
 
 

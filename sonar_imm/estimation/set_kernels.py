@@ -40,6 +40,7 @@ def propagate(
     old_cell: IntArray,
     old_sign: NDArray[np.int8],
     parent: IntArray,
+    jump: IntArray,
     centre: IntArray,
     walk: FloatArray,
     walk_ratio: FloatArray,
@@ -52,23 +53,25 @@ def propagate(
     sign: NDArray[np.int8],
     log_ratio: FloatArray,
 ) -> None:
-    """Steps 3 to 5 of `set_model`, for a lattice of `cells`: those that are left walk, others are
-    born.
+    """Steps 3 to 5 of `set_model`, for a lattice of `cells`: those that are left jump together and
+    walk, others are born.
 
-    old_order to parent: of `set_model.Left`. Each particle comes with its new `order` and shift,
-    and gets its members, the parent of each, -1 for those that are born, and in log_ratio (N,),
-    which is added to, that of model to proposal; -inf for impossible sets (whose members mean
-    nothing). uniform (N, U): column ``1 + deaths + k`` for the birth k, ``walks_from + k`` for the
-    walk of the member k. centre (n,): the middle of the walks from each cell of the record,
-    against that cell; walk and walk_ratio: of `set_proposals.WalkTables`; birth to birth_positive:
-    of `set_proposals.Births`.
+    old_order to parent: of `set_model.Left`; jump (N,), cells. Each particle comes with its new
+    `order` and shift, and gets its members, the parent of each, -1 for those that are born, and in
+    log_ratio (N,), which is added to, that of model to proposal; -inf for impossible sets (whose
+    members mean nothing). uniform (N, U): column ``1 + deaths + k`` for the birth k,
+    ``walks_from + k`` for the walk of the member k. centre (n,): the middle of the walks from each
+    cell of the record, against that cell; walk and walk_ratio: of `set_proposals.WalkTables`;
+    birth to birth_positive: of `set_proposals.Births`.
     """
     width, (signs, n) = walk.shape[1], birth_ratio.shape
     for i in range(first, last):
         left, offset, ratio = old_order[i] - deaths[i], shift[i], log_ratio[i]
         for k in range(left):
             source = parent[i, k]
-            z = old_cell[i, source]
+            z = old_cell[i, source] + jump[i]
+            if not 0 <= z < cells:
+                ratio, z = -math.inf, min(max(z, 0), cells - 1)
             row = z + offset
             step, end = 0, width
             if old_sign[i, source] < 0:

@@ -15,7 +15,8 @@ that depends on a record is a table made once, and no particle ever looks at a w
 
 The set, in the order in which it is drawn
     1. the order m' from row m of ``transition`` (rows from, columns to, from ``order_min`` on);
-    2. deaths: for m' < m, a uniformly drawn subset of m - m' leaves;
+    2. deaths: for m' < m, a uniformly drawn subset of m - m' leaves; with ``jump`` all that are
+       left may move by the same distance, see `set_shifts`;
     3. each survivor walks by ``walk``, or by what is known of it beforehand (`Walks`); what leaves
        the lattice is impossible;
     4. births: for m' > m, m' - m are born, each uniformly on the lattice;
@@ -67,7 +68,7 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
 from .markov import check_transition_matrix
-from .set_shifts import Shift
+from .set_shifts import Jump, Shift
 
 PRIORS = ('marginal', 'bic_half', 'paper')
 
@@ -176,7 +177,8 @@ class SetModel:
     0; amplitude_prior: of PRIORS, with amplitude_std: s, and independent_samples: N;
     walk_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
     noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
-    negative_probability: that a member is negative; shift: that all members share, None for none.
+    negative_probability: that a member is negative; shift: that all members share, jump: that all
+    members make, None for none of it; only one of both.
     With a shift, records b have ``record_cells`` cells, the lattice with the largest shift before
     and after it.
     """
@@ -196,6 +198,7 @@ class SetModel:
     amplitude_memory: float = 0.0
     negative_probability: float = 0.0
     shift: Shift | None = None
+    jump: Jump | None = None
     start: FloatArray = Factory(
         lambda self: np.full(len(self.transition), 1.0 / len(self.transition)), takes_self=True
     )
@@ -207,6 +210,8 @@ class SetModel:
             raise ValueError('only marginal amplitudes can have a memory')
         if not 0.0 <= self.negative_probability < 1.0:
             raise ValueError('negative_probability lies in [0, 1)')
+        if self.shift and self.jump:
+            raise ValueError('members that share a shift do not jump as well')
         if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:
             raise ValueError('a set model needs order_min >= 0, separation >= 1, gram (n,)')
         if np.shape(self.start) != self.transition.shape[:1] or not np.all(self.start > 0.0):
@@ -236,7 +241,8 @@ class SetModel:
     @property
     def uniforms(self) -> int:
         """Random numbers a particle needs for one record."""
-        return 1 + self.most_changes + self.order_max + (self.shift is not None)
+        shared = self.shift is not None or self.jump is not None
+        return 1 + self.most_changes + self.order_max + shared
 
     @property
     def pad(self) -> int:

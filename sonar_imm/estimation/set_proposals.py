@@ -183,6 +183,18 @@ def fill_walks(
     pad = width // 2 + int(np.abs(walks.centre).max())
     # Peaks that were levelled are so low that one scale serves all of them.
     worth = np.exp(g) if walks.wide else g
+    if all_sums and walks.wide:
+        # Walks of one kind from neighbours are a correlation.
+        padded, edges = np.pad(worth, ((0, 0), (pad, pad))), np.flatnonzero(np.diff(walks.kind))
+        sums = tables.log_sum.reshape(-1, n)
+        for low, high in zip(np.append(0, edges + 1), np.append(edges + 1, n)):
+            kind = walks.kind[low]
+            first = low + walks.centre[kind] + pad - width // 2
+            for sign, part in enumerate(padded[:, first : first + high - low + width - 1]):
+                with np.errstate(divide='ignore'):
+                    log_sum = np.log(np.correlate(part, walks.probability[kind], 'valid'))
+                sums[sign, low:high] = log_sum
+        all_sums = False
     # Nothing of the record is negative, so that -1 says where it ends.
     windows = np.pad(worth, ((0, 0), (pad, pad)), constant_values=-1.0)
     windows = sliding_window_view(windows, width, axis=1)

@@ -6,8 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""The shift of each particle, compiled: see `set_shifts`, whose tables are handed over column by
-column. Only a filter whose members share a shift imports this."""
+"""The shift or jump of each particle, compiled: see `set_shifts`, whose tables are handed over
+column by column. Only a filter whose members share one imports this."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, IntArray
 from .jit import kernel
 
-SLOTS = 256
-"""Sets that were resampled from one have one proposal; what was found for it is kept."""
+SLOTS, REST = 256, 18.0
+"""Sets that were resampled from one have one proposal; what was found for it is kept. Of the
+data-driven part nothing is that is less than e^-REST of its best."""
 
 
 @kernel
@@ -49,18 +50,18 @@ def draw_shifts(
     """The shift plus pad (N,) of each particle in a record, drawn from q of `set_shifts` by the
     last column of uniform (N, U), and log_ratio (N,) of model to q.
 
-    log_prior and prior: of `set_shifts.ShiftTables`; log_sum (S, n) log Z by sign, in the cells of
-    the record; old_order to parent: of `set_model.Left`; old_shift (N,): of the record before.
-    Scratch, a row for each slot: key (SLOTS, J + 2), -1 throughout; weight and running (SLOTS, G)
-    of the data-driven part of q, divided by their total, and span (SLOTS, 2), where it begins and
-    ends.
+    log_prior and prior: of `set_shifts.ShiftTables`; log_sum (S, step, n) log Z by sign, of cell
+    ``step * k + r`` of the record, or of the padded lattice, in row r; old_order to parent: of
+    `set_model.Left`; old_shift (N,): of the record before. Scratch, a row for each slot: key
+    (SLOTS, J + 2), -1 throughout; weight and running (SLOTS, G) of the data-driven part of q,
+    divided by their total, and span (SLOTS, 2), where it begins and ends.
     """
     G, column = log_prior.shape[1], uniform.shape[1] - 1
     for i in range(first, last):
         before, count = 0, old_order[i] - deaths[i]
         if len(prior) > 1:
             before = old_shift[i] // step
-        slot, n = before, log_sum.shape[1]
+        slot, n = before, step * log_sum.shape[2]
         for k in range(count):
             j = parent[i, k]
             row = old_cell[i, j] + n if old_sign[i, j] < 0 else old_cell[i, j]
@@ -79,24 +80,21 @@ def draw_shifts(
             for k in range(count):
                 negative = key[slot, 2 + k] // n
                 z = key[slot, 2 + k] - negative * n
-                if step == 1:  # neighbours in memory: added several at a time
-                    for g in range(G):
-                        weight[slot, g] += log_sum[negative, z + g]
-                else:
-                    for g in range(G):
-                        weight[slot, g] += log_sum[negative, z + g * step]
+                near, at = log_sum[negative, z % step], z // step
+                for g in range(G):  # neighbours in memory: added several at a time
+                    weight[slot, g] += near[at + g]
             best = weight[slot, 0]
             for g in range(1, G):
                 best = weight[slot, g] if weight[slot, g] > best else best
-            # What is less than e^-40 of the best is never drawn by these numbers.
             begin, end = 0, G - 1
-            while begin < end and weight[slot, begin] < best - 40.0:
+            while begin < end and weight[slot, begin] < best - REST:
                 begin += 1
-            while end > begin and weight[slot, end] < best - 40.0:
+            while end > begin and weight[slot, end] < best - REST:
                 end -= 1
             total = 0.0
             for g in range(begin, end + 1):
-                weight[slot, g] = math.exp(weight[slot, g] - best)
+                x = weight[slot, g] - best
+                weight[slot, g] = math.exp(x) if x > -REST else 0.0
                 total += weight[slot, g]
                 running[slot, g] = total
             for g in range(begin, end + 1):

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 
-"""A shift that all members of a set share: where the record lies against the lattice.
+"""What all members of a set share: a shift of the record against the lattice, or a jump.
 
 What is at z shows at z + shift in a record, the same shift for every member, with a new one in
 each record: that of an instrument whose own place is told with an error. The shift is a state of
@@ -30,6 +30,12 @@ the posterior as it is)::
 
 for shifts s_0 .. s_T of memory phi (`ShiftPath`). What is reported of shift and places has the
 mean of that offset and its variance in place of one draw.
+
+A jump is drawn as a shift is, from what it is beforehand and what the walks after it hold of the
+record, but it is no state: all members are then elsewhere, and stay there. With `Jump` a set stays
+where it is with the probability ``1 - probability``; else it jumps by N(0, std^2), which is cut at
+`reach`. What jumps off the lattice is impossible.
+
 W. R. Gilks and C. Berzuini, *Following a moving target: Monte Carlo inference for dynamic Bayesian
 models*, J. R. Statist. Soc. B 63 (2001).
 """
@@ -160,8 +166,8 @@ def _log_normal(x: FloatArray, std: float) -> FloatArray:
 
 
 class ShiftTables(NamedTuple):
-    """start (G,) running sum of p(shift) before the first record; log_prior (G, G), a single row
-    where nothing is remembered, and prior, the running sums of its rows."""
+    """start (G,) running sum of p(shift) before the first record, empty for a jump; log_prior (G,
+    G), a single row where nothing is remembered, and prior, the running sums of its rows."""
 
     start: FloatArray
     log_prior: FloatArray
@@ -173,3 +179,34 @@ class ShiftTables(NamedTuple):
         if shift.memory:
             log_prior = shift.log_prior()
         return cls(np.cumsum(np.exp(start)), log_prior, np.cumsum(np.exp(log_prior), axis=1))
+
+
+@frozen(kw_only=True)
+class Jump:
+    """probability: of a jump until the next record, whenever that comes; std: standard deviation,
+    cells; step: of the grid of jumps, cells; reach: the farthest, steps."""
+
+    probability: float
+    std: float
+    step: int
+    reach: int
+
+    def __attrs_post_init__(self) -> None:
+        if not (0.0 < self.probability < 1.0 and self.std > 0.0 and self.step >= 1):
+            raise ValueError('a jump needs a probability in (0, 1), std > 0, step >= 1')
+        if not 1 <= self.reach <= MAX_SHIFTS // 2:
+            raise ValueError(f'a jump reaches 1 to {MAX_SHIFTS // 2} steps')
+
+    @property
+    def pad(self) -> int:
+        """Farthest jump, cells."""
+        return self.step * self.reach
+
+    def tables(self) -> ShiftTables:
+        """Of the jump plus pad."""
+        places = np.arange(-self.pad, self.pad + 1, self.step, dtype=np.float64)
+        prior = self.probability * np.exp(_log_normal(places, self.std))
+        prior[self.reach] += 1.0 - self.probability
+        return ShiftTables(
+            np.empty(0), np.log(np.maximum(prior, _TINY))[None], np.cumsum(prior)[None]
+        )

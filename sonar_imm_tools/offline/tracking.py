@@ -292,7 +292,10 @@ class OfflineRun:
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        kept = ('covariance_repairs', 'not_started', 'pings_moving_alike', 'waiting_for_vessel')
+        kept = (
+            *('covariance_repairs', 'not_started', 'names_without_track'),
+            *('pings_moving_alike', 'waiting_for_vessel'),
+        )
         for name in kept:
             if count := health.get(name):
                 counts[name] = int(count)

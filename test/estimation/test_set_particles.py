@@ -34,7 +34,9 @@ from sonar_imm.estimation.set_model import (
     Sets,
     turnover,
 )
-from sonar_imm.estimation.set_shifts import Shift, ShiftPath
+from sonar_imm.estimation.set_shifts import Jump, Shift, ShiftPath
+
+JUMP = Jump(probability=0.2, std=4.0, step=2, reach=5)
 
 
 @pytest.fixture(scope='module')
@@ -54,7 +56,7 @@ def run(model, records, particles, seed, threads=1):
     for name, b in enumerate(records):
         step = cycle(tracker, before, b, (seed, name))
         before = step.after
-        pmf, sums, _ = tracker.summarise(step)
+        pmf, sums, *_ = tracker.summarise(step)
         pmfs.append(pmf)
         intensities.append(sums[0])
         evidence += step.log_evidence
@@ -148,6 +150,7 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
         {'negative_probability': 0.3},
         {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3},
         {'shift': Shift(std=1.5, memory=0.9)},
+        {'jump': JUMP, 'negative_probability': 0.3, 'amplitude_memory': 0.9},
         {'transition': banded_transition(3, 0.3), 'order_min': 0},
         {'transition': np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]])},
     ],
@@ -204,7 +207,7 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     assert np.allclose(amplitude[possible][alive], mean[alive])
 
 
-@pytest.mark.parametrize('change', [{}, {'shift': Shift(std=1.5, memory=0.9)}])
+@pytest.mark.parametrize('change', [{}, {'shift': Shift(std=1.5, memory=0.9)}, {'jump': JUMP}])
 def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     """Sets that come again, and those that compete for a slot, are moved and weighed as if each
     came alone."""
@@ -214,12 +217,13 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     record = tracker.record(b, (1, 2))
     sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 90, N))
     uniform = np.random.default_rng(3).random((N, changed.uniforms))
-    moved, ratio = tracker._drawn(sets, record, uniform)
+    moved, ratio, jump = tracker._drawn(sets, record, uniform)
     step = tracker.weigh(Weighted(moved, np.zeros(N)), record)
     alone = SetFilter(changed, 1)
     for i in range(0, N, 7):
         own = alone.record(b, (1, 2))
-        single, paid = alone._drawn(sets.take(np.array([i])), own, uniform[i : i + 1])
+        single, paid, own_jump = alone._drawn(sets.take(np.array([i])), own, uniform[i : i + 1])
+        assert jump is None or own_jump[0] == jump[i]
         assert paid[0] == ratio[i] and single.shift[0] == moved.shift[i]
         assert single.cell[0].tobytes() == moved.cell[i].tobytes()
         found = alone.weigh(Weighted(moved.take(np.array([i])), np.zeros(1)), own)

@@ -18,7 +18,7 @@ import numpy as np
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.estimation.set_model import SetModel, Sets
 from sonar_imm.estimation.set_proposals import begin, Beginning, Births, gains, propose_births
-from sonar_imm.estimation.set_shifts import Shift, ShiftTables
+from sonar_imm.estimation.set_shifts import Jump, Shift, ShiftTables
 
 IMPOSSIBLE = -math.inf
 
@@ -26,14 +26,15 @@ IMPOSSIBLE = -math.inf
 class Proposals(NamedTuple):
     """Tables of one record, for S signs, negative ones in the second n rows: walk (S n, 2 r + 1)
     cumulative, walk_ratio (S n, 2 r + 1) of model to proposal, log_sum (S, n) log Z of the walks
-    from each cell; births; share of walks that see the record; the shift that all have."""
+    from each cell; births; share of walks that see the record; the shift that all have, or the
+    jump that all make."""
 
     walk: FloatArray
     walk_ratio: FloatArray
     log_sum: FloatArray
     births: Births
     share: float
-    shift: Shift | None
+    shared: Shift | Jump | None
 
 
 def propose(model: SetModel, b: FloatArray) -> Proposals:
@@ -55,7 +56,8 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
     births = propose_births(model, gained, model.birth_share, model.birth_cap)
     walk = np.cumsum(q, axis=1)
-    return Proposals(walk, ratio, log_sum, births, model.walk_share, model.shift)
+    shared = model.shift or model.jump
+    return Proposals(walk, ratio, log_sum, births, model.walk_share, shared)
 
 
 def start(
@@ -142,13 +144,21 @@ def propagate(
         for k in range(len(members) - m):
             del members[min(int(uniform[i, 1 + k] * len(members)), len(members) - 1)]
         offset = model.pad
-        if model.shift:
+        if proposals.shared:
             at = np.array([z for z, _ in members], np.int64)
             below = np.array([int(sets.sign[i, j] < 0) for _, j in members], np.int64)
-            chances, paid = propose_shift(proposals, int(sets.shift[i]), at, below)
+            chances, paid = propose_shared(proposals, int(sets.shift[i]), at, below)
             running = np.cumsum(chances)
             place = int(np.searchsorted(running, uniform[i, -1] * running[-1], 'right'))
-            offset, log_ratio[i] = place * model.shift.step, paid[place]
+            log_ratio[i] = paid[place]
+            if model.shift:
+                offset = place * model.shift.step
+            else:
+                jump = place * model.jump.step - model.jump.pad
+                members = [(z + jump, j) for z, j in members]
+                if not all(0 <= z < model.cells for z, _ in members):
+                    log_ratio[i] = IMPOSSIBLE
+                members = [(min(max(z, 0), model.cells - 1), j) for z, j in members]
         new.shift[i] = offset
         survivors = []
         for k, (z, j) in enumerate(members):
@@ -245,17 +255,21 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
     return log_likelihood, amplitude
 
 
-def propose_shift(
+def propose_shared(
     proposals: Proposals, before: int, cells: IntArray, negative: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
     `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
-    shift, share = proposals.shift, proposals.share
-    assert shift
-    log_prior = ShiftTables.of(shift).log_prior
-    prior = log_prior[before // shift.step if len(log_prior) > 1 else 0]
-    at = cells[:, None] + shift.step * np.arange(len(prior))
-    score = prior + proposals.log_sum[negative[:, None], at].sum(axis=0)
+    shared, share, log_sum = proposals.shared, proposals.share, proposals.log_sum
+    assert shared
+    if isinstance(shared, Jump):
+        log_prior = shared.tables().log_prior
+        log_sum = np.pad(log_sum, [(0, 0), (shared.pad, shared.pad)], constant_values=-np.inf)
+    else:
+        log_prior = ShiftTables.of(shared).log_prior
+    prior = log_prior[before // shared.step if len(log_prior) > 1 else 0]
+    at = cells[:, None] + shared.step * np.arange(len(prior))
+    score = prior + log_sum[negative[:, None], at].sum(axis=0)
     driven = np.exp(score - score.max())
     q = share * driven / driven.sum() + (1.0 - share) * np.exp(prior)
     with np.errstate(divide='ignore'):

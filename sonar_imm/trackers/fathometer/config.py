@@ -14,7 +14,7 @@ from attrs import evolve, fields, frozen
 
 from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
-from ...parameters import inherited, live, parameter
+from ...parameters import constant, inherited, live, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
 
@@ -47,7 +47,7 @@ class FathometerConfig(StampParameters):
     array_depth: float = parameter(0.0, 'm',
         'depth of the deepest hydrophone, where neither the record nor a companion instrument '
         'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))
-    array_depth_age: float = live(30.0, 's',
+    array_depth_age: float = constant(30.0, 's',
         'largest time between a record and the depth or position of a companion instrument that '
         'is used for it', range=(0.0, 86400.0))
     array_depth_std: float = live(0.03, 'm',
@@ -59,7 +59,7 @@ class FathometerConfig(StampParameters):
         'reflectors share: none; independent (a new error in each record); memory (correlated by '
         'heave_memory); auto: none until the reflectors of an array move together by more than '
         'twice of it, then independent with the error that was found', choices=HEAVES)
-    heave_memory: float = parameter(0.9, '',
+    heave_memory: float = constant(0.9, '',
         'heave memory: share of the error of the array depth that stays from record to record',
         range=(0.01, 0.99))
 
@@ -88,17 +88,17 @@ class FathometerConfig(StampParameters):
 
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', '', 'beamformer that looks up and down', choices=PROCESSORS)
-    output: str = parameter('coherence', '',
+    output: str = constant('coherence', '',
         'response made of the beams up and down: coherence; correlation, which red noise spoils; '
         'or printed, equations (2) and (4) of the paper to the letter, which for mvdr puts the '
         'echoes above the array', choices=OUTPUTS)
-    envelope: bool = parameter(False, '',
+    envelope: bool = constant(False, '',
         'for arrays: use the envelope of the response, as the paper does, in place of the '
         'response')
     loading: float = live(1e-2, '',
         'processor mvdr: diagonal loading, in units of the mean power of a hydrophone',
         range=(0.0, 1e6))
-    white_noise_gain_db: float = live(-3.0, 'dB',
+    white_noise_gain_db: float = constant(-3.0, 'dB',
         'processor white_noise: least white noise gain, relative to the largest possible',
         range=(-60.0, -0.01))
     frequency_min: float = parameter(50.0, 'Hz',
@@ -111,7 +111,7 @@ class FathometerConfig(StampParameters):
     depth_max: float = parameter(0.0, 'm',
         'greatest depth of a reflector; 0 together with depth_min: see there',
         range=(0.0, 12000.0))
-    depth_step: float = parameter(0.0, 'm',
+    depth_step: float = constant(0.0, 'm',
         'distance between the depths of the grid; 0: as the trace has it, or a sixth of the '
         'shortest half wavelength', range=(0.0, 100.0))
     noise_depth_min: float = live(180.0, 'm',
@@ -182,7 +182,7 @@ class FathometerConfig(StampParameters):
         'standard deviation of the slope of a reflector that dips, as the change of its depth '
         'from record to record; 0: all are still. With heave there are no slopes',
         range=(0.0, 100.0))
-    slope_switch_probability: float = parameter(0.02, '',
+    slope_switch_probability: float = constant(0.02, '',
         'slopes (slope_std): probability that from a record to the next a reflector begins to '
         'dip, ends it, or has a new slope', range=(1e-6, 0.3))
     record_interval: float = parameter(0.0, 's',
@@ -192,19 +192,25 @@ class FathometerConfig(StampParameters):
     record_distance: float = parameter(0.0, 'm',
         'distance from record to record that they are meant for instead, where positions tell how '
         'far apart two records are; 0: time counts', range=(0.0, 100_000.0))
+    common_jump_probability: float = parameter(0.05, '',
+        'probability that from a record to the next all reflectors jump by the same distance, as '
+        'over a fault of the floor, or where the depth of the array or the window of a trace '
+        'changes unsaid; 0: they never do. With heave there are no jumps', range=(0.0, 0.5))
+    common_jump_std: float = parameter(1.5, 'm',
+        'standard deviation of such a jump, which is cut at 2.67 of it', range=(0.01, 100.0))
     min_separation: float = parameter(0.4, 'm',
         'least distance between two reflectors', range=(1e-4, 1000.0))
     polarity: str = parameter('auto', '',
         'sign of the reflectors looked for: positive where the impedance grows with depth; '
         'envelopes (remove_background) have no negative ones; auto: both for records of an array '
         'with pulse processor, else positive', choices=POLARITIES)
-    negative_probability: float = parameter(0.05, '',
+    negative_probability: float = constant(0.05, '',
         'polarity both: probability that a new reflector is negative', range=(1e-6, 0.999))
     amplitude_std_sigmas: float = parameter(7.5, '',
         'standard deviation of amplitudes, in units of the noise; a third of it with processor '
         'conventional, whose echoes stand out by a third, unless amplitudes have a memory',
         range=(0.01, 1e6))
-    amplitude_memory: float = parameter(0.0, '',
+    amplitude_memory: float = constant(0.0, '',
         'share of its amplitude that a reflector keeps from record to record; 0: none',
         range=(0.0, 0.9999))
 
@@ -224,10 +230,10 @@ class FathometerConfig(StampParameters):
     detectable_sigmas: float = live(4.0, '',
         'amplitude, in units of the noise, above which reflectors are surely held: the columns '
         'prob_detectable_k are of the number of those above it', range=(0.1, 1000.0))
-    multiples: str = live('mark', '',
+    multiples: str = constant('mark', '',
         'whether reflectors get a probability of being multiples of others, from their depths '
         'below the surface: mark or off; they are never left out', choices=MULTIPLES)
-    track_memory: int = live(5, '',
+    track_memory: int = constant(5, '',
         'number of records after which a reflector that was not seen in them gets a new id',
         range=(0, 10_000))
 

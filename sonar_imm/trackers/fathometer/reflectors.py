@@ -98,10 +98,12 @@ class Identities:
         *,
         strength: FloatArray | None = None,
         floor_known: bool = False,
+        jump: float = 0.0,
     ) -> tuple[Identities, IdArray]:
         """Ids (K,) for reflectors at `depth` (K,) of the next record, is_bottom (K,) the
         probability of each to be the floor, variance (K,) of the depth, m^2, strength (K,) in
-        units of the noise; floor_known: is_bottom is more than which of them is the first."""
+        units of the noise; floor_known: is_bottom is more than which of them is the first; jump:
+        of all of them from the last record, m, by which these here have been `moved`."""
         ids = nearest_ids(depth, self.reflectors, config)
         bottom_id = self.bottom_id
         if floor_known and len(depth):
@@ -110,7 +112,7 @@ class Identities:
         living = np.array([known.track_id for known in self.reflectors], np.uint32)
         ids[new], next_id = new_ids(self.next_id, len(new), living)
         slopes = self._slopes(
-            ids, depth, np.zeros(len(ids)) if variance is None else variance, config
+            ids, depth, np.zeros(len(ids)) if variance is None else variance, config, jump
         )
         shown = self._shown(ids, np.zeros(len(ids)) if strength is None else strength)
         seen = [
@@ -156,7 +158,12 @@ class Identities:
         return pmf
 
     def _slopes(
-        self, ids: IdArray, depth: FloatArray, variance: FloatArray, config: FathometerConfig
+        self,
+        ids: IdArray,
+        depth: FloatArray,
+        variance: FloatArray,
+        config: FathometerConfig,
+        jump: float,
     ) -> list[Slope]:
         """What is known of the slopes of those that now have `ids` (K,) and `depth` (K,)."""
         known = {
@@ -172,7 +179,8 @@ class Identities:
                 continue
             before, common = known[track_id]
             change = z - before.depth
-            found.append(learned(before.slope, common, change, noise, before.walked, config))
+            seen = change, noise, before.walked, config, jump
+            found.append(learned(before.slope, common, *seen))
         return found
 
     def slopes(self, ids: IdArray) -> tuple[FloatArray, ...]:
@@ -228,6 +236,13 @@ class Identities:
         waited = (known._replace(absent=known.absent + records) for known in self.reflectors)
         return evolve(self, reflectors=tuple(waited))
 
+    def moved(self, jump: float) -> Identities:
+        """All reflectors, those that are waited for among them, jump by so many m."""
+        if not jump:
+            return self
+        there = (known._replace(depth=known.depth + jump) for known in self.reflectors)
+        return evolve(self, reflectors=tuple(there))
+
     def forget(self) -> Identities:
         """Ids given so far belong to no reflector any more; later ones go on counting."""
         return evolve(self, reflectors=(), bottom_id=0)
@@ -278,7 +293,8 @@ class Reflectors:
     covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability to be the floor,
     without an envelope that nothing lies above it; strength (K,): amplitude in units of the noise;
     above_bottom (K,): probability to lie above the floor, NaN without an envelope; heave and
-    heave_std: stated minus true depth of the array, m, 0 where it is no state.
+    heave_std: stated minus true depth of the array, m, 0 where it is no state; jumped: probability
+    that all have jumped since the record before, and jump, by how many m if so.
 
     What they share: the error of the array's depth, datum_std (m), a part of the covariance; and
     that of the speed of sound, speed_std (K,), m, the same share of the depth of each below the
@@ -298,6 +314,13 @@ class Reflectors:
     datum_std: float = 0.0
     heave: float = 0.0
     heave_std: float = 0.0
+    jumped: float = 0.0
+    jump: float = 0.0
+
+    @property
+    def probable_jump(self) -> float:
+        """By how much all have jumped, m, 0 where it is more probable that they did not."""
+        return self.jump if self.jumped > 0.5 else 0.0
 
     @property
     def common_std(self) -> FloatArray:
@@ -318,10 +341,12 @@ def reflectors_of(
     config: FathometerConfig,
     heave: tuple[float, float] | None = None,
     array_depth_found: float = 0.0,
+    jump: tuple[float, float] = (0.0, 0.0),
 ) -> Reflectors:
     """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
     heave: its mean and standard deviation, m, where it is a state; array_depth_found: error of the
-    array's depth, m, that counts where it is more than what is told."""
+    array's depth, m, that counts where it is more than what is told; jump: probability that all
+    jumped, and how far, in cells."""
     depth, lift = lattice.first + lattice.step * members.place, heave[0] if heave else 0.0
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
@@ -355,6 +380,8 @@ def reflectors_of(
         _speed_std(depth + lift, response, config),
         heave[1] if heave else datum_std,
         *(heave or (0.0, 0.0)),
+        jump[0],
+        lattice.step * jump[1],
     )
 
 
@@ -475,6 +502,7 @@ def write_estimate(
         name: np.full(rows, value)
         for name, value in {
             **bottom_columns(reflectors, response, config),
+            'common_jump': reflectors.jumped * reflectors.jump,
             'array_depth_found': array_depth_found,
             'detectable_amplitude': detectable_amplitude(response, config),
         }.items()

@@ -40,7 +40,7 @@ from ...acoustics.pulse import (
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
 from ...estimation.set_model import walk_reach
-from ...estimation.set_shifts import Shift
+from ...estimation.set_shifts import Jump, MAX_SHIFTS, Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError, small_text
 from .config import FathometerConfig
@@ -56,6 +56,8 @@ LEAST_SHIFT, MORE_ROOM = 0.02, 0.25
 MAX_SIGMAS = 1e6
 LOUDEST = 1e100
 """Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
+_JUMP_STEP, _JUMP_REACH = 1.0 / 16.0, 4.0 / 1.5
+"""Of the grid of jumps, m, and how far they reach, in standard deviations."""
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 _PHASES = 4
 """At how many depths the phase of an echo is found."""
@@ -224,6 +226,20 @@ def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
     return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
 
 
+def common_jump(config: FathometerConfig, step: float) -> Jump | None:
+    """The jump of all reflectors in cells of `step` m, on a grid that walks reach between."""
+    if config.heave != 'none' or not config.common_jump_probability:
+        return None
+    reach = _JUMP_REACH * config.common_jump_std / step
+    grid = int(max(1.0, np.round(_JUMP_STEP / step), np.ceil(reach / (MAX_SHIFTS // 2))))
+    return Jump(
+        probability=config.common_jump_probability,
+        std=config.common_jump_std / step,
+        step=grid,
+        reach=max(1, round(reach / grid)),
+    )
+
+
 def trace_response(
     trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float, water: Water
 ) -> Response:
@@ -240,8 +256,6 @@ def trace_response(
     depth = lattice.depth
     if depth[0] > trace.depth[-1] or depth[-1] < trace.depth[0]:
         raise Rejection('other_depths', 'the trace lies outside of the depths that are tracked')
-    if water.active is None:
-        water.begin(trace)
     if water.active:
         return _envelope_response(trace, lattice, config, reference_depth, water)
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)

@@ -163,15 +163,40 @@ def learned(
     noise: float,
     records: int,
     config: FathometerConfig,
+    jump: float = 0.0,
 ) -> Slope:
     """The slope after the depth changed by `change` over so many records, to a depth of variance
-    `noise`."""
+    `noise`. jump: by how much all seem to have jumped besides, m; where slopes explain all of it
+    better than a jump does, they have it, and reflectors that dip do not jump again and again."""
+    plain, _ = _after(slope, common, change, noise, records, config)
+    if not jump:
+        return plain
+    sloping, density = _after(slope, common, change + jump, noise, records, config)
+    std = config.common_jump_std
+    leap = config.common_jump_probability * math.exp(-0.5 * (jump / std) ** 2)
+    leap /= std * math.sqrt(2.0 * math.pi)
+    share = density / (density + leap) if density > 0.0 else 0.0
+    weight = np.array([(1.0 - share) * plain.dipping, share * sloping.dipping])
+    mean, variance = np.array([plain[1:3], sloping[1:3]]).T
+    return Slope(min(1.0, float(weight.sum())), *_mixed(weight, mean, variance), noise)
+
+
+def _after(
+    slope: Slope,
+    common: Common,
+    change: float,
+    noise: float,
+    records: int,
+    config: FathometerConfig,
+) -> tuple[Slope, float]:
+    """The slope after a change, and how probable that was, 1/m."""
     to = ways(slope, common, records, config)
     error = noise + slope.noise
     log = to.log_weight - 0.5 * (
         np.square(change - to.mean) / (to.variance + error) + np.log(to.variance + error)
     )
     w = np.exp(log - log.max())
+    density = float(w.sum()) * math.exp(float(log.max())) / math.sqrt(2.0 * math.pi)
     w /= w.sum()
     walk = records * config.depth_std**2 + error
     found = []
@@ -179,12 +204,16 @@ def learned(
     for before, P, times in ((slope.mean, old, records), (0.0, config.slope_std**2, 1)):
         gain = P * times / (times**2 * P + walk)
         found.append((before + gain * (change - times * before), (1.0 - gain * times) * P))
-    dipping = float(w[1] + w[2])
-    share = w[1:] / dipping if dipping > 0.0 else np.array([1.0, 0.0])
     means, variances = np.array(found).T
-    mean = float(share @ means)
-    variance = float(share @ (variances + np.square(means - mean)))
-    return Slope(dipping, mean, variance, noise)
+    return Slope(float(w[1] + w[2]), *_mixed(w[1:], means, variances), noise), density
+
+
+def _mixed(weight: FloatArray, mean: FloatArray, variance: FloatArray) -> tuple[float, float]:
+    """Mean and variance of what is so by either of two, with so much weight (2,)."""
+    total = float(weight.sum())
+    share = weight / total if total > 0.0 else np.array([1.0, 0.0])
+    middle = float(share @ mean)
+    return middle, float(share @ (variance + np.square(mean - middle)))
 
 
 def walks_to(

@@ -16,7 +16,7 @@
 
 The cycle of the particle filter, for each record (`FathometerTracker._cycle`):
 
-    propagate   each set: heave of the array, deaths, walks in depth, births
+    propagate   each set: heave of the array, deaths, common jump, walks in depth, births
     weigh       each set by how well it explains the depth response
     resample    sets by their weights, where few of them count
     move        heave and depths of each set together, where the array's heave is a state: records
@@ -85,6 +85,7 @@ from .reflectors import (
 )
 from .response import (
     array_response,
+    common_jump,
     depths_wanted,
     heave_shift,
     Lattice,
@@ -109,10 +110,12 @@ LONGEST_GAP = 5000
 
 @frozen(eq=False)
 class Taken:
-    """A record that was taken in: what was seen and how it was named."""
+    """A record that was taken in: what was seen, how it was named, and by how many m all jumped
+    since the one before."""
 
     response: Response
     named: tuple[Identified, ...]
+    jump: float
 
 
 class FathometerTracker:
@@ -124,25 +127,9 @@ class FathometerTracker:
     """
 
     STATE = (
-        'response',
-        'refusals',
-        '_stream',
-        '_pace',
-        '_ids',
-        '_depths',
-        '_places',
-        '_hydrophones',
-        '_pressure',
-        '_multiples',
-        '_lattice',
-        '_before',
-        '_smoother',
-        '_taken',
-        '_health',
-        '_fit',
-        '_phones',
-        '_water',
-        '_datum',
+        *('response', 'refusals', '_stream', '_pace', '_ids', '_depths', '_places'),
+        *('_hydrophones', '_pressure', '_multiples', '_lattice', '_before', '_smoother'),
+        *('_taken', '_health', '_fit', '_phones', '_water', '_datum'),
     )
 
     response: Response | None
@@ -241,11 +228,17 @@ class FathometerTracker:
             depth_min=0.0,
             depth_max=0.0,
             depth_step=0.05,
-            min_separation=0.05,
+            min_separation=0.4,
             array_depth_std=0.1,
+            order_min=1,
+            order_max=2,
+            order_transition_matrix=(),
+            particles=64,
+            threads=1,
         )
-        tracker = FathometerTracker(evolve(config, particles=8, threads=1))
-        amplitude = np.exp(-np.square((depth - 5.0) / 0.1)) + 0.01 * np.sin(31.0 * depth)
+        # What is not explained has no next record, and leaves kernels that are for that one.
+        tracker = FathometerTracker(config)
+        amplitude = 0.1 * np.exp(-np.square((depth - 5.0) / 0.1)) + 0.01 * np.sin(31.0 * depth)
         for second in (1, 2):
             trace = Trace(stamp_ns=second * 10**9, depth=depth, amplitude=amplitude)
             tracker.process(trace)
@@ -301,7 +294,9 @@ class FathometerTracker:
         if isinstance(item, Trace):
             depth = self._array_depth(item, 0)
             if self._lattice is None:
-                self._begin(lattice_of_trace(item, self._own))
+                lattice = lattice_of_trace(item, self._own)
+                self._water.begin(item)
+                self._begin(lattice)
             elif wider := widened(self._lattice, item, self._own):
                 self._begin_anew(wider)
                 if self._water.active:
@@ -402,6 +397,8 @@ class FathometerTracker:
             amplitude_memory=config.amplitude_memory,
             negative_probability=config.negative_share,
             shift=heave_shift(config, step),
+            # Schools of fish come and go together as layers that jump would.
+            jump=None if self._water.active else common_jump(config, step),
             start=independent_orders(config.order_min, config.orders),
         )
 
@@ -463,14 +460,15 @@ class FathometerTracker:
 
     def _named(self, reflectors: Reflectors, records: int) -> tuple[Identities, IdArray]:
         known = self._ids.wait(records - 1) if records <= LONGEST_GAP else self._ids.forget()
-        variance = reflectors.covariance[:, 0, 0]
-        return known.name(
+        jump = reflectors.probable_jump
+        return known.moved(jump).name(
             reflectors.depth,
             reflectors.is_bottom,
             self._own,
-            variance,
+            reflectors.covariance[:, 0, 0],
             strength=reflectors.strength,
             floor_known=bool(self._water.active),
+            jump=jump,
         )
 
     def _record(self, response: Response) -> list[Estimate]:
@@ -483,12 +481,12 @@ class FathometerTracker:
             self._smoother = LagSmoother(self._own.smoothing_lag)
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._summarise(step, response)
-        before = {e.track_id: e.depth for e in self._ids.reflectors if not e.missed + e.absent}
+        before = self._ids
         self._ids, ids = self._named(reflectors, records)
-        moved = [z - before[i] for i, z in zip(ids.tolist(), reflectors.depth) if i in before]
-        if moved and records == 1 and not self._water.active:
-            self._datum.add(float(np.mean(moved)))
-        self._taken.append(Taken(response, self._ids.reflectors))
+        if records == 1:
+            array = not self._water.active
+            self._datum.note(before, ids, reflectors, self._own, array=array)
+        self._taken.append(Taken(response, self._ids.reflectors, reflectors.probable_jump))
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,
@@ -553,11 +551,12 @@ class FathometerTracker:
         response = self._taken[0].response
         reflectors, pmf = self._summarise(step, response)
         # A reflector that only smoothing finds so early has its id from a later record.
-        ids = np.zeros(len(reflectors.depth), np.uint32)
-        for taken in self._taken:
+        ids, depth = np.zeros(len(reflectors.depth), np.uint32), reflectors.depth
+        for k, taken in enumerate(self._taken):
+            depth = depth + taken.jump if k else depth
             free = [named for named in taken.named if named.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
-            ids[missing] = nearest_ids(reflectors.depth[missing], free, self._own)
+            ids[missing] = nearest_ids(depth[missing], free, self._own)
         return [self._write(reflectors, ids, pmf, response, self._ids)]
 
     def _write(
@@ -592,7 +591,7 @@ class FathometerTracker:
     def _summarise(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
         """The reflectors of the most probable order, and the PMF (orders,) of the order."""
         assert self._filter is not None and self._lattice is not None
-        pmf, sums, shift = self._filter.summarise(step)
+        pmf, sums, shift, jump = self._filter.summarise(step)
         most = self._own.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
         modes = bool(self._water.active)
@@ -601,7 +600,5 @@ class FathometerTracker:
         if shift:
             heave = self._lattice.step * shift[0], self._lattice.step * shift[1]
         pulse = response.pulse or self.pulse
-        found = reflectors_of(
-            members, response, self._lattice, pulse, self._own, heave, self._error_of_depth
-        )
-        return found, pmf
+        common = heave, self._error_of_depth, jump
+        return reflectors_of(members, response, self._lattice, pulse, self._own, *common), pmf

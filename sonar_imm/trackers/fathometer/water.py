@@ -345,21 +345,20 @@ class Water:
         return CAUTION * self._update_scatter(trace, self._state.found)
 
     def _update_scatter(self, trace: FloatArray, onset: int) -> FloatArray:
-        """Noise and scatter (n,) of a trace (n,) whose floor begins at `onset`, by the scatter of
-        those before it; this one's is remembered."""
+        """Noise and scatter (n,) of a trace (n,) whose floor begins at `onset`, by its scatter and
+        that of those before it."""
         power = np.square(self._noise)
         if onset < 0:
             return self._noise.copy()
-        begin = onset + math.ceil(4.0 * self._pulse)
-        if self._seen and begin < self.cells:
-            scatter = np.minimum.accumulate(self._scatter) / self._seen
-            power[begin:] += scatter[: self.cells - begin]
-            # Nearer to the floor its own echo hides how loud the scatter is: no less than there.
-            near = onset + math.ceil(self._lead + self._pulse)
-            power[near:begin] += scatter[0]
         own = envelopes.scatter_power(trace, self._noise, onset, self._pulse)
         self._scatter = SCATTER_MEMORY * self._scatter + (1.0 - SCATTER_MEMORY) * own
         self._seen = SCATTER_MEMORY * self._seen + 1.0 - SCATTER_MEMORY
+        begin = onset + math.ceil(4.0 * self._pulse)
+        if begin < self.cells:
+            power[begin:] += self._scatter[: self.cells - begin] / self._seen
+            # Nearer to the floor its own echo hides how loud the scatter is: no less than there.
+            near = onset + math.ceil(self._lead + self._pulse)
+            power[near:begin] += self._scatter[0] / self._seen
         return np.sqrt(power)
 
     # -- what is wrong with the line --------------------------------------------------------------

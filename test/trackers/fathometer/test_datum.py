@@ -9,41 +9,15 @@
 """The depth of the array that is wrong: found from its reflectors, counted in, and followed."""
 
 from helpers.fathometer_runs import run
+from helpers.moving_layers import scene
 from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.pulse import band_pulse
-from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.datum import DatumError, found_std
 
-LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
-STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
 FEW = {'particles': 2000, 'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
-
-
-def scene(error, seed, records=36, floor=None):
-    """Traces of six layers as an array at 30 m sees them, told by `error` m (T,) wrongly; and the
-    true depths (T, 6). Only lags are seen: the stated depth shifts all that is drawn."""
-    rng, pulse = np.random.default_rng(seed), band_pulse(100.0, 2800.0, 1500.0)
-    depth, traces = np.arange(42.0, 82.0, 0.05), []
-    true = LAYERS + (np.zeros(records) if floor is None else floor)[:, None]
-    kernel = pulse(0.05 * np.arange(-60, 61))
-    for k, wrong in enumerate(error):
-        noise = np.convolve(rng.standard_normal(len(depth) + 120), kernel, 'valid')
-        noise /= np.sqrt(np.sum(np.square(kernel)))
-        echo = pulse(depth[:, None] - true[k] - wrong) @ STRENGTH
-        traces.append(
-            Trace(
-                stamp_ns=(k + 1) * 10**9,
-                depth=depth,
-                amplitude=echo + noise,
-                sigma=np.ones(len(depth)),
-                reference_depth=30.0 + wrong,
-            )
-        )
-    return traces, true
 
 
 def test_errors_of_the_vectors():
@@ -100,7 +74,7 @@ def test_a_depth_that_is_wrong_anew_in_each_record_is_followed():
     newest = found[36 * 10**9]
     assert newest.extras['array_depth_found'][0] == pytest.approx(0.2, abs=0.08)
     assert newest.extras['heave_std'][0] > 0.0
-    assert inside(found, true, 18) > 0.9
+    assert inside(found, true, 18) > 0.85
     assert any('it is followed as heave' in each for each in tracker.warnings())
     # A state, and not only a wider covariance: depths are better than what is told of the array.
     settled = range(25, 37)
@@ -110,7 +84,8 @@ def test_a_depth_that_is_wrong_anew_in_each_record_is_followed():
     assert rms < 0.12
 
     tracker, plain = run(traces, **FEW, heave='none')
-    assert inside(plain, true, 18) > 0.6  # reflectors are lost and found by jumps as these
+    assert inside(plain, true, 18) > 0.6
+    assert len(set(np.concatenate([e.extras['track_id'] for e in plain.values()]))) == 6
     assert plain[36 * 10**9].extras['heave_std'][0] == 0.0
     assert any('heave auto follows it' in each for each in tracker.warnings())
 

@@ -47,7 +47,9 @@ def test_layers_that_dip_are_followed_without_a_parameter(kind, dip, gap):
 
 def test_without_slopes_they_are_lost():
     traces, truth = case('parallel', 0.4, 0, 0)
-    found = summary([tracked(traces, truth, slope_std=0.0, **OPTIONS)])
+    found = summary(
+        [tracked(traces, truth, slope_std=0.0, common_jump_probability=0.0, **OPTIONS)]
+    )
     assert found['P, before'] < 0.5 and found['identities'] > 2 * len(LAYERS)
 
 

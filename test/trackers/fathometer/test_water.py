@@ -13,7 +13,7 @@ from helpers.vector_files import load_vectors
 import numpy as np
 import pytest
 
-from benchmarks.fathometer_floor import halves, line, LINES, real_lines, tracked
+from benchmarks.fathometer_field import halves, line, LINES, real_lines, tracked
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
@@ -25,6 +25,31 @@ FEW = {'particles': 300, 'min_separation': 0.45, 'depth_std': 0.35, 'order_max':
 def run(traces, **options):
     tracker = FathometerTracker(FathometerConfig(**{**FEW, 'sound_speed_std': 0.0, **options}))
     return tracker, [each.columns() for trace in traces for each in tracker.process(trace)]
+
+
+def test_noise_and_scatter_of_the_vectors():
+    """From four pulses below the onset on; nearer ours has the scatter of there."""
+    v = load_vectors('fathometer_in_the_field/floor')
+    step, count = float(v['step']), v['trace'].shape[1]
+    water = Water(FathometerConfig())
+    depth = step * np.arange(count)
+    water.begin(Trace(stamp_ns=1, depth=depth, amplitude=v['trace'][0]))
+    water._noise, water._scatter = v['water_profile'], np.zeros(count)
+    water._pulse = float(v['pulse']) / step
+    water._lead, expected = (
+        2.4 * water._pulse,
+        dict(zip(v['posterior_records'].tolist(), v['noise_and_scatter'])),
+    )
+    for k, (trace, onset) in enumerate(zip(v['trace'], v['onset'].tolist())):
+        seen = water._update_scatter(trace, onset)
+        if k in expected:
+            begin = onset + int(np.ceil(4.0 * water._pulse))
+            assert seen[begin:] == pytest.approx(expected[k][begin:], rel=1e-9)
+            near = onset + int(np.ceil(3.4 * water._pulse))
+            assert seen[:near] == pytest.approx(expected[k][:near], rel=1e-9)
+            power = seen[near:begin] ** 2 - water._noise[near:begin] ** 2
+            assert power == pytest.approx(seen[begin] ** 2 - water._noise[begin] ** 2, abs=1e-12)
+            assert k == 0 or seen[begin] > 1.02 * water._noise[begin]
 
 
 def test_labels_of_the_vectors():

@@ -1,0 +1,479 @@
+# Copyright 2026 The sonar_imm developers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+
+"""The fathometer in the field: hydrophones that differ, profiler lines, waves and faults, a depth
+that is told wrongly, and what can be counted. Nothing is told to the tracker but what a recording
+has.
+
+    python -m benchmarks.fathometer_field --out docs/results/fathometer_field.json
+
+lines: 120 envelopes of a Gaussian pulse of 0.15 m, 0.05 m a sample over 20 m, in complex noise of
+rms 0.02 with echoes of modulus one for the floor at about 10 m and of 0.5 and 0.25 at 3 m and 6 m
+below it, each of a phase of its own. ghosts: reflectors a record of existence 0.5 or more that lie
+more than 1 m above the floor; label: share of the records whose greatest `is_bottom` is within
+0.5 m of the floor, and what it says there; inside: share with the floor within two
+`bottom_depth_std` of `bottom_depth`. Records after the tenth count.
+
+phones: cross-spectra of 16 hydrophones 0.25 m apart from 100 to 2800 Hz, 100 snapshots, three
+layers, 10 records, scored after four, with `phone_correction` off and full.
+
+moving: traces of six layers of 7 to 25 sigma, 100 to 2800 Hz, 44 records, scored after eight; the
+floor moves, or the depth of the array is told wrongly (in m, rms, anew in each record, or slowly:
+an autoregression of 0.9). Without jumps: common_jump_probability 0. ids: for each layer.
+
+counted: scenes of 3 to 7 layers of log-uniform 1.5 to 20 sigma; how probable the numbers of
+reflectors above 4 sigma, and of all, were said to be, and how often it was so.
+
+halves: of the lines of real data, if SONAR_IMM_DATA names them, even and odd traces: share of the
+records whose floors differ by more than 0.75 m, and what is said where they do and do not.
+
+cost: CPU ms a record of 20,000 particles, of the first scene of moving (800 cells), without jumps
+and with; and of `correct_phones` for 16 hydrophones and 541 frequencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+import os
+from pathlib import Path
+import time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.study import known, Parts, standard_error, study
+from sonar_imm.acoustics.ambient import sample_csdm, surface_noise_csdm
+from sonar_imm.acoustics.hydrophones import correct_phones
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.consistency import ospa
+from sonar_imm.measurements import CrossSpectra, Trace
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.trackers.fathometer.water import Water
+from sonar_imm_tools.recordings.segy_lines import read_segy
+
+STEP, SAMPLES, RECORDS, PULSE, NOISE = 0.05, 400, 120, 0.15, 0.02
+SETTLED, APART, SPACING = 10, 0.75, 0.376
+LINES: dict[str, dict[str, Any]] = {
+    'flat': {},
+    'quiet water': {'noise': 0.002},
+    'silent water': {'noise': 0.002, 'threshold': 0.02},
+    'growing gain': {'gain': 0.12},
+    'coarse': {'steps': 32},
+    'soft floor': {'floor': 0.15},
+    'scatter': {'scatter': 0.3},
+    'transmit pulse': {'ring': 1.5},
+    'waves': {'waves': 2.5},
+    'fault': {'fault': 3.0},
+    'fish': {'fish': 0.4},
+    'echo at a fixed depth': {'fixed': 0.2, 'waves': 1.0},
+}
+
+
+def line(
+    seed: int,
+    *,
+    records: int = RECORDS,
+    noise: float = NOISE,
+    threshold: float = 0.0,
+    gain: float = 0.0,
+    steps: int = 0,
+    floor: float = 1.0,
+    scatter: float = 0.0,
+    ring: float = 0.0,
+    waves: float = 0.0,
+    fault: float = 0.0,
+    fish: float = 0.0,
+    fixed: float = 0.0,
+) -> tuple[list[Trace], FloatArray]:
+    """Traces of a line, and the depth of its floor (T,), m. threshold: below which nothing is
+    written; gain: growth of all by e over so many 1/m; steps of a converter up to one; floor:
+    amplitude; scatter: rms below it, falling over 1.5 m; ring: m of transmit pulse; waves:
+    amplitude, m, in 25 records; fault, m, at half of the line; fish: share of the records with a
+    school; fixed: amplitude of an echo at 4 m."""
+    rng, depth = np.random.default_rng(seed), STEP * np.arange(SAMPLES)
+    record = np.arange(records)
+    below = 10.0 + 0.3 * np.sin(record / 19.0) + waves * np.sin(2.0 * np.pi * record / 25.0)
+    below = below + fault * (record >= records // 2)
+    traces = []
+
+    def echo(place: float, amplitude: float, width: float = PULSE) -> FloatArray:
+        phase = np.exp(2j * np.pi * rng.random())
+        return amplitude * phase * np.exp(-0.5 * np.square((depth - place) / width))
+
+    for k, z in enumerate(below):
+        field = noise * _normal(rng, SAMPLES) + echo(z, floor)
+        field = field + echo(z + 3.0, 0.5 * floor) + echo(z + 6.0, 0.25 * floor)
+        if scatter:
+            under = np.maximum(depth - z, 0.0)
+            level = scatter * np.exp(-under / 1.5) * (depth > z)
+            field = field + level * _normal(rng, SAMPLES)
+        if rng.random() < fish:
+            school = rng.uniform(3.0, 8.0)
+            for place in school + 0.3 * rng.standard_normal(4):
+                field = field + echo(place, rng.uniform(0.1, 0.5))
+        if fixed:
+            field = field + echo(4.0, fixed)
+        if ring:
+            field = field + 2.0 * np.exp(-np.maximum(depth - ring, 0.0) / 0.1)
+        heard = np.abs(field) * np.exp(gain * depth)
+        if steps:
+            heard = np.round(heard * steps) / steps
+        heard[heard < threshold] = 0.0
+        traces.append(Trace(stamp_ns=(k + 1) * 10**9, depth=depth, amplitude=heard))
+    return traces, below
+
+
+def _normal(rng: np.random.Generator, count: int) -> FloatArray:
+    return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) / np.sqrt(2.0)
+
+
+def tracked(traces: Sequence[Trace], floor: FloatArray, particles: int) -> dict[str, float]:
+    """A line with nothing told but what converters write."""
+    config = FathometerConfig(
+        particles=particles, min_separation=0.45, depth_std=0.35, order_max=6, sound_speed_std=0.0
+    )
+    tracker, rows = FathometerTracker(config), []
+    for trace, z in zip(traces, floor.tolist()):
+        for estimate in tracker.process(trace):
+            found = estimate.columns()
+            if trace.stamp_ns <= SETTLED * 10**9:
+                continue
+            depth, label = found['depth'], np.nan_to_num(found['is_bottom'])
+            best = int(np.argmax(label))
+            near = np.abs(depth - z) < 0.5
+            error = found['bottom_depth'][0] - z
+            rows.append(
+                (
+                    np.sum((found['existence'] >= 0.5) & (depth < z - 1.0)),
+                    abs(depth[best] - z) < 0.5,
+                    label[near].max(initial=0.0),
+                    abs(error) <= 2.0 * found['bottom_depth_std'][0],
+                    abs(error),
+                )
+            )
+    ghosts, right, said, inside, error = np.array(rows, np.float64).T
+    return {
+        'ghosts': float(ghosts.mean()),
+        'label': float(right.mean()),
+        'said': float(said.mean()),
+        'inside': float(inside.mean()),
+        'error': float(np.nanmedian(error)),
+        'warnings': float(len(tracker.warnings())),
+    }
+
+
+def halves(path: Path, spacing: float) -> dict[str, float]:
+    """Even and odd traces of a real line, each stacked in pairs, as two lines."""
+    amplitude = read_segy(path).amplitude
+    depth = spacing * np.arange(amplitude.shape[1])
+    floors = []
+    for half in (amplitude[::2], amplitude[1::2]):
+        water, found = Water(FathometerConfig()), []
+        stacked = half[: len(half) // 2 * 2].reshape(-1, 2, half.shape[1]).mean(axis=1)
+        for k, row in enumerate(stacked):
+            trace = Trace(stamp_ns=k + 1, depth=depth, amplitude=row)
+            if water.active is None:
+                water.begin(trace)
+            _, _, floor = water.take(trace)
+            sure = floor.posterior[:-1]
+            said = 0.0
+            if len(sure):
+                best = int(np.argmax(sure))
+                said = float(sure[max(0, best - 2) : best + 3].sum())
+            found.append((*floor.depth, said))
+        floors.append(np.array(found))
+    count = min(map(len, floors))
+    (z, std, said), (other, other_std, _) = (each[SETTLED:count].T for each in floors)
+    apart = np.abs(z - other)
+    inside = apart <= 2.0 * np.hypot(std, other_std)
+    differ = ~(apart <= APART)
+    return {
+        'records': float(count - SETTLED),
+        'apart': float(differ.mean()),
+        'inside': float(inside.mean()),
+        'said where apart': float(said[differ].mean()) if differ.any() else float('nan'),
+        'said where not': float(said[~differ].mean()),
+    }
+
+
+def real_lines() -> list[Path]:
+    folder = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'
+    return sorted(folder.glob('*.seg'))
+
+
+# -- layers below an array ------------------------------------------------------------------------
+
+LAYERS = np.array([52.0, 56.5, 60.0, 64.2, 68.0, 72.5])
+STRENGTH = np.array([25.0, 18.0, 13.0, 10.0, 8.5, 7.0])
+BAND: dict[str, Any] = {'frequency_min': 100.0, 'frequency_max': 2800.0, 'sound_speed_std': 0.0}
+MOVING, UNSCORED, ARRAY = 44, 8, 30.0
+
+
+def floors(records: int) -> dict[str, FloatArray]:
+    """How deep the floor lies in each record (T,), against the first, m."""
+    record = np.arange(records, dtype=np.float64)
+    wave = np.asarray(np.sin(2.0 * np.pi * record / 25.0))
+    return {
+        'flat': 0.0 * record,
+        'dip 0.18': 0.18 * record - 4.0,
+        'waves 2.5': 2.5 * wave,
+        'waves 5': 5.0 * wave,
+        'fault 3': np.where(record >= records // 2, 3.0, 0.0),
+        'fault -3': np.where(record >= records // 2, -3.0, 0.0),
+    }
+
+
+def depth_errors(records: int, rng: np.random.Generator) -> dict[str, FloatArray]:
+    """How wrong the depth of the array is told in each record (T,), m."""
+    new = rng.standard_normal(records)
+    slow = 0.2 * new
+    for k in range(1, records):
+        slow[k] = 0.9 * slow[k - 1] + np.sqrt(1.0 - 0.81) * slow[k]
+    return {'depth 0.1': 0.1 * new, 'depth 0.2': 0.2 * new, 'depth 0.5': 0.5 * new, 'slow': slow}
+
+
+def layered(
+    seed: int, floor: FloatArray, wrong: FloatArray, layers: FloatArray, strength: FloatArray
+) -> tuple[list[Trace], FloatArray]:
+    """Traces as an array sees them, and the true depths (T, K)."""
+    rng, pulse = np.random.default_rng([seed, 1]), band_pulse(100.0, 2800.0, 1500.0)
+    depth = 40.0 + 0.05 * np.arange(800)
+    true, kernel, traces = layers + floor[:, None], pulse(0.05 * np.arange(-60.0, 61.0)), []
+    for k, off in enumerate(wrong):
+        noise = np.convolve(rng.standard_normal(len(depth) + 120), kernel, 'valid')
+        noise /= np.sqrt(np.sum(np.square(kernel)))
+        traces.append(
+            Trace(
+                stamp_ns=(k + 1) * 10**9,
+                depth=depth,
+                amplitude=pulse(depth[:, None] - true[k] - off) @ strength + noise,
+                sigma=np.ones(len(depth)),
+                reference_depth=ARRAY + off,
+            )
+        )
+    return traces, true
+
+
+def scored(pairs: Iterator[tuple[Estimate, FloatArray]], skip: int) -> dict[str, float]:
+    """P, OSPA of second order and a cutoff of 2 m, share of the true depths (K,) within two stated
+    standard deviations, and ids a layer, of estimates after the first so many."""
+    right, apart, inside, ids = [], [], [], set()
+    for k, (estimate, true) in enumerate(pairs):
+        z = estimate.state[:, 0]
+        found = z[np.isfinite(z)]
+        if k < skip:
+            continue
+        order = estimate.model_names[int(np.argmax(estimate.probabilities[0]))]
+        right.append(int(order.removeprefix('order_')) == len(true))
+        apart.append(ospa(true[:, None], found[:, None], 2.0))
+        for layer, place in enumerate(true.tolist()):
+            off = np.abs(z - place)
+            row = int(np.argmin(np.nan_to_num(off, nan=np.inf)))
+            if off[row] < 1.0:
+                ids.add((layer, int(estimate.extras['track_id'][row])))
+                inside.append(off[row] <= 2.0 * np.sqrt(estimate.covariance[row, 0, 0]))
+    return {
+        'P': float(np.mean(right)),
+        'OSPA': float(np.mean(apart)),
+        'inside': float(np.mean(inside)) if inside else 0.0,
+        'ids': len(ids) / len(true),
+    }
+
+
+def moving(seed: int, particles: int, kind: str, jumps: bool) -> dict[str, float]:
+    rng, still = np.random.default_rng([seed, 0]), np.zeros(MOVING)
+    wrong = depth_errors(MOVING, rng).get(kind, still)
+    floor = floors(MOVING).get(kind, still)
+    traces, true = layered(seed, floor, wrong, LAYERS, STRENGTH)
+    own = BAND if jumps else {**BAND, 'common_jump_probability': 0.0}
+    tracker = FathometerTracker(FathometerConfig(particles=particles, **own))
+    pairs = ((tracker.process(trace)[-1], z) for trace, z in zip(traces, true))
+    found = scored(pairs, UNSCORED)
+    return found | {'followed': float(any('as heave' in each for each in tracker.warnings()))}
+
+
+def counted(seed: int, particles: int) -> dict[str, float]:
+    """Of one scene: what was said of the true number above 4 sigma and of all, and whether the
+    most probable one was it; Brier scores of every number."""
+    rng, still = np.random.default_rng([seed, 2]), np.zeros(40)
+    layers = 45.0 + np.cumsum(rng.uniform(2.5, 5.0, rng.integers(3, 8)))
+    strength = 1.5 * (20.0 / 1.5) ** rng.random(len(layers))
+    traces, _ = layered(seed, still, still, layers, strength)
+    tracker = FathometerTracker(FathometerConfig(particles=particles, **BAND))
+    rows = []
+    for k, trace in enumerate(traces):
+        (estimate,) = tracker.process(trace)
+        if k < 15:
+            continue
+        above = int(np.sum(strength > 4.0))
+        sure = np.array([estimate.extras[f'prob_detectable_{n}'][0] for n in range(13)])
+        held = np.append(0.0, estimate.probabilities[0])
+        own = []
+        for pmf in (sure, held):
+            happened = np.arange(13) == above
+            own += [pmf[above], np.argmax(pmf) == above, np.mean(np.square(pmf - happened))]
+        rows.append(own)
+    names = [f'{a}, {b}' for a in ('detectable', 'order') for b in ('said', 'right', 'Brier')]
+    return dict(zip(names, np.mean(np.array(rows, np.float64), axis=0).tolist()))
+
+
+# -- hydrophones ----------------------------------------------------------------------------------
+
+FREQUENCY, PHONES, SPACING_M = np.arange(100.0, 2800.1, 5.0), 16, 0.25
+HEIGHTS, ECHOES = np.array([22.0, 27.5, 34.0]), np.array([0.35, -0.2, 0.15])
+
+
+def response(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Response (F, M) of the hydrophones."""
+    c = np.ones((len(FREQUENCY), PHONES), np.complex128)
+    every = ('gains 2', 'inverted', 'late 50 us', 'slope') if kind == 'all' else (kind,)
+    if 'gains 1' in every or 'gains 2' in every:
+        c *= 10.0 ** (float(every[0][-1]) * rng.standard_normal(PHONES) / 20.0)
+    if 'half' in every:
+        c[:, 5] *= 0.5
+    if 'weak 20 dB' in every:
+        c[:, 5] *= 0.1
+    if 'slope' in every:
+        c[:, 12] *= 100.0 / FREQUENCY
+    if 'inverted' in every or 'two inverted' in every:
+        c[:, 4] *= -1.0
+    if 'two inverted' in every:
+        c[:, 11] *= -1.0
+    late = np.zeros(PHONES)
+    late[9] = 50e-6 * ('late 50 us' in every)
+    if 'delays 30 us' in every:
+        late = 30e-6 * rng.standard_normal(PHONES)
+    return c * np.exp(-2j * np.pi * FREQUENCY[:, None] * late)
+
+
+FAULTS = (
+    *('none', 'gains 1', 'gains 2', 'half', 'weak 20 dB', 'slope', 'inverted', 'two inverted'),
+    *('late 50 us', 'delays 30 us', 'all'),
+)
+
+
+def phones(seed: int, particles: int, kind: str, correction: str) -> dict[str, float]:
+    rng = np.random.default_rng([seed, 3])
+    clean = surface_noise_csdm(FREQUENCY, PHONES, SPACING_M, HEIGHTS, ECHOES, 1500.0)
+    c = response(kind, rng)
+    clean = (clean + 0.01 * np.eye(PHONES)) * c[:, :, None] * c.conj()[:, None, :]
+    config = FathometerConfig(
+        phones=PHONES,
+        element_spacing=SPACING_M,
+        array_depth=ARRAY,
+        depth_min=ARRAY + 12.0,
+        depth_max=ARRAY + 44.0,
+        phone_correction=correction,
+        particles=particles,
+        **BAND,
+    )
+    tracker = FathometerTracker(config)
+
+    def tracked_records() -> Iterator[tuple[Estimate, FloatArray]]:
+        for k in range(10):
+            record = CrossSpectra(
+                stamp_ns=(k + 1) * 10**9,
+                frequency=FREQUENCY,
+                csdm=sample_csdm(clean, 100, rng),
+                snapshots=100,
+                reference_depth=ARRAY,
+            )
+            yield tracker.process(record)[-1], ARRAY + HEIGHTS
+
+    return scored(tracked_records(), 4)
+
+
+# -- cost -----------------------------------------------------------------------------------------
+
+
+def cost(seed: int, _: int) -> dict[str, float]:
+    """CPU ms a record, of 20,000 particles."""
+    still = np.zeros(20)
+    traces = layered(seed, still, still, LAYERS, STRENGTH)[0]
+    found = {}
+    for name, chance in (('without jumps', 0.0), ('with jumps', 0.05)):
+        config = FathometerConfig(particles=20_000, common_jump_probability=chance, **BAND)
+        tracker = FathometerTracker(config)
+        tracker.process(traces[0])
+        begin = time.process_time()
+        for trace in traces[1:]:
+            tracker.process(trace)
+        found[f'{name}, ms'] = 1e3 * (time.process_time() - begin) / (len(traces) - 1)
+    rng = np.random.default_rng([seed, 4])
+    clean = surface_noise_csdm(FREQUENCY, PHONES, SPACING_M, HEIGHTS, ECHOES, 1500.0)
+    csdm = sample_csdm(clean + 0.01 * np.eye(PHONES), 100, rng)
+    begin = time.process_time()
+    for _ in range(10):
+        correct_phones(csdm, FREQUENCY, np.arange(PHONES), 1500.0 / SPACING_M, 0.1)
+    found['levelling of 16 hydrophones, ms'] = 1e3 * (time.process_time() - begin) / 10
+    return found
+
+
+# -- the study ------------------------------------------------------------------------------------
+
+
+def of_line(seed: int, particles: int, kind: str) -> dict[str, float]:
+    return tracked(*line(seed, **LINES[kind]), particles)
+
+
+def rows_of(case: str) -> dict[str, Callable[[int, int], dict[str, float]]]:
+    """The rows of a table, each of a seed and a number of particles."""
+    if case == 'lines':
+        return {kind: partial(of_line, kind=kind) for kind in LINES}
+    if case == 'phones':
+        return {
+            f'{kind}, {how}': partial(phones, kind=kind, correction=how)
+            for kind in FAULTS
+            for how in ('off', 'full')
+        }
+    if case == 'moving':
+        kinds = [*floors(1), *depth_errors(1, np.random.default_rng(0))]
+        return {
+            kind + ('' if jumps else ', without jumps'): partial(moving, kind=kind, jumps=jumps)
+            for kind in kinds
+            for jumps in (False, True)
+        }
+    return {case: counted if case == 'counted' else cost}
+
+
+CASES = ('cost', 'moving', 'counted', 'phones', 'lines')
+
+
+def main(
+    runs: int = 20,
+    first: int = 0,
+    particles: int = 3000,
+    cases: Sequence[str] = CASES,
+    out: Path | None = None,
+) -> Parts:
+    """first: the first seed."""
+    yield known(out)
+    for path in real_lines():
+        yield {'halves': {path.stem.split('_SBP_')[1][:5]: halves(path, SPACING)}}
+    for case in cases:
+        for name, row in rows_of(case).items():
+            found = []
+            for seed in range(first, first + runs):
+                found.append(row(seed, particles))
+                means = {
+                    key: value
+                    for label in found[0]
+                    for key, value in (
+                        (label, float(np.mean([each[label] for each in found]))),
+                        (f'{label}, s.e.', standard_error([each[label] for each in found])),
+                    )
+                    if not key.endswith('s.e.') or label in ('P', 'OSPA', 'label', 'ghosts')
+                }
+                yield {case: {name: {'runs': len(found), 'particles': particles} | means}}
+
+
+if __name__ == '__main__':
+    study(main, cases={'choices': list(CASES)})
