@@ -149,9 +149,8 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     config = scenario(scene_name, {'pings': pings, **changes})
     scene = simulate(config, seed)
     inputs = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
-    settings = BathymetryConfig.from_mapping(
-        {**config.instruments(), **WALKS, **values}
-    ).for_inputs(inputs)
+    given = {**config.instruments(), **WALKS, **values}
+    settings = BathymetryConfig(**given).for_inputs(inputs)
     if settings.navigation == 'ignored' and settings.sound_speed_profile:
         raise ValueError('a profile needs navigation')
     tracker = BathymetryTracker(settings)

@@ -30,7 +30,14 @@ BAGS = {
     'obstacle': 'obstacle_wreck',
 }
 OF_SYSTEM = {
-    'variant': 'bathymetry',
+    **dict.fromkeys(
+        (
+            *('variant', 'sigma_reference_bin', 'rough_sigma', 'scatters', 'grid_step'),
+            *('grid_extent', 'initial_slope_std', 'redrawn_slope_std', 'multipath_level_db'),
+            *('likelihood', 'max_extrapolation'),
+        ),
+        'bathymetry',
+    ),
     **dict.fromkeys(
         (
             *('amplitude_prior', 'proposal', 'output', 'envelope', 'multiples', 'depth_step'),

@@ -261,7 +261,7 @@ def under_way(
     config = scenario(name, {'pings': 1, **changes})
     measurements = [item.measurement for item in simulate(config, 1).measurements]
     ping = next(item for item in measurements if isinstance(item, Snapshot))
-    stated = BathymetryConfig.from_mapping({**config.instruments(), **values})
+    stated = BathymetryConfig(**{**config.instruments(), **values})
     inputs = {'snapshot', 'nav'} if config.moving else {'snapshot'}
     tracker = BathymetryTracker(stated.for_inputs(frozenset(inputs)))
     for measurement in measurements:

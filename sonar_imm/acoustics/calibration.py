@@ -55,7 +55,7 @@ most so many, spread over the ping, show whether it is exact, and so many what i
 DEAD, NOISE_ONLY, NO_WAVE = 0.1, 0.5, 0.9
 """Power of a dead stave, in that of the median; coherence of one that hears noise only, and of one
 that fits no plane wave, in the median of all."""
-SURE = 0.8
+SURE = 0.88
 """Below this coherence of the median stave the bins hold no plane waves."""
 ROUNDS, CONVERGED = 12, 0.3
 """At most; and the step that ends them, in standard deviations."""

@@ -58,7 +58,7 @@ def vector(name):
         noise_variance=noise,
         signal_variance=case['rho'] * noise,
     )
-    return case, BathymetryConfig.from_mapping(values), snapshot
+    return case, BathymetryConfig(**values), snapshot
 
 
 def floor(height, *, seed=1, stamp_ns=1_000, snr_db=25.0, H=15.0, tilt_deg=30.0, P=8, **more):

@@ -35,7 +35,7 @@ def sea_config(case, **values):
         'tilt_deg': float(case['tilt_deg']),
         'side': str(case['side']),
     }
-    return BathymetryConfig.from_mapping({**EXACT, **stated, **values})
+    return BathymetryConfig(**{**EXACT, **stated, **values})
 
 
 def navigation(case, *, late_s=0.0):

@@ -21,7 +21,7 @@ from attrs import evolve, frozen
 from ...acoustics.laplace import LIKELIHOODS
 from ...acoustics.rays import profile_problem
 from ...acoustics.sounding import ErrorBudget, GeometryDoubt
-from ...parameters import live
+from ...parameters import constant, live
 from ..model_checks import chain_problems
 from ..shared_parameters import MountingParameters
 from .terrain import KINDS
@@ -81,13 +81,13 @@ class BathymetryConfig(MountingParameters):
         'angle_two_rw: process noise of the first model over a range bin, then of the second at '
         'the first and at the last bin, linear between; empty: 0.1, 0.1, 2', range=(0.0, 90.0),
         kind='float[]')
-    sigma_reference_bin: float = live(0.0, 'm',
+    sigma_reference_bin: float = constant(0.0, 'm',
         'range bin for which sigmas and sigmas_deg are stated: they grow with sqrt(bin / '
         'reference); 0: as stated, whatever the bin', range=(0.0, 100.0))
-    rough_sigma: float = live(0.07, 'm',
+    rough_sigma: float = constant(0.07, 'm',
         'height_bank: random walks with at least this noise over a range bin are rough floor; '
         'undulations and slopes of a smooth floor need up to 0.05', range=(0.0, 1000.0))
-    scatters: tuple[float, ...] = live((), 'm',
+    scatters: tuple[float, ...] = constant((), 'm',
         'scatter_bank: standard deviation of single bins about the walk of each rough model, in '
         'the order of sigmas; empty: values that suit most floors', range=(0.0, 100.0),
         kind='float[]')
@@ -110,9 +110,9 @@ class BathymetryConfig(MountingParameters):
     initial_std: float = live(0.0, '',
         'standard deviation of the state before the first bin, m or rad; 0: 1 m, or 5 deg around '
         'the angle of the first echo of the reference floor', range=(0.0, 1000.0))
-    initial_slope_std: float = live(0.1, '',
+    initial_slope_std: float = constant(0.1, '',
         'standard deviation of the slope before the first bin', range=(0.0, 100.0))
-    redrawn_slope_std: float = live(0.1, '',
+    redrawn_slope_std: float = constant(0.1, '',
         'height_rw_ncs: standard deviation of the slope while the random walk model holds, which '
         'has no slope; the paper has 0', range=(0.0, 100.0))
 
@@ -143,7 +143,7 @@ class BathymetryConfig(MountingParameters):
         range=(1300.0, 1700.0))
 
     # -- what is heard ---------------------------------------------------------------------------
-    likelihood: str = live('laplace', '',
+    likelihood: str = constant('laplace', '',
         'distribution of the samples of one bin', choices=LIKELIHOODS)
     noise_variance: float = live(0.0, '',
         'noise power at a stave, for snapshots that do not state it; 0: estimated from the water '
@@ -164,7 +164,7 @@ class BathymetryConfig(MountingParameters):
         'expect echoes by way of the surface, modelled as noise from their directions')
     sonar_depth: float = live(3.0, 'm',
         'depth of the sonar below the surface, for multipath', range=(0.0, 12000.0))
-    multipath_level_db: float = live(0.0, 'dB',
+    multipath_level_db: float = constant(0.0, 'dB',
         'multipath: power of echoes by way of the surface, relative to those of the floor',
         range=(-60.0, 60.0))
 
@@ -175,10 +175,10 @@ class BathymetryConfig(MountingParameters):
         'else particles', choices=('auto', 'gaussian', 'particles', 'grid'))
     particles_per_model: int = live(100, '',
         'number of particles of each model', range=(2, 100_000))
-    grid_step: float = live(0.0, '',
+    grid_step: float = constant(0.0, '',
         'distance between grid points, m or rad; 0: the smallest noise, at most 0.01 m or 0.05 '
         'deg; 0.01 m for height_bank, 0.02 m for scatter_bank', range=(0.0, 100.0))
-    grid_extent: float = live(20.0, 'm',
+    grid_extent: float = constant(20.0, 'm',
         'distance that a grid of heights reaches to both sides of the start, at least 2 '
         'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
     smoothing: str = live('auto', '',
@@ -205,7 +205,7 @@ class BathymetryConfig(MountingParameters):
     max_gap: float = live(1.0, 's',
         'longest time between two poses of nav that is interpolated; pings in a longer gap are '
         'skipped and counted', range=(0.01, 60.0))
-    max_extrapolation: float = live(0.0, 's',
+    max_extrapolation: float = constant(0.0, 's',
         'time by which the last bin of a ping may be newer than the newest pose of nav; later '
         'ones wait', range=(0.0, 10.0))
 

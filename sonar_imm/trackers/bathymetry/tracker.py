@@ -53,7 +53,7 @@ from typing import Any, ClassVar, NamedTuple
 from attrs import define, evolve, field, frozen
 import numpy as np
 
-from ...acoustics.calibration import Calibration
+from ...acoustics.calibration import Calibration, FEWEST_STAVES
 from ...acoustics.layover import Layover
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
@@ -380,8 +380,10 @@ def _evidence_of_sign(ping: Ping) -> float:
     """What a ping says of the sign of its phase, see `Sign`; nothing without echoes."""
     config = with_open_start(ping.config)
     seen = look(evolve(ping, config=config))
-    unknown = config.calibrate_array and not config.multipath and not seen.staves.fits.all()
-    if unknown or np.count_nonzero(seen.likelihood.echo) < FEWEST_LOUD:
+    measured = config.calibrate_array and not config.multipath
+    measured &= seen.snapshot.staves >= FEWEST_STAVES
+    known = seen.staves.bins > 0 and bool(seen.staves.fits.all())
+    if measured and not known or np.count_nonzero(seen.likelihood.echo) < FEWEST_LOUD:
         return 0.0
     turned = look(evolve(ping, config=evolve(config, conjugate=not config.conjugate)))
     return sign_evidence(run(seen).log_likelihood, run(turned).log_likelihood)

@@ -218,7 +218,7 @@ SHARE = 0.2
 
 COSTLY = {
     'particles': 200, 'particles_per_model': 20, 'threads': 1, 'directions': 24,
-    'order_max': 6, 'grid_extent': 50.0, 'smoothing_lag': 3, 'phones': 0, 'max_tracks': 10,
+    'order_max': 6, 'smoothing_lag': 3, 'phones': 0, 'max_tracks': 10,
 }  # fmt: skip
 """The most that is tried of what only costs time: how much is a matter of what a user pays."""
 

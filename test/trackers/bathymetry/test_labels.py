@@ -252,4 +252,4 @@ def test_neighbours_lean_on_each_other_in_this_bank_too():
 )
 def test_what_does_not_fit_is_refused(values, words):
     with pytest.raises(ConfigError, match=words):
-        BathymetryConfig.from_mapping({'model_set': 'scatter_bank', **values})
+        BathymetryConfig(**{'model_set': 'scatter_bank', **values})
